@@ -12,7 +12,7 @@ import pytest
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect
 from workbench.gap.prediction import workers as module
-from workbench.gap.prediction.workers import FORKS, LEFT_OVER, MOST_TURNS, Workers, shared_array
+from workbench.gap.prediction.workers import FORKS, LEFT_OVER, MOST_TURNS, Workers
 
 TWO = Workers(2)
 forked = pytest.mark.skipif(not FORKS, reason="processes are forked on Linux only")
@@ -176,7 +176,7 @@ def test_a_kind_of_effect_comes_back_as_itself():
 
 
 def test_what_processes_write_into_a_shared_array_is_read_here():
-    rows = shared_array(20, 3)
+    rows = TWO.array(20, 3)
 
     def write(i):
         time.sleep(0.005)
@@ -184,7 +184,41 @@ def test_what_processes_write_into_a_shared_array_is_read_here():
 
     TWO.map(write, range(20))
     assert np.array_equal(rows, np.outer(np.arange(20), np.ones(3)))
-    assert shared_array(0, 3).shape == (0, 3)
+    assert TWO.array(0, 3).shape == (0, 3)
+
+
+@forked
+def test_processes_that_stand_by_are_forked_once_and_as_many_as_there_is_work_for(helpers):
+    offset = 0
+
+    def late(i):
+        time.sleep(0.02)
+        return os.getpid(), i + offset
+
+    with Workers(3).standing(late) as share:
+        assert share([]) == [] and share([1]) == [(os.getpid(), 1)] and not helpers
+        assert [i for _, i in share(range(2))] == [0, 1] and len(helpers) == 1
+        offset = 10  # which only this process knows of
+        for _ in range(3):
+            found = share(range(8))
+            assert {pid for pid, _ in found} == {os.getpid(), *helpers} and len(helpers) == 2
+            assert all(i == n + (10 if pid in (os.getpid(), helpers[1]) else 0) for n, (pid, i) in enumerate(found))
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_failure_of_processes_that_stand_by_is_raised_whoever_fails(number, monkeypatch):
+    def fails(i):
+        time.sleep(0.01)
+        if i == 7:
+            raise ValueError("no rig 7")
+        return i
+
+    for forks in (FORKS, False):
+        monkeypatch.setattr(module, "FORKS", forks)
+        with Workers(number).standing(fails) as share:
+            assert share(range(5)) == list(range(5))
+            with pytest.raises(ValueError, match="no rig 7"):
+                share(range(9))
 
 
 def test_where_nothing_is_forked_threads_do_it(monkeypatch):

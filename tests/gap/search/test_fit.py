@@ -163,6 +163,11 @@ def test_a_set_must_hold_on_records_it_has_not_seen():
     assert not _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77), beyond=0.12**2), "noise of the inputs is"
 
 
+def _of(problem):
+    """Slopes by this process alone."""
+    return lambda moves: [problem.slope(move) for move in moves]
+
+
 @pytest.mark.parametrize("swapped", [False, True])
 def test_numbers_of_different_sensors_are_moved_at_once_where_each_alters_its_own_readings(rig, measured, swapped):
     """Slopes are those of one number at a time, but for the last digit of what is divided by a step."""
@@ -175,7 +180,7 @@ def test_numbers_of_different_sensors_are_moved_at_once_where_each_alters_its_ow
     alone._of_sensors_alone = lambda numbers: []
     assert bool(together._of_sensors_alone(range(20))) != swapped
     start = together.residual(together.start)
-    one, other = (each.jacobian(each.start, start, False) for each in (together, alone))
+    one, other = (each.jacobian(each.start, start, False, _of(each)) for each in (together, alone))
     np.testing.assert_allclose(one, other, atol=1e-12 / min(together.steps) * np.abs(start).max())
 
 
@@ -184,10 +189,10 @@ def test_slopes_along_believed_numbers_are_kept_and_others_taken_anew(rig, measu
     effects = (Effect(CUBIC, None, {"at": 0.8, "stiffness": 400.0}), nominal_errors(rig, NominalPrior(gain=0.01)))
     chord = _Problem(rig, effects, data, chord=True)
     residual = chord.residual(chord.start)
-    first = chord.jacobian(chord.start, residual, False).copy()
+    first = chord.jacobian(chord.start, residual, False, _of(chord)).copy()
     np.testing.assert_allclose(chord.normal(first), first.T @ first)
     moved = chord.start + 0.01 * (np.arange(chord.start.size) < 2)
-    second = chord.jacobian(moved, chord.residual(moved), False)
+    second = chord.jacobian(moved, chord.residual(moved), False, _of(chord))
     np.testing.assert_array_equal(second[:, chord.believed], first[:, chord.believed])
     assert np.abs(second[:, :2] - first[:, :2]).max() > 1e-6 * np.abs(first[:, :2]).max()
     np.testing.assert_allclose(chord.normal(second), second.T @ second, rtol=1e-9, atol=1e-6)

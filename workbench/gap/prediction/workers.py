@@ -6,7 +6,7 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from ctypes import CDLL
@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
 from mmap import mmap
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from typing import Any, NoReturn, TypeVar
 
 import joblib
@@ -26,6 +28,7 @@ FORKS = sys.platform == "linux"  # elsewhere libraries of the system do not surv
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 LEFT_OVER = 5  # niceness of what is computed in the background: less urgent, but asked for in the end
 TURN = 4  # bytes of a number in the pipe that turns are taken from
+NO_MORE = 2**32 - 1  # in the place of a turn: nothing is left of these items
 MOST_TURNS = 8192  # what a pipe holds at once, with room to spare
 
 Item = TypeVar("Item")
@@ -54,31 +57,49 @@ class Workers:
     def map(self, function: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
         """`function(item)` of each, in their order; each process takes the next item when it is done with one.
 
-        A forked process changes nothing in this one: what a function finds, it returns, or writes into a
-        `shared_array`.
+        A forked process changes nothing in this one: what a function finds, it returns, or writes into
+        an `array`.
 
         Raises:
             ChildProcessError: a process was killed, for want of memory for instance.
         """
-        items = list(items)
-        number = 1 if _Helper.is_this_process else min(self.number, len(items))
-        if number < 2:
-            return [function(item) for item in items]
-        if not FORKS:
-            with ThreadPoolExecutor(number) as pool:
-                return list(pool.map(function, items))
-        turns = _turns(len(items))
-        helpers: list[_Helper] = []
-        try:
-            helpers += (_Helper(lambda: _taken(function, items, turns)) for _ in range(number - 1))
-            found = _taken(function, items, turns)
-            for helper in helpers:
-                found.update(helper.found())
-        finally:
-            os.close(turns)
-            for helper in helpers:
-                helper.end()
-        return [found[i] for i in range(len(items))]
+        at_hand = list(items)
+
+        def of(i: int) -> Found:
+            return function(at_hand[i])
+
+        with self.standing(of) as share:
+            return share(range(len(at_hand)))
+
+    @contextmanager
+    def standing(self, function: Callable[[Item], Found]) -> Iterator[Callable[[Sequence[Item]], list[Found]]]:
+        """Processes that stand by: what is given to the block is `map` of the function, again and again.
+
+        They are forked when it is first called, and once: what changes here afterwards they only learn from the items.
+        To fork takes a hundredth of a second, and as long again for the memory that is written to after it.
+        """
+        if self._are_alone:
+            yield lambda items: [function(item) for item in items]
+        elif not FORKS:
+            with ThreadPoolExecutor(self.number) as pool:
+                yield lambda items: list(pool.map(function, items))
+        else:
+            crew = _Crew(function, self.number)
+            try:
+                yield crew.share
+            finally:
+                crew.end()
+
+    def array(self, *shape: int) -> np.ndarray:
+        """Zeros that forked processes write into for this one to read."""
+        if self._are_alone or not FORKS:
+            return np.zeros(shape)
+        n_bytes = 8 * int(np.prod(shape))
+        return np.frombuffer(mmap(-1, max(n_bytes, 8)), float, n_bytes // 8).reshape(shape)
+
+    @property
+    def _are_alone(self) -> bool:
+        return _Helper.is_this_process or self.number < 2
 
     @contextmanager
     def in_background(self, function: Callable[[], Found]) -> Iterator[Callable[[], Found]]:
@@ -87,10 +108,11 @@ class Workers:
         Its work may be shared further. Where no process is forked it is computed when it is asked for. What
         nobody has asked for by the end of the block is given up.
         """
-        if _Helper.is_this_process or self.number < 2 or not FORKS:
+        if self._are_alone or not FORKS:
             yield cache(function)
             return
-        helper = _Helper(function, background=True)
+        helper = _Helper(lambda _: function(), background=True)
+        helper.ask(None)
         try:
             yield cache(helper.found)
         finally:
@@ -100,57 +122,76 @@ class Workers:
 ALONE = Workers(1)
 
 
-def shared_array(*shape: int) -> np.ndarray:
-    """Zeros that forked processes write into for this one to read."""
-    n_bytes = 8 * int(np.prod(shape))
-    return np.frombuffer(mmap(-1, max(n_bytes, 8)), float, n_bytes // 8).reshape(shape)
+class _Crew:
+    """This process and the helpers that take turns with it; each takes the next item when it is done with one."""
+
+    def __init__(self, function: Callable[[Any], Any], number: int) -> None:
+        self._function, self._number = function, number
+        self._helpers: list[_Helper] = []
+        self._turns, self._sink = os.pipe()  # it holds the first index of every turn, for whoever is free
+
+    def share(self, items: Sequence[Any]) -> list[Any]:
+        while len(self._helpers) < min(self._number, len(items)) - 1:
+            self._helpers.append(_Helper(self._taken))
+        if len(items) < 2:
+            return [self._function(item) for item in items]
+        for start in range(0, len(items), _per_turn(items)):
+            self._put(start)
+        for helper in self._helpers:
+            helper.ask(items)
+        for _ in range(len(self._helpers) + 1):
+            self._put(NO_MORE)
+        found = self._taken(items)
+        for helper in self._helpers:
+            found.update(helper.found())
+        return [found[i] for i in range(len(items))]
+
+    def end(self) -> None:
+        os.close(self._turns)
+        os.close(self._sink)
+        for helper in self._helpers:
+            helper.end()
+
+    def _put(self, turn: int) -> None:
+        os.write(self._sink, turn.to_bytes(TURN, "little"))
+
+    def _taken(self, items: Sequence[Any]) -> dict[int, Any]:
+        """What this process found, by the index of the item."""
+        found, per_turn = {}, _per_turn(items)
+        while (start := int.from_bytes(os.read(self._turns, TURN), "little")) != NO_MORE:
+            for i in range(start, min(start + per_turn, len(items))):
+                found[i] = self._function(items[i])
+        return found
 
 
-def _turns(n: int) -> int:
-    """The end of a pipe that holds the first index of every turn, to be read by whoever is free."""
-    source, sink = os.pipe()
-    for start in range(0, n, _per_turn(n)):
-        os.write(sink, start.to_bytes(TURN, "little"))
-    os.close(sink)
-    return source
-
-
-def _per_turn(n: int) -> int:
-    return -(-n // MOST_TURNS)
-
-
-def _taken(function: Callable[[Any], Any], items: list[Any], turns: int) -> dict[int, Any]:
-    """What this process found, by the index of the item."""
-    found = {}
-    while turn := os.read(turns, TURN):
-        start = int.from_bytes(turn, "little")
-        for i in range(start, min(start + _per_turn(len(items)), len(items))):
-            found[i] = function(items[i])
-    return found
+def _per_turn(items: Sequence[Any]) -> int:
+    return -(-len(items) // MOST_TURNS)
 
 
 class _Helper:
-    """A forked process that sends back what it found; without helpers of its own, unless in the background."""
+    """A forked process that answers what it is asked; without helpers of its own, unless in the background."""
 
     is_this_process = False
 
-    def __init__(self, work: Callable[[], Any], background: bool = False) -> None:
-        self._source, sink = os.pipe()
+    def __init__(self, work: Callable[[Any], Any], background: bool = False) -> None:
+        self._here, there = Pipe()
         with warnings.catch_warnings():
             # no lock of another thread is ever asked for by a helper: it computes, writes to its pipe and ends
             warnings.filterwarnings("ignore", message=".*multi-threaded.*", category=DeprecationWarning)
             self._pid = os.fork()
         if self._pid == 0:
-            _help(work, sink, background)
-        os.close(sink)
+            _help(work, there, background)
+        there.close()
+
+    def ask(self, asked: Any) -> None:
+        with suppress(BrokenPipeError):  # of one that was killed: it is missed when its answer is
+            self._here.send_bytes(_sent(asked))
 
     def found(self) -> Any:
-        """What it found; what it failed by is raised here."""
-        with open(self._source, "rb", closefd=False) as sent:
-            answer = sent.read()
+        """Its answer; what it failed by is raised here."""
         try:
-            found = _Receiver(BytesIO(answer)).load()
-        except (EOFError, pickle.UnpicklingError):
+            found = _received(self._here.recv_bytes())
+        except (EOFError, ConnectionResetError):
             text = "a process of the diagnosis was killed; is there memory for so many? Try one worker alone"
             raise ChildProcessError(text) from None
         if isinstance(found, BaseException):
@@ -159,25 +200,26 @@ class _Helper:
 
     def end(self) -> None:
         """Nothing is left of it, whatever it was at."""
-        os.close(self._source)
+        self._here.close()
         with suppress(ProcessLookupError, ChildProcessError):
             os.kill(self._pid, signal.SIGKILL)
             os.waitpid(self._pid, 0)
 
 
-def _help(work: Callable[[], Any], sink: int, background: bool) -> NoReturn:
+def _help(work: Callable[[Any], Any], there: Connection, background: bool) -> NoReturn:
     """The life of a helper; it ends here, without what a process does at its end for those that it was forked from."""
     try:
         _Helper.is_this_process = not background
         os.nice(LEFT_OVER if background else 0)
         CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # it outlives nobody whom it works for
-        try:
-            answer = _sent(work())
-        except Exception as error:
-            error.add_note("".join(traceback.format_tb(error.__traceback__)))
-            answer = _sent(error)
-        with open(sink, "wb") as out:
-            out.write(answer)
+        while True:
+            asked = _received(there.recv_bytes())
+            try:
+                answer = _sent(work(asked))
+            except Exception as error:
+                error.add_note("".join(traceback.format_tb(error.__traceback__)))
+                answer = _sent(error)
+            there.send_bytes(answer)
     finally:
         os._exit(0)
 
@@ -186,6 +228,10 @@ def _sent(found: Any) -> bytes:
     out = BytesIO()
     _Sender(out, pickle.HIGHEST_PROTOCOL).dump(found)
     return out.getvalue()
+
+
+def _received(sent: bytes) -> Any:
+    return _Receiver(BytesIO(sent)).load()
 
 
 class _Sender(pickle.Pickler):

@@ -1,12 +1,12 @@
 """Fit of a set of effects to the fit records: nonlinear least squares of the simulation error."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from workbench.arrays import Flags, Floats
+from workbench.arrays import Flags, Floats, Integers
 from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_all, key_of
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
@@ -75,6 +75,28 @@ def finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.nd
         return residual if residual @ residual < HOPELESS else None
 
 
+@dataclass(frozen=True, eq=False)
+class Move:
+    """Numbers that are moved at once, to see what each does to the residual.
+
+    Attributes:
+        free: (n_parameters,) all of them.
+        to: where they are moved.
+        numbers: which of them.
+        coarsely: whether the residual is taken by coarser steps of time.
+        of_sensors_alone: whether each alters the readings of a sensor of its own, and no other's.
+    """
+
+    free: Floats
+    to: Floats
+    numbers: list[int]
+    coarsely: bool
+    of_sensors_alone: bool = False
+
+
+Shared = Callable[[list[Move]], list[bool]]
+
+
 class _Problem:
     """The residual as a function of the free coordinates of all parameters of all effects."""
 
@@ -104,7 +126,8 @@ class _Problem:
         self.believed = [j for j, (_, p) in enumerate(self.parameters) if p.prior_std is not None]
         self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.believed])
         self.is_known = known is not None  # whether the slopes along believed values stay as they are
-        self._jacobian: Floats | None = None
+        # a row a number, of what it does to each value, and one of the residual beside which it does
+        self._columns = np.zeros((len(self.parameters) + 1, 0))
         self._normal: Floats | None = None
 
     @cached_property
@@ -133,67 +156,62 @@ class _Problem:
         on_coarse = self.residual(free, coarsely=True) if self.is_coarsened else None
         return (residual, False) if on_coarse is None else (on_coarse, True)
 
-    def _moved(self, free: np.ndarray, j: int) -> np.ndarray:
-        """The free coordinates with one a small step away, inside its bounds."""
-        parameter = self.parameters[j][1]
-        step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name in COORDINATES else self.steps[j]
+    def _moved(self, free: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
+        """The free coordinates with some a small step away, inside their bounds."""
         moved = free.copy()
-        moved[j] += step
-        if self.high[j] < moved[j]:
-            moved[j] = free[j] - step
+        for j in numbers:
+            parameter = self.parameters[j][1]
+            step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name in COORDINATES else self.steps[j]
+            moved[j] = free[j] - step if self.high[j] < free[j] + step else free[j] + step
         return moved
 
-    def _of_sensors_alone(self, numbers: Sequence[int]) -> list[list[tuple[int, np.ndarray]]]:
-        """Groups of numbers of different sensors, which one move tells apart, each with the values it alters.
-
-        None where values mix the readings of several sensors.
-        """
+    def _of_sensors_alone(self, numbers: Sequence[int]) -> list[list[int]]:
+        """Groups of numbers of different sensors, which one move tells apart; none where values mix their readings."""
         both = (e for e in (*self.effects, *self.held) if e.kind.path == "sensor" and isinstance(e.target, tuple))
         if self.data.mixes_sensors or any(both) or any(sensor.crosstalk for sensor in self.rig.sensors):
             return []
-        names = [sensor.name for sensor in self.rig.sensors]
-        sources = self.data.sources
         by_sensor: dict[str, list[int]] = {}
         for j in numbers:
             by_sensor.setdefault(self.parameters[j][1].sensor, []).append(j)
-        own = {names.index(name): each for name, each in by_sensor.items() if name}
-        rows = {row: np.flatnonzero(sources == row) for row in own}
-        most = max(map(len, own.values()), default=0)
-        groups = [[(each[k], rows[row]) for row, each in own.items() if k < len(each)] for k in range(most)]
-        believed = {j: np.array([self.data.n_values + i]) for i, j in enumerate(self.believed)}
-        none = np.zeros(0, int)
-        return [[(j, np.concatenate([at, believed.get(j, none)])) for j, at in group] for group in groups]
+        own = [each for name, each in by_sensor.items() if name]
+        return [[each[k] for each in own if k < len(each)] for k in range(max(map(len, own), default=0))]
 
-    def jacobian(self, free: np.ndarray, residual: np.ndarray, coarsely: bool) -> np.ndarray:
+    def _altered(self, j: int) -> Integers:
+        """The values that a number of one sensor alters."""
+        names = [sensor.name for sensor in self.rig.sensors]
+        read = np.flatnonzero(self.data.sources == names.index(self.parameters[j][1].sensor))
+        return np.append(read, [self.data.n_values + i for i, k in enumerate(self.believed) if k == j])
+
+    def slope(self, move: Move) -> bool:
+        """Write the columns of what a move tells, from the residual beside; False where the rig cannot be there."""
+        beside = self.residual(move.to, coarsely=move.coarsely)
+        if beside is None:
+            return False
+        for j in move.numbers:
+            rows = self._altered(j) if move.of_sensors_alone else slice(None)
+            self._columns[j, rows] = (beside[rows] - self._columns[-1, rows]) / (move.to[j] - move.free[j])
+        return True
+
+    def jacobian(self, free: Floats, residual: Floats, coarsely: bool, share: Shared) -> Floats:
         """Differences from the residual that `near` gives; the next call overwrites them."""
-
-        def column(j: int) -> np.ndarray:
-            moved = self._moved(free, j)
-            beside = self.residual(moved, coarsely=coarsely)
-            if beside is None:
-                moved[j] = 2.0 * free[j] - moved[j]
-                beside = self.residual(moved, coarsely=coarsely)
-            return np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j])
-
-        if self._jacobian is None:
-            self._jacobian = np.zeros((residual.size, len(self.parameters)), order="F")
+        if self._columns.shape[1] != residual.size:  # before helpers are forked, which write into them
+            self._columns = self.workers.array(len(self.parameters) + 1, residual.size)
             if self.known is not None:
-                self._jacobian[: len(self.known), self.believed] = self.known
-        jacobian = self._jacobian
+                self._columns[self.believed, : len(self.known)] = self.known.T
+        jacobian = self._columns[:-1].T
         fresh = [j for j in range(len(self.parameters)) if not self.is_known or j not in self.believed]
-        jacobian[:, fresh] = 0.0
-        for group in self._of_sensors_alone(fresh):
-            moved = free.copy()
-            for j, _ in group:
-                moved[j] = self._moved(free, j)[j]
-            beside = self.residual(moved, coarsely=coarsely)
-            if beside is None:
-                continue
-            for j, rows in group:
-                jacobian[rows, j] = (beside[rows] - residual[rows]) / (moved[j] - free[j])
-            fresh = [j for j in fresh if all(j != done for done, _ in group)]
-        for j, found in zip(fresh, self.workers.map(column, fresh), strict=True):
-            jacobian[:, j] = found
+        self._columns[fresh], self._columns[-1] = 0.0, residual
+        groups = self._of_sensors_alone(fresh)
+        alone = [j for j in fresh if all(j not in group for group in groups)]
+        moves = [Move(free, self._moved(free, group), group, coarsely, of_sensors_alone=True) for group in groups]
+        moves += (Move(free, self._moved(free, [j]), [j], coarsely) for j in alone)
+        # where the rig cannot be: each number alone, and then to its other side
+        failed = [move for move, told in zip(moves, share(moves), strict=True) if not told]
+        single = [j for move in failed if len(move.numbers) > 1 for j in move.numbers]
+        moves = [Move(free, self._moved(free, [j]), [j], coarsely) for j in single]
+        failed = [move for move in failed if len(move.numbers) == 1]
+        failed += (move for move, told in zip(moves, share(moves), strict=True) if not told)
+        share([Move(free, 2.0 * free - move.to, move.numbers, coarsely) for move in failed])
         if self.is_known:
             jacobian[residual.size - len(self.believed) :, self.believed] = np.diag(1.0 / self.prior_std)
         self.is_known = self.is_known or self.chord
@@ -242,10 +260,12 @@ def slopes(
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")
-    jacobian = problem.jacobian(problem.start, *problem.near(problem.start, residual))
-    if wide:
-        jacobian, problem.steps = jacobian.copy(), -problem.steps
-        jacobian = 0.5 * (jacobian + problem.jacobian(problem.start, *problem.near(problem.start, residual)))
+    with workers.standing(problem.slope) as share:
+        near = problem.near(problem.start, residual)
+        jacobian = problem.jacobian(problem.start, *near, share)
+        if wide:
+            jacobian, problem.steps = jacobian.copy(), -problem.steps
+            jacobian = 0.5 * (jacobian + problem.jacobian(problem.start, *near, share))
     return residual[: data.n_values], jacobian[: data.n_values]
 
 
@@ -284,20 +304,28 @@ def fit(
         damping: of the first step, as a share of the diagonal of Jᵀ J.
     """
     problem = _Problem(rig, effects, data, held, workers, known, chord)
-    free = problem.start.copy()
-    residual = problem.residual(free)
+    residual = problem.residual(problem.start)
     if residual is None:
         shape = (len(data.records), data.noise.size)
-        return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), free.size, "no rig at the start")
+        return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), problem.start.size, "no rig at the start")
+    with workers.standing(problem.slope) as share:
+        return _descended(problem, share, residual, iterations, tolerance, damping)
+
+
+def _descended(
+    problem: _Problem, share: Shared, residual: Floats, iterations: int, tolerance: float, damping: float
+) -> Fit:
+    """The fit from where the problem starts, with this residual."""
+    free = problem.start.copy()
     cost = residual @ residual
     status, falling = "most iterations done", 0.0
     normal = np.zeros((free.size, free.size))
     for _ in range(iterations if free.size else 0):
-        if data.deadline.is_past:
+        if problem.data.deadline.is_past:
             status, falling = "no time left", 0.0
             break
         nearly, coarsely = problem.near(free, residual)
-        jacobian = problem.jacobian(free, nearly, coarsely)
+        jacobian = problem.jacobian(free, nearly, coarsely, share)
         normal, gradient = problem.normal(jacobian), jacobian.T @ residual
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
         improved: np.ndarray | None = None

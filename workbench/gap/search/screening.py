@@ -10,7 +10,6 @@ from workbench.arrays import Flags, Floats
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.workers import shared_array
 from workbench.gap.search.fit import finite_residual, slopes
 from workbench.gap.search.search import Search, apart
 from workbench.gap.search.settings import SCREENING, SEARCH
@@ -61,7 +60,7 @@ class Screening:
         starts = [start for task in tasks for start in task]
         bounds = [_bounds(task) for task in tasks for _ in task]
         left = before[thin]
-        moves = shared_array(len(starts), left.size)  # the one large array
+        moves = search.workers.array(len(starts), left.size)  # the one large array
 
         def tells(i: int) -> bool:
             moved = finite_residual(search.rig, (*given, starts[i], *search.held), data)
