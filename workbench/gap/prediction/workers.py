@@ -98,6 +98,11 @@ class Workers:
         return np.frombuffer(mmap(-1, max(n_bytes, 8)), float, n_bytes // 8).reshape(shape)
 
     @property
+    def at_once(self) -> int:
+        """How many processes there are here: helpers have none of their own."""
+        return 1 if self._are_alone else self.number
+
+    @property
     def _are_alone(self) -> bool:
         return _Helper.is_this_process or self.number < 2
 

@@ -1,8 +1,11 @@
 """Fit of a set of effects to the fit records: nonlinear least squares of the simulation error."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate, islice
+from operator import mul
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +18,7 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
 HOPELESS = 1e300
+ATTEMPTS, LESS_FAR = 7, 6.0  # steps that are tried from one place, each damped by so much more than the one before
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +98,27 @@ class Move:
     of_sensors_alone: bool = False
 
 
-Shared = Callable[[list[Move]], list[bool]]
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """A step that may lower the cost.
+
+    Attributes:
+        free: (n_parameters,) where it starts.
+        coarsely: whether slopes there are taken by coarser steps of time.
+        normal, gradient: Jᵀ J and Jᵀ r there.
+        damping: as a share of the diagonal of Jᵀ J.
+        worth: the least decrease of the cost, to second order, for which it is tried.
+    """
+
+    free: Floats
+    coarsely: bool
+    normal: Floats
+    gradient: Floats
+    damping: float
+    worth: float
+
+
+Shared = Callable[[Sequence[Move | Attempt]], list[Any]]
 
 
 class _Problem:
@@ -178,9 +202,13 @@ class _Problem:
 
     def _altered(self, j: int) -> Integers:
         """The values that a number of one sensor alters."""
-        names = [sensor.name for sensor in self.rig.sensors]
-        read = np.flatnonzero(self.data.sources == names.index(self.parameters[j][1].sensor))
-        return np.append(read, [self.data.n_values + i for i, k in enumerate(self.believed) if k == j])
+        believed = [self.data.n_values + self.believed.index(j)] if j in self.believed else []
+        return np.append(self._read_by[self.parameters[j][1].sensor], believed).astype(int)
+
+    @cached_property
+    def _read_by(self) -> dict[str, Integers]:
+        """By name of sensor, the values that are its readings."""
+        return {s.name: np.flatnonzero(self.data.sources == i) for i, s in enumerate(self.rig.sensors)}
 
     def slope(self, move: Move) -> bool:
         """Write the columns of what a move tells, from the residual beside; False where the rig cannot be there."""
@@ -191,6 +219,40 @@ class _Problem:
             rows = self._altered(j) if move.of_sensors_alone else slice(None)
             self._columns[j, rows] = (beside[rows] - self._columns[-1, rows]) / (move.to[j] - move.free[j])
         return True
+
+    def attempt(self, attempt: Attempt) -> tuple[Floats, Floats | None] | None:
+        """Where a step leads, and the residual there if the rig can be; None where it promises too little."""
+        free, normal = attempt.free, attempt.normal
+        diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
+        damped = normal + attempt.damping * np.diag(diagonal)
+        straight, moving = _straight(self, free, attempt.gradient, damped)
+        if -(2.0 * attempt.gradient + normal @ straight) @ straight < attempt.worth:
+            return None
+        to = free + _bounded(self, free, straight + self._bend(attempt, damped, straight, moving))
+        return to, self.residual(to)
+
+    def _bend(self, attempt: Attempt, damped: Floats, step: Floats, moving: Flags) -> Floats:
+        """What a step turns by in a valley that bends: geodesic acceleration, none where it is no small correction.
+
+        Transtrum & Sethna (2012), arXiv:1201.5885. A place and a strength make up for one another along such a valley.
+        """
+        turn = np.zeros_like(step)
+        if moving.sum() < 2:
+            return turn
+        beside = self.residual(attempt.free + FIT.bent * step, coarsely=attempt.coarsely)
+        if beside is None:
+            return turn
+        # J' times the second derivative along the step
+        columns, residual = self._columns[:-1], self._columns[-1]
+        curvature = 2.0 / FIT.bent * (columns @ (beside - residual) / FIT.bent - attempt.normal @ step)
+        turn[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], curvature[moving])
+        with np.errstate(over="ignore"):
+            small = 2.0 * np.linalg.norm(turn) < FIT.most_bent * np.linalg.norm(step)
+        return turn if small else np.zeros_like(step)
+
+    def done(self, job: Move | Attempt) -> Any:
+        """A share of the work of an iteration."""
+        return self.slope(job) if isinstance(job, Move) else self.attempt(job)
 
     def jacobian(self, free: Floats, residual: Floats, coarsely: bool, share: Shared) -> Floats:
         """Differences from the residual that `near` gives; the next call overwrites them."""
@@ -260,7 +322,7 @@ def slopes(
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")
-    with workers.standing(problem.slope) as share:
+    with workers.standing(problem.done) as share:
         near = problem.near(problem.start, residual)
         jacobian = problem.jacobian(problem.start, *near, share)
         if wide:
@@ -308,7 +370,7 @@ def fit(
     if residual is None:
         shape = (len(data.records), data.noise.size)
         return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), problem.start.size, "no rig at the start")
-    with workers.standing(problem.slope) as share:
+    with workers.standing(problem.done) as share:
         return _descended(problem, share, residual, iterations, tolerance, damping)
 
 
@@ -317,7 +379,7 @@ def _descended(
 ) -> Fit:
     """The fit from where the problem starts, with this residual."""
     free = problem.start.copy()
-    cost = residual @ residual
+    cost = float(residual @ residual)
     status, falling = "most iterations done", 0.0
     normal = np.zeros((free.size, free.size))
     for _ in range(iterations if free.size else 0):
@@ -327,31 +389,36 @@ def _descended(
         nearly, coarsely = problem.near(free, residual)
         jacobian = problem.jacobian(free, nearly, coarsely, share)
         normal, gradient = problem.normal(jacobian), jacobian.T @ residual
-        diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
-        improved: np.ndarray | None = None
-        for _ in range(7):
-            damped = normal + damping * np.diag(diagonal)
-            straight, moving = _straight(problem, free, gradient, damped)
-            promised = -(2.0 * gradient + normal @ straight) @ straight
-            if promised < FIT.promised * tolerance * cost:
-                break
-            bend = _bend(problem, free, nearly, coarsely, jacobian, normal, damped, straight, moving)
-            step = _bounded(problem, free, straight + bend)
-            trial = problem.residual(free + step)
-            if trial is not None and trial @ trial < cost:
-                improved = trial
-                break
-            damping *= 6.0
-        if improved is None:
+        dampings = accumulate([damping, *[LESS_FAR] * (ATTEMPTS - 1)], mul)
+        worth = FIT.promised * tolerance * cost
+        attempts = (Attempt(free, coarsely, normal, gradient, each, worth) for each in dampings)
+        found = _first_below(cost, attempts, share, problem.workers.at_once)
+        if found is None:
             status, falling = "no step lowers the cost", 0.0
             break
-        falling = 1.0 - (improved @ improved) / cost
-        free, residual, cost = free + step, improved, improved @ improved
-        damping = max(damping / 8.0, 1e-9)
+        (free, residual), damping = found
+        falling = 1.0 - float(residual @ residual) / cost
+        cost, damping = float(residual @ residual), max(damping / 8.0, 1e-9)
         if falling < tolerance:
             status, falling = "settled", 0.0
             break
     return _result(problem, free, residual, normal, status, falling)
+
+
+def _first_below(
+    cost: float, attempts: Iterator[Attempt], share: Shared, at_once: int
+) -> tuple[tuple[Floats, Floats], float] | None:
+    """Where the first step leads that lowers the cost, with the residual there, and its damping.
+
+    As many are tried at once as there are processes: every other one fails, and the next would wait for it.
+    """
+    while some := list(islice(attempts, at_once)):
+        for attempt, ended in zip(some, share(some), strict=True):
+            if ended is None:
+                return None
+            if ended[1] is not None and ended[1] @ ended[1] < cost:
+                return ended, attempt.damping
+    return None
 
 
 def _straight(problem: _Problem, free: Floats, gradient: Floats, damped: Floats) -> tuple[Floats, Flags]:
@@ -375,35 +442,6 @@ def _bounded(problem: _Problem, free: Floats, step: Floats) -> Floats:
     step = np.clip(step, -reach, reach)
     ended: Floats = np.clip(free + step, problem.low, problem.high)
     return ended - free
-
-
-def _bend(
-    problem: _Problem,
-    free: Floats,
-    residual: Floats,
-    coarsely: bool,
-    jacobian: Floats,
-    normal: Floats,
-    damped: Floats,
-    step: Floats,
-    moving: Flags,
-) -> Floats:
-    """What the step turns by in a valley that bends: geodesic acceleration, none where it is no small correction.
-
-    Transtrum & Sethna (2012), arXiv:1201.5885. A place and a strength make up for one another along such a valley.
-    """
-    turn = np.zeros_like(step)
-    if moving.sum() < 2:
-        return turn
-    beside = problem.residual(free + FIT.bent * step, coarsely=coarsely)
-    if beside is None:
-        return turn
-    # J' times the second derivative along the step
-    curvature = 2.0 / FIT.bent * (jacobian.T @ (beside - residual) / FIT.bent - normal @ step)
-    turn[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], curvature[moving])
-    with np.errstate(over="ignore"):
-        small = 2.0 * np.linalg.norm(turn) < FIT.most_bent * np.linalg.norm(step)
-    return turn if small else np.zeros_like(step)
 
 
 def _reach(problem: _Problem) -> np.ndarray:
