@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -55,7 +56,8 @@ class BetweenSamples:
         series: (3 n_modes, n_samples) displacements, velocities, and forces beside those of stiffness and damping.
         arrivals: (2 n_modes, n_samples - 1) displacements and velocities where each interval ends, less what steps of
             force within it bring about.
-        changes: (n_modes, n_samples) of the forces over each interval, but for the jumps of those that are held.
+        changes: (n_modes, n_samples) of the forces over each interval, but for the jumps of those that are held; None
+            where all are.
         steps: of the forces within each interval.
         ends: (2, 5, n_modes) p_0 and p_1, of displacement, velocity and force where an interval begins, displacement
             and velocity where it ends.
@@ -67,7 +69,7 @@ class BetweenSamples:
     damping: Floats
     series: Floats
     arrivals: Floats
-    changes: Floats
+    changes: Floats | None
     steps: tuple[Step, ...]
     ends: Floats
     sample_time: float
@@ -101,15 +103,20 @@ class BetweenSamples:
             beside = beside - (stiffness - omega[:, None] ** 2) * displacement
         if coupled.any():
             beside = beside - coupled @ velocity
-        changes = np.diff(beside - held, axis=1, append=0.0)
-        changes[:, -1] = 0.0  # after the last sample its force is held
-        ends = _ends(omega, own, sample_time) if changes.any() else _held(omega.size)
+        changes: Floats | None = None
+        if beside is not held:
+            changes = np.diff(beside - held, axis=1, append=0.0)
+            changes[:, -1] = 0.0  # after the last sample its force is held
+        if changes is None or not changes.any():
+            changes, ends = None, _held(omega.size)
+        else:
+            ends = _ends(omega, own, sample_time)
         rests = not (displacement[:, 0].any() or velocity[:, 0].any())
         series = np.concatenate([displacement, velocity, beside])
-        arrivals = series[: 2 * omega.size, 1:].copy()
+        arrivals = series[: 2 * omega.size, 1:]
         for step in steps:
             added = step.answer(omega, own, sample_time)
-            arrivals -= np.concatenate([row[:, None] * step.forces[:, :-1] for row in added[:2]])
+            arrivals = arrivals - np.concatenate([row[:, None] * step.forces[:, :-1] for row in added[:2]])
         return cls(omega, own, series, arrivals, changes, steps, ends, sample_time, rests)
 
     def earlier(self, order: int, shapes: Floats, delays: Floats) -> Floats:
@@ -120,10 +127,7 @@ class BetweenSamples:
             shapes: (n_sensors, n_modes) at the sensors.
             delays: (n_sensors,) s; negative for what is read ahead.
         """
-        back = [delay / self.sample_time for delay in delays]
-        whole = [int(np.ceil(round(samples, 9))) for samples in back]
-        # a span of next to nothing would be divided by
-        within = [self.sample_time * round(n - samples, 9) for n, samples in zip(whole, back, strict=True)]
+        whole, within = _intervals(tuple(delays.tolist()), self.sample_time)
         read = self._read(order, shapes, within)
         for step in self.steps:
             for j in (j for j, time in enumerate(within) if time > step.late):
@@ -155,12 +159,15 @@ class BetweenSamples:
 
         by_motion = weights(self.ends)
         read: Floats = by_motion[:, : 3 * n_modes] @ series
-        read[:, :-1] += by_motion[:, 3 * n_modes :] @ arrivals[:, : series.shape[1] - 1]
-        # after the last sample its force is held
-        read[:, -1] = weights(_held(n_modes))[:, : 3 * n_modes] @ series[:, -1]
+        if self.changes is not None:  # forces that are held lead to the motion where the interval ends by themselves
+            read[:, :-1] += by_motion[:, 3 * n_modes :] @ arrivals[:, : series.shape[1] - 1]
+            # after the last sample its force is held
+            read[:, -1] = weights(_held(n_modes))[:, : 3 * n_modes] @ series[:, -1]
         if order == 2:
             shares = np.array(times)[:, None] / self.sample_time
-            read += shapes @ series[2 * n_modes :] + shares * (shapes @ self.changes[:, samples])
+            read += shapes @ series[2 * n_modes :]
+            if self.changes is not None:
+                read += shares * (shapes @ self.changes[:, samples])
         return read
 
     def _rows(self, order: int, time: float) -> Floats:
@@ -170,6 +177,15 @@ class BetweenSamples:
         """
         motion = _propagators(self.omega, self.damping, self.sample_time, time)
         return np.asarray(motion[order] if order < 2 else -(self.omega**2) * motion[0] - self.damping * motion[1])
+
+
+@lru_cache(maxsize=64)
+def _intervals(delays: tuple[float, ...], sample_time: float) -> tuple[list[int], list[float]]:
+    """How many samples before each its interval begins that holds what is read, and the times within it, s."""
+    back = [delay / sample_time for delay in delays]
+    whole = [int(np.ceil(round(samples, 9))) for samples in back]
+    # a span of next to nothing would be divided by
+    return whole, [sample_time * round(n - samples, 9) for n, samples in zip(whole, back, strict=True)]
 
 
 def _held(n_modes: int) -> Floats:
@@ -197,14 +213,20 @@ def _ends(omega: Floats, damping: Floats, sample_time: float) -> Floats:
 
 def _propagators(omega: Floats, damping: Floats, span: float, time: float | None = None) -> Floats:
     """(2, 4, n_modes): q and q' at `time`, of q, q', p_0 and p_1 at the start of a span, the force linear over it."""
-    time = span if time is None else time
+    return _remembered(omega.tobytes(), damping.tobytes(), span, span if time is None else time)
+
+
+@lru_cache(maxsize=256)  # records of one rig, and sensors that are as late, ask for the same
+def _remembered(frequencies: bytes, dampings: bytes, span: float, time: float) -> Floats:
+    omega, damping = np.frombuffer(frequencies).copy(), np.frombuffer(dampings).copy()
     out = np.zeros((2, 4, omega.size))
     if time == 0:
         out[0, 0] = out[1, 1] = 1.0
-        return out
-    propagators(omega, damping, time, out)
-    # the force at that time is a share of the way from p_0 to p_1
-    share = time / span
-    out[:, 2] += (1.0 - share) * out[:, 3]
-    out[:, 3] *= share
+    else:
+        propagators(omega, damping, time, out)
+        # the force at that time is a share of the way from p_0 to p_1
+        share = time / span
+        out[:, 2] += (1.0 - share) * out[:, 3]
+        out[:, 3] *= share
+    out.flags.writeable = False
     return out

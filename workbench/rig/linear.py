@@ -60,6 +60,32 @@ def _recursion(decay: Complexes, drive: Complexes, out: Complexes) -> None:
             out[i, k + 1] = s
 
 
+@njit(cache=True, nogil=True)
+def _driven(
+    decay: Complexes, newly: Complexes, newer: Floats, before: Complexes, older: Floats, out: Complexes
+) -> None:
+    """The same, mode by mode, driven by newly[i] newer[i, k] + before[i] older[i, k]; `older` may have no samples."""
+    for i in range(out.shape[0]):
+        s = out[i, 0]
+        d, a, b = decay[i], newly[i], before[i]
+        for k in range(out.shape[1] - 1):
+            s = d * s + a * newer[i, k]
+            if older.shape[1]:
+                s += b * older[i, k]
+            out[i, k + 1] = s
+
+
+@njit(cache=True, nogil=True)
+def _real_motion(poles: Complexes, response: Complexes, displacement: Floats, velocity: Floats) -> None:
+    """Twice the real parts of each pole's coordinate, and of its rate."""
+    for i in range(response.shape[0]):
+        sigma, omega = poles[i].real, poles[i].imag
+        for k in range(response.shape[1]):
+            s = response[i, k]
+            displacement[i, k] = 2.0 * s.real
+            velocity[i, k] = 2.0 * (sigma * s.real - omega * s.imag)
+
+
 def held_response(
     system: ModalPoles,
     forces: np.ndarray,
@@ -82,7 +108,7 @@ def held_response(
     Returns:
         s (n_poles, n_samples), and the forces that act at the sample instants (n_inputs, n_samples).
     """
-    poles, weights = system.poles, system.weights @ participation
+    poles = system.poles
     n_samples = forces.shape[1]
     shift, rest = divmod(delay, sample_time)
     shift = int(shift)
@@ -92,11 +118,18 @@ def held_response(
     decay = np.exp(poles * sample_time)
     if time_constant == 0:
         whole, late = _growth(poles, sample_time), _growth(poles, sample_time - rest)
+        if system.uncoupled:
+            own = np.diag(system.weights)
+            before = participation @ older if rest > 0 else np.zeros((poles.size, 0))
+            _driven(decay, own * late, participation @ newer, own * (whole - late), before, response)
+            return response, newer if rest == 0 else older
+        weights = system.weights @ participation
         drive = late[:, None] * (weights @ newer)
         if rest > 0:
             drive += (whole - late)[:, None] * (weights @ older)
         _recursion(decay, drive, response)
         return response, newer if rest == 0 else older
+    weights = system.weights @ participation
     rate = 1.0 / time_constant
     acting = np.zeros_like(forces)
     fade = np.exp(-rate * (sample_time - rest))
@@ -204,7 +237,9 @@ def sinusoid_response(
 def modal_motion(system: ModalPoles, response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Modal displacements and velocities (n_modes, n_samples) from pole coordinates."""
     if system.uncoupled:
-        return 2.0 * response.real, 2.0 * (system.poles[:, None] * response).real
+        displacement, velocity = np.empty(response.shape), np.empty(response.shape)
+        _real_motion(system.poles, response, displacement, velocity)
+        return displacement, velocity
     rates = system.shapes * system.poles
     return _real_product(system.shapes, response), _real_product(rates, response)
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 from scipy.signal import lfilter
 
-from workbench.arrays import Floats, Integers
+from workbench.arrays import Complexes, Floats, Integers
 from workbench.records.record import Record
 from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
@@ -241,7 +241,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
     modes, participation = rig.modes, participation_of(rig)
     system = modal_poles(modes.omega, modes.damping)
     n_samples = inputs.shape[1]
-    response = np.zeros((system.poles.size, n_samples), complex)
+    responses: list[Complexes] = []
     acting = np.zeros_like(inputs)
     response_to = held_response if input_hold == "zero" else straight_response
     for delay, lag in {(a.delay, a.time_constant) for a in rig.actuators}:
@@ -250,13 +250,13 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
         share, at_samples = response_to(
             system, forces, participation[:, group], sample_time, delay=delay, time_constant=lag
         )
-        response += share
+        responses.append(share)
         acting[group] = at_samples
     steps = _steps_within(rig, inputs, acting, participation, sample_time) if input_hold == "zero" else ()
     bias = np.array([actuator.bias for actuator in rig.actuators])
     if bias.any():
         constant = np.outer(bias, np.ones(n_samples))
-        response += held_response(system, constant, participation, sample_time)[0]
+        responses.append(held_response(system, constant, participation, sample_time)[0])
         acting += constant
     on_modes = participation @ acting
     held = on_modes if input_hold == "zero" else 0.0
@@ -266,9 +266,11 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
             continue
         shape = modes.phi_at(element.at)
         omega, phasor = 2 * np.pi * element.frequency_hz, element.amplitude * np.exp(1j * element.phase)
-        response += sinusoid_response(system, shape, omega, phasor, sample_time, n_samples)
+        responses.append(sinusoid_response(system, shape, omega, phasor, sample_time, n_samples))
         on_modes = on_modes + np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
-    q, v = modal_motion(system, response)
+    if not responses:
+        responses.append(np.zeros((system.poles.size, n_samples), complex))
+    q, v = modal_motion(system, reduce(np.add, responses))
     return Motion(q, v, on_modes, modes.omega[:, None] ** 2, modes.damping, steps, held)
 
 

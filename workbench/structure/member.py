@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -58,7 +59,7 @@ class _Member(Printed):
         for name in ("mass_per_length", stiffness):
             profile = as_profile(getattr(self, name))
             object.__setattr__(self, name, profile)
-            self._check_positive(name, profile)
+            _check_positive(name, profile, self.length)
         for part in self.attachments:
             if not isinstance(part.at, float):
                 raise ValueError(f"{part}: a place along a bar or beam is a position x, m; got {part.at!r}")
@@ -67,29 +68,9 @@ class _Member(Printed):
             if isinstance(part, PointMass) and (part.mass < 0 or part.rotary_inertia < 0):
                 raise ValueError(f"{part}: a negative mass is not a structure; leave it out or lower mass_per_length")
 
-    def _check_positive(self, name: str, profile: Profile) -> None:
-        nodes = self._nodes(profile.breaks)
-        inside = (nodes[:-1, None] + np.diff(nodes)[:, None] * np.linspace(0.002, 0.998, 101)).ravel()
-        values = profile(inside)
-        if not np.isfinite(values).all() or (values <= 0).any():
-            i = int(np.argmax(~(values > 0)))
-            raise ValueError(
-                f"{name} must be positive inside the structure; it is {values[i]:g} at x = {inside[i]:g}"
-                " (it may vanish at an end)"
-            )
-
-    def _nodes(self, breaks: tuple[float, ...]) -> np.ndarray:
-        slack = NO_SLIVER * self.length
-        inside = sorted(b for b in breaks if slack < b < self.length - slack)
-        nodes = [0.0]
-        for b in [*inside, self.length]:
-            if b - nodes[-1] > slack:
-                nodes.append(b)
-        return np.array(nodes)
-
     def _segments(self, n_modes: int, stiffness: Profile, continuity: int, extra: int) -> Segments:
         """Segments that can carry n_modes half waves, with `extra` more degrees than the bare count."""
-        nodes = self._nodes((*self.mass_per_length.breaks, *stiffness.breaks))
+        nodes = _nodes((*self.mass_per_length.breaks, *stiffness.breaks), self.length)
         for part in self.attachments:
             # a node at an attachment keeps its kink out of the polynomials
             if np.abs(nodes - part.at).min() >= self._thinnest(continuity):
@@ -260,6 +241,29 @@ class _Member(Printed):
                         row = self._seen_at(segments, position(part.at), derivative) @ coefficients
                         matrix = matrix + value * row.T @ row
         return matrix
+
+
+@lru_cache(maxsize=64)  # one profile stays where another changes
+def _check_positive(name: str, profile: Profile, length: float) -> None:
+    nodes = _nodes(profile.breaks, length)
+    inside = (nodes[:-1, None] + np.diff(nodes)[:, None] * np.linspace(0.002, 0.998, 101)).ravel()
+    values = profile(inside)
+    if not np.isfinite(values).all() or (values <= 0).any():
+        i = int(np.argmax(~(values > 0)))
+        raise ValueError(
+            f"{name} must be positive inside the structure; it is {values[i]:g} at x = {inside[i]:g}"
+            " (it may vanish at an end)"
+        )
+
+
+def _nodes(breaks: tuple[float, ...], length: float) -> np.ndarray:
+    slack = NO_SLIVER * length
+    inside = sorted(b for b in breaks if slack < b < length - slack)
+    nodes = [0.0]
+    for b in [*inside, length]:
+        if b - nodes[-1] > slack:
+            nodes.append(b)
+    return np.array(nodes)
 
 
 def _end_text(end: End) -> str:

@@ -120,10 +120,19 @@ class Segments:
             (n_points,), (n_points,) and (n_points, degree + 1); the rule is exact for squares times a polynomial of
             the seventh degree.
         """
+        known = self._tabulated.get((segment, derivative))
+        if known is not None:
+            return known
         degree, h = self.degrees[segment], self.nodes[segment + 1] - self.nodes[segment]
         points, weights, tables = tabulated_basis(degree, self.continuity, degree + 4)
         table = tables[derivative] * self.scales(segment) * (2.0 / h) ** derivative
-        return self.nodes[segment] + 0.5 * h * (points + 1.0), 0.5 * h * weights, table
+        found = self.nodes[segment] + 0.5 * h * (points + 1.0), 0.5 * h * weights, table
+        self._tabulated[segment, derivative] = found
+        return found
+
+    @cached_property
+    def _tabulated(self) -> dict[tuple[int, int], tuple[Floats, Floats, Floats]]:
+        return {}
 
     def tables(self, derivatives: Iterable[int]) -> tuple[Floats, Floats, list[Floats]]:
         """Gauss points of all segments (n_points,), m, their weights, and derivatives of all functions there.

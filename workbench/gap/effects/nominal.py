@@ -252,19 +252,21 @@ def _off(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, floa
     rig = differing(rig, prior.figure, deviations_of(values))
     ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
     units = _shape_units(rig) if prior.shape else np.zeros((len(ports), 0))
-    off = [
-        _off_port(_off_place(rig, port, values) if prior.place else port, unit, prior, values)
-        for port, unit in zip(ports, units, strict=True)
-    ]
+    off = [_off_port(rig, port, unit, prior, values) for port, unit in zip(ports, units, strict=True)]
     if all(one is other for one, other in zip(ports, off, strict=True)):
         return rig
     n = len(rig.actuators)
     return replace(rig, actuators=tuple(off[:n]), sensors=tuple(off[n:]))
 
 
-def _off_port(port: Any, units: Floats, prior: NominalPrior, values: dict[str, float]) -> Any:
-    """An actuator or a sensor with the errors of its calibration, its mode shapes (n_modes,) and its timing."""
+def _off_port(rig: Rig, port: Any, units: Floats, prior: NominalPrior, values: dict[str, float]) -> Any:
+    """An actuator or a sensor with the errors of its place, its calibration, its mode shapes (n_modes,), its timing."""
     changes: dict[str, Any] = {}
+    if prior.place:
+        errors = [values.get(name, 0.0) for name in _places(rig, port)]  # shares of the extent
+        if any(errors):
+            at = np.atleast_1d(np.asarray(middle(port.at), float)) + np.array(errors) * rig.modes.domain.size
+            changes["at"] = centred_at(port.at, tuple(at.tolist()) if at.size > 1 else float(at[0]))
     if gain := values.get(_gain(port), 0.0):
         changes["gain"] = port.gain * float(np.exp(gain))
     if units.size:
@@ -275,15 +277,6 @@ def _off_port(port: Any, units: Floats, prior: NominalPrior, values: dict[str, f
     if prior.interpolated and isinstance(port, Sensor):
         changes["interpolated"] = True
     return replace(port, **changes) if changes else port
-
-
-def _off_place(rig: Rig, port: Any, values: dict[str, float]) -> Any:
-    """An actuator or a sensor where it stands, off its place by a share of the extent in each coordinate."""
-    errors = np.array([values.get(name, 0.0) for name in _places(rig, port)])
-    if not errors.any():
-        return port
-    at = np.atleast_1d(np.asarray(middle(port.at), float)) + errors * rig.modes.domain.size
-    return replace(port, at=centred_at(port.at, tuple(at.tolist()) if at.size > 1 else float(at[0])))
 
 
 def _room(rig: Rig, port: Actuator | Sensor) -> Floats:
