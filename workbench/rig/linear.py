@@ -108,7 +108,7 @@ def held_response(
     Returns:
         s (n_poles, n_samples), and the forces that act at the sample instants (n_inputs, n_samples).
     """
-    poles = system.poles
+    poles, weights = system.poles, system.weights @ participation
     n_samples = forces.shape[1]
     shift, rest = divmod(delay, sample_time)
     shift = int(shift)
@@ -122,14 +122,12 @@ def held_response(
             own = np.diag(system.weights)
             before = participation @ older if rest > 0 else np.zeros((poles.size, 0))
             _driven(decay, own * late, participation @ newer, own * (whole - late), before, response)
-            return response, newer if rest == 0 else older
-        weights = system.weights @ participation
-        drive = late[:, None] * (weights @ newer)
-        if rest > 0:
-            drive += (whole - late)[:, None] * (weights @ older)
-        _recursion(decay, drive, response)
+        else:
+            drive = late[:, None] * (weights @ newer)
+            if rest > 0:
+                drive += (whole - late)[:, None] * (weights @ older)
+            _recursion(decay, drive, response)
         return response, newer if rest == 0 else older
-    weights = system.weights @ participation
     rate = 1.0 / time_constant
     acting = np.zeros_like(forces)
     fade = np.exp(-rate * (sample_time - rest))

@@ -18,7 +18,6 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
 HOPELESS = 1e300
-ATTEMPTS, LESS_FAR = 7, 6.0  # steps that are tried from one place, each damped by so much more than the one before
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,7 +388,7 @@ def _descended(
         nearly, coarsely = problem.near(free, residual)
         jacobian = problem.jacobian(free, nearly, coarsely, share)
         normal, gradient = problem.normal(jacobian), jacobian.T @ residual
-        dampings = accumulate([damping, *[LESS_FAR] * (ATTEMPTS - 1)], mul)
+        dampings = accumulate([damping, *[FIT.less_far] * (FIT.attempts - 1)], mul)
         worth = FIT.promised * tolerance * cost
         attempts = (Attempt(free, coarsely, normal, gradient, each, worth) for each in dampings)
         found = _first_below(cost, attempts, share, problem.workers.at_once)

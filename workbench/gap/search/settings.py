@@ -36,6 +36,8 @@ class FitSettings:
     slope_substeps: int = 2  # of a sample, for slopes: they need not be as exact as residuals
     wider: float = 30.0  # times the steps of a fit: of numbers a hundredth
     wider_place: float = 1000.0  # likewise: of a place a thousandth
+    attempts: int = 7  # steps that are tried from one place
+    less_far: float = 6.0  # times the damping of a step that failed: of the next, shorter one
     promised: float = 0.1  # of the tolerance: a step that promises less is not worth trying
 
 
