@@ -17,6 +17,7 @@ from workbench.gap.prediction.logged_inputs import (
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import log_likelihood, whiten
 from workbench.rig.actuators import Actuator
+from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import predict, simulate
 
 NOISE = 1e-5
@@ -49,6 +50,18 @@ def test_none_is_told_from_some(rig, record_of):
     rng = np.random.default_rng(4)
     quiet = FitData((record_of(rig, rng.normal(size=(2, 1000)), rng, name="quiet"),), np.full(4, NOISE))
     assert likeliest_share(rig, quiet, quiet.differences(rig)).share < 0.1 * LOGGED.most
+
+
+def test_a_law_of_the_structure_is_no_such_noise(rig, logged, record_of):
+    """It leaves more than any logger's noise would, in most records; that noise itself does not."""
+    stiffened = replace(rig, elements=(CubicSpring(1.0, 2e9),))
+    rng, hold = np.random.default_rng(6), np.ones(5)
+    levels = {"low": 0.3, "high": 1.0}
+    sent = {name: level * np.kron(rng.normal(size=(2, 400)), hold) for name, level in levels.items()}
+    records = tuple(record_of(stiffened, inputs, rng, name=name) for name, inputs in sent.items())
+    hidden = FitData(records, np.full(4, NOISE))
+    assert likeliest_share(rig, hidden, hidden.differences(rig)).is_beyond
+    assert not likeliest_share(rig, logged, logged.differences(rig)).is_beyond
 
 
 def test_its_power_is_that_of_draws(rig, logged):

@@ -21,6 +21,8 @@ class LoggedSettings:
     draws: int = 12  # of that noise, of which the loudest is what chance may leave
     quietest: float = 1e-12  # of the loudest force: none at all would leave the filter nothing to estimate
     most: float = 0.02  # of the rms of an input: what a logger adds at most
+    # likewise: a record to which this is likelier than what a logger adds is left something else
+    beyond: float = 0.04
 
 
 LOGGED = LoggedSettings()
@@ -111,10 +113,17 @@ def _variances(record: Record, share: float) -> Floats:
 
 
 class LikeliestShare(NamedTuple):
-    """Noise of the logged inputs, as a share of their rms, and minus the log-likelihood of what is left beside it."""
+    """Noise of the logged inputs as what is left shows it.
+
+    Attributes:
+        share: of their rms.
+        loss: minus the log-likelihood of what is left beside it.
+        is_beyond: whether most records would have it louder than any logger's.
+    """
 
     share: float
     loss: float
+    is_beyond: bool
 
 
 def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) -> LikeliestShare:
@@ -126,15 +135,16 @@ def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) ->
         residuals: (n_outputs, n_samples) measured less predicted, one a record.
     """
 
-    def loss(share: float) -> float:
+    def losses_of(share: float) -> list[float]:
         filters = input_filters(rig, data, share)
-        each = zip(data.records, residuals, strict=True)
-        return -sum(log_likelihood(filters[record.name], [left]) for record, left in each)
+        return [-log_likelihood(filters[r.name], [left]) for r, left in zip(data.records, residuals, strict=True)]
 
-    losses = np.array([loss(share) for share in SHARES])
+    by_record = np.array([losses_of(share) for share in (LOGGED.beyond, *SHARES)])
+    beyond = bool(np.median(by_record.argmin(axis=0)) < 1.0)
+    losses = by_record[1:].sum(axis=1)
     best = int(np.argmin(losses))
     if best in (0, len(SHARES) - 1):
-        return LikeliestShare(SHARES[best], float(losses[best]))
+        return LikeliestShare(SHARES[best], float(losses[best]), beyond)
     before, at, after = losses[best - 1 : best + 2]
     turn = 0.5 * (before - after) / (before - 2.0 * at + after)
-    return LikeliestShare(float(SHARES[best] * 0.5**turn), float(at))
+    return LikeliestShare(float(SHARES[best] * 0.5**turn), float(at), beyond)

@@ -159,10 +159,19 @@ class FitData:
     def residual(self, rig: Rig) -> np.ndarray:
         """(measured - predicted) / noise, or their innovations of unit variance, all records joined: (n_values,)."""
         residual = self._left(rig)
+        self.give_way(residual)
+        return residual if self.heat == 1.0 else residual / np.sqrt(self.heat)
+
+    def give_way(self, residuals: np.ndarray) -> None:
+        """Let residuals (..., n_values) of `standing` become as small as uncertain parameters make them, in place."""
         if self.given_way is not None:
             directions, shares = self.given_way
-            residual -= directions @ (shares * (directions.T @ residual))
-        return residual if self.heat == 1.0 else residual / np.sqrt(self.heat)
+            residuals -= (shares * (residuals @ directions)) @ directions.T
+
+    @cached_property
+    def standing(self) -> "FitData":
+        """The same yardstick without uncertain parameters."""
+        return self if self.given_way is None else replace(self, given_way=None)
 
     def _left(self, rig: Rig) -> np.ndarray:
         follower = self.follower

@@ -471,7 +471,8 @@ def _with_a_second(
 def _clean_pair(search: Search, start: Fit, singles: Sequence[Fit], screened: Screening) -> Decision | None:
     """Two effects that leave only the stated noise of the sensors, neither of which a model may be off by; None else.
 
-    Errors of the model come to that only where the model has them, and cost more to ask for.
+    None either where no number of one is known: an error of the model is likelier than what may be nothing. Errors of
+    the model come to that only where the model has them, and cost more to ask for.
     """
     pairs = Pairs(search)
     near = [effect for f in singles if search.near(f, PAIRS.most) for effect in f.effects]
@@ -479,7 +480,10 @@ def _clean_pair(search: Search, start: Fit, singles: Sequence[Fit], screened: Sc
         return None
     decision = pairs.decision(start)
     effects = decision.best.effects
-    return None if are_common(effects) or any(may_be_error(effect, search) for effect in effects) else decision
+    if are_common(effects) or any(may_be_error(effect, search) for effect in effects):
+        return None
+    sure = with_intervals(search.rig, decision.best, search.data, search.workers).effects
+    return decision if all(effect.stands_out(search.rig) for effect in sure) else None
 
 
 def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: Stepwise) -> Decision | None:

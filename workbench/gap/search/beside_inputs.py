@@ -14,6 +14,8 @@ from workbench.rig.rig import Rig
 def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Search | None:
     """The search beside noise of the logged inputs as a set shows it; None where that is not what the set leaves.
 
+    What most records would have louder than any logger's noise is none: a law that is missing grows with the level too.
+
     Args:
         search: without that noise.
         fitted: the set, errors of the nominal model among it.
@@ -23,10 +25,10 @@ def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Sear
     left, found = search.data.differences(rig), search.with_noise(np.sqrt(sensor_noise) * search.data.noise)
     # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
     heard = [likeliest_share(rig, s.data, left) for s in (search, found)]
-    (share, _), louder = min(zip(heard, (search, found), strict=True), key=lambda each: each[0].loss)
-    beside = louder.beside_inputs(rig, share)
-    if share < LEAST_LOGGED:
+    (share, _, is_beyond), louder = min(zip(heard, (search, found), strict=True), key=lambda each: each[0].loss)
+    if share < LEAST_LOGGED or is_beyond:
         return None
+    beside = louder.beside_inputs(rig, share)
     white = measured(beside, fitted).fit
     if INPUTS.white < white.cost < INPUTS.bent * fitted.cost:
         fitted = white = fit_jointly(beside, fitted.effects[:-1], fitted.effects[-1]).fit

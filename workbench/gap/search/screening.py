@@ -50,8 +50,8 @@ class Screening:
         Args:
             evidence: of the rig with the given effects.
         """
-        data = search.first_ahead
-        before = finite_residual(search.rig, (*given, *search.held), data)
+        data, standing = search.first_ahead, search.first_ahead.standing
+        before = finite_residual(search.rig, (*given, *search.held), standing)
         if before is None:
             return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.domain)
         thin = slice(None, None, max(1, before.size // SCREENING.most_values))
@@ -59,19 +59,26 @@ class Screening:
         tasks = _starts(search, given, evidence)
         starts = [start for task in tasks for start in task]
         bounds = [_bounds(task) for task in tasks for _ in task]
-        left = before[thin]
+        left = before.copy()
+        data.give_way(left)
+        left = left[thin]
         moves = search.workers.array(len(starts), left.size)  # the one large array
 
-        def tells(i: int) -> bool:
-            moved = finite_residual(search.rig, (*given, starts[i], *search.held), data)
-            if moved is None:
-                return False
-            moves[i] = (moved - before)[thin]
-            return bool(0 < moves[i] @ moves[i] < RUNAWAY * left.size)
+        def tells(some: range) -> list[bool]:
+            # errors of the model give way to many starts at once: their directions are large
+            moved = np.zeros((len(some), before.size))
+            for row, i in zip(moved, some, strict=True):
+                there = finite_residual(search.rig, (*given, starts[i], *search.held), standing)
+                row[:] = 0.0 if there is None else there - before
+            data.give_way(moved)
+            moves[some] = moved[:, thin]
+            return [bool(0 < moves[i] @ moves[i] < RUNAWAY * left.size) for i in some]
 
         for i in {start.kind: i for i, start in enumerate(starts) if start.kind not in CATALOGUE}.values():
-            tells(i)  # a law of the user's own is compiled here, before processes part that would each compile it
-        telling = [i for i, tell in enumerate(search.workers.map(tells, range(len(starts)))) if tell]
+            tells(range(i, i + 1))  # a law of the user's own is compiled here, before processes that would each do so
+        at_once = [range(i, min(i + SCREENING.at_once, len(starts))) for i in range(0, len(starts), SCREENING.at_once)]
+        told = [tell for some in search.workers.map(tells, at_once) for tell in some]
+        telling = [i for i, tell in enumerate(told) if tell]
         for row, i in enumerate(telling):  # those that tell nothing are closed up in place
             moves[row] = moves[i]
         moves = moves[: len(telling)]

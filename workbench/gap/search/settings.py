@@ -48,6 +48,7 @@ class ScreeningSettings:
     weaker: float = 0.03  # times its strength at the start: the least that an effect may turn out to have
     stronger: float = 30.0  # likewise, the most
     most_values: int = 20_000  # of the errors that are screened
+    at_once: int = 32  # starts: of more, the errors of whole records no longer stay in a processor's cache
 
 
 @dataclass(frozen=True)

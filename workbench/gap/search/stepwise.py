@@ -370,7 +370,8 @@ class Stepwise:
         """The step with one more effect that leaves only noise of the sensors, as noise of the inputs never does."""
         near = [s for s in self._with_each(step) if s.fit.cost < PLAIN.near and not self._may_be_errors(s)]
         near = sorted(near, key=lambda s: s.fit.cost)[: STEPWISE.finalists]
-        found = [s for s in map(self._whole, near) if self.explains(s) and s.is_plausible and self._is_worth(s, step)]
+        whole = self.search.workers.map(self._whole, near)
+        found = [s for s in whole if self.explains(s) and s.is_plausible and self._is_worth(s, step)]
         return self._simplest_of(sorted(found, key=lambda s: s.fit.cost)) if found else None
 
     def _on_the_other_side(self, step: Step, tried: Sequence[Step]) -> Step | None:
@@ -396,7 +397,8 @@ class Stepwise:
         alone = [] if step.effects else self.alone
         tried = sorted((s for s in tried if not self._may_be_errors(s)), key=self._loss)
         near = [s for s in tried if s.fit.cost < STEPWISE.near * tried[0].fit.cost][: STEPWISE.finalists]
-        whole = sorted((*(self._without_idle(self._whole(s)) for s in near), *alone), key=self._loss)
+        whole = self.search.workers.map(lambda s: self._without_idle(self._whole(s)), near)
+        whole = sorted((*whole, *alone), key=self._loss)
         return self._simplest_of(whole) if whole else step
 
     def _simplest_of(self, sets: Sequence[Step]) -> Step:
@@ -405,7 +407,8 @@ class Stepwise:
 
     def _chosen_again(self, step: Step) -> Step:
         """The best of the sets that a step was chosen from, in another search."""
-        others = [self._whole(s) for s in step.others if key_of(s.effects) != key_of(step.effects)]
+        others = [s for s in step.others if key_of(s.effects) != key_of(step.effects)]
+        others = self.search.workers.map(self._whole, others)
         return self._simplest_of(sorted((step, *others), key=self._loss))
 
     def _loss(self, step: Step) -> float:
