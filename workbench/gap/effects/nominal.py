@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -276,7 +277,13 @@ def _off_port(rig: Rig, port: Any, units: Floats, prior: NominalPrior, values: d
         changes["delay"] = port.delay + delay * prior.sample_time
     if prior.interpolated and isinstance(port, Sensor):
         changes["interpolated"] = True
-    return replace(port, **changes) if changes else port
+    return _changed(port, tuple(changes.items())) if changes else port
+
+
+@lru_cache(maxsize=4096)
+def _changed(port: Any, changes: tuple[tuple[str, Any], ...]) -> Any:
+    """The port with some of its attributes changed; a slope along one error leaves the other ports as they were."""
+    return replace(port, **dict(changes))
 
 
 def _room(rig: Rig, port: Actuator | Sensor) -> Floats:
