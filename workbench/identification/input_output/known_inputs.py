@@ -110,6 +110,7 @@ class KnownInputs:
         fastest = max(0.1 * np.pi / self.dt, 2.0 / span)
         self.rates = np.geomspace(0.5 / span, fastest, max(int(np.log(fastest * span)) + 2, 3))
         self.cells = self.rates.size * max(lengths)
+        self._last: tuple[complex, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] | None = None
 
     def weighted_by(self, line_std: Sequence[np.ndarray] | None) -> "KnownInputs":
         """The same records with lines weighted by their noise; with None, samples of equal weight."""
@@ -278,22 +279,20 @@ class KnownInputs:
         return np.vstack([lines_of(each) if self.by_line else each for each in samples])
 
     def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
-        x = np.zeros((self.values.shape[0], self.n_excitations), complex)
-        for k, (record, rows) in enumerate(zip(self.records, self.rows)):
-            u = record.inputs
-            z = self._late_driven(u, pole, self._driven(u, pole)[0])
+        x = np.zeros((self.values.shape[0], self.n_excitations), complex, order="F")
+        for k, (record, rows, (driven, _, decay)) in enumerate(zip(self.records, self.rows, self._of_pole(pole))):
+            z = self._late_driven(record.inputs, pole, driven)
             x[rows, : self.n_inputs] = self._shifted(z).T[self.first :]
             if not self.at_rest:
-                x[rows, self.n_inputs + k] = np.exp(pole * self.dt * np.arange(self.first, u.shape[1]))
+                x[rows, self.n_inputs + k] = decay[self.first :]
         return self._rows(x.real), self._rows(x.imag)
 
     def slopes(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = np.zeros(self.values.shape[0], complex)
         mu, l_r = np.exp(pole * self.dt), participation[: self.n_inputs]
-        for k, (record, rows) in enumerate(zip(self.records, self.rows)):
+        each = zip(self.records, self.rows, self._of_pole(pole))
+        for k, (record, rows, (x, by_coefficients, decay)) in enumerate(each):
             u = record.inputs
-            x, by_coefficients = self._driven(u, pole)
-            by_coefficients[:, 0] = 0.0  # nothing drives the first sample
             if self.fraction.any():
                 driving = self.dt * mu * x[:, :-1] + by_coefficients[:, 1:]
                 slope = lfilter([1.0], [1.0, -mu], np.hstack([np.zeros((len(u), 1)), driving]), axis=1)
@@ -304,8 +303,17 @@ class KnownInputs:
             found[rows] = all_samples[self.first :]
             if not self.at_rest:
                 time = self.dt * np.arange(self.first, u.shape[1])
-                found[rows] += participation[self.n_inputs + k] * time * np.exp(pole * time)
+                found[rows] += participation[self.n_inputs + k] * time * decay[self.first :]
         return self._rows(found.real[:, None])[:, 0], self._rows(found.imag[:, None])[:, 0]
+
+    def _of_pole(self, pole: complex) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """By record: z of each input from rest, the derivative of its sources by λ, (n_inputs, n_samples) each, and
+        what an initial state of one decays to, (n_samples,). Those of the last pole are remembered."""
+        if self._last is None or self._last[0] != pole:
+            inputs = [record.inputs for record in self.records]
+            each = [(*self._driven(u, pole), powers(pole * self.dt, u.shape[1])) for u in inputs]
+            self._last = pole, each
+        return self._last[1]
 
     def _driven(self, inputs: np.ndarray, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         """z of each input from rest, and the derivative of its sources by λ, (n_inputs, n_samples) each."""
@@ -313,8 +321,10 @@ class KnownInputs:
         u = inputs.astype(complex)
         rest = -after * u[:, :1]
         x = lfilter([after, now], [1.0, -np.exp(pole * self.dt)], u, axis=1, zi=rest)[0]
-        before = np.hstack([np.zeros((u.shape[0], 1)), u[:, :-1]])
-        return x, now_slope * before + after_slope * u
+        by_coefficients = after_slope * u
+        by_coefficients[:, 1:] += now_slope * inputs[:, :-1]
+        by_coefficients[:, 0] = 0.0  # nothing drives the first sample
+        return x, by_coefficients
 
     def _late_driven(
         self, inputs: np.ndarray, pole: complex, z: np.ndarray, slope: np.ndarray | None = None
@@ -377,6 +387,13 @@ class KnownInputs:
         at = round(pole.imag / self.resolution) - 1
         beside = power[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
         return max(1.0, float(np.median(beside) / power.mean())) if beside.size else 1.0
+
+
+def powers(exponent: complex, n: int) -> np.ndarray:
+    """e^(k exponent) for k = 0 ... n - 1, as products of few exponentials."""
+    few = int(np.ceil(np.sqrt(n)))
+    fine, coarse = np.exp(exponent * np.arange(few)), np.exp(exponent * few * np.arange(-(-n // few)))
+    return np.multiply.outer(coarse, fine).ravel()[:n]
 
 
 def _resampled(line_std: np.ndarray, n_rows: int) -> np.ndarray:

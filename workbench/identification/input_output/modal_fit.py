@@ -23,6 +23,7 @@ from workbench.identification.signal.projection import pole_blocks
 from workbench.identification.signal.searches import FIT, Budget, minimise
 
 Pair = tuple[np.ndarray, np.ndarray]
+LEAST_APART = 1e-5  # of the length of a column, what others leave of it: of less its square would be lost in rounding
 
 
 class Measurement(Protocol):
@@ -133,13 +134,20 @@ def modal_coordinate(response: Pair, l_r: np.ndarray) -> Pair:
 
 def columns(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> Pair:
     """Modal coordinates and fixed columns, Φ (n_rows, n_columns), and tangents T (n_rows, n_tangents), not weighted."""
-    responses = [data.responses(pole) for pole in poles]
-    slopes = [data.slopes(pole, l_r) for pole, l_r in zip(poles, participation)]
-    coordinates = [modal_coordinate(a, l_r) for a, l_r in zip(responses, participation)]
-    both = (0, 1)  # real parts, imaginary parts
-    phi = np.column_stack([*(z[k] for k in both for z in coordinates), data.fixed]) if coordinates else data.fixed
-    tangents = [np.column_stack([s[k], a[k]]) for k in both for s, a in zip(slopes, responses)]
-    return phi, np.hstack(tangents) if tangents else np.zeros((data.values.shape[0], 0))
+    n, n_rows, n_fixed = poles.size, *data.fixed.shape
+    phi = np.empty((n_rows, 2 * n + n_fixed), order="F")
+    phi[:, 2 * n :] = data.fixed
+    q = participation.shape[1] + 1
+    t = np.empty((n_rows, 2 * n * q), order="F")
+    for r, (pole, l_r) in enumerate(zip(poles, participation)):
+        responses, slopes = data.responses(pole), data.slopes(pole, l_r)
+        coordinate = modal_coordinate(responses, l_r)
+        for part in (0, 1):  # real parts, imaginary parts
+            phi[:, part * n + r] = coordinate[part]
+            first = (part * n + r) * q
+            t[:, first] = slopes[part]
+            t[:, first + 1 : first + q] = responses[part]
+    return phi, t
 
 
 def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
@@ -149,14 +157,31 @@ def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
 
 def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
     size = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
-    q, r = qr(phi / size, mode="economic", check_finite=False)
+    q, r = _orthonormal(phi / size)
     if phi.shape[1] and np.abs(np.diag(r)).min() < 1e-13:
         raise np.linalg.LinAlgError("modes that cannot be distinguished")
     qy, qt = q.T @ y, q.T @ t
-    rest = t - q @ qt
     residual = y - q @ qy
+    rest = t - q @ qt
     inverse = solve_triangular(r, np.eye(r.shape[0])) / size[:, None]
     return Part(residual, inverse @ qy, rest.T @ rest, rest.T @ residual, inverse @ inverse.T, inverse @ qt)
+
+
+def _orthonormal(columns: np.ndarray) -> Pair:
+    """Q and R of columns, by Cholesky factors of their products twice where these are far from singular.
+
+    As accurate there as reflections, in a fraction of the time (Yamamoto et al., ETNA 44 (2015) 306).
+    """
+    q, whole = columns, np.eye(columns.shape[1])
+    for _ in range(2):
+        try:
+            r = np.linalg.cholesky(q.T @ q).T
+        except np.linalg.LinAlgError:
+            return qr(columns, mode="economic", check_finite=False)
+        if r.size and np.diag(r).min() < LEAST_APART:
+            return qr(columns, mode="economic", check_finite=False)
+        q, whole = q @ solve_triangular(r, np.eye(r.shape[0])), r @ whole
+    return q, whole
 
 
 def scaled_vectors(fit: Fit, kept: np.ndarray, derivative: np.ndarray) -> Pair:
