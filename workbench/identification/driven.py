@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
+from workbench.identification.input_output.force_window import force_window
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, added_misfit, only, projected, scaled_vectors, settled
@@ -170,7 +171,8 @@ def identify_driven(
     """The modes between inputs and outputs, their number selected, with participation factors and standard errors.
 
     Any excitation serves that moves the modes: noise, multisine, PRBS, an impulse. Each mode enters if it raises the
-    likelihood by more than noise would in one record of a thousand.
+    likelihood by more than noise would in one record of a thousand. Inputs that are blows count as zero between them,
+    with a remark: what their channels read there is noise.
 
     Args:
         records: with the same inputs and outputs at one rate; each output may hold a constant, another in each record.
@@ -197,6 +199,7 @@ def identify_driven(
     budget = Budget(seconds, progress)
     records = of_same_sensors(records)
     _check_inputs(records)
+    records, remarks_on_inputs = force_window(records)
     straight = records[0].input_hold == "first" if straight is None else straight
     data = KnownInputs(
         records, at_rest=at_rest, straight=straight, feedthrough=feedthrough, delays=_checked_delays(records, delays)
@@ -219,6 +222,7 @@ def identify_driven(
     selected, remarks = _without_artefacts(data, selected, budget)
     if delays is None:
         remarks = (*_late_remarks(data), *remarks)
+    remarks = (*remarks_on_inputs, *remarks)
     fit = joined(data, selected.fit, budget)
     selected = selected if fit is selected.fit else selected.refitted(fit)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)

@@ -252,11 +252,13 @@ def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: c
     together = [left] if data.weights is None else np.hsplit(left, left.shape[1])
     for weights, basis, rest in zip(weights_of(data), bases, together, strict=True):
         weighted = weights * columns / scale
-        apart = weighted - basis @ (basis.T @ weighted)
-        u, s, vt = np.linalg.svd(apart, full_matrices=False)
-        good = s > 1e-4 * max(s[0], 1e-3)
-        seen = u.T[good] @ rest
-        wanted.append((vt.T[:, good] / s[good]) @ seen / scale[:, None])
+        inside = basis.T @ weighted
+        squares, directions = np.linalg.eigh(weighted.T @ weighted - inside.T @ inside)
+        sizes = np.sqrt(np.maximum(squares, 0.0))
+        good = sizes > 1e-4 * max(sizes[-1], 1e-3)
+        apart = directions[:, good] / sizes[good]
+        seen = apart.T @ (weighted.T @ rest)  # what is left has no part in the basis
+        wanted.append(apart @ seen / scale[:, None])
         strength += float((seen**2).sum())
     residues = np.hstack(wanted)
     return strength, _of_rank_one(residues, scale)
