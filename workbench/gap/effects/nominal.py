@@ -264,10 +264,11 @@ def _off_port(rig: Rig, port: Any, units: Floats, prior: NominalPrior, values: d
     """An actuator or a sensor with the errors of its place, its calibration, its mode shapes (n_modes,), its timing."""
     changes: dict[str, Any] = {}
     if prior.place:
+        domain = rig.modes.domain
         errors = [values.get(name, 0.0) for name in _places(rig, port)]  # shares of the extent
-        if any(errors):
-            at = np.atleast_1d(np.asarray(middle(port.at), float)) + np.array(errors) * rig.modes.domain.size
-            at = np.clip(at, *reach(rig.modes.domain, port.at))  # where outputs are exchanged, it stands elsewhere
+        if any(errors) and not isinstance(domain, NamedPoints):
+            at = np.atleast_1d(np.asarray(middle(port.at), float)) + np.array(errors) * domain.size
+            at = np.clip(at, *reach(domain, port.at))  # where outputs are exchanged, it stands elsewhere
             changes["at"] = centred_at(port.at, tuple(at.tolist()) if at.size > 1 else float(at[0]))
     if gain := values.get(_gain(port), 0.0):
         changes["gain"] = port.gain * float(np.exp(gain))

@@ -393,7 +393,7 @@ def powers(exponent: complex, n: int) -> np.ndarray:
     """e^(k exponent) for k = 0 ... n - 1, as products of few exponentials."""
     few = int(np.ceil(np.sqrt(n)))
     fine, coarse = np.exp(exponent * np.arange(few)), np.exp(exponent * few * np.arange(-(-n // few)))
-    return np.multiply.outer(coarse, fine).ravel()[:n]
+    return np.asarray(np.multiply.outer(coarse, fine).ravel()[:n])
 
 
 def _resampled(line_std: np.ndarray, n_rows: int) -> np.ndarray:

@@ -173,14 +173,14 @@ def _orthonormal(columns: np.ndarray) -> Pair:
     As accurate there as reflections, in a fraction of the time (Yamamoto et al., ETNA 44 (2015) 306).
     """
     q, whole = columns, np.eye(columns.shape[1])
-    for _ in range(2):
-        try:
+    try:
+        for _ in range(2):
             r = np.linalg.cholesky(q.T @ q).T
-        except np.linalg.LinAlgError:
-            return qr(columns, mode="economic", check_finite=False)
-        if r.size and np.diag(r).min() < LEAST_APART:
-            return qr(columns, mode="economic", check_finite=False)
-        q, whole = q @ solve_triangular(r, np.eye(r.shape[0])), r @ whole
+            if r.size and np.diag(r).min() < LEAST_APART:
+                raise np.linalg.LinAlgError("columns that are nearly dependent")
+            q, whole = q @ solve_triangular(r, np.eye(r.shape[0])), r @ whole
+    except np.linalg.LinAlgError:
+        q, whole = qr(columns, mode="economic", check_finite=False)
     return q, whole
 
 
