@@ -199,7 +199,7 @@ def identify_driven(
     budget = Budget(seconds, progress)
     records = of_same_sensors(records)
     _check_inputs(records)
-    records, remarks_on_inputs = force_window(records)
+    records, windowed = force_window(records)
     straight = records[0].input_hold == "first" if straight is None else straight
     data = KnownInputs(
         records, at_rest=at_rest, straight=straight, feedthrough=feedthrough, delays=_checked_delays(records, delays)
@@ -222,13 +222,12 @@ def identify_driven(
     selected, remarks = _without_artefacts(data, selected, budget)
     if delays is None:
         remarks = (*_late_remarks(data), *remarks)
-    remarks = (*remarks_on_inputs, *remarks)
     fit = joined(data, selected.fit, budget)
     selected = selected if fit is selected.fit else selected.refitted(fit)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     late = budget.spent("check of modes that change within the record")
     changes = () if late else change_remarks(data, fit, changing)
-    return _report(records, data, selected, (*remarks, *overlap, *changes, *budget.remarks))
+    return _report(records, data, selected, (*windowed, *remarks, *overlap, *changes, *budget.remarks))
 
 
 def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:

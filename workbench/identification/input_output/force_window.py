@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import median_abs_deviation
 
 from workbench.arrays import Flags, Floats
 from workbench.records.record import Record
@@ -37,12 +38,12 @@ def force_window(records: Sequence[Record]) -> tuple[tuple[Record, ...], tuple[s
         inputs = record.inputs.copy()
         for row, name in zip(inputs, record.input_names, strict=True):
             level = np.median(row)
-            noise = 1.4826 * np.median(np.abs(row - level))
-            blows = _blows(row - level, float(noise))
+            noise = float(median_abs_deviation(row, scale="normal"))
+            blows = _blows(row - level, noise)
             between = np.where(blows, 0.0, row - level)
             if blows.any() and between.any() and not _follows(between, np.where(blows, 0.0, record.outputs)):
                 row[:] = np.where(blows, row - level, 0.0)
-                removed.setdefault(name, []).append(float(noise))
+                removed.setdefault(name, []).append(noise)
         same = np.array_equal(inputs, record.inputs)
         windowed.append(record if same else replace(record, inputs=inputs))
     remarks = tuple(

@@ -161,8 +161,8 @@ def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
     if phi.shape[1] and np.abs(np.diag(r)).min() < 1e-13:
         raise np.linalg.LinAlgError("modes that cannot be distinguished")
     qy, qt = q.T @ y, q.T @ t
-    residual = y - q @ qy
     rest = t - q @ qt
+    residual = y - q @ qy
     inverse = solve_triangular(r, np.eye(r.shape[0])) / size[:, None]
     return Part(residual, inverse @ qy, rest.T @ rest, rest.T @ residual, inverse @ inverse.T, inverse @ qt)
 
