@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.deadline import NEVER, Deadline
 from workbench.gap.prediction.innovations import LOOSE, Follower
 from workbench.gap.prediction.unmodelled_force import ForceFilter, whiten
@@ -33,8 +34,8 @@ class FitData:
         whiteners: filter of random forces on the structure, by record, through which its residual is seen; none where
             there are none. With a follower, laws then act on the motion that was measured: that of the rig has no such
             force.
-        given_way: (n_values, k) orthonormal directions and (k,) shares by which residuals give way along them, for
-            uncertain parameters that are re-estimated with every candidate to first order; None where none are.
+        given_way: (n_values, k) W: a residual r becomes r - W Wᵀ r, for uncertain parameters that are re-estimated
+            with every candidate to first order; None where none are.
         follower: what holds the rig beside the records, so that its predictions are of one sample ahead; None where
             they are of the whole record.
         heat: mean square of a residual that counts as noise, for now.
@@ -46,7 +47,7 @@ class FitData:
     substeps: int = 4
     lead: int = 0
     whiteners: Mapping[str, ForceFilter] = field(default_factory=dict)
-    given_way: tuple[np.ndarray, np.ndarray] | None = None
+    given_way: Floats | None = None
     follower: Follower | None = None
     heat: float = 1.0
     deadline: Deadline = NEVER
@@ -99,8 +100,11 @@ class FitData:
         Args:
             sensitivity: (n_values, n_parameters) S, in prior standard deviations of each.
         """
-        directions, sizes, _ = np.linalg.svd(sensitivity, full_matrices=False)
-        return replace(self, given_way=(directions, 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)))
+        if not sensitivity.size:
+            return replace(self, given_way=None)
+        _, sizes, turned = np.linalg.svd(_triangle(sensitivity))
+        root = np.sqrt(1.0 + sizes**2)
+        return replace(self, given_way=sensitivity @ (turned.T / np.sqrt(root * (root + 1.0))))
 
     def following(self, rig: Rig, loose: float = LOOSE) -> "FitData":
         """The same yardstick on predictions one sample ahead, by a rig held beside the records as this one would be.
@@ -165,8 +169,7 @@ class FitData:
     def give_way(self, residuals: np.ndarray) -> None:
         """Let residuals (..., n_values) of `standing` become as small as uncertain parameters make them, in place."""
         if self.given_way is not None:
-            directions, shares = self.given_way
-            residuals -= (shares * (residuals @ directions)) @ directions.T
+            residuals -= (residuals @ self.given_way) @ self.given_way.T
 
     @cached_property
     def standing(self) -> "FitData":
@@ -231,3 +234,13 @@ class FitData:
                 rows.append((residual[start : start + size].reshape(record.outputs.shape) ** 2).mean(axis=1))
             start += size
         return np.array(rows)
+
+
+def _triangle(matrix: Floats) -> Floats:
+    """R of a tall matrix = Q R, by blocks of rows that stay in a processor's cache."""
+    n_columns = matrix.shape[1]
+    n_rows = 4 * n_columns
+    whole = len(matrix) // n_rows * n_rows
+    blocks: Any = np.linalg.qr(matrix[:whole].reshape(-1, n_rows, n_columns), mode="r")
+    triangle: Any = np.linalg.qr(np.concatenate([*blocks, matrix[whole:]]), mode="r")
+    return np.asarray(triangle)

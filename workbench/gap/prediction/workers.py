@@ -16,11 +16,12 @@ from io import BytesIO
 from mmap import mmap
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn, TypeVar
+from typing import Any, ClassVar, NoReturn, TypeVar
 
 import joblib
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import Kind
 
 MOST = 8  # processes: to fork one takes a hundredth of a second, every time
@@ -30,6 +31,11 @@ LEFT_OVER = 5  # niceness of what is computed in the background: less urgent, bu
 TURN = 4  # bytes of a number in the pipe that turns are taken from
 NO_MORE = 2**32 - 1  # in the place of a turn: nothing is left of these items
 MOST_TURNS = 8192  # what a pipe holds at once, with room to spare
+
+SPARE = 2  # arrays given back that are kept
+LARGER = 4  # times the room that is asked for, that it may be taken from
+
+_spare: dict[bool, list[Floats]] = {True: [], False: []}  # room given back: shared with forked processes, or not
 
 Item = TypeVar("Item")
 Found = TypeVar("Found")
@@ -90,12 +96,24 @@ class Workers:
             finally:
                 crew.end()
 
-    def array(self, *shape: int) -> np.ndarray:
-        """Zeros that forked processes write into for this one to read."""
-        if self._are_alone or not FORKS:
-            return np.zeros(shape)
-        n_bytes = 8 * int(np.prod(shape))
-        return np.frombuffer(mmap(-1, max(n_bytes, 8)), float, n_bytes // 8).reshape(shape)
+    def array(self, *shape: int) -> Floats:
+        """Room that forked processes write into for this one to read; what stands in it at first is left over."""
+        size, shared = int(np.prod(shape)), FORKS and not self._are_alone
+        spare = _spare[shared]
+        i = next((i for i, room in enumerate(spare) if size <= room.size <= LARGER * size), None)
+        if i is not None:
+            room = spare.pop(i)
+        elif shared:
+            room = np.frombuffer(mmap(-1, max(8 * size, 8)), float, size)
+        else:
+            room = np.empty(size)
+        return room[:size].reshape(shape)
+
+    def give_back(self, array: Floats) -> None:
+        """Keep room for the next `array`: the system takes a microsecond to clear every kilobyte anew."""
+        if isinstance(array.base, np.ndarray):
+            spare = _spare[FORKS and not self._are_alone]
+            spare[:] = [array.base, *spare[: SPARE - 1]]
 
     @property
     def at_once(self) -> int:
@@ -177,6 +195,7 @@ class _Helper:
     """A forked process that answers what it is asked; without helpers of its own, unless in the background."""
 
     is_this_process = False
+    _ending: ClassVar[list[int]] = []  # helpers that were ended: it takes a hundredth of a second to clear one's memory
 
     def __init__(self, work: Callable[[Any], Any], background: bool = False) -> None:
         self._here, there = Pipe()
@@ -206,15 +225,24 @@ class _Helper:
     def end(self) -> None:
         """Nothing is left of it, whatever it was at."""
         self._here.close()
-        with suppress(ProcessLookupError, ChildProcessError):
+        with suppress(ProcessLookupError):
             os.kill(self._pid, signal.SIGKILL)
-            os.waitpid(self._pid, 0)
+        _Helper._ending = [pid for pid in (*_Helper._ending, self._pid) if not _is_gone(pid)]
+
+
+def _is_gone(pid: int) -> bool:
+    """Whether nothing is left of an ended helper; not waited for."""
+    try:
+        return os.waitpid(pid, os.WNOHANG)[0] == pid
+    except ChildProcessError:  # none of this process's
+        return True
 
 
 def _help(work: Callable[[Any], Any], there: Connection, background: bool) -> NoReturn:
     """The life of a helper; it ends here, without what a process does at its end for those that it was forked from."""
     try:
         _Helper.is_this_process = not background
+        _spare[True].clear()  # it is there for one process to give to others
         os.nice(LEFT_OVER if background else 0)
         CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # it outlives nobody whom it works for
         while True:

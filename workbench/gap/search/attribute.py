@@ -419,7 +419,8 @@ def _with_a_second(
     tolerance: float,
 ) -> Decision:
     """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
-    pair = _clean_pair(search, start, singles[:1], screened)
+    at_once = Pairs.at_once(search, screened)
+    pair = _clean_pair(at_once.further(), start, singles[:1])
     if pair is not None:
         return pair
     beside = Stepwise(search, tolerance, ahead)
@@ -443,14 +444,14 @@ def _with_a_second(
     if varied is not None:
         return varied.decision()
     law = None if search.is_over else one_law(search, evidence)
-    pairs = Pairs(search)
+    pairs = at_once.further()
     # beside errors that no model has, something is missing that may stand in for them: few effects without come first
     nearer = beside.last.is_plausible and beside.last.fit.cost < min(f.cost for f in (start, *singles))
     if law is None and nearer:
         beside.run()
         if beside.is_settled:
             return beside.decision()
-    explained = pairs.at_once(screened) or (law is None and pairs.with_a_third())
+    explained = pairs.explain or (law is None and pairs.with_a_third())
     decision = pairs.decision(start)
     if law is not None:
         return compared_with(law, search, decision)
@@ -468,15 +469,15 @@ def _with_a_second(
     return random or random_beside_errors(search, beside.steps[0], surely=False) or decision
 
 
-def _clean_pair(search: Search, start: Fit, singles: Sequence[Fit], screened: Screening) -> Decision | None:
+def _clean_pair(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> Decision | None:
     """Two effects that leave only the stated noise of the sensors, neither of which a model may be off by; None else.
 
     None either where no number of one is known: an error of the model is likelier than what may be nothing. Errors of
     the model come to that only where the model has them, and cost more to ask for.
     """
-    pairs = Pairs(search)
+    search = pairs.search
     near = [effect for f in singles if search.near(f, PAIRS.most) for effect in f.effects]
-    if not (pairs.at_once(screened) or pairs.beside_any(near)):
+    if not (pairs.explain or pairs.beside_any(near)):
         return None
     decision = pairs.decision(start)
     effects = decision.best.effects

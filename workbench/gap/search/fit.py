@@ -259,15 +259,17 @@ class _Problem:
             self._columns = self.workers.array(len(self.parameters) + 1, residual.size)
             if self.known is not None:
                 self._columns[self.believed, : len(self.known)] = self.known.T
+                self._columns[self.believed, len(self.known) :] = 0.0
         jacobian = self._columns[:-1].T
         fresh = [j for j in range(len(self.parameters)) if not self.is_known or j not in self.believed]
-        self._columns[fresh], self._columns[-1] = 0.0, residual
         groups = self._of_sensors_alone(fresh)
+        self._columns[[j for group in groups for j in group]], self._columns[-1] = 0.0, residual
         alone = [j for j in fresh if all(j not in group for group in groups)]
         moves = [Move(free, self._moved(free, group), group, coarsely, of_sensors_alone=True) for group in groups]
         moves += (Move(free, self._moved(free, [j]), [j], coarsely) for j in alone)
         # where the rig cannot be: each number alone, and then to its other side
         failed = [move for move, told in zip(moves, share(moves), strict=True) if not told]
+        self._columns[[j for move in failed for j in move.numbers]] = 0.0
         single = [j for move in failed if len(move.numbers) > 1 for j in move.numbers]
         moves = [Move(free, self._moved(free, [j]), [j], coarsely) for j in single]
         failed = [move for move in failed if len(move.numbers) == 1]
@@ -277,6 +279,11 @@ class _Problem:
             jacobian[residual.size - len(self.believed) :, self.believed] = np.diag(1.0 / self.prior_std)
         self.is_known = self.is_known or self.chord
         return jacobian
+
+    def end(self) -> None:
+        """No slope is asked for any more."""
+        self.workers.give_back(self._columns)
+        self._columns = self._columns[:, :0]
 
     def normal(self, jacobian: np.ndarray) -> np.ndarray:
         """Jᵀ J; the part of sensitivities that are known is multiplied once."""
@@ -370,7 +377,9 @@ def fit(
         shape = (len(data.records), data.noise.size)
         return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), problem.start.size, "no rig at the start")
     with workers.standing(problem.done) as share:
-        return _descended(problem, share, residual, iterations, tolerance, damping)
+        found = _descended(problem, share, residual, iterations, tolerance, damping)
+    problem.end()
+    return found
 
 
 def _descended(

@@ -29,6 +29,7 @@ class Pairs:
         given: single effects that a second one was looked for beside.
         missed: near misses of which each half was kept and the other sought anew.
         moved: those tried from other places.
+        explain: whether one of those that are likeliest at first sight explains the records.
     """
 
     search: Search
@@ -39,17 +40,29 @@ class Pairs:
     given: list[Effect] = field(default_factory=list)
     missed: list[Fit] = field(default_factory=list)
     moved: list[Fit] = field(default_factory=list)
+    explain: bool = False
 
-    def at_once(self, screened: Screening) -> bool:
-        """Whether one of the pairs that are likeliest at first sight explains the records.
+    @classmethod
+    def at_once(cls, search: Search, screened: Screening) -> "Pairs":
+        """The pairs that are likeliest at first sight.
 
         Args:
+            search: what they are sought in.
             screened: what may be there, with nothing given.
         """
-        if self.search.is_over:
-            return False
-        self.search.report("all pairs at once", 0.4)
-        return self._explained_by(pairs_at_once(self.search, screened))
+        pairs = cls(search)
+        if not search.is_over:
+            search.report("all pairs at once", 0.4)
+            pairs.explain = pairs._explained_by(pairs_at_once(search, screened))
+        return pairs
+
+    def further(self) -> "Pairs":
+        """The same, to go on from."""
+        both = Pairs(self.search, explain=self.explain)
+        for name, value in vars(self).items():
+            if isinstance(value, list):
+                setattr(both, name, list(value))
+        return both
 
     def with_a_third(self) -> bool:
         """Whether the best pair and one more effect explain the records, where the pair leaves enough for one."""

@@ -527,11 +527,15 @@ class Stepwise:
     def _ahead(self, effects: Sequence[Effect], errors: Effect) -> Fit:
         """Effects and errors fitted to predictions one sample ahead, by slopes taken anew as long as the cost falls."""
         search = self.search
-        found = fit(search.rig, (*effects, errors), search.ahead, iterations=JOINT.iterations, chord=True)
+
+        def on(sets: Sequence[Effect]) -> Fit:
+            return fit(search.rig, sets, search.ahead, iterations=JOINT.iterations, workers=search.workers, chord=True)
+
+        found = on((*effects, errors))
         for _ in range(JOINT.anew - 1):
             if found.falling < JOINT.still:
                 break
-            found = fit(search.rig, found.effects, search.ahead, iterations=JOINT.iterations, chord=True)
+            found = on(found.effects)
         return found
 
     def _whole(self, step: Step) -> Step:
