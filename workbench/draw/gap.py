@@ -39,8 +39,8 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure
         for (name, values), colour, style in zip(outputs.items(), (COLOURS[1], COLOURS[0]), ("--", "-")):
             ax.plot(time, values[j, piece], color=colour, label=name, linestyle=style)
         ax.set(title=f"record {record.name}, sensor {channel.name}", ylabel=in_units(channel.quantity, channel.unit))
-        ax.legend(loc="upper right", ncols=3)
     axes[-1, 0].set_xlabel("time [s]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure
 
 

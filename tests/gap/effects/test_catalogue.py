@@ -115,6 +115,11 @@ def test_a_parameter_goes_to_its_free_coordinate_and_back(low):
         assert parameter.slope(value) == pytest.approx(slope, rel=1e-6)
 
 
+def test_a_strength_of_nothing_starts_a_fit_at_the_least_that_there_may_be():
+    strength = Parameter("mass", "kg", 1e-9, 1e3, logarithmic=True, neutral=0.0)
+    assert strength.from_free(strength.to_free(0.0)) == pytest.approx(1e-9)
+
+
 def test_a_spring_to_ground_may_be_negative():
     nominal, spring = rig(), kind_named("ground_spring")
     softer = spring.apply(nominal, None, {"at": 0.8, "stiffness": -1.0})

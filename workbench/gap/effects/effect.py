@@ -102,7 +102,8 @@ class Parameter:
     def to_free(self, value: float) -> float:
         """From the unit to the coordinate of the fit."""
         if self.logarithmic:
-            return float(np.arcsinh(value / self.scale)) if self.low < 0 else float(np.log(value))
+            # an effect may start from nothing, whose logarithm is no number
+            return float(np.arcsinh(value / self.scale) if self.low < 0 else np.log(max(value, self.low)))
         return value / self.scale
 
     def from_free(self, free: float) -> float:
