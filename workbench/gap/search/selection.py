@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.limiting_cases import contained
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Search, in_one_valley, promise, spread_over_kinds
@@ -73,18 +72,21 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
         sets: the likeliest first.
     """
 
-    def ahead(effects: tuple[Effect, ...], data: FitData, iterations: int) -> Fit:
+    first, both = search.first_ahead, search.ahead  # before helpers are forked, which would each find them
+
+    def ahead(task: tuple[tuple[Effect, ...], bool, int]) -> Fit:
+        effects, alone, iterations = task
+        data = first if alone else both
         return fit(search.rig, effects, data, held=search.held, iterations=iterations, tolerance=1e-4)
 
-    tried = search.workers.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[: SELECTION.tried])
-    likely = sorted(tried, key=promise)[: SELECTION.likely]
-    fits = distinct_valleys(
-        search, sorted(search.workers.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise)
-    )
-    falling = [
-        f for f in fits[: SELECTION.likeliest] if f.falling and promise(f) < SELECTION.far_behind * promise(fits[0])
-    ]
-    longer = search.workers.map(lambda f: ahead(f.effects, search.ahead, 8), falling)
+    with search.workers.standing(ahead) as share:
+        tried = share([(effects, True, 2) for effects in sets[: SELECTION.tried]])
+        likely = sorted(tried, key=promise)[: SELECTION.likely]
+        fits = distinct_valleys(search, sorted(share([(f.effects, False, 3) for f in likely]), key=promise))
+        falling = [
+            f for f in fits[: SELECTION.likeliest] if f.falling and promise(f) < SELECTION.far_behind * promise(fits[0])
+        ]
+        longer = share([(f.effects, False, 8) for f in falling])
     return distinct_valleys(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
 
 
