@@ -11,6 +11,7 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+from matplotlib.lines import Line2D
 from scipy.linalg import block_diag, expm
 
 from workbench.draw.style import COLOURS, GREY, new_figure
@@ -217,19 +218,26 @@ def _won(row, name):
     return min((present - redesigned) / (present - 1.0), 1.0)
 
 
+def _state(run):
+    return "unstable" if not run["stable"] else "not within the test" if run["settling"] is None else "settles"
+
+
 def _figure(lost):
     figure, axes = new_figure(1, len(lost), width=10, height=4.0, sharey=True)
+    designs = (("present", COLOURS[1], -0.12), ("redesigned", COLOURS[0], 0.12))
+    markers = {"settles": "o", "not within the test": "^", "unstable": "x"}
     for ax, (name, there) in zip(axes, lost.items(), strict=True):
         order = sorted(there, key=lambda row: _over(row, name, "present"))
-        for who, words, colour in (("present", "present", COLOURS[1]), ("redesigned", "redesigned", COLOURS[0])):
-            values = [_over(row, name, who) for row in order]
-            ax.plot(np.arange(len(order)), values, "o", color=colour, markersize=4, label=words)
         for i, row in enumerate(order):
-            ends = [_over(row, name, who) for who in ("present", "redesigned")]
-            ax.plot([i, i], ends, color=GREY, linewidth=0.8, zorder=0)
+            ends = [_over(row, name, who) for who, *_ in designs]
+            ax.plot([i + shift for *_, shift in designs], ends, color=GREY, linewidth=0.8, zorder=0)
+            for end, (who, colour, shift) in zip(ends, designs, strict=True):
+                ax.plot(i + shift, end, markers[_state(row[name][who])], color=colour, markersize=4)
         ax.axhline(1.0, color=GREY, linewidth=0.8)
         ax.set(yscale="log", xlabel="hidden plant that loses time", title=name)
         ax.set_xticks([])
     axes[0].set_ylabel("settling time over that\nwithout the effect")
-    axes[0].legend(fontsize=8)
+    handles = [Line2D([], [], marker="o", linewidth=0, color=colour, label=who) for who, colour, _ in designs]
+    handles += [Line2D([], [], marker=m, linewidth=0, color="black", label=state) for state, m in markers.items()]
+    axes[0].legend(handles=handles, fontsize=8)
     return figure

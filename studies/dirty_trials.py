@@ -46,5 +46,7 @@ def study(outcome, data: Path | None = None) -> None:
     outcome.table("reliability", [point._asdict() for point in points])
     off = max((abs(p.right - p.probability) for p in points if p.claims >= FEW), default=0.0)
     outcome.check(f"reliability: distance from the diagonal of {FEW} claims or more", off, 0.1)
-    outcome.figure("named", plot_dirt(scores), "Share named rightly, by class and size of the small errors.")
-    outcome.figure("reliability", plot_reliability(points), "Share of claims that are right, by the probability told.")
+    outcome.figure("named", plot_dirt(scores), "Share named correctly, by class and size of the small errors.")
+    outcome.figure(
+        "reliability", plot_reliability(points), "Share of claims that are right, by the probability stated."
+    )

@@ -216,7 +216,7 @@ def study(outcome, data: Path | None = None) -> None:
     names = list(METHODS)
     if importlib.util.find_spec("pyoma2") is None:
         names.remove(SSI)
-        outcome.say(f"{SSI}: not tried, pyoma2 is not installed (pip install 'modal-workbench[peers]')")
+        outcome.say(f"{SSI}: not tried, pyoma2 is not installed (pip install -e '.[peers]')")
     seeds = range(FIRST_SEED, FIRST_SEED + STRUCTURES)
     cases = [{"seed": seed, "level": level, "names": names} for seed in seeds for level in LEVELS_DB]
     found = outcome.run(cases, trial, workers=1)  # one at a time, so that their times compare

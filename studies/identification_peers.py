@@ -206,7 +206,7 @@ def study(outcome, data: Path | None = None) -> None:
     logging.disable(logging.INFO)
     absent = {name: package for name, package in PACKAGES.items() if importlib.util.find_spec(package) is None}
     for name, package in absent.items():
-        outcome.say(f"{name}: not tried, {package} is not installed (pip install 'modal-workbench[peers]')")
+        outcome.say(f"{name}: not tried, {package} is not installed (pip install -e '.[peers]')")
     methods = {name: method for name, method in METHODS.items() if name not in absent}
     seeds = range(FIRST_SEED, FIRST_SEED + STRUCTURES)
     every, efficient = {}, {}

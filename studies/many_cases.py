@@ -100,8 +100,10 @@ def study(outcome, data=None):
             f" a second run takes {100 * kept:.2g} %."
         )
     outcome.table("speed", rows)
+    drawn = plot_cases(found.rows(), x="shift", y="W_R", by="weight")
+    drawn.axes[0].set(xlabel="shift of the two inner actuators [m]", ylabel="spillover work W_R [J]")
     outcome.figure(
         "spillover",
-        plot_cases(found.rows(), x="shift", y="W_R", by="weight"),
+        drawn,
         "Work spilled by every weight and shift of the two inner actuators of four on a hinged beam.",
     )

@@ -117,7 +117,7 @@ def test_every_public_name_has_a_room_whose_page_shows_it():
 
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path):
-    pytest.importorskip("furo", reason="pip install 'modal-workbench[docs]'")
+    pytest.importorskip("furo", reason="pip install -e '.[docs]'")
     build = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", DOCS, tmp_path]
     subprocess.run(build, check=True, timeout=600)
     pages = {path: path.read_text(encoding="utf-8") for path in tmp_path.rglob("*.html")}

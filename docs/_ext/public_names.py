@@ -12,12 +12,20 @@ from sphinx.util.docutils import SphinxDirective
 import workbench
 
 STUB = Path(workbench.__file__).with_suffix(".pyi")
+DOCS = Path(__file__).resolve().parents[1]
 
 
 def public_names() -> dict[str, str]:
-    """Dotted path of each public name -> its room: the names of `workbench` first, then those of the rooms' files."""
+    """Dotted path of each public name -> its room: the names of `workbench` first, then those of the rooms' files.
+
+    Of the rooms' files, names that `workbench` once had, and those that a page of the documentation imports.
+    """
     core = re.findall(r"^from \.(\w+)\S* import (\w+)", STUB.read_text(encoding="utf-8"), re.M)
-    further = sorted(path for path in set(workbench.RENAMED.values()) if "." in path)
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in sorted(DOCS.rglob("*.md")))
+    imported = re.findall(r"^ *from workbench\.(\S+) import (\w+(?:, \w+)*)", pages, re.M)
+    named = {name for _, name in core}
+    shown = {f"{module}.{name}" for module, names in imported for name in names.split(", ") if name not in named}
+    further = sorted(path for path in shown.union(workbench.RENAMED.values()) if "." in path)
     return {f"workbench.{name}": room for room, name in core} | {
         f"workbench.{path}": path.split(".")[0] for path in further
     }

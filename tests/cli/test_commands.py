@@ -144,7 +144,7 @@ def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
 def test_design_offers_what_can_be_had(rig, tmp_path):
     found = tmp_path / "design.json"
     nodes = run("design", rig, "--control", 5)
-    assert nodes.exit_code == 2 and "no actuator moves mode 5: all stand at its nodes" in nodes.output
+    assert nodes.exit_code == 2 and "mode 5 is uncontrollable: all actuators stand at its nodes" in nodes.output
     rig.write_text(rig.read_text().replace("at = 4.0", "at = 4.3"))
     few = run("design", rig, "--control", 5, "--damping", 0.1, "--errors", 0.02, "--json", found)
     assert few.exit_code == 0 and "IMSC needs as many actuators as controlled modes, 5; there are 4" in few.output

@@ -143,7 +143,7 @@ def test_a_tone_is_remarked():
     tone = 10.0 * np.sin(13.0 * record.time) * [[1.0], [-0.5]]
     told = ring_down(replace(record, outputs=record.outputs + tone))
     assert "does not decay within the record" in told.notes[0]
-    assert told.remarks == ("", "does not decay: a hum?", "")
+    assert told.remarks == ("", "does not decay: mains hum?", "")
 
 
 def test_proportional_damping_is_told():

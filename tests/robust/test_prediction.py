@@ -163,7 +163,7 @@ def test_a_record_too_slow_for_a_mode_is_noted_and_one_too_short_is_refused(plai
     sent = np.random.default_rng(0).normal(size=(1, 100))
     assert not predict(uncertain(plain), sent, sample_time=0.01, draws=40).notes
     slow = predict(uncertain(plain), sent, sample_time=0.02, draws=40)
-    assert slow.notes[-1].startswith("Modes at 28.27 Hz lie above half of 50 samples a second")
+    assert slow.notes[-1].startswith("Modes at 28.27 Hz lie above the Nyquist frequency of 25 Hz")
     short = measured(plain, 1.0, np.random.default_rng(1), n=39)
     with pytest.raises(ValueError, match="'new' has 39 samples, too few to test a model: measure 40 or more"):
         check_prediction(predict(uncertain(plain), short, draws=40), short)

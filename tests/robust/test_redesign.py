@@ -61,7 +61,7 @@ def test_at_least_half_of_what_a_fault_costs_is_won_back(rig, controller, fault)
     kept = [step for step in found.steps if step.kept]
     assert found.steps[0].loss > 0.03
     assert kept[-1].loss < 0.5 * found.steps[0].loss
-    assert found.safe and "stable on 4 of 4 draws" in found.sentence
+    assert found.safe and "stable on 4 of 4 Monte Carlo samples" in found.sentence
 
 
 def test_a_dead_zone_is_made_up_for_though_it_spills_less(rig):
@@ -99,7 +99,7 @@ def test_a_loop_that_a_long_delay_destabilises_is_made_stable(rig, controller):
     late = possible(rig, effect("actuator_delay", "all", delay=6.0 * DT))
     found = redesign(late, controller, sample_time=DT, impulse_at=0.8, draws=8, placement=False)
     assert found.present_proof.share_stable == 0.0 and found.proof.share_stable == 1.0
-    assert "the present controller is unstable on 8 of 8 draws" in found.sentence
+    assert "the present controller is unstable on 8 of 8 samples" in found.sentence
 
 
 def test_a_filter_through_which_residual_modes_diverge_is_made_slower(rig):
@@ -185,7 +185,7 @@ def test_a_law_is_judged_by_what_it_is_for(rig, controller):
     sooner = judged(found, 1.1, 0.7, 1.1)
     assert sooner.pays and not judged(by_weight, 1.1, 0.7, 1.1).pays
     assert "settles the controlled modes in 0.7 s where the present one settles them in 1 s" in sooner.advice
-    assert "for 1.1 times the effort (medians); it does better on 2 of 2 draws" in sooner.advice
+    assert "for 1.1 times the effort (medians); it does better on 2 of 2 samples" in sooner.advice
     dear = judged(found, 1.0, 0.9, 1.5)
     assert not dear.pays and "costs 20 % more, time and effort taken together: more_cost = 0.2" in dear.advice
     asked = redesign(
@@ -294,7 +294,7 @@ def test_the_ends_of_an_interval_are_told_apart(rig, controller):
     assert "at 10.43 % (95 %: 10.41 to 10.45) damping" in found.sentence
     assert "25 % (20 to 30), as much effort" in found.sentence
     alike = replace(sure.proof, damping=np.full((3, 6), 0.05))
-    assert "redesigned: 5.00 % (draws alike)," in replace(found, proof=alike).sentence
+    assert "redesigned: 5.00 % (samples alike)," in replace(found, proof=alike).sentence
 
 
 def test_every_draw_is_judged_by_its_own_simulation(rig, controller):
@@ -318,7 +318,7 @@ def test_on_off_control_is_told_by_its_settling(rig):
     found = redesign(stuck, relays, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
     assert "settles in" in found.sentence and found.steps[-1].loss < 0.1 * found.steps[0].loss
     alike = replace(found.proof, controlled_settling=np.full(3, 2.29), settling=np.full(3, 2.29))
-    assert "redesigned: 2.29 s (draws alike)" in replace(found, proof=alike).sentence
+    assert "redesigned: 2.29 s (samples alike)" in replace(found, proof=alike).sentence
 
 
 def test_relays_that_a_dead_zone_silences_are_made_to_act_again(rig):
@@ -344,14 +344,14 @@ def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, 
     sure = possible(rig, unexplained=0.01, outcome="unknown")
     found = redesign(sure, controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False)
     assert found.proof.margin > 0.01 and found.safe
-    assert found.sentence.endswith("so stability is sure unless some frequency is off by more.")
+    assert found.sentence.endswith("so stability is guaranteed while no frequency is off by more.")
     proofs = {name: replace(getattr(found, name), margin=1.004) for name in ("present_proof", "proof")}
     certain = replace(found, **proofs)  # whichever controller is the one to use
-    assert "the loop bears 100 % of any phase" in certain.sentence and "off by 1 % that" in certain.sentence
+    assert "the small-gain margin is 100 %" in certain.sentence and "1 % of the output is unexplained" in certain.sentence
     unsure = redesign(
         replace(sure, unexplained=0.5), controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False
     )
-    assert not unsure.safe and "off by 50 %" in unsure.sentence and "not sure" in unsure.sentence
+    assert not unsure.safe and "50 % of the output is unexplained" in unsure.sentence and "not guaranteed" in unsure.sentence
 
 
 def test_an_impulse_is_as_large_in_volts_as_in_metres(rig):

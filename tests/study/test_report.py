@@ -61,7 +61,7 @@ def test_identified_modes_swing(tmp_path):
 
 def test_a_design_shows_what_it_spills(tmp_path):
     shown = page_content_in(written(tmp_path, DESIGNED))
-    heads = ("law", "cost", "effort", "peak force", "W_R", "loop")
+    heads = ("law", "cost", "effort [N² s]", "peak force [N]", "W_R [J]", "loop")
     assert shown.tables == [("Laws", heads, [["IMSC", 1.0, 2.0, 3.0, 0.75, "stable"]])]
     [bars] = [m for m in shown.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "bars"]
     assert [box[3] for box in bars["boxes"]] == [0.25, 0.5]

@@ -395,7 +395,9 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path) -> R
     for sensor in rig.sensors:
         if np.ptp(arrays[sensor.name]) == 0:
             level = arrays[sensor.name][0]
-            raise CaseError(f"{file}: output {sensor.name!r} is flat at {level:g}: is the sensor alive?")
+            raise CaseError(
+                f"{file}: output {sensor.name!r} is flat at {level:g}: check the sensor and its cable, or leave it out"
+            )
     inputs, outputs = (np.array([arrays[port.name] for port in ports]) for ports in (rig.actuators, rig.sensors))
     return rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=_hold(entry, where))
 

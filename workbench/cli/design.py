@@ -60,12 +60,12 @@ def design(
         numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
         fastest = row.poles.real.max()
-        stable = "stable" if fastest < 0 else "unstable" if fastest > 0 else "undamped poles"
+        stable = "stable" if fastest < 0 else "unstable" if fastest > 0 else "marginally stable"
         shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, stable))
     say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {modes.domain.text(at)}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
-    show_table(("law", "cost", "effort", "peak force", "W_C", "W_R", "largest W_r", "loop"), shown)
+    show_table(("law", "cost", "effort [N² s]", "peak force [N]", "W_C [J]", "W_R [J]", "largest W_r", "loop"), shown)
     tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
@@ -121,7 +121,7 @@ def _limit(explained: "Explanation") -> tuple[str, str]:
     if worst is None:
         return "", ""
     if not explained.loop.stable and explained.destabilising is None:
-        return "none: unstable without any" if explained.reduced_margin <= 0 else "no single one", ""
+        return "none: unstable without them" if explained.reduced_margin <= 0 else "no single mode", ""
     grows = explained.loop.stable or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without it"
     return (

@@ -16,7 +16,7 @@ CasePath = Annotated[Path, typer.Argument(help="Case folder: case.toml and its r
 VerdictPath = Annotated[
     Path | None, typer.Option(help="Verdict that `workbench diagnose --json` wrote; diagnosed now unless given.")
 ]
-Workers = Annotated[int | None, typer.Option(help="Processes that share the diagnosis; one a core.")]
+Workers = Annotated[int | None, typer.Option(help="Processes that share the diagnosis; one per core unless given.")]
 # a bracket that opens a word would be taken for markup of the help text
 RigPath = Annotated[
     Path, typer.Argument(help=r"Case folder, or TOML file with \[structure], \[\[input]] and \[\[output]] as in one.")
@@ -28,13 +28,14 @@ ImpulseAt = Annotated[
         help="Place of the impulse: m (X,Y on a plate), a point or an input by name; the hammer's unless given.",
     ),
 ]
-Weight = Annotated[float, typer.Option(help="Control weight R: force against motion.")]
+Weight = Annotated[float, typer.Option(help="Control weight R, of the forces in the quadratic cost.")]
 LawName = Annotated[str, typer.Option(help="Control law: imsc, coupled, poles or on-off.")]
 Control = Annotated[
     int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
 ]
 LawWeight = Annotated[
-    float | None, typer.Option("--weight", help="Control weight R: force against motion; in place of --damping.")
+    float | None,
+    typer.Option("--weight", help="Control weight R, of the forces in the quadratic cost; in place of --damping."),
 ]
 Damping = Annotated[
     float | None, typer.Option(help=f"Damping ratio of the controlled modes; {DAMPING:g} unless given.")

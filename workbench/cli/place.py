@@ -116,7 +116,7 @@ def place(
         bold=True,
     )
     where = "points" if isinstance(domain, NamedPoints) else "places [m]"
-    show_table((where, "W_R", "effort", "peak force", "condition of B", ""), shown)
+    show_table((where, "W_R [J]", "effort [N² s]", "peak force [N]", "condition number of B", ""), shown)
     if certificate is not None:
         say(f"  {certificate}")
     if picture is not None:

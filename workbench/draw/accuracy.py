@@ -65,8 +65,8 @@ def plot_bands(bands: Bands, exact: Modes | None = None, positions: Sequence[flo
         top.plot(bands.x, bands.phi[:, r], color=COLOURS[0])
         top.set_title(f"mode {r + 1}")
         for edges, alpha, label in (
-            ((low[:, r], high[:, r]), 0.25, f"holds the whole curve, {bands.level:.0%}"),
-            (tuple(edge[:, r] for edge in bands.pointwise), 0.35, f"holds each point, {bands.level:.0%}"),
+            ((low[:, r], high[:, r]), 0.25, f"simultaneous {bands.level:.0%} band"),
+            (tuple(edge[:, r] for edge in bands.pointwise), 0.35, f"pointwise {bands.level:.0%} band"),
         ):
             bottom.fill_between(
                 bands.x, edges[0] - bands.phi[:, r], edges[1] - bands.phi[:, r], color=COLOURS[0], alpha=alpha, lw=0,
@@ -78,7 +78,7 @@ def plot_bands(bands: Bands, exact: Modes | None = None, positions: Sequence[flo
             bottom.plot(bands.x, sign * truth - bands.phi[:, r], color=COLOURS[1], label="exact")
         if len(positions):
             bottom.plot(positions, np.zeros(len(positions)), "|", color=GREY, ms=9, label="sensors")
-        bottom.set_xlabel("x")
+        bottom.set_xlabel("x [m]")
     axes[0, 0].set_ylabel("identified φ(x)")
     axes[1, 0].set_ylabel("about the identified curve")
     figure.legend(*axes[1, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)

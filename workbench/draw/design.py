@@ -36,11 +36,13 @@ def plot_displacements(
             k = int(np.argmin(np.abs(response.time - time)))
             ax.plot(x, motion[:, k], color=COLOURS[0])
             ax.axhline(0.0, color=GREY, linewidth=0.8)
-            ax.plot(positions[name], np.zeros(len(positions[name])), "x", color=COLOURS[1], markersize=7, mew=2)
+            at = np.array(positions[name])
+            ax.plot(at, np.zeros(at.size), "x", color=COLOURS[1], markersize=7, mew=2, label="actuator")
             if column == 0:
-                ax.set_ylabel(f"t = {time:g} s")
+                ax.set_ylabel(f"w [m] at\nt = {time:g} s")
         axes[0, column].set_title(f"actuators at {name}")
         axes[-1, column].set_xlabel("x [m]")
+    axes[0, 0].legend(loc="upper right", fontsize=8)
     return figure
 
 
@@ -55,10 +57,10 @@ def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
         image = ax.pcolormesh(
             time, x, field, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud", rasterized=True
         )
-        ax.set(ylabel="x", title=name)
+        ax.set(ylabel="x [m]", title=name)
         ax.grid(False)
     axes[-1, 0].set_xlabel("time [s]")
-    figure.colorbar(image, ax=axes[:, 0], label="displacement")
+    figure.colorbar(image, ax=axes[:, 0], label="displacement [m]")
     return figure
 
 
@@ -69,7 +71,7 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
     for i, (name, work) in enumerate(works.items()):
         numbers = first + 1 + np.arange(work.size)
         ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, work, width, label=f"{name}: W_R = {work.sum():.3g}")
-    ax.set(xticks=numbers, xlabel="residual mode", ylabel="spillover work in the mode, W_r")
+    ax.set(xticks=numbers, xlabel="residual mode", ylabel="spillover work in the mode, W_r [J]")
     ax.set_title("spillover work by residual mode")
     ax.legend()
     return figure
@@ -90,7 +92,7 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
         for x, value in zip(at, work.residual_work, strict=True):
             if value < least:
                 ax.text(x, 1.3 * least, "≈ 0", ha="center", color=bars.patches[0].get_facecolor())
-    ax.set(yscale="log", xlabel="residual mode", ylabel="spillover work W_r", xticks=modes)
+    ax.set(yscale="log", xlabel="residual mode", ylabel="spillover work W_r [J]", xticks=modes)
     # room above the bars for the legend
     ax.set_ylim(least, 10.0 ** (1.0 + 0.35 * len(spillovers)) * total)
     ax.set_title("control spillover: energy that control leaves in the residual modes")
@@ -106,14 +108,14 @@ def plot_effort_front(placements: Sequence[Placement], marked: dict[str, Placeme
     axes[0].plot(effort, work, "o-", color=COLOURS[0], label="least W_R at each effort")
     for (name, p), colour in zip(marked.items(), COLOURS[1:], strict=False):
         axes[0].plot(p.effort, p.residual_work, "s", color=colour, markersize=9, label=name)
-    axes[0].set(xscale="log", yscale="log", xlabel="effort ∫ FᵀF dt [N² s]", ylabel="spillover work W_R")
+    axes[0].set(xscale="log", yscale="log", xlabel="effort ∫ FᵀF dt [N² s]", ylabel="spillover work W_R [J]")
     axes[0].set_title("spillover against effort")
     axes[0].legend()
     for p in placements:
         axes[1].plot(p.positions, np.full(p.positions.size, p.effort), "o", color=COLOURS[0], markersize=4)
     for (_, p), colour in zip(marked.items(), COLOURS[1:], strict=False):
         axes[1].plot(p.positions, np.full(p.positions.size, p.effort), "s", color=colour)
-    axes[1].set(yscale="log", xlabel="places of the actuators, x [m]", ylabel="effort")
+    axes[1].set(yscale="log", xlabel="places of the actuators, x [m]", ylabel="effort [N² s]")
     return figure
 
 
@@ -231,14 +233,14 @@ def plot_how_many(found: dict[str, HowMany], share: float | None = None) -> Figu
     figure, axes = new_figure(1, len(found), width=11, height=4.5, sharey=True, squeeze=False)
     for ax, (name, result) in zip(axes[0], found.items(), strict=True):
         untouched, spilled = result.untouched / result.energy.sum(), result.spilled / result.energy.sum()
-        ax.bar(result.counts, untouched, color=COLOURS[0], label="in modes not controlled")
+        ax.bar(result.counts, untouched, color=COLOURS[0], label="in residual modes")
         ax.bar(result.counts, spilled, bottom=untouched, color=COLOURS[1], label="spillover")
         if share is not None:
             ax.axhline(share, color=GREY, linestyle="--", label=f"{share:.0%} may be left")
         if result.recommended:
-            label = f"control {result.recommended}"
+            label = f"recommended: {result.recommended} modes"
             ax.axvline(result.recommended, color=COLOURS[2], linewidth=6, alpha=0.35, label=label)
-        ax.set(xlabel="modes controlled, n", xticks=result.counts, title=name)
+        ax.set(xlabel="controlled modes, n", xticks=result.counts, title=name)
         ax.legend()
     axes[0, 0].set_ylabel("share of the disturbance's energy left")
     return figure
@@ -329,7 +331,7 @@ def plot_switching(law: OnOffLaw, switched: Switched) -> Figure:
     handles, labels = axes[0].get_legend_handles_labels()
     once = dict(zip(labels, handles, strict=True))
     axes[0].legend(once.values(), once.keys(), loc="lower left")
-    axes[0].set(xlabel=f"q{r + 1}", ylabel=f"rate of q{r + 1}", title=f"mode {r + 1} in the phase plane")
+    axes[0].set(xlabel=f"q{r + 1}", ylabel=f"dq{r + 1}/dt", title=f"mode {r + 1} in the phase plane")
     pushes = np.zeros(response.time.size)
     for s in stretches:
         tau = response.time - s.start

@@ -53,7 +53,7 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
         ax.bar(np.arange(len(records)) + 0.27 * (i - 1), values, 0.27, color=colour, label=name)
     ax.set_xticks(np.arange(len(records)), records)
     ax.set_xlim(-1.0, max(len(records), 3) - 0.5)
-    ax.set(yscale="log", xlabel="record", ylabel="gap", title="gap on the validation records")
+    ax.set(yscale="log", xlabel="record", ylabel="rms error / rms signal", title="gap on the validation records")
     ax.legend()
     return figure
 
@@ -95,7 +95,13 @@ def plot_where(verdict: Verdict) -> Figure:
     for i in order:
         at = (where.input_levels[i], where.record_gaps[i])
         axes[1, 1].annotate(where.record_names[i], at, (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    axes[1, 1].set(title="by record and level", xlabel="input level [N rms]", ylabel="gap", xscale="log", yscale="log")
+    axes[1, 1].set(
+        title="by record and level",
+        xlabel="rms of the inputs",
+        ylabel="gap (rms error / rms signal)",
+        xscale="log",
+        yscale="log",
+    )
     axes[2, 0].imshow(100 * where.time_shares, aspect="auto", cmap="Blues", vmin=0.0, extent=(0, 8, len(order), 0))
     axes[2, 0].set(title="by time: darker is more of the record's gap", xlabel="eighth of the record")
     axes[2, 0].set_xticks(np.arange(8) + 0.5, np.arange(1, 9))
@@ -114,7 +120,7 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
         False: "no single point force: where one fits best",
         None: "no place of a force can be identified",
     }
-    ax.set(title=title[place.holds], ylabel="log-likelihood, less its peak")
+    ax.set(title=title[place.holds], ylabel="log-likelihood below its maximum")
     domain = verdict.nominal.modes.domain
     if isinstance(domain, Rectangle):
         _map(ax, verdict, domain)
@@ -211,7 +217,7 @@ def plot_rivals(verdict: Verdict) -> Figure:
     ax.axvline(verdict.attribution.nominal_cost, color=COLOURS[1], linestyle="--", label="nominal")
     ax.set(
         xscale="log",
-        xlabel="mean square residual, in units of the noise",
+        xlabel="mean square residual over that of the noise",
         title="each effect alone, fitted as well as it can be",
     )
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)

@@ -33,7 +33,8 @@ def plot_ring_down(record: Record, *, stretch: float) -> Figure:
         place = channel.name if channel.at is None else f"x = {channel.at:.3g}"
         ax.text(shown.time[-1], j, f"  {place}", va="center")
     ax.set(xlabel="time [s]", yticks=[], xlim=(shown.time[0], shown.time[-1]))
-    ax.set_title("measured ring-down, one line a sensor")
+    first = record.output_channels[0]
+    ax.set_title(f"{first.quantity}, one line per sensor, {2.0 * size:.2g} {first.unit} apart".lstrip(", "))
     return figure
 
 
@@ -49,7 +50,7 @@ def plot_identified(found: Modes, truth: Modes, positions: np.ndarray, *, count:
         ax.plot(positions, at_sensors, "o", color=COLOURS[1], markersize=4, label="at the sensors")
         ax.set_title(f"mode {r + 1}: {found.frequencies_hz[r]:.4f} Hz, ζ = {100 * found.zeta[r]:.2f} %", fontsize=10)
     for ax in axes[-1]:
-        ax.set_xlabel("x")
+        ax.set_xlabel("x [m]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -85,7 +86,7 @@ def eigenfunction(found: Modes, exact: Modes, *, mode: int, positions: np.ndarra
     top.set_ylabel(f"φ{mode + 1}(x), mass-normalised")
     top.legend(ncols=3)
     bottom.plot(x, sign * identified - truth, color=COLOURS[0])
-    bottom.set(ylabel="difference", xlabel="x")
+    bottom.set(ylabel="difference", xlabel="x [m]")
     return figure
 
 
@@ -101,7 +102,7 @@ def distribution_errors(
                 axes[row, column].semilogy(x, np.maximum(curve, 1e-8), color=colour, label=label)
             axes[row, column].set_ylim(1e-8, 1e-1)
         axes[0, column].set_title(f"{m} sensors")
-        axes[1, column].set_xlabel("x")
+        axes[1, column].set_xlabel("x [m]")
     axes[0, 0].set_ylabel("error of m(x)")
     axes[1, 0].set_ylabel("error of EA(x)")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)

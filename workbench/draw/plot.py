@@ -83,7 +83,8 @@ def _(result: Modes) -> Figure:
         ax.axhline(0.0, color=GREY, linewidth=0.6)
         ax.plot(x, shapes[:, r])
         ax.set_title(_named(r, result.frequencies_hz[r], result.zeta[r]), fontsize=10)
-        ax.set_xlabel("x")
+        ax.set_xlabel("x [m]")
+    axes[0].set_ylabel("φ(x) [1/√kg]")
     return figure
 
 
@@ -100,7 +101,7 @@ def _(result: SampledModes) -> Figure:
         ax.plot(x, shapes[:, r].real, "o-", label="real")
         ax.plot(x, shapes[:, r].imag, ".", color=COLOURS[1], label="imaginary")
         ax.set_title(_named(r, result.frequencies_hz[r], result.zeta[r]), fontsize=10)
-        ax.set_xlabel("x" if placed else "sensor")
+        ax.set_xlabel("x [m]" if placed else "sensor")
     axes[0].legend(fontsize=8)
     return figure
 
@@ -146,7 +147,7 @@ def _(result: Placement) -> Figure:
     numbers = len(result.positions) + 1 + np.arange(result.by_mode.size)
     ax.bar(numbers, result.by_mode)
     where = "; ".join(place_text(place) for place in listed(result.positions))
-    ax.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=numbers)
+    ax.set(xlabel="residual mode", ylabel="spillover work, W_r [J]", xticks=numbers)
     ax.set_title(f"actuators at {where}: W_R = {result.residual_work:.3g}, effort {result.effort:.3g}")
     return figure
 

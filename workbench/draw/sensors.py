@@ -65,7 +65,7 @@ def _first_left_alone(placement: SensorPlacement) -> tuple[int, str]:
     modes = placement.modes
     left = [r for r in range(modes.n_modes) if r not in placement.controlled]
     shown = left[0] if left else modes.n_modes - 1
-    return shown, f"mode {shown + 1}, {modes.frequencies_hz[shown]:.3g} Hz" + ", the first left alone" * bool(left)
+    return shown, f"mode {shown + 1}, {modes.frequencies_hz[shown]:.3g} Hz" + ", the lowest residual mode" * bool(left)
 
 
 def _along(ax: Axes, placement: SensorPlacement) -> None:
@@ -105,8 +105,8 @@ def _errors(ax: Axes, placement: SensorPlacement) -> None:
     errors = 100.0 * np.sqrt(placement.by_mode)
     controlled = np.isin(np.arange(errors.size), placement.controlled)
     for which, colour, label in (
-        (controlled, COLOURS[0], "controlled: what the filter misses"),
-        (~controlled, COLOURS[4], "left alone: observation spillover"),
+        (controlled, COLOURS[0], "controlled: estimation error"),
+        (~controlled, COLOURS[4], "residual: observation spillover"),
     ):
         ax.bar(1 + np.flatnonzero(which), errors[which], color=colour, label=label)
     most = max(errors.max(), 1e-12)

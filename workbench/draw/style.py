@@ -59,10 +59,14 @@ def plain_ticks(figure: Figure) -> Figure:
                 continue
             if high / low < PLAIN_DECADES and low >= PLAIN_LEAST and high <= 1.0 / PLAIN_LEAST:
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            axis.set_minor_formatter(
-                FuncFormatter(lambda value, _: f"{value:g}") if high / low < 10 else NullFormatter()
-            )
+            axis.set_minor_formatter(FuncFormatter(_plain_minor) if high / low < 10 else NullFormatter())
     return figure
+
+
+def _plain_minor(value: float, _: int) -> str:
+    """Between the decades, as many numbers as there is room for: 2, 3 and 5 times them."""
+    text = f"{value:g}"
+    return text if text.strip("0.").startswith(("2", "3", "5")) and len(text.strip("0.")) == 1 else ""
 
 
 def envelope(y: np.ndarray) -> np.ndarray:

@@ -179,7 +179,7 @@ def plot_surface_placement(
         right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
     if struck is not None:
         left.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
-    first = f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, the first left alone"
+    first = f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, the lowest residual mode"
     left.set_title(f"{modes.domain}, with the nodal lines of {first}", fontsize=10)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), fontsize=9, ncols=2)
     work = np.concatenate([placement.by_mode for placement in placements.values()])

@@ -16,6 +16,19 @@ _FAMILY = {
     "none": "nothing hidden:",
     "unknown": "outside the catalogue:",
 }
+_ERRORS = {
+    "clean": "none",
+    "shape": "mass, stiffness, damping vary",
+    "offset": "all stiffness, all damping off",
+    "noise": "noise louder than stated",
+    "coloured": "coloured noise",
+    "input": "noise of logged inputs",
+    "late": "sensors late",
+    "gain": "calibration of gains",
+    "place": "places off",
+    "mixed": "several of these",
+    "triple": "none; three effects",
+}
 BOTH, OTHER = "both of the two", "another two"
 
 
@@ -47,13 +60,13 @@ def plot_times(seconds: Mapping[str, Sequence[float]], limits: Mapping[str, floa
         ends, label = [y - 0.35, y + 0.35], "limit" if y == 0 else None
         ax.plot([limits[family]] * 2, ends, color=COLOURS[1], linewidth=2, label=label)
     ax.set_yticks(range(len(seconds)), [_FAMILY[family].rstrip(":") for family in seconds])
-    ax.set(xlim=(0, None), ylim=(len(seconds) - 0.5, -0.5), xlabel="seconds by the clock, two cores")
+    ax.set(xlim=(0, None), ylim=(len(seconds) - 0.5, -0.5), xlabel="wall-clock time on two cores [s]")
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure
 
 
 def plot_dirt(scores: Sequence[Mapping[str, Any]]) -> Figure:
-    """How many of the trials of `score_dirty` were named rightly, by class and size of the small errors beside them."""
+    """How many trials of `score_dirty` were named correctly, by class and size of the small errors beside them."""
     classes, sizes = list(dict.fromkeys(s["class"] for s in scores)), sorted({s["size"] for s in scores})
     figure, ax = new_figure(width=9, height=1.6 + 0.45 * len(classes))
     for row, name in enumerate(classes):
@@ -66,9 +79,9 @@ def plot_dirt(scores: Sequence[Mapping[str, Any]]) -> Figure:
             words = f"{sum(s['named'] for s in there)} of {len(there)}"
             ax.text(101, row + 0.27 * (column - (len(sizes) - 1) / 2), words, va="center", fontsize=7)
     for column, size in enumerate(sizes):
-        ax.barh(0, 0, color=COLOURS[column], label=f"{size:g} times a careful laboratory's errors")
-    ax.set_yticks(range(len(classes)), classes)
-    ax.set(xlim=(0, 112), ylim=(len(classes) - 0.4, -0.6), xlabel="verdicts that are right, %")
+        ax.barh(0, 0, color=COLOURS[column], label=f"{size:g} × the errors of a careful test")
+    ax.set_yticks(range(len(classes)), [_ERRORS[name] for name in classes])
+    ax.set(xlim=(0, 112), ylim=(len(classes) - 0.4, -0.6), xlabel="verdicts that are right [%]")
     ax.set_ylabel("small errors of the test")
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(sizes), fontsize=8)
     return figure

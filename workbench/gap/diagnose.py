@@ -275,7 +275,7 @@ def _notes(
 ) -> tuple[str, ...]:
     """What is said beside the sentence; `silent` are the sensors whose noise was not stated."""
     taken = f"noise_std of {', '.join(silent)} is not stated; it was taken from the records."
-    seen = "The nearest set explains the records it was fitted to, but not those it has not seen."
+    seen = "The nearest set explains the records it was fitted to, but not the validation records: over-fitting."
     cut = f"The search ended after {seconds} s of processor time with the best that it had; more by `seconds`."
     notes = (
         *([taken] if silent else []),

@@ -346,14 +346,14 @@ def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, 
         f, zeta, doubt = modes.frequencies_hz[r], modes.zeta[r], SURE * refined.zeta_std[r]
         base, times = _base(modes.frequencies_hz, size, r)
         if f * span < 1.0:
-            found.append("slower than the record is long: a drift?")
+            found.append("period longer than the record: a drift?")
         elif zeta < -doubt:
             found.append("grows")
         elif base is not None:
-            found.append(f"{times} x mode {base + 1}: its overtone?")
+            found.append(f"{times} × mode {base + 1}: its harmonic?")
         elif zeta < doubt:
             goes_on = zeta * modes.omega[r] * span < 1.0
-            found.append("does not decay: a hum?" if goes_on else "damping no larger than its error")
+            found.append("does not decay: mains hum?" if goes_on else "damping no larger than its error")
         else:
             found.append("")
     return tuple(found)

@@ -207,7 +207,7 @@ def _units(keys: Iterable[str]) -> dict[str, Unit]:
 
 def _unit_remark(name: str, written: str, unit: Unit) -> str:
     if unit.si == "counts":
-        return f"{name}: in counts, whose size nobody says; modes have no scale"
+        return f"{name}: in counts of unstated sensitivity; modes have no scale"
     return "" if unit.factor == 1.0 else f"{name}: {written} taken as {unit.factor:g} {unit.si}"
 
 

@@ -166,7 +166,7 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
     """
     sensors = without([s for s in rig.sensors if MEASURED[s.quantity][1] < 2])
     if not sensors:
-        raise DesignError("no sensor of the rig reads motion or rate, so no law can know the state; add one")
+        raise DesignError("no sensor of the rig reads displacement or velocity, so the state is unobservable; add one")
     index = list(law.controlled)
     at = rig.actuators[0].at if test.impulse_at is None else test.impulse_at
     speed = np.abs(test.impulse * rig.modes.phi_at(at)[index])
@@ -190,8 +190,8 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
             best, least = controller, reached
     if best is None:
         raise DesignError(
-            f"no Kalman filter on {', '.join(s.name for s in sensors)} leaves the loop of all modes stable; hand a"
-            " controller, weight the forces more, or control fewer modes"
+            f"no Kalman filter on {', '.join(s.name for s in sensors)} leaves the loop of all modes stable; pass"
+            " a controller, increase R, or control fewer modes"
         )
     return best
 

@@ -158,8 +158,8 @@ def _too_fast(modes: Modes, period: float) -> tuple[str, ...]:
     if not fast:
         return ()
     return (
-        f"Modes at {', '.join(fast)} Hz lie above half of {1 / period:.4g} samples a second: what drives them between"
-        " samples is not in the inputs, unless these were held as input_hold says; sample faster.",
+        f"Modes at {', '.join(fast)} Hz lie above the Nyquist frequency of {0.5 / period:.4g} Hz: what drives them"
+        " between samples is not in the inputs, unless these were held as input_hold says; sample faster.",
     )
 
 

@@ -228,14 +228,16 @@ class Redesign:
         unstable = old.n_draws - int(old.stable.sum())
         effort, work = _times(new.effort, old.effort), _times(new.all_work, old.all_work)
         if old.share_stable < 0.5:
-            text = f"the present controller is unstable on {_of(unstable, old.n_draws)} draws; redesigned, it "
+            text = f"the present controller is unstable on {_of(unstable, old.n_draws)} samples; redesigned, it "
             text += self._does(new, "95 %: ")
         else:
             text = f"the present controller {self._does(old, '95 %: ')}"
-            text += f", unstable on {unstable} draws" if unstable else ""
+            text += f", unstable on {unstable} samples" if unstable else ""
             text += f"; redesigned: {self._does(new, '', named=False)}, {effort} effort"
             text += "" if work == AS_MUCH else f" and {work} work"
-        text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
+        text = (
+            f"On the corrected model {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} Monte Carlo samples."
+        )
         return f"{text} {self.left_undamped}".rstrip()
 
     @property
@@ -245,7 +247,7 @@ class Redesign:
         if self._neither:
             return self._neither
         if new.stable.sum() < old.stable.sum():
-            why = "it is stable on more draws"
+            why = "it is stable on more samples of the model"
         elif self._better and np.isfinite(self._over).all():
             why = f"the new one {self._difference}, but {self._more}"
         else:
@@ -259,8 +261,8 @@ class Redesign:
         if max(old.share_stable, new.share_stable) >= 0.5:
             return ""
         return (
-            f"Use neither controller: the present one is stable on {_of(int(old.stable.sum()), old.n_draws)} draws, the"
-            f" redesigned on {int(new.stable.sum()):,}; weight the forces more, make the estimator slower, control"
+            f"Use neither controller: the present one is stable on {_of(int(old.stable.sum()), old.n_draws)} samples of"
+            f" the model, the redesigned on {int(new.stable.sum()):,}; increase R, make the estimator slower, control"
             " fewer modes, or read more sensors."
         )
 
@@ -270,7 +272,7 @@ class Redesign:
             middle, low, high = interval(self._settling(proof))
             if not np.isfinite(high):
                 return self._settles(proof)
-            ends = "draws alike" if f"{low:.3g}" == f"{high:.3g}" else f"{lead}{low:.3g} to {high:.3g}"
+            ends = "samples alike" if f"{low:.3g}" == f"{high:.3g}" else f"{lead}{low:.3g} to {high:.3g}"
             return f"{'settles in ' * named}{middle:.3g} s ({ends})"
         ratios = _ratios(proof.damping[:, self.mode], lead)
         return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
@@ -284,11 +286,11 @@ class Redesign:
         if self.present_proof.stable.sum() != self.proof.stable.sum():
             return f"Use the redesigned controller: it {difference}."
         if max(1.0 - self._over[0], self._sooner_by) < PAYS:
-            return f"Either controller does: the redesigned {difference} (medians of the draws)."
+            return f"Either controller does: the redesigned {difference} (medians of the samples of the model)."
         forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
         after, before = (f"{force:.3g} N" for force in forces)
         forced = f", with at most {after} instead of {before}" if np.isfinite(forces).all() and after != before else ""
-        sure = f"it does better on {_of(self._better_on, self.proof.n_draws)} draws"
+        sure = f"it does better on {_of(self._better_on, self.proof.n_draws)} samples"
         return f"Use the redesigned controller: it {difference}{forced} (medians); {sure}."
 
     @property
@@ -297,7 +299,7 @@ class Redesign:
         old, new = self.present_proof, self.proof
         if new.stable.sum() != old.stable.sum():
             stable = _of(int(new.stable.sum()), new.n_draws)
-            return f"is stable on {stable} draws, the present one on {int(old.stable.sum()):,}"
+            return f"is stable on {stable} samples, the present one on {int(old.stable.sum()):,}"
         if self.aim == "settling":
             settles, effort = self._settles(new, " the controlled modes"), f"{_times(new.effort, old.effort)} effort"
             settles += f" where the present one {self._settles(old, ' them')}"
@@ -338,12 +340,12 @@ class Redesign:
         if self.possible.explained:
             return ""
         share, margin = self.possible.unexplained, self._used.margin
-        error = f"the model's readings are off by {_percent(share)} that nothing explains"
+        error = f"{_percent(share)} of the output is unexplained"
         if np.isnan(margin):
-            return f"No promise: {error}, and on-off control has no linear bound."
-        bears = f"the loop bears {_percent(min(margin, 9.99))} of any phase"
+            return f"No stability guarantee: {error}, and on-off control has no small-gain margin."
+        bears = f"the small-gain margin is {_percent(min(margin, 9.99))}"
         # the share is a mean over frequencies, and the bound is of each of them
-        sure = "sure unless some frequency is off by more" if margin > share else "not sure"
+        sure = "guaranteed while no frequency is off by more" if margin > share else "not guaranteed"
         return f"No effect explains the gap: {error} in the mean; {bears}, so stability is {sure}."
 
     def __repr__(self) -> str:
@@ -633,8 +635,7 @@ def _weighted(loop: Loop) -> bool:
 def _tuning(loop: Loop, weight: float, noise: float) -> str:
     """By what a law and its filter were tuned, in words."""
     of_law = ("weight", weight) if _weighted(loop) else ("gain", 1.0 / np.sqrt(weight))
-    said = [f"{what} taken as {by:.3g} times" for what, by in (of_law, ("noise", noise)) if by != 1]
-    return f"{' and '.join(said)} what was designed for"
+    return " and ".join(f"{what} × {by:.3g}" for what, by in (of_law, ("measurement noise", noise)) if by != 1)
 
 
 def _faulty(rig: Rig, loop: Loop) -> list[str]:
@@ -763,7 +764,7 @@ def _ratios(values: np.ndarray, lead: str = "") -> str:
     middle, low, high = (100.0 * v for v in interval(values))
     digits = next((n for n in (2, 3, 4) if _rounded(low, n) != _rounded(high, n)), 0)
     if not digits:
-        return f"{_rounded(middle, 3)} % (draws alike)"
+        return f"{_rounded(middle, 3)} % (samples alike)"
     return f"{_rounded(middle, digits)} % ({lead}{_rounded(low, digits)} to {_rounded(high, digits)})"
 
 

@@ -220,16 +220,16 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
             block(plot_poles(poles), "Closed-loop poles."),
         ],
         "tables": [
-            ("Laws", ("law", "cost", "effort", "peak force", "W_R", "loop"), rows),
+            ("Laws", ("law", "cost", "effort [N² s]", "peak force [N]", "W_R [J]", "loop"), rows),
             *([("With sensors", heads, sensed)] if sensed else []),
         ],
     }
 
 
 def _loop(poles: np.ndarray) -> str:
-    """Stable, undamped or unstable, by the rightmost pole."""
+    """Stable, marginally stable or unstable, by the rightmost pole."""
     rightmost = float(poles.real.max())
-    return "stable" if rightmost < -ON_AXIS else "undamped poles" if rightmost <= ON_AXIS else "unstable"
+    return "stable" if rightmost < -ON_AXIS else "marginally stable" if rightmost <= ON_AXIS else "unstable"
 
 
 def _stability(loops: list[str], unstable: list[str]) -> str:
@@ -266,7 +266,13 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
             ),
             block(plot_two_works(works, first=n), "Spillover work of each placement in each residual mode."),
         ],
-        "tables": [("Placements", ("placement", "W_R", "effort", "peak force", "condition of B", "places [m]"), rows)],
+        "tables": [
+            (
+                "Placements",
+                ("placement", "W_R [J]", "effort [N² s]", "peak force [N]", "condition number of B", "places [m]"),
+                rows,
+            )
+        ],
     }
 
 

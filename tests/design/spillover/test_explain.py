@@ -172,7 +172,7 @@ def test_the_filter_cures_it_with_sensors_enough():
 @pytest.mark.parametrize(
     ("act", "words"),
     [
-        (lambda m: observed(m, 5.0), "no sensor sees mode 2"),
+        (lambda m: observed(m, 5.0), "mode 2 is unobservable"),
         (lambda m: observed(m, []), "needs a sensor"),
         (
             lambda m: kalman(m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], disturbance=1, noise=0),

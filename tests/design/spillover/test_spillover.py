@@ -120,7 +120,7 @@ def test_a_loop_through_sensors_that_cannot_see_a_mode_names_it():
     filter_ = displacement_filter(found, [5.0], 1.0)
     assert abs(filter_.seen(found)[1, 1]) < 1e-12
     law = imsc(found, 2, [Actuator("a", 2.0), Actuator("b", 3.0)], weight=1.0)
-    with pytest.raises(ValueError, match="cannot see mode 2"):
+    with pytest.raises(ValueError, match="mode 2 is unobservable"):
         close_loop(found, law, filter_)
 
 

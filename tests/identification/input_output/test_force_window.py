@@ -49,7 +49,7 @@ def test_noise_of_a_force_channel_makes_no_modes(blows):
     assert found.modes.n_modes == 3
     assert found.modes.frequencies_hz == pytest.approx(HZ, rel=1e-4)
     assert found.modes.zeta == pytest.approx(ZETA, rel=1e-2)
-    assert any("zero between its blows, where it reads 0.3 rms" in remark for remark in found.remarks)
+    assert any("zero between impacts, where it reads 0.3 rms" in remark for remark in found.remarks)
 
 
 def test_blows_stay_whole(blows):

@@ -72,7 +72,9 @@ def reading(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
     """
     for sensor in sensors:
         if MEASURED[sensor.quantity][1] > 1:
-            raise ValueError(f"sensor {sensor.name} reads {sensor.quantity}; a controller here reads motion or rates")
+            raise ValueError(
+                f"sensor {sensor.name} reads {sensor.quantity}; a controller here reads displacement or velocity"
+            )
     shapes = output_matrix(modes, sensors)
     rates = np.array([MEASURED[sensor.quantity][1] for sensor in sensors])[:, None]
     return np.hstack([np.where(rates == 0, shapes, 0.0), np.where(rates == 1, shapes, 0.0)])

@@ -59,8 +59,10 @@ def kalman(
     """
     a, b, c = observed_plant(modes, law, sensors)
     n = law.n_controlled
-    push = positive_definite(disturbance, n, f"the disturbance must be positive, one figure or {n}")
-    spread = positive_definite(noise, len(sensors), f"the noise must be positive, one figure or {len(sensors)}")
+    push = positive_definite(disturbance, n, f"the disturbance intensity must be positive, one number or {n}")
+    spread = positive_definite(
+        noise, len(sensors), f"the noise intensity must be positive, one number or {len(sensors)}"
+    )
     try:
         gain, _, _ = control.lqe(a, np.vstack([np.zeros((n, n)), np.eye(n)]), c, push, spread)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -85,9 +87,9 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
     for j, r in enumerate(index):
         strength = max(np.abs(c[:, j]).max(), np.abs(c[:, n + j]).max())
         if strength <= UNSEEN * grid[j]:
-            raise DesignError(f"no sensor sees mode {r + 1}: all stand at its nodes; move or add one")
+            raise DesignError(f"mode {r + 1} is unobservable: all sensors stand at its nodes; move or add one")
         if modes.omega[r] == 0 and np.abs(c[:, j]).max() <= UNSEEN * grid[j]:
-            raise DesignError(f"rates alone do not show where rigid-body mode {r + 1} is; add a displacement sensor")
+            raise DesignError(f"velocity alone leaves rigid-body mode {r + 1} unobservable; add a displacement sensor")
     a, b = controlled_plant(modes, index, law.actuators)
     return a, b, c
 

@@ -90,7 +90,7 @@ class SampledDesign(Printed):
             (str(r + 1), f"{f:.5g}", f"{self.sample_rate_hz / f:.3g}" if f else "", f"{np.degrees(lag):.3g}")
             for r, f, lag in zip(own, self.modes.frequencies_hz[list(own)], self.phase_lag)
         ]
-        return line, ("mode", "frequency [Hz]", "samples a period", "phase lag [°]"), rows, self.remarks
+        return line, ("mode", "frequency [Hz]", "samples per period", "phase lag [°]"), rows, self.remarks
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -106,8 +106,8 @@ class SampledDesign(Printed):
             r, f = folded[0]
             more = f", and {len(folded) - 1} more above it" if len(folded) > 1 else ""
             said.append(
-                f"mode {r + 1} at {f:.4g} Hz{more}: beyond half the rate, so it is read as"
-                f" {abs(f - rate * round(f / rate)):.4g} Hz; filter it before sampling, or sample faster"
+                f"mode {r + 1} at {f:.4g} Hz{more}: above the Nyquist frequency, aliased to"
+                f" {abs(f - rate * round(f / rate)):.4g} Hz; add an anti-aliasing filter, or sample faster"
             )
         return tuple(said)
 

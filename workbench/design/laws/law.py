@@ -152,7 +152,7 @@ def controllable_input(modes: Modes, controlled: Sequence[int], actuators: Seque
     possible = _largest_participation(modes, actuators)
     for row, r in zip(b, controlled, strict=True):
         if np.abs(row).max() < UNMOVED * possible[r]:
-            raise DesignError(f"no actuator moves mode {r + 1}: all stand at its nodes; move one")
+            raise DesignError(f"mode {r + 1} is uncontrollable: all actuators stand at its nodes; move one")
     return b
 
 

@@ -106,8 +106,8 @@ def close_loop(modes: Modes, law: Law, filter_: ModalFilter | None = None) -> Cl
         strength = np.abs(seen[np.arange(law.n_controlled), list(law.controlled)])
         if strength.min() < UNSEEN:
             raise ValueError(
-                f"the filter's sensors at {'; '.join(map(place_text, filter_.places))} cannot see mode"
-                f" {law.controlled[strength.argmin()] + 1}: they all stand at its nodes; move or add a sensor"
+                f"mode {law.controlled[strength.argmin()] + 1} is unobservable: the filter's sensors at"
+                f" {'; '.join(map(place_text, filter_.places))} all stand at its nodes; move or add a sensor"
             )
     estimate = np.kron(np.eye(2), seen)
     feedback = -law.gain @ estimate

@@ -183,7 +183,7 @@ def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
         raise ValueError("a loop cannot simulate a UserLaw; describe it by one of the laws of workbench.rig.elements")
     for name in controller.sensors:
         if MEASURED[named(rig.sensors, name).quantity][1] > 1:
-            raise ValueError(f"sensor {name} reads acceleration; a controller here reads motion or rates")
+            raise ValueError(f"sensor {name} reads acceleration; a controller here reads displacement or velocity")
 
 
 def named(parts: Sequence[P], name: str) -> P:

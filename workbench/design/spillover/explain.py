@@ -90,7 +90,7 @@ class Explanation(Printed):
     destabilising: PoleShift | None
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        grows = f"unstable, grows by {-self.margin:.3g} 1/s"
+        grows = f"unstable, growth rate {-self.margin:.3g} 1/s"
         state = f"stable, margin {self.margin:.3g} 1/s" if self.loop.stable else grows
         rows = [
             (
@@ -107,7 +107,13 @@ class Explanation(Printed):
             f"controlled modes alone: margin {self.reduced_margin:.3g} 1/s",
             *((f"mode {behind.mode + 1} makes the loop unstable",) if behind else ()),
         )
-        headings = ("residual mode", "frequency [Hz]", "growth alone [1/s]", "controlled [1/s]", "path that adds most")
+        headings = (
+            "residual mode",
+            "frequency [Hz]",
+            "Re λ, open loop [1/s]",
+            "Re λ, closed loop [1/s]",
+            "dominant path",
+        )
         return f"closed loop of {counted(self.loop.modes.n_modes, 'mode')}: {state}", headings, rows, remarks
 
     @property

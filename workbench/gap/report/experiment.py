@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
@@ -36,10 +37,11 @@ class Experiment:
     @property
     def sentence(self) -> str:
         """The proposal in a sentence."""
+        one, other = map(in_words, self.rivals)
         if not np.isfinite(self.seconds):
-            return f"No experiment on this rig separates {self.rivals[0]} from {self.rivals[1]}."
+            return f"No experiment on this rig separates {one} from {other}."
         return (
-            f"To separate {self.rivals[0]} from {self.rivals[1]}: drive {' and '.join(self.inputs)} as in record"
+            f"To separate {one} from {other}: drive {' and '.join(self.inputs)} as in record"
             f" {self.like} at {self.level:g} times its level, for {max(self.seconds, 0.0):.3g} s."
         )
 

@@ -81,7 +81,10 @@ def check_records(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -
         row = []
         for sensor, measured, expected in zip(rig.sensors, outputs, predicted, strict=True):
             if np.ptp(measured) == 0:
-                raise RecordsError(f"record {record.name!r}: output {sensor.name!r} is flat; is the sensor alive?")
+                raise RecordsError(
+                    f"record {record.name!r}: output {sensor.name!r} is flat; check the sensor and its cable, or leave"
+                    " it out"
+                )
             row.append(np.corrcoef(measured, expected)[0, 1] if np.ptp(expected) > 0 else 0.0)
         signs.append(row)
         sizes.append(_sizes(rig, outputs, predicted, np.array(row)))
@@ -93,7 +96,7 @@ def check_records(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -
         name = rig.sensors[turned[0]].name
         raise RecordsError(
             f"output {name!r} reads with the wrong sign: its correlation with the model is"
-            f" {np.array(signs)[:, turned[0]].mean():.2f} in every record; turn it round"
+            f" {np.array(signs)[:, turned[0]].mean():.2f} in every record; reverse its sign"
         )
 
 

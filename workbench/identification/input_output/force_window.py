@@ -47,7 +47,8 @@ def force_window(records: Sequence[Record]) -> tuple[tuple[Record, ...], tuple[s
         same = np.array_equal(inputs, record.inputs)
         windowed.append(record if same else replace(record, inputs=inputs))
     remarks = tuple(
-        f"input {name}: zero between its blows, where it reads {np.sqrt(np.mean(np.square(noise))):.2g} rms of noise"
+        f"input {name}: force window, zero between impacts, where it reads"
+        f" {np.sqrt(np.mean(np.square(noise))):.2g} rms of noise"
         for name, noise in removed.items()
     )
     return tuple(windowed), remarks

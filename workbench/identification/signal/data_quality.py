@@ -171,7 +171,7 @@ def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
             yield DataFault(
                 "clipped",
                 (name,),
-                f"output {name!r} is cut off {clear[0]} at {ends[clear[0]]:g}, {piled[clear[0]].size} samples; up to"
+                f"output {name!r} is clipped {clear[0]} at {ends[clear[0]]:g}, {piled[clear[0]].size} samples; up to"
                 f" {last:g} s motion beyond the range is lost and would be read as modes; begin later, or measure with"
                 " a larger range",
                 until=last,

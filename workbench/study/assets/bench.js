@@ -78,7 +78,7 @@
     });
     ports("actuators", "actuators");
     ports("sensors", "sensors (none: exact modes)");
-    var t = row("count until [s]"), time = html("input", { id: "time", type: "number", min: 0, step: "any", value: +design.final_time.toPrecision(4) }, t);
+    var t = row("final time [s]"), time = html("input", { id: "time", type: "number", min: 0, step: "any", value: +design.final_time.toPrecision(4) }, t);
     time.addEventListener("change", function () { if (+time.value > 0) { design.final_time = +time.value; ask(); } });
     weights();
   }

@@ -168,7 +168,7 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
     broad = np.flatnonzero(found.modes.zeta > BROAD)
     if broad.size:
         which = ", ".join(str(r + 1) for r in broad)
-        lines.append(f"modes {which}: too damped for modes; what the model does not explain may look like that")
+        lines.append(f"modes {which}: implausibly damped; they may fit the residual, not the structure")
     at, apart = found.modes.frequencies_hz, found.modes.phase_collinearity < AGREED
     doubtful = np.zeros(at.size, bool)
     for low, high in found.full_hz:
@@ -176,15 +176,15 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
         doubtful |= here & apart
         lines.append(
             f"between {low:.6g} and {high:.6g} Hz the search stopped at its limit of modes, the residual is not noise:"
-            f" of {here.sum()} modes there {(here & apart).sum()} are not reported, their points do not move in phase;"
-            " points measured one after another, or on a structure that changes, are inconsistent like that: leave that"
-            " band out by --band-hz, or take more --modes"
+            f" of {here.sum()} modes there {(here & apart).sum()} are not reported, their shapes are complex (low phase"
+            " collinearity); roving sensors or hammers, or a structure that changes, make data inconsistent like that:"
+            " leave that band out by --band-hz, or take more --modes"
         )
     for r, parts in enumerate(found.parts_hz):
         if parts:
             others = ", ".join(f"{f:.4g}" for f in parts)
             lines.append(
-                f"mode {r + 1} is a cluster, its other members at {others} Hz: points measured one after another are"
+                f"mode {r + 1} is a cluster, its other members at {others} Hz: data of roving sensors or hammers are"
                 " inconsistent there, or it drifts or depends on amplitude; closer modes are not resolved"
             )
     doubt = SURE * found.omega_std / TURN + float(np.diff(found.frequencies_hz).min())
@@ -196,8 +196,9 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
     uneasy = np.flatnonzero(apart & ~doubtful & ~hums)
     if uneasy.size:
         lines.append(
-            f"modes {', '.join(str(r + 1) for r in uneasy)}: their points do not move in phase; either damping couples"
-            " close modes, or points measured one after another are inconsistent and these are parts of fewer modes"
+            f"modes {', '.join(str(r + 1) for r in uneasy)}: complex shapes (low phase collinearity); either damping"
+            " couples close modes, or data of roving sensors or hammers are inconsistent, and these are parts of fewer"
+            " modes"
         )
     band = found.frequencies_hz
     outputs, inputs = found.modes.n_outputs, len(measured.references)

@@ -101,7 +101,7 @@ def _figures(found: Redesign) -> list[tuple[str, ...]]:
         ("stroke", "largest displacement at an actuator [m]", 1.0),
         ("controlled_work", "work in controlled modes, W_C [J]", 1.0),
         ("residual_work", "in residual modes, W_R [J]", 1.0),
-        ("effort", "effort, ∫ FᵀF dt", 1.0),
+        ("effort", "effort, ∫ FᵀF dt [N² s]", 1.0),
     )
     for name, words, scale in each:
         # what a motion that grows comes to is a matter of the length of the test

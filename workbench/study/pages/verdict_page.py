@@ -50,12 +50,12 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         (
             plot_budget(verdict.budget),
             "What causes the gap: the power of the nominal residual, split by cause, on"
-            + (" records that no fit has seen." if case.validation else " the records that were fitted."),
+            + (" the validation records." if case.validation else " the records that were fitted."),
         ),
         (
             plot_responses(rigs, records),
-            f"Measured and simulated response ({', '.join(rigs)}) where they differ most. No fit has seen the"
-            " validation records.",
+            f"Measured and simulated response ({', '.join(rigs)}) where they differ most. Nothing was fitted"
+            " to the validation records.",
         ),
     ]
     if verdict.outcome != "none":  # there is nothing to take apart in noise
@@ -123,8 +123,8 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     ]
     tables = [
         ("Effects", ("effect", "parameter", "value", "standard error", "x [m]", "input or output"), effects),
-        ("Gap on held-out records", ("record", "before", "after", "floor", "share closed"), gaps),
-        ("Rivals", ("set of effects", "probability"), rivals),
+        ("Gap (rms error / rms signal)", ("record", "before", "after", "floor", "share closed"), gaps),
+        ("Other explanations", ("set of effects", "probability"), rivals),
     ]
     return [table for table in tables if table[2]]
 

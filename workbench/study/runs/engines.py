@@ -216,9 +216,7 @@ def cluster(function: Callable[..., Any], jobs: list[Job], address: str) -> Iter
     try:
         from distributed import Client, as_completed
     except ImportError:
-        raise StudyError(
-            "a cluster needs Dask, which is not installed: pip install 'modal-workbench[cluster]'"
-        ) from None
+        raise StudyError("a cluster needs Dask, which is not installed: pip install -e '.[cluster]'") from None
     try:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -136,7 +136,7 @@ class Results(Sequence[Result]):
         try:
             import pandas as pd
         except ImportError:
-            raise StudyError("a frame needs pandas: pip install 'modal-workbench[table]'") from None
+            raise StudyError("a frame needs pandas: pip install -e '.[table]'") from None
         return pd.DataFrame(self.rows())
 
 
@@ -174,7 +174,7 @@ def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise StudyError("Parquet needs pyarrow: pip install 'modal-workbench[table]', or write .csv") from None
+        raise StudyError("Parquet needs pyarrow: pip install -e '.[table]', or write .csv") from None
     try:
         columns = {name: pa.array([row[name] for row in rows]) for name in rows[0]}
     except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
