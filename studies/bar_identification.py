@@ -12,7 +12,7 @@ import numpy as np
 from workbench.draw.identification import distribution_errors, eigenfunction, eigenvalue_errors
 from workbench.identification.free_decay.ibrahim import two_delays
 from workbench.identification.free_decay.order import identify
-from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.identification.updating.distributions import Basis, mass_and_stiffness
 from workbench.structure.damping import ProportionalDamping
@@ -151,7 +151,7 @@ def tables_4_2_and_4_3(outcome, exact, found) -> None:
 
 def first_eigenfunctions(found: SampledModes, *, count: int, degree: int | None):
     """The lowest modes of the bar, held at x = 0; where the stiffness vanishes, at x = 1, nothing is known."""
-    ends = KnownEnds.of("bar", length=1.0, left="fixed")
+    ends = BoundaryConditions.of("bar", length=1.0, left="fixed")
     return eigenfunctions(found.select(slice(count)), length=1.0, mass_per_length=taper, ends=ends, degree=degree)
 
 

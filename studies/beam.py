@@ -20,7 +20,7 @@ from workbench.draw.identification import plot_identified, plot_ring_down
 from workbench.draw.motion import response_motion
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
-from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -59,7 +59,7 @@ def measured():
 def identified(record):
     """Mass-normalised modes with the uncertainty of each figure."""
     found = refine(record, stacked_delays(record, n_modes=N_MODES))
-    ends = KnownEnds.of("beam", length=LENGTH, left="hinged", right="hinged")
+    ends = BoundaryConditions.of("beam", length=LENGTH, left="hinged", right="hinged")
     modes = eigenfunctions(found.modes, length=LENGTH, mass_per_length=MASS, ends=ends, covariance=found.covariance)
     return modes, found
 

@@ -15,7 +15,7 @@ from workbench.draw.accuracy import plot_bands
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
 from workbench.identification.shapes.bands import eigenfunction_bands
-from workbench.identification.shapes.eigenfunctions import KnownEnds
+from workbench.identification.shapes.eigenfunctions import BoundaryConditions
 from workbench.identification.signal.modal_estimates import Refined
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.member import Beam
@@ -73,7 +73,7 @@ def study(outcome, data: Path | None = None) -> None:
         "beam": (decay, {"sample_time": 0.2, "n_samples": 1000, "level_db": 40.0}),
         "close pair": (close_pair(), {"sample_time": 0.01, "n_samples": 500, "level_db": 30.0}),
     }
-    ends = KnownEnds.of("beam", length=LENGTH, left="hinged", right="hinged")
+    ends = BoundaryConditions.of("beam", length=LENGTH, left="hinged", right="hinged")
     inside = {"point": [], "curve": []}
     for name, (truth, how) in setups.items():
         every: dict[str, list] = {"frequency": [], "damping": [], "shape": []}

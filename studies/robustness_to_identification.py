@@ -14,7 +14,7 @@ from workbench.design.spillover.spillover import distributed_cost, modal_cost
 from workbench.draw.design import plot_drift, plot_robustness
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
-from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -48,7 +48,7 @@ def identified():
     noise = 0.03 * free_decay(decay, **sampling).outputs.std()
     record = free_decay(decay, **sampling, noise_std=noise, seed=3)
     found = refine(record, stacked_delays(record, n_modes=N_MODES))
-    ends = KnownEnds.of("beam", length=LENGTH, left="hinged", right="hinged")
+    ends = BoundaryConditions.of("beam", length=LENGTH, left="hinged", right="hinged")
     modes = eigenfunctions(found.modes, length=LENGTH, mass_per_length=1.0, ends=ends, covariance=found.covariance)
     return modes, found
 

@@ -18,7 +18,7 @@ from workbench.draw.identification import measured_modes, placement_on_shapes, s
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.identification.free_decay.refinement import modal_amplitudes
-from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
 from workbench.identification.shapes.mode_pairing import pair_modes
 from workbench.records.resample import decimate
 from workbench.records.transfer_functions import read_transfer
@@ -141,7 +141,7 @@ def _disagreement(rig, kinds, start, bending):
 
 
 def compare_placements(outcome, bending) -> None:
-    ends = KnownEnds.of("beam", length=1.0, left="free", right="free")
+    ends = BoundaryConditions.of("beam", length=1.0, left="free", right="free")
     modes = eigenfunctions(bending, length=1.0, mass_per_length=1.0, ends=ends)
     # The design leaves damping out, as in Chapter 5: it only helps.
     modes = replace(modes, damping=np.zeros(modes.n_modes))

@@ -37,7 +37,7 @@ RENAMED = {
     "GaussianPrior": "identification.updating.structure_task.GaussianPrior",
     "Identified": "identification.signal.modal_estimates.Identified",
     "Judged": "design.spillover.performance.Performance",
-    "KnownEnds": "identification.shapes.eigenfunctions.KnownEnds",
+    "KnownEnds": "identification.shapes.eigenfunctions.BoundaryConditions",
     "LinearDamper": "rig.elements.LinearDamper",
     "LinearSpring": "rig.elements.LinearSpring",
     "LocalLoss": "identification.updating.sensitivity.LocalLoss",

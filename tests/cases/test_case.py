@@ -16,7 +16,7 @@ from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
+from workbench.structure.member import Bar, Beam
 from workbench.structure.supports import PointMass
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -45,6 +45,21 @@ def case() -> Case:
 def folder(case, tmp_path) -> Path:
     write_case(case, tmp_path / "case")
     return tmp_path / "case"
+
+
+@pytest.mark.parametrize("word", ["rod", "bar"])
+def test_a_rod_is_a_bar(word, tmp_path):
+    rod = Bar(
+        length=2.0, mass_per_length=1.0, axial_stiffness=4.0, left="fixed", right="free", damping=ModalDamping(0.01)
+    )
+    rig = Rig(rod.modes(3), (Actuator("F1", 0.7),), (Sensor("d1", 0.5, noise_std=1e-4),), structure=rod)
+    record = simulate(rig, np.random.default_rng(1).standard_normal((1, 200)), sample_time=0.02, name="one")
+    folder = write_case(Case("a rod", rig, (record,), ()), tmp_path / "case") or tmp_path / "case"
+    file = folder / "case.toml"
+    file.write_text(file.read_text().replace('kind = "rod"', f'kind = "{word}"'))
+    assert f'"{word}"' in file.read_text()
+    # a fixed-free bar: (2 r - 1) π / 2 · c / L
+    np.testing.assert_allclose(read_case(folder).rig.modes.omega, np.array([1, 3, 5]) * np.pi / 2, rtol=1e-9)
 
 
 def test_what_is_written_is_read_back(case, folder):

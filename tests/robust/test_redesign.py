@@ -347,11 +347,17 @@ def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, 
     assert found.sentence.endswith("so stability is guaranteed while no frequency is off by more.")
     proofs = {name: replace(getattr(found, name), margin=1.004) for name in ("present_proof", "proof")}
     certain = replace(found, **proofs)  # whichever controller is the one to use
-    assert "the small-gain margin is 100 %" in certain.sentence and "1 % of the output is unexplained" in certain.sentence
+    assert (
+        "the small-gain margin is 100 %" in certain.sentence and "1 % of the output is unexplained" in certain.sentence
+    )
     unsure = redesign(
         replace(sure, unexplained=0.5), controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False
     )
-    assert not unsure.safe and "50 % of the output is unexplained" in unsure.sentence and "not guaranteed" in unsure.sentence
+    assert (
+        not unsure.safe
+        and "50 % of the output is unexplained" in unsure.sentence
+        and "not guaranteed" in unsure.sentence
+    )
 
 
 def test_an_impulse_is_as_large_in_volts_as_in_metres(rig):

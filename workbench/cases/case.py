@@ -42,6 +42,7 @@ MOST_MODES = 200
 TABLES = ("title", "input_hold", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
+STRUCTURES["bar"] = STRUCTURES["rod"]  # two words for one thing
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
 PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio", "edges", "damping_ratio", "modes")
 EDGES = ("left", "right", "bottom", "top")
@@ -51,6 +52,7 @@ INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
 MORE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "beam": (("quantity", "patch"), ()),
     "rod": ((), ()),
+    "bar": ((), ()),
     "plate": (("quantity", "patch", "axis"), ("axis",)),
     "points": (("quantity", "axis", "direction"), ("axis", "direction")),
     "modal": ((), ()),

@@ -84,5 +84,5 @@ def test_a_mode_that_the_sensors_cannot_see_is_named():
     modes = structure.modes(4)
     law = imsc(modes, 2, [Actuator("F1", (0.3, 0.24)), Actuator("F2", (0.84, 0.52))], weight=0.01)
     midline = filter_on(structure, modes, law.controlled, [(0.6, 0.2), (0.6, 0.4)])
-    with pytest.raises(ValueError, match="mode 2 is unobservable: the filter.s sensors at 0.6, 0.2; 0.6, 0.4"):
+    with pytest.raises(ValueError, match=r"mode 2 is unobservable: the filter.s sensors at 0.6, 0.2; 0.6, 0.4"):
         close_loop(modes, law, midline)

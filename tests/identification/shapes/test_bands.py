@@ -6,14 +6,14 @@ import pytest
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.shapes.bands import eigenfunction_bands
-from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 from workbench.structure.supports import End, PointMass
 
 LENGTH = 2.0
-HINGED = KnownEnds.of("beam", length=LENGTH, left="hinged", right="hinged")
+HINGED = BoundaryConditions.of("beam", length=LENGTH, left="hinged", right="hinged")
 X = np.linspace(0.0, LENGTH, 41)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.shapes.bands import check_ends, eigenfunction_bands
-from workbench.identification.shapes.eigenfunctions import KnownEnds
+from workbench.identification.shapes.eigenfunctions import BoundaryConditions
 from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
@@ -30,7 +30,7 @@ def refined(left, *, level, seed, n_sensors=8, n_modes=3):
 
 
 def told(left):
-    return KnownEnds.of("beam", length=LENGTH, left=left, right="hinged")
+    return BoundaryConditions.of("beam", length=LENGTH, left=left, right="hinged")
 
 
 @pytest.mark.parametrize("level", [0.01, 1e-4])
@@ -52,7 +52,7 @@ def test_the_refusal_says_what_the_shapes_say_instead():
     assert abs(slope - np.pi) < 3.0 * std < 1.0
     assert "leave it out" in str(refusal.value)
     with pytest.raises(ValueError, match="the right end is stated to have zero value and slope"):
-        check_ends(found, KnownEnds.of("beam", length=LENGTH, right="clamped"), length=LENGTH)
+        check_ends(found, BoundaryConditions.of("beam", length=LENGTH, right="clamped"), length=LENGTH)
 
 
 def test_too_few_sensors_contradict_nothing():

@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 
 from workbench.identification.shapes.bands import peano_kernel
-from workbench.identification.shapes.eigenfunctions import KnownEnds, best_degrees, eigenfunctions, interpolating_spline
+from workbench.identification.shapes.eigenfunctions import (
+    BoundaryConditions,
+    best_degrees,
+    eigenfunctions,
+    interpolating_spline,
+)
 from workbench.identification.signal.synthesis import impulse_response_modes
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
@@ -37,7 +42,7 @@ def test_reproduces_polynomials_of_its_degree(degree):
 )
 @pytest.mark.parametrize("degree", [3, 5, 7])
 def test_honours_known_ends(kind, left, right, degree):
-    ends = KnownEnds.of(kind, length=2.0, left=left, right=right)
+    ends = BoundaryConditions.of(kind, length=2.0, left=left, right=right)
     modes = elastic(kind, left, right, 2)
     positions = np.linspace(0.15, 1.85, 9)
     found = eigenfunctions(
@@ -52,7 +57,7 @@ def test_honours_known_ends(kind, left, right, degree):
 def test_order_of_convergence(degree, order):
     """Errors fall as the distance of the sensors to the power degree + 1, at known ends too."""
     modes = elastic("beam", "clamped", "free", 3)
-    ends = KnownEnds.of("beam", length=2.0, left="clamped", right="free")
+    ends = BoundaryConditions.of("beam", length=2.0, left="clamped", right="free")
     errors = []
     for n in (16, 32):
         positions = np.linspace(0.0, 2.0, n + 1)
@@ -66,7 +71,7 @@ def test_order_of_convergence(degree, order):
 def test_scaled_by_an_impulse_without_knowing_the_mass():
     modes = elastic("beam", "clamped", "free", 4)
     positions = np.linspace(0.1, 2.0, 20)
-    ends = KnownEnds.of("beam", length=2.0, left="clamped", right="free")
+    ends = BoundaryConditions.of("beam", length=2.0, left="clamped", right="free")
     found = eigenfunctions(
         impulse_response_modes(modes, at=1.63, positions=positions), length=2.0, driven_at=1.63, ends=ends
     )
@@ -82,7 +87,7 @@ def test_scaled_by_a_mass_distribution_and_what_is_attached():
     ).modes(3)
     positions = np.linspace(0.1, 2.0, 20)
     sampled = SampledModes(modes.omega, modes.zeta, modes.phi(positions), positions)
-    ends = KnownEnds.of("beam", length=2.0, left="clamped")
+    ends = BoundaryConditions.of("beam", length=2.0, left="clamped")
     found = eigenfunctions(sampled, length=2.0, mass_per_length=1.0, point_masses=[tip], ends=ends)
     assert np.abs(np.abs(found.phi(X)) - np.abs(modes.phi(X))).max() < 1e-4
     with pytest.raises(ValueError, match="beside a mass distribution"):
@@ -96,7 +101,7 @@ def test_scaled_by_a_mass_distribution_and_what_is_attached():
 def test_what_a_spline_misses_by_its_peano_kernel(derivative, right):
     """Of sin 2x, whose fourth derivative is known, what the ends hold taken into account."""
     positions, x = np.linspace(0.1, 1.8, 9), np.linspace(0.0, 2.0, 11)
-    ends = KnownEnds.of("beam", length=2.0, left="clamped", right=right)
+    ends = BoundaryConditions.of("beam", length=2.0, left="clamped", right=right)
     spline = interpolating_spline(positions, length=2.0, ends=ends, degree=5)
 
     def sine(x, k):
@@ -115,7 +120,7 @@ def test_default_degree_follows_the_mode():
     modes = elastic("bar", "fixed", "free", 8)
     positions = np.arange(1, 13) / 6
     sampled = SampledModes(modes.omega, modes.zeta, modes.phi(positions), positions)
-    degrees = best_degrees(sampled, length=2.0, ends=KnownEnds.of("bar", length=2.0, left="fixed"))
+    degrees = best_degrees(sampled, length=2.0, ends=BoundaryConditions.of("bar", length=2.0, left="fixed"))
     assert degrees[0] == 9
     assert degrees[-1] < 9
 
@@ -132,9 +137,15 @@ def test_refusals():
         eigenfunctions(SampledModes([1.0], [0.0], [[1.0], [0.5]], [0.5, 0.5]), length=1.0, degree=1)
     with pytest.raises(ValueError, match="has no place"):
         eigenfunctions(SampledModes([1.0], [0.0], [[1.0], [0.5]], [0.5, np.nan]), length=1.0, degree=1)
-    with pytest.raises(ValueError, match="no known end"):
-        KnownEnds.of("bar", length=1.0, left="clamped")
+    with pytest.raises(ValueError, match=r"no boundary condition of a .* is called"):
+        BoundaryConditions.of("bar", length=1.0, left="clamped")
     hinged = elastic("beam", "hinged", "hinged", 2)
     impulse_at_node = impulse_response_modes(hinged, at=1.0, positions=np.linspace(0.1, 1.9, 15))
     with pytest.raises(ValueError, match="hardly excites mode 2"):
         eigenfunctions(impulse_at_node, length=2.0, driven_at=1.0, degree=5)
+
+
+def test_the_former_name_of_boundary_conditions_warns():
+    with pytest.warns(DeprecationWarning, match="BoundaryConditions"):
+        from workbench.identification.shapes.eigenfunctions import KnownEnds
+    assert KnownEnds is BoundaryConditions

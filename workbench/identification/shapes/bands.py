@@ -36,7 +36,7 @@ from scipy.stats import chi2
 
 from workbench.arrays import symmetric_root
 from workbench.identification.shapes.eigenfunctions import (
-    KnownEnds,
+    BoundaryConditions,
     Spline,
     Splines,
     check_along,
@@ -98,7 +98,7 @@ def peano_kernel(
 class LeaveOneOut:
     """How splines of one degree through the other sensors predict each sensor."""
 
-    def __init__(self, positions: np.ndarray, *, length: float, ends: KnownEnds, degree: int) -> None:
+    def __init__(self, positions: np.ndarray, *, length: float, ends: BoundaryConditions, degree: int) -> None:
         n = positions.size
         self.rule, kernels = np.zeros((n, n)), []
         for j in range(n):
@@ -150,7 +150,7 @@ def _power(x: np.ndarray, u: np.ndarray, order: int, derivative: int = 0) -> np.
     return np.where(apart > 0, np.abs(apart) ** k / factorial(k), 0.0)
 
 
-def check_ends(found: ShapeEstimates, ends: KnownEnds, *, length: float) -> None:
+def check_ends(found: ShapeEstimates, ends: BoundaryConditions, *, length: float) -> None:
     """Refuse an end that the shapes contradict; of fewer than five sensors or so none is.
 
     Args:
@@ -165,7 +165,7 @@ def check_ends(found: ShapeEstimates, ends: KnownEnds, *, length: float) -> None
     values, positions = normalised_shapes(found.modes.shapes).real, found.modes.positions
     for name, at in (("left", 0.0), ("right", length)):
         conditions = [d for x, d in ends.zeros if abs(x - at) <= 1e-9 * length]
-        others = KnownEnds(tuple(zero for zero in ends.zeros if abs(zero[0] - at) > 1e-9 * length))
+        others = BoundaryConditions(tuple(zero for zero in ends.zeros if abs(zero[0] - at) > 1e-9 * length))
         extrapolated = _extrapolated(positions, others, at, conditions, length) if conditions else None
         if extrapolated is None:
             continue
@@ -192,7 +192,7 @@ def check_ends(found: ShapeEstimates, ends: KnownEnds, *, length: float) -> None
 
 
 def _extrapolated(
-    positions: np.ndarray, others: KnownEnds, at: float, conditions: list[int], length: float
+    positions: np.ndarray, others: BoundaryConditions, at: float, conditions: list[int], length: float
 ) -> tuple[np.ndarray, np.ndarray, LeaveOneOut] | None:
     """The derivatives stated to be zero by the sensors, (n_conditions, n_sensors), and their interpolation error,
     (n_conditions, n_cells), the length as unit; and how such splines predict the sensors. None where sensors are too
@@ -292,7 +292,7 @@ def eigenfunction_bands(
     length: float,
     mass_per_length: ProfileLike | None = None,
     point_masses: Sequence[PointMass] = (),
-    ends: KnownEnds | None = None,
+    ends: BoundaryConditions | None = None,
     degree: int | None = None,
     level: float = 0.95,
     seed: int | np.random.Generator = 0,
@@ -323,7 +323,7 @@ def eigenfunction_bands(
     if ends is not None:
         check_ends(found, ends, length=length)
     modes, rng = found.modes, np.random.default_rng(seed)
-    where: dict[str, Any] = {"length": length, "ends": ends or KnownEnds()}
+    where: dict[str, Any] = {"length": length, "ends": ends or BoundaryConditions()}
     splines = Splines.through(modes, degree=degree, **where)
     inertia = inertia_of(mass_per_length, point_masses, length)
     values = normalised_shapes(modes.shapes).real

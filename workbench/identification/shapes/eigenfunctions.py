@@ -8,6 +8,7 @@ go by leaving out the knots nearest that end ("not a knot"), which assumes nothi
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
+from warnings import warn
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -36,7 +37,7 @@ ESSENTIAL_BELOW = {"bar": 1, "beam": 2}
 
 
 @dataclass(frozen=True)
-class KnownEnds:
+class BoundaryConditions:
     """Where the ends hold an eigenfunction or a derivative of it at zero: ((x, derivative), ...).
 
     Attributes:
@@ -48,7 +49,7 @@ class KnownEnds:
     essential: tuple[tuple[float, int], ...] = ()
 
     @classmethod
-    def of(cls, kind: str, *, length: float, left: str | None = None, right: str | None = None) -> "KnownEnds":
+    def of(cls, kind: str, *, length: float, left: str | None = None, right: str | None = None) -> "BoundaryConditions":
         """What "fixed" or "free" ends of a "bar", or "hinged", "clamped", "sliding" or "free" ends of a "beam" imply.
 
         An end left as None is not known. Leave a free end out where the stiffness vanishes there: it then says nothing.
@@ -62,7 +63,7 @@ class KnownEnds:
                 continue
             if (kind, end) not in ZERO_AT:
                 known = ", ".join(f"{e} {k}" for k, e in ZERO_AT)
-                raise ValueError(f"no known end is called {end!r} of a {kind!r}; there are {known}")
+                raise ValueError(f"no boundary condition of a {kind!r} is called {end!r}; there are {known}")
             zeros += [(at, derivative) for derivative in ZERO_AT[kind, end]]
             essential += [(at, d) for d in ZERO_AT[kind, end] if d < ESSENTIAL_BELOW[kind]]
         return cls(tuple(zeros), tuple(essential))
@@ -98,7 +99,11 @@ class Spline:
 
 
 def interpolating_spline(
-    positions: Sequence[float] | np.ndarray, *, length: float, ends: KnownEnds = KnownEnds(), degree: int
+    positions: Sequence[float] | np.ndarray,
+    *,
+    length: float,
+    ends: BoundaryConditions = BoundaryConditions(),
+    degree: int,
 ) -> Spline:
     """The spline through values at the sensors that honours the known ends.
 
@@ -144,7 +149,7 @@ def eigenfunctions(
     mass_per_length: ProfileLike | None = None,
     point_masses: Sequence[PointMass] = (),
     driven_at: float | None = None,
-    ends: KnownEnds = KnownEnds(),
+    ends: BoundaryConditions = BoundaryConditions(),
     degree: int | None = None,
     covariance: np.ndarray | None = None,
 ) -> Modes:
@@ -193,7 +198,9 @@ def eigenfunctions(
     )
 
 
-def best_degrees(sampled: SampledModes, *, length: float, ends: KnownEnds = KnownEnds()) -> np.ndarray:
+def best_degrees(
+    sampled: SampledModes, *, length: float, ends: BoundaryConditions = BoundaryConditions()
+) -> np.ndarray:
     """The degree among 3, 5, 7 and 9 that best predicts every inner sensor from the others, (n_modes,).
 
     Args:
@@ -228,7 +235,9 @@ class Splines:
     groups: tuple[tuple[Spline, np.ndarray], ...]
 
     @classmethod
-    def through(cls, sampled: SampledModes, *, length: float, ends: KnownEnds, degree: int | None) -> "Splines":
+    def through(
+        cls, sampled: SampledModes, *, length: float, ends: BoundaryConditions, degree: int | None
+    ) -> "Splines":
         check_along(sampled)
         where: dict[str, Any] = {"length": length, "ends": ends}
         degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **where)
@@ -344,3 +353,10 @@ def _scaled_by_impulse(sampled: SampledModes, splines: Splines, x0: float) -> np
     values = products / np.sqrt(at_impulse)
     clear = np.argmax(np.abs(values) > 0.05 * np.abs(values).max(axis=0), axis=0)
     return np.asarray(values * np.sign(values[clear, np.arange(values.shape[1])]))
+
+
+def __getattr__(name: str) -> object:
+    if name != "KnownEnds":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warn("KnownEnds is now BoundaryConditions; the old name goes with the next version", DeprecationWarning, 2)
+    return BoundaryConditions
