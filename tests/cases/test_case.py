@@ -53,7 +53,7 @@ def test_a_rod_is_a_bar(word, tmp_path):
         length=2.0, mass_per_length=1.0, axial_stiffness=4.0, left="fixed", right="free", damping=ModalDamping(0.01)
     )
     rig = Rig(rod.modes(3), (Actuator("F1", 0.7),), (Sensor("d1", 0.5, noise_std=1e-4),), structure=rod)
-    record = simulate(rig, np.random.default_rng(1).standard_normal((1, 200)), sample_time=0.02, name="one")
+    record = simulate(rig, np.random.default_rng(1).standard_normal((1, 300)), sample_time=0.02, name="one")
     write_case(Case("a rod", rig, (record,), ()), tmp_path / "case")
     file = tmp_path / "case" / "case.toml"
     file.write_text(file.read_text().replace('kind = "rod"', f'kind = "{word}"'))
