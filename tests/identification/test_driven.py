@@ -225,7 +225,7 @@ def test_inputs_that_run_straight_between_samples():
     # first order hold by python-control: a ramp is linear in time, so lsim of the continuous system has it
     y = control.forced_response(plant, time, np.interp(time, DT * np.arange(N), u[0])).outputs[:, ::fine]
     record = Record(DT, y, (Channel("a"), Channel("b")), u, (Channel("f", "force"),))
-    found = identify_driven(record, straight=True)
+    found = identify_driven(record, input_hold="first")
     assert np.abs(found.modes.poles / POLES - 1).max() < 1e-7
     w = 1j * OMEGA
     assert np.abs(found.state_space(w) - plant(w)).max() < 1e-6 * np.abs(plant(w)).max()
@@ -540,3 +540,11 @@ def test_after_a_blow_one_sensor_tells_a_mode_that_changes(seed):
     assert found.modes.frequencies_hz == pytest.approx([21.0, 37.0, 95.0], rel=1e-2)
     (said,) = [remark for remark in found.remarks if "change within the record" in remark]
     assert "mode 2" in said and "mode 1" not in said and "mode 3" not in said
+
+
+def test_the_former_name_of_the_hold_warns_and_an_unknown_one_is_refused():
+    record = measured(system(), np.zeros((2, 200)))
+    with pytest.warns(DeprecationWarning, match='input_hold="first"'), pytest.raises(ValueError, match="is zero"):
+        identify_driven(record, straight=True)
+    with pytest.raises(ValueError, match="input_hold is 'zero' or 'first'; got 'straight'"):
+        identify_driven(record, input_hold="straight")

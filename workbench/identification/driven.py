@@ -8,6 +8,7 @@ of that noise is estimated from the residual, and the modes from it in turn (`in
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+from warnings import warn
 
 import control
 import numpy as np
@@ -27,7 +28,7 @@ from workbench.identification.input_output.time_variance import beside_changing,
 from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
-from workbench.records.record import Channel, Record
+from workbench.records.record import HOLDS, Channel, Record
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
@@ -60,7 +61,7 @@ class Driven(ParticipatingModes):
         feedthrough: (n_outputs, n_inputs) D: of accelerations, and of the modes above those identified.
         feedthrough_std: (n_outputs, n_inputs).
         delays: (n_inputs,) s, τ by which each input acts late.
-        straight: whether inputs follow a first-order hold; otherwise a zero-order one.
+        input_hold: "zero" or "first": the order of the hold that inputs follow between samples.
         sample_time: s, of the records.
         initial: one (n_modes,) complex a record: z_r at its first sample, where y = Re Σ 2 c_r z_r; zero if at rest.
         noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
@@ -74,7 +75,7 @@ class Driven(ParticipatingModes):
     feedthrough: np.ndarray
     feedthrough_std: np.ndarray
     delays: np.ndarray
-    straight: bool
+    input_hold: str
     sample_time: float
     initial: tuple[np.ndarray, ...]
     noise: np.ndarray
@@ -138,7 +139,7 @@ class Driven(ParticipatingModes):
         silent = np.zeros((len(self.output_channels), u.shape[1]))
         driven = Record(self.sample_time, silent, self.output_channels, u, self.input_channels)
         delays = _checked_delays([driven], self.delays)
-        data = KnownInputs([driven], at_rest=True, straight=self.straight, feedthrough=True, delays=delays)
+        data = KnownInputs([driven], at_rest=True, straight=self.input_hold == "first", feedthrough=True, delays=delays)
         y = self.feedthrough @ data.direct(u)
         time = self.sample_time * np.arange(u.shape[1])
         for r, pole in enumerate(self.modes.poles):
@@ -160,13 +161,14 @@ def identify_driven(
     records: Record | Sequence[Record],
     *,
     at_rest: bool = False,
-    straight: bool | None = None,
+    input_hold: str | None = None,
     feedthrough: bool = True,
     delays: ArrayLike | None = None,
     most_modes: int = 40,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
+    straight: bool | None = None,
 ) -> Driven:
     """The modes between inputs and outputs, their number selected, with participation factors and standard errors.
 
@@ -177,9 +179,9 @@ def identify_driven(
     Args:
         records: with the same inputs and outputs at one rate; each output may hold a constant, another in each record.
         at_rest: that nothing moves at the first sample; otherwise each record has an initial state of its own.
-        straight: whether inputs follow a first-order hold, straight from sample to sample, as measured signals through
-            a filter nearly do; otherwise a zero-order hold, as a converter gives them. As the records say
-            (`input_hold`) unless given.
+        input_hold: "first" for inputs that follow a first-order hold, straight from sample to sample, as measured
+            signals through a filter nearly do; "zero" for a zero-order hold, as a converter gives them. As the records
+            say unless given.
         feedthrough: whether there is a direct term: of accelerations, and of modes beyond the sample rate.
         delays: (n_inputs,) s, by which each input acts late; estimated unless given, up to 60 samples. Of inputs held
             between samples, with a direct term, the fraction of a sample is the one that makes the modes most nearly
@@ -189,6 +191,7 @@ def identify_driven(
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
             limit.
         progress: called with the search under way and the share of the time that is spent.
+        straight: former name of `input_hold="first"`; it warns.
 
     Returns:
         `Driven`. Its standard errors hold in noise of any smooth spectrum.
@@ -198,11 +201,20 @@ def identify_driven(
     """
     budget = Budget(seconds, progress)
     records = of_same_sensors(records)
+    if straight is not None:
+        warn('straight is now input_hold="first"; it goes with the next version', DeprecationWarning, 3)
+        input_hold = "first" if straight else "zero"
+    hold = records[0].input_hold if input_hold is None else input_hold
+    if hold not in HOLDS:
+        raise ValueError(f"input_hold is {' or '.join(map(repr, HOLDS))}; got {input_hold!r}")
     _check_inputs(records)
     records, windowed = force_window(records)
-    straight = records[0].input_hold == "first" if straight is None else straight
     data = KnownInputs(
-        records, at_rest=at_rest, straight=straight, feedthrough=feedthrough, delays=_checked_delays(records, delays)
+        records,
+        at_rest=at_rest,
+        straight=hold == "first",
+        feedthrough=feedthrough,
+        delays=_checked_delays(records, delays),
     )
     rows, columns = data.fixed.shape
     if rows < columns + 4 * (data.n_excitations + 2):
@@ -476,7 +488,7 @@ def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, re
         feedthrough=frozen(direct),
         feedthrough_std=frozen(direct_std),
         delays=frozen(data.delays * data.dt),
-        straight=data.straight,
+        input_hold="first" if data.straight else "zero",
         sample_time=data.dt,
         initial=tuple(
             frozen(np.zeros(n) if data.at_rest else participation[:, n_inputs + k], complex)
