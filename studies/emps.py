@@ -18,7 +18,7 @@ from workbench.structure.modes import Modes, PointShapes
 NEEDS_DATA = "the folder with DATA_EMPS.mat and DATA_EMPS_PULSES.mat of the EMPS benchmark"
 # Janot, Gautier, Brunot, Data set and reference models of EMPS (2019)
 PUBLISHED = {"mass": 95.11, "viscous": 203.5, "dry": 20.39, "offset": 3.16}  # kg, N s/m, N, N
-RATE, KEPT = 1000.0, 10  # samples a second as measured; of which one in ten is kept, forces averaged between
+RATE, KEPT = 1000.0, 10  # samples per second as measured; of which one in ten is kept, forces averaged between
 QUIET_ABOVE_HZ, BELIEVED_BELOW_HZ = 100.0, 50.0  # of the position; of the forces that are compared
 NOISE = 1e-3  # m/s and m: about a hundredth of the motion, which is as much as a model is asked to explain
 EDGE = 200  # samples at either end that the filters spoil

@@ -111,7 +111,7 @@ def designed(make):
 
 
 def every_design(places):
-    """Each law on each way to know the state, on a lightly damped beam with residual modes: one row a design."""
+    """Each law on each way to know the state, on a lightly damped beam with residual modes: one row per design."""
     modes = Beam(
         length=LENGTH, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged",
         damping=ModalDamping(0.005),

@@ -198,8 +198,8 @@ def test_what_a_universal_file_cannot_say_is_asked_for(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "given", "message"),
     [
-        ({}, {"modal_mass": [1.0, 2.0]}, "modal_mass is one number, or one a mode: 3 modes need as many; got 2"),
-        ({}, {"damping_ratios": [0.01] * 4}, "damping_ratios is one number, or one a mode: .* got 4"),
+        ({}, {"modal_mass": [1.0, 2.0]}, "modal_mass is one number, or one per mode: 3 modes need as many; got 2"),
+        ({}, {"damping_ratios": [0.01] * 4}, "damping_ratios is one number, or one per mode: .* got 4"),
         ({"frequencies_hz": [3.0, -5.0, 8.0]}, {}, "frequencies_hz must be .* not negative; of mode 2 it is -5;"),
         ({"frequencies_hz": [3.0, 5.0, np.nan]}, {}, "of mode 3 it is nan"),
     ],

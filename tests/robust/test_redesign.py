@@ -398,7 +398,7 @@ def test_a_motor_at_a_support_is_tested_by_an_impulse_that_moves_the_modes():
 def test_what_cannot_be_redesigned_is_named(rig, controller):
     plain = possible(rig)
     with pytest.raises(
-        DesignError, match=r"10 samples a second are too slow for mode 2 at 3.142 Hz: sample at 12.57 Hz"
+        DesignError, match=r"10 samples per second are too slow for mode 2 at 3.142 Hz: sample at 12.57 Hz"
     ):
         redesign(plain, controller, sample_time=0.1)
     with pytest.raises(DesignError, match="above 0; got 0"):

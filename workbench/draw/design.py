@@ -25,7 +25,7 @@ MOST_INSTANTS = 700  # more than a picture has columns for
 def plot_displacements(
     responses: dict[str, Response], positions: dict[str, Sequence[float]], times: Sequence[float], x: np.ndarray
 ) -> Figure:
-    """The structure's displacement at several times, one column a design, one row a time; actuators marked."""
+    """The structure's displacement at several times, one column per design, one row a time; actuators marked."""
     figure, axes = new_figure(
         len(times), len(responses), width=10, height=1.55 * len(times), sharex=True, sharey=True, squeeze=False
     )
@@ -65,7 +65,7 @@ def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
 
 
 def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
-    """Work put into each residual mode, a group of bars a mode; `first` is the zero-based index of the first one."""
+    """Work put into each residual mode, a group of bars per mode; `first` is the zero-based index of the first one."""
     figure, ax = new_figure(width=9, height=4)
     width = 0.8 / len(works)
     for i, (name, work) in enumerate(works.items()):
@@ -78,7 +78,7 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
 
 
 def plot_work(spillovers: dict[str, Spillover]) -> Figure:
-    """Spillover work in each residual mode, one group of bars a design, on a logarithmic scale."""
+    """Spillover work in each residual mode, one group of bars per design, on a logarithmic scale."""
     figure, ax = new_figure(1, 1, width=9, height=4)
     first = next(iter(spillovers.values()))
     modes = np.array(first.residual) + 1
@@ -266,7 +266,7 @@ def plot_placement_fronts(fronts: dict[str, Sequence[Placement]], rule: dict[str
 
 
 def plot_scaling(times: dict[str, dict[int, float]], slopes: dict[str, float]) -> Figure:
-    """Time to design against the number of modes, one line a method, each with its slope on the log-log scale."""
+    """Time to design against the number of modes, one line per method, each with its slope on the log-log scale."""
     figure, ax = new_figure(width=9, height=5)
     for (name, series), colour, mark in zip(times.items(), COLOURS, "osD^v", strict=False):
         label = f"{name}: slope {slopes[name]:.1f}"

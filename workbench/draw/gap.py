@@ -59,7 +59,7 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
 
 
 def plot_budget(budget: Budget) -> Figure:
-    """What causes the gap of each record: one bar a record, split by cause."""
+    """What causes the gap of each record: one bar per record, split by cause."""
     causes = [label_in_words(label) for label in budget.effects]
     causes += ["small errors of the model", "unexplained", "noise"]
     colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], GREY]

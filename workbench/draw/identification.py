@@ -127,7 +127,7 @@ def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz:
 
 
 def measured_modes(bending: SampledModes, others: SampledModes, pairing: ModePairing, model: Modes) -> Figure:
-    """Measured shapes over the model's, one panel a mode; those that are not the model's last, in grey."""
+    """Measured shapes over the model's, one panel per mode; those that are not the model's last, in grey."""
     n = bending.n_modes + others.n_modes
     figure, axes = new_figure(int(np.ceil(n / 4)), 4, width=12, height=2.7 * np.ceil(n / 4), sharex=True, sharey=True)
     x = np.linspace(0.0, model.length, 200)

@@ -60,7 +60,7 @@ def plot_steps(result: Redesign) -> Figure:
 
 
 def plot_prediction(prediction: Prediction, measured: Record | None = None) -> Figure:
-    """A row a sensor: readings over time on the left, amplitudes of their Fourier transform on the right.
+    """A row per sensor: readings over time on the left, amplitudes of their Fourier transform on the right.
 
     Args:
         prediction: with its bands.

@@ -97,7 +97,7 @@ def plot_frf(record: Record) -> Figure:
 
 
 def plot_distortion(distortions: Sequence[Distortion]) -> Figure:
-    """Excited lines, odd and even lines that are not, and noise, a column a record and a row an output."""
+    """Excited lines, odd and even lines that are not, and noise, a column per record and a row per output."""
     rows = distortions[0].channels[:OUTPUTS_SHOWN]
     figure, axes = new_figure(
         len(rows), len(distortions), width=10, height=1.0 + 2.3 * len(rows), sharex=True, sharey="row", squeeze=False

@@ -34,7 +34,7 @@ DOT: Any = {"color": "none", "marker": "o", "markeredgecolor": "black", "markerf
 def plot_surface_modes(
     modes: Modes, *, count: int | None = None, places: np.ndarray | None = None, values: np.ndarray | None = None
 ) -> Figure:
-    """Shapes over a rectangle, a panel a mode: red up, blue down, nodal lines black, edges that are held thick.
+    """Shapes over a rectangle, a panel per mode: red up, blue down, nodal lines black, edges that are held thick.
 
     Args:
         count: of the lowest modes; all where not given.
@@ -191,7 +191,7 @@ def plot_surface_placement(
 
 
 def plot_point_modes(modes: Modes, *, count: int | None = None) -> Figure:
-    """Shapes at named points, a panel a mode: the structure at rest grey, moved blue, neighbouring nodes joined.
+    """Shapes at named points, a panel per mode: the structure at rest grey, moved blue, neighbouring nodes joined.
 
     A plane structure is seen from the front, any other from above it: x to the right, z up, y away.
 
@@ -205,7 +205,7 @@ def plot_point_modes(modes: Modes, *, count: int | None = None) -> Figure:
 
 
 def plot_scattered_modes(modes: SampledModes, *, count: int) -> Figure:
-    """Shapes at sensors on a plate, a panel a mode, each sensor at the phase in which most of them are largest."""
+    """Shapes at sensors on a plate, a panel per mode, each sensor at the phase in which most of them are largest."""
     phase = np.exp(-0.5j * np.angle(np.sum(modes.shapes**2, axis=0)))
     turned = replace(modes, shapes=modes.shapes * phase)
     return _net_panels(scattered_net(modes.positions), turned, min(count, modes.n_modes))

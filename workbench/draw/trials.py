@@ -53,7 +53,7 @@ def plot_confusion(tally: Tally) -> Figure:
 
 
 def plot_times(seconds: Mapping[str, Sequence[float]], limits: Mapping[str, float]) -> Figure:
-    """How long each diagnosis took, a dot a case, and how long it may take, by family of cases."""
+    """How long each diagnosis took, a dot per case, and how long it may take, by family of cases."""
     figure, ax = new_figure(width=9, height=1.2 + 0.7 * len(seconds))
     for y, (family, times) in enumerate(seconds.items()):
         ax.plot(times, [y] * len(times), "o", color=COLOURS[0], alpha=0.6, label="a case" if y == 0 else None)

@@ -74,7 +74,7 @@ def diagnose(
         catalogue: kinds of effects to try.
         name: of the case.
         report: called with (what, share done) as the search proceeds.
-        workers: processes that share the work, this one included; None for one a core.
+        workers: processes that share the work, this one included; None for one per core.
         seconds: of processor time of this process, after which the search ends with the best that it has, and the
             verdict says so; None for no limit.
         settle: seconds at the start of each record that are simulated but not counted, where a record does not start

@@ -318,7 +318,7 @@ def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.n
     longest = 0.25 * min(record.n_samples for record in records) * dt
     if not ((given >= 0) & (given <= longest)).all():
         raise ValueError(
-            f"delays must lie between 0 and {longest:.3g} s, a quarter of the record, one an input; got {delays!s}"
+            f"delays must lie between 0 and {longest:.3g} s, a quarter of the record, one per input; got {delays!s}"
         )
     near = np.round(given / dt)
     return np.where(np.abs(given / dt - near) < 1e-6, near, given / dt)

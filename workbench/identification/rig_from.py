@@ -224,7 +224,7 @@ def _of_shapes(identified: Any, out: tuple[Channel, ...], modal_masses: ArrayLik
 def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:
     masses = np.broadcast_to(np.asarray(modal_masses, float), (n_modes,))
     if not (np.isfinite(masses).all() and (masses > 0).all()):
-        raise ValueError(f"modal_masses must be positive, kg, one a mode; got {modal_masses!s}")
+        raise ValueError(f"modal_masses must be positive, kg, one per mode; got {modal_masses!s}")
     return masses
 
 

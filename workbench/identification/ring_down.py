@@ -57,7 +57,7 @@ class RingDown(OfRefined):
     Attributes:
         records: as used: each from the start of its free decay on, drift removed.
         refined: their modes.
-        remarks: one a mode, empty where there is none.
+        remarks: one per mode, empty where there is none.
         noise_modes: candidates rejected as noise.
         noise_evidence: (n_noise,) theirs, below `limit`.
         limit: evidence from which on a mode counts.

@@ -126,7 +126,7 @@ def identify_transfer(
         transfer: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
             input; of receptance, mobility or accelerance by the quantity of each channel.
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
-        channels: one an output; where no quantity is stated, the residual terms are those of any motion.
+        channels: one per output; where no quantity is stated, the residual terms are those of any motion.
         band_hz: lowest and highest line to fit; modes beyond are held by residual terms.
         noise_std: standard error of real and imaginary part, of the shape of `transfer`: from repeated measurements,
             or by `coherence_noise`. Without it, noise is taken to be the same at all lines of an output, or to go with

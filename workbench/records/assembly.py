@@ -159,7 +159,7 @@ def _n_samples(path: Path, time: np.ndarray | None, signals: Mapping[str, np.nda
         if length != most:
             raise RecordFileError(f"{path}, channel {_name(key)!r} has {length} samples; the others have {most}")
     if most < 2:
-        raise RecordFileError(f"{path} holds {most} samples a channel; a record needs at least two")
+        raise RecordFileError(f"{path} holds {most} samples per channel; a record needs at least two")
     return most
 
 

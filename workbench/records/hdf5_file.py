@@ -1,4 +1,4 @@
-"""HDF5: one dataset a signal at the top of the file, `t` or `time` for the instants."""
+"""HDF5: one dataset per signal at the top of the file, `t` or `time` for the instants."""
 
 import json
 import math

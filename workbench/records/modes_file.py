@@ -177,7 +177,7 @@ def _one_a_mode(path: Path, name: str, values: ArrayLike, n_modes: int) -> Float
     found = np.ravel(np.asarray(values, float))
     if found.size not in (1, n_modes):
         raise RecordFileError(
-            f"{path}: {name} is one number, or one a mode: {n_modes} modes need as many; got {found.size}"
+            f"{path}: {name} is one number, or one per mode: {n_modes} modes need as many; got {found.size}"
         )
     return np.broadcast_to(found, (n_modes,))
 

@@ -1,4 +1,4 @@
-"""NPZ: one array a signal, `t` or `time` for the instants; never a pickle."""
+"""NPZ: one array per signal, `t` or `time` for the instants; never a pickle."""
 
 import json
 import zipfile

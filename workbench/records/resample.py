@@ -1,4 +1,4 @@
-"""Fewer samples a second, with what lies above the new band filtered out first."""
+"""Fewer samples per second, with what lies above the new band filtered out first."""
 
 import numpy as np
 from scipy.signal import firwin, oaconvolve

@@ -284,7 +284,7 @@ def impulse_record(
     Args:
         transfer: (n_outputs, n_frequencies) complex, per unit input, first column at 0 Hz, last at Nyquist.
         sample_rate_hz: of the time signals behind it.
-        channels: one an output.
+        channels: one per output.
 
     Raises:
         ValueError: shapes that do not fit, or non-finite values (channel and line named).

@@ -54,8 +54,8 @@ class Rig(Printed):
 
     Attributes:
         modes: of the structure; as many as the rig shows.
-        actuators: one an input, in the order of the inputs.
-        sensors: one an output, in the order of the outputs.
+        actuators: one per input, in the order of the inputs.
+        sensors: one per output, in the order of the outputs.
         elements: forces at points or all along, linear or not.
         stiffness_rate: the stiffness is 1 + rate t times itself, 1/s; t from the start of a record.
         structure: the bar, beam, plate or membrane behind the modes, where it is known; changes of structure are solved

@@ -115,7 +115,7 @@ def check_rate(modes: Modes, controlled: Sequence[int], sample_time: float) -> N
     per_period = 2.0 * np.pi / modes.omega[r] / sample_time if modes.omega[r] > 0 else np.inf
     if per_period < SLOWEST:
         raise DesignError(
-            f"{1 / sample_time:g} samples a second are too slow for mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz:"
+            f"{1 / sample_time:g} samples per second are too slow for mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz:"
             f" sample at {SLOWEST * modes.frequencies_hz[r]:.4g} Hz or faster, or leave the mode out"
         )
 

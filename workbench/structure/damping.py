@@ -10,7 +10,7 @@ from workbench.structure.profile import ProfileLike
 
 @dataclass(frozen=True, eq=False)
 class ModalDamping:
-    """One damping ratio for every mode, or one a mode, lowest first (the last one serves all modes above)."""
+    """One damping ratio for every mode, or one per mode, lowest first (the last one serves all modes above)."""
 
     zeta: ArrayLike = 0.0
 

@@ -278,7 +278,7 @@ Modes.__init__ = _taking_a_length(Modes.__init__)  # type: ignore[method-assign]
 
 
 class PointShapes:
-    """Shapes known at named points only: one row a point, one column a mode.
+    """Shapes known at named points only: one row a point, one column per mode.
 
     Attributes:
         values: (n_points, n_modes), mass-normalised, in the order of the points.
@@ -298,7 +298,7 @@ class SampledModes(Printed):
     Attributes:
         omega: (n_modes,) rad/s, increasing.
         zeta: (n_modes,) damping ratios.
-        shapes: (n_outputs, n_modes) complex, one row a sensor; scale arbitrary.
+        shapes: (n_outputs, n_modes) complex, one row per sensor; scale arbitrary.
         positions: places of the sensors: (n_outputs,) or (n_outputs, 2) m, nan where unknown, or (n_outputs,) names.
     """
 

@@ -88,7 +88,7 @@ def test_intervals_hold_where_repeated_modes_are_turned_by_almost_half_a_right_a
     "changed, message",
     [
         ({"omega": [3.0, np.nan, 8.0, 9.0]}, "omega must be positive and finite; got .*nan"),
-        ({"omega_std": np.ones(3)}, r"omega_std is one number, or one a mode, \(4,\); got \(3,\)"),
+        ({"omega_std": np.ones(3)}, r"omega_std is one number, or one per mode, \(4,\); got \(3,\)"),
         ({"shapes": np.ones(6)}, r"shapes must be finite, .* with 4 measured frequencies; got \(6,\)"),
         ({"build": lambda p: None}, "build must return modes, .* got NoneType"),
     ],

@@ -26,7 +26,7 @@ class Controller(Printed):
 
     Attributes:
         law: whose forces it commands.
-        sensors: that it reads, one a channel: displacement, slope, velocity or angular velocity.
+        sensors: that it reads, one per channel: displacement, slope, velocity or angular velocity.
         state: (n_states, n_states) A_z, 1/s; empty for a filter.
         reads: (n_states, n_channels) B_z.
         commands: (n_actuators, n_states) C_z.

@@ -18,7 +18,7 @@ from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed
 
 ON_CIRCLE = 1e-9  # a pole no further outside the unit circle stands on it
-COMFORTABLE = 10.0  # samples a period of the highest controlled mode
+COMFORTABLE = 10.0  # samples per period of the highest controlled mode
 FASTEST = 1024.0  # times the rate asked for, up to which a rate that holds is looked for
 MOST_LATE, TRIES = 40, 160  # samples of further delay that are tried, in so many steps
 

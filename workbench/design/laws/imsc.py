@@ -31,11 +31,11 @@ def riccati_gains(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0.0)
         g1 (n_modes,) in 1/s² and g2 (n_modes,) in 1/s.
 
     Raises:
-        DesignError: a weight that is not positive, or others than one a mode.
+        DesignError: a weight that is not positive, or others than one per mode.
     """
     if np.ndim(omega) and np.size(weight) not in (1, np.size(omega)):
         raise DesignError(
-            f"the control weight R is one number, or one a mode: {np.size(omega)} modes need as many; got"
+            f"the control weight R is one number, or one per mode: {np.size(omega)} modes need as many; got"
             f" {np.size(weight)}"
         )
     omega, weight, c = np.broadcast_arrays(*(np.asarray(each, float) for each in (omega, weight, damping)))

@@ -50,7 +50,7 @@ class FeedbackTask:
     def __post_init__(self) -> None:
         freeze(self, "gain", "state")
         if self.gain.ndim != 2 or self.gain.shape[0] != self.gain.shape[1]:
-            raise DesignError(f"the feedback gain must be square, one row a pair; got shape {self.gain.shape}")
+            raise DesignError(f"the feedback gain must be square, one row per pair; got shape {self.gain.shape}")
         if self.state.shape != (2 * self.modes.n_modes,):
             raise DesignError(
                 f"the state has {2 * self.modes.n_modes} entries for {self.modes.n_modes} modes; got {self.state.shape}"

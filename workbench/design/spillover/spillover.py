@@ -225,7 +225,7 @@ def modal_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> floa
 def distributed_cost(modes: Modes, controlled: int | Sequence[int], state: np.ndarray, weight: float) -> float:
     """The least `modal_cost` of any law: that of distributed control, f(x, t) = Σ m φ_r f_r (5.5), with W_R = 0.
 
-    Modal forces are then at will, one a mode, so the cost is Σ x_rᵀ P_r x_r of the closed-form Riccati equations.
+    Modal forces are then at will, one per mode, so the cost is Σ x_rᵀ P_r x_r of the closed-form Riccati equations.
     """
     index = list(controlled_indices(modes, controlled))
     p = riccati_matrices(modes.omega[index], weight, np.diag(modes.damping)[index])

@@ -50,7 +50,7 @@ FEWER_PLACES = 20  # where a force is looked for beside what is given
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """The unmodelled force at a point and the motion there, one row a record joined end to end.
+    """The unmodelled force at a point and the motion there, one row per record joined end to end.
 
     Attributes:
         at: on the structure.
@@ -87,7 +87,7 @@ class Evidence:
     Attributes:
         rig: the rig that was simulated.
         data: fit records with their noise.
-        motions: its motion, one a record.
+        motions: its motion, one per record.
         residuals: (n_sensors, n_samples) a record, in the sensors' units.
         n_places: where a force is looked for.
         given_places: places of the force, where they are known from elsewhere.

@@ -132,7 +132,7 @@ def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) ->
     Args:
         rig: whose modes answer to it.
         data: records, with the noise of the sensors.
-        residuals: (n_outputs, n_samples) measured less predicted, one a record.
+        residuals: (n_outputs, n_samples) measured less predicted, one per record.
     """
 
     def losses_of(share: float) -> list[float]:

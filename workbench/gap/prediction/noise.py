@@ -42,7 +42,7 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     a spectrum that is smooth otherwise, white or coloured.
 
     Args:
-        residuals: (n_outputs, n_samples) measured less predicted, one a record.
+        residuals: (n_outputs, n_samples) measured less predicted, one per record.
     """
     whole = np.sort([(residual**2).mean(axis=1) for residual in residuals], axis=0)
     under = np.min([_under_peaks(residual) for residual in residuals], axis=0)
@@ -58,7 +58,7 @@ def is_noise_alone(residuals: Sequence[np.ndarray], records: Sequence[Record]) -
     """Whether what is left is noise, however loud: without peaks, and as strong in records of other levels.
 
     Args:
-        residuals: (n_outputs, n_samples) measured less predicted, one a record.
+        residuals: (n_outputs, n_samples) measured less predicted, one per record.
         records: what was measured.
     """
     levels = [(record.outputs**2).mean() for record in records]

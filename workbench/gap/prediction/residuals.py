@@ -221,7 +221,7 @@ class FitData:
         ]
 
     def differences(self, rig: Rig) -> list[np.ndarray]:
-        """Measured less predicted on whole records (n_outputs, n_samples), one a record, in the sensors' units."""
+        """Measured less predicted on whole records (n_outputs, n_samples), one per record, in the sensors' units."""
         both = zip(self.counted, self.predictions(rig), strict=True)
         return [record.outputs - prediction for record, prediction in both]
 

@@ -226,7 +226,7 @@ def left_by_common_backbone(bands: Sequence[_Band], weights: Floats, pair: Compl
     """The same of each of several records, (n_records,), one backbone for all: where their weighted sum is least.
 
     Args:
-        bands: one a record.
+        bands: one per record.
         weights: (n_records,) 1 / noise.
         pair: as for one.
     """

@@ -71,7 +71,7 @@ def in_coloured_noise(
     Args:
         refined: of `refine` with a constant in each output, made for white noise.
         records: that it was identified from.
-        fits: of its poles, in any order, one a record; found anew unless given.
+        fits: of its poles, in any order, one per record; found anew unless given.
     """
     records = [records] if isinstance(records, Record) else list(records)
     fits = fits or [project(record, refined.modes.poles, True) for record in records]
@@ -103,7 +103,7 @@ def as_refined(
     Args:
         records: of the fit.
         poles: (n_modes,) rad/s.
-        fits: one a record.
+        fits: one per record.
         noise: (n_records, n_outputs) standard deviations.
         converged, steps: of the search.
         noise_ratio: κ (n_records, n_outputs, n_modes), variance of the noise about each mode over its mean; 1 unless
@@ -139,7 +139,7 @@ def normal_equations(
     """Gauss-Newton matrix and right-hand side of (σ, ω_d), over all records, outputs weighted by 1 / noise.
 
     Args:
-        fits: one a record, of the same poles.
+        fits: one per record, of the same poles.
         weights: (n_records, n_outputs).
         factor: (n_records, n_modes, n_outputs) of the share of each mode and output: κ^½ gives J^T S J.
     """
@@ -166,7 +166,7 @@ def _mean_shapes(
     the mean over the records by their own noise, so that a record that misses a mode, or is noisy, counts little.
 
     Args:
-        fits: one a record, of the same poles.
+        fits: one per record, of the same poles.
         derivative: (n_outputs,) order of the time derivative each output measures.
         pole_covariance: (2 n_modes, 2 n_modes) of (σ, ω_d).
         variance: (n_records, n_outputs, n_modes) of the noise about each mode.

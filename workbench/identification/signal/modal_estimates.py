@@ -211,7 +211,7 @@ class Identified(OfRefined):
 
 
 def rows_of(found: ModalEstimates) -> Iterator[tuple[str, ...]]:
-    """One row a mode under `HEADINGS`, figures to the second digit of their standard errors."""
+    """One row per mode under `HEADINGS`, figures to the second digit of their standard errors."""
     modes = found.modes
     collinearity = modes.phase_collinearity
     for r in range(modes.n_modes):

@@ -110,7 +110,7 @@ def update_model(
         if not (np.isfinite(values) & (values > 0)).all():
             raise ValueError(f"{name} must be positive and finite; got {values}")
     if deviation.shape not in ((), target.shape):
-        raise ValueError(f"omega_std is one number, or one a mode, {target.shape}; got {deviation.shape}")
+        raise ValueError(f"omega_std is one number, or one per mode, {target.shape}; got {deviation.shape}")
     if first.size > target.size:
         raise ValueError(f"{target.size} measured frequencies cannot determine {first.size} parameters; choose fewer")
     if measured.ndim != 2 or measured.shape[1] != target.size or not np.isfinite(measured).all():

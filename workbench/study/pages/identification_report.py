@@ -31,7 +31,7 @@ class IdentificationReport:
 
     Attributes:
         heading: what was identified.
-        rows: one a mode, under `HEADINGS`; figures to the second digit of their standard errors.
+        rows: one per mode, under `HEADINGS`; figures to the second digit of their standard errors.
         lines: remarks.
         content: for JSON.
         decays: free decays that the modes are of, or correlation functions that decay alike; none of other data.

@@ -33,7 +33,7 @@ class Look:
 
     Attributes:
         heading: number of channels and samples, rate, length.
-        rows: one a channel, under `HEADINGS`.
+        rows: one per channel, under `HEADINGS`.
         remarks: faults of the data and what else to know.
         command: the command to go on with.
         page_content: the page of it.

@@ -1,4 +1,4 @@
-"""Results on disk, one JSON file a case: whole or not there, and never a pickle."""
+"""Results on disk, one JSON file per case: whole or not there, and never a pickle."""
 
 import base64
 import hashlib
