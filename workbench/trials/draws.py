@@ -1,7 +1,7 @@
 """Hidden effects at random: a kind, a place, and a strength at which the gap can be seen.
 
-A draw, one per kind, gives the numbers of an effect, or a function of a strength near 1 that gives them. Truncated modes
-are drawn with the bench, whose nominal model gives them up.
+A draw, one per kind, gives the numbers of an effect, or a function of a strength near 1 that gives them. Truncated
+modes are drawn with the bench, whose nominal model gives them up.
 """
 
 from collections.abc import Callable, Sequence
