@@ -282,3 +282,20 @@ def test_arrays_come_back_bit_by_bit():
     for seed, one in enumerate(found, 1):
         assert one.cost == 1.0 / seed
         assert np.array_equal(one.residual, np.random.default_rng(seed).normal(size=20_000))
+
+
+@forked
+def test_nothing_is_left_after_work_in_the_background(monkeypatch):
+    pids, fork = [], os.fork
+
+    def recorded():
+        pids.append(fork())
+        return pids[-1]
+
+    monkeypatch.setattr(os, "fork", recorded)
+    with TWO.in_background(os.getpid) as found:
+        TWO.give_back(TWO.array(100))
+        assert TWO.map(abs, range(4)) == [0, 1, 2, 3]
+        assert found() in pids
+    assert len(pids) == 2 and not any(state_of(pid) for pid in pids)
+    assert not any(module._spare.values())

@@ -129,17 +129,27 @@ class Workers:
         """Have `function()` computed in the time that the others leave; what is given to the block, called, has it.
 
         Its work may be shared further. Where no process is forked it is computed when it is asked for. What
-        nobody has asked for by the end of the block is given up.
+        nobody has asked for by the end of the block is given up; no helper and no room is left after it.
         """
-        if self._are_alone or not FORKS:
-            yield cache(function)
-            return
-        helper = _Helper(lambda _: function(), background=True)
-        helper.ask(None)
+        helper = None if self._are_alone or not FORKS else _Helper(lambda _: function(), background=True)
         try:
-            yield cache(helper.found)
+            if helper is not None:
+                helper.ask(None)
+            yield cache(function if helper is None else helper.found)
         finally:
-            helper.end()
+            if helper is not None:
+                helper.end()
+            _leave_nothing()
+
+
+def _leave_nothing() -> None:
+    """Helpers that were ended are gone, and the system has the room that was given back."""
+    for pid in _Helper.ending:
+        with suppress(ChildProcessError):
+            os.waitpid(pid, 0)
+    _Helper.ending = []
+    for spare in _spare.values():
+        spare.clear()
 
 
 ALONE = Workers(1)
@@ -195,7 +205,7 @@ class _Helper:
     """A forked process that answers what it is asked; without helpers of its own, unless in the background."""
 
     is_this_process = False
-    _ending: ClassVar[list[int]] = []  # helpers that were ended: it takes a hundredth of a second to clear one's memory
+    ending: ClassVar[list[int]] = []  # helpers that were ended: it takes a hundredth of a second to clear one's memory
 
     def __init__(self, work: Callable[[Any], Any], background: bool = False) -> None:
         self._here, there = Pipe()
@@ -227,7 +237,7 @@ class _Helper:
         self._here.close()
         with suppress(ProcessLookupError):
             os.kill(self._pid, signal.SIGKILL)
-        _Helper._ending = [pid for pid in (*_Helper._ending, self._pid) if not _is_gone(pid)]
+        _Helper.ending = [pid for pid in (*_Helper.ending, self._pid) if not _is_gone(pid)]
 
 
 def _is_gone(pid: int) -> bool:
