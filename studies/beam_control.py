@@ -119,6 +119,6 @@ def study(outcome, data=None):
     )
     outcome.figure(
         "work",
-        plot_work({labels[n]: w for n, w in works.items()}),
+        plot_work({f"actuators at {labels[n]} m": w for n, w in works.items()}),
         "Work that control spills into the five residual modes.",
     )

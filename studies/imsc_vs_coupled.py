@@ -293,7 +293,9 @@ def study(outcome, data=None):
         " places decide is the effort and the spillover"
     )
     outcome.figure(
-        "comparison", plot_comparison(close[:2]), "Actuators at 1.3, 2.6, 3.9, 5.2: coupled LQR beside IMSC."
+        "comparison",
+        plot_comparison(close[:2], "the same modes with the same actuators, close together: at 1.3, 2.6, 3.9, 5.2 m"),
+        "Actuators close together: coupled LQR beside IMSC.",
     )
     relay = on_off(modes, 4, [Actuator(f"F{i + 1}", x) for i, x in enumerate((2.0, 4.0, 6.0, 8.0))], **RELAY)
     coarse, fine = (respond_on_off(modes, relay, state, np.linspace(0.0, 120.0, n)) for n in (481, 15361))

@@ -130,7 +130,7 @@ def plot_filter_errors(counts: Sequence[int], errors: np.ndarray) -> Figure:
     return figure
 
 
-def plot_comparison(rows: Sequence[dict[str, Any]]) -> Figure:
+def plot_comparison(rows: Sequence[dict[str, Any]], title: str) -> Figure:
     """Cost, effort and spillover of several designs as ratios to the first, on a logarithmic scale."""
     figure, ax = new_figure(1, 1, width=9, height=4)
     keys = ("cost", "effort", "W_R")
@@ -145,7 +145,7 @@ def plot_comparison(rows: Sequence[dict[str, Any]]) -> Figure:
     ax.set(yscale="log", ylim=(least, 4.0 * ratios.max()), ylabel=f"ratio to {rows[0]['law']} (less is better)")
     ax.set_xticks(np.arange(len(keys)), ["quadratic cost", "actuator effort", "spillover W_R"])
     ax.axhline(1.0, color=GREY, linewidth=0.8)
-    ax.set_title("independent modal-space and coupled control of the same modes with the same actuators")
+    ax.set_title(title)
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
@@ -217,7 +217,7 @@ def plot_sensor_counts(margins: dict[str, np.ndarray], counts: dict[str, int | N
         numbers = np.arange(1, len(values) + 1)
         there = np.isfinite(values)
         count = counts[name]
-        label = f"{name}: {count} sensors suffice" if count else f"{name}: none up to {len(values)} suffices"
+        label = f"{name}: stable from {count} sensors on" if count else f"{name}: unstable up to {len(values)}"
         ax.plot(numbers[there], values[there], mark + "-", color=colour, label=label, markersize=4)
     ax.axhline(0.0, color=GREY, linewidth=1.0)
     largest = max(v[np.isfinite(v)].max() for v in margins.values())
