@@ -227,6 +227,8 @@ def test_inputs_that_run_straight_between_samples():
     record = Record(DT, y, (Channel("a"), Channel("b")), u, (Channel("f", "force"),))
     found = identify_driven(record, input_hold="first")
     assert np.abs(found.modes.poles / POLES - 1).max() < 1e-7
+    with pytest.warns(DeprecationWarning, match="input_hold"):
+        assert found.input_hold == "first" and found.straight
     w = 1j * OMEGA
     assert np.abs(found.state_space(w) - plant(w)).max() < 1e-6 * np.abs(plant(w)).max()
 

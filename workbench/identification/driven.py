@@ -150,6 +150,12 @@ class Driven(ParticipatingModes):
             y += 2.0 * np.real(np.outer(self._measured_shapes[:, r], z))
         return np.asarray(y)
 
+    @property
+    def straight(self) -> bool:
+        """Former name of `input_hold == "first"`."""
+        warn("straight is now input_hold; it goes with the next version", DeprecationWarning, 2)
+        return self.input_hold == "first"
+
     def initial_state(self, record: int = 0) -> np.ndarray:
         """States of `state_space` at the first sample of a record, (2 n_modes,)."""
         z = self.initial[record]
