@@ -51,6 +51,8 @@ def plot_identified(found: Modes, truth: Modes, positions: np.ndarray, *, count:
         ax.set_title(f"mode {r + 1}: {found.frequencies_hz[r]:.4f} Hz, ζ = {100 * found.zeta[r]:.2f} %", fontsize=10)
     for ax in axes[-1]:
         ax.set_xlabel("x [m]")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("φ(x) [1/√kg]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
