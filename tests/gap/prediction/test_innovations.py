@@ -9,7 +9,7 @@ import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
-from workbench.gap.prediction.innovations import LOOSE, Follower
+from workbench.gap.prediction.innovations import LOOSE, Follower, _grows
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.gap.search.fit import cost_of
@@ -68,3 +68,12 @@ def test_records_and_motions_are_let_go(hinged_rig, record_of):
         assert gone() is None
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.5, 0.999, 0.99999, 1.00001, 1.001, 3.0, 1e30])
+def test_a_motion_grows_where_an_eigenvalue_is_beyond_one(radius):
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        step = rng.standard_normal((12, 12))
+        step *= radius / np.abs(np.linalg.eigvals(step)).max()
+        assert _grows(step) is (radius > 1.0)

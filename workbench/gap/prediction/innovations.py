@@ -140,16 +140,20 @@ def _runs_away(rig: Rig, gain: Floats, sample_time: float) -> bool:
     n = rig.modes.n_modes
     derivatives = np.vstack([np.eye(2 * n), rig.modes.state_matrix[n:]]).reshape(3, n, 2 * n)
     output = np.einsum("jr,jrs->js", rows, derivatives[orders])
-    corrected = step - gain.reshape(2 * n, -1) @ (output @ step)
-    power = corrected
-    for _ in range(DOUBLINGS):  # no eigenvalue is beyond 1 where the norm of a power is not, which is quicker to see
+    return _grows(step - gain.reshape(2 * n, -1) @ (output @ step))
+
+
+def _grows(step: Floats) -> bool:
+    """Whether a motion may grow, step after step: an eigenvalue is beyond 1."""
+    power = step
+    for _ in range(DOUBLINGS):  # none is where the norm of a power is not, which is quicker to see
         power = power @ power
         size = float(np.einsum("ij,ij->", power, power))
         if size < 1.0:
             return False
         if size > RUN_AWAY:
             break
-    return bool(np.abs(np.linalg.eigvals(corrected)).max() > 1.0)
+    return bool(np.abs(np.linalg.eigvals(step)).max() > 1.0)
 
 
 @lru_cache(maxsize=4)
