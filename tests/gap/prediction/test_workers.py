@@ -19,15 +19,21 @@ forked = pytest.mark.skipif(not FORKS, reason="processes are forked on Linux onl
 
 
 @pytest.fixture
-def helpers(monkeypatch):
-    """The processes that were forked; at the end none runs on, and none but the last is left for the system to keep."""
-    pids, fork = [], os.fork
+def pids(monkeypatch):
+    """The processes that are forked."""
+    found, fork = [], os.fork
 
     def recorded():
-        pids.append(fork())
-        return pids[-1]
+        found.append(fork())
+        return found[-1]
 
     monkeypatch.setattr(os, "fork", recorded)
+    return found
+
+
+@pytest.fixture
+def helpers(pids):
+    """The processes that were forked; at the end none runs on, and none but the last is left for the system to keep."""
     yield pids
     assert pids
     assert eventually(lambda: not any(state_of(pid) not in ("Z", "") for pid in pids))
@@ -285,14 +291,7 @@ def test_arrays_come_back_bit_by_bit():
 
 
 @forked
-def test_nothing_is_left_after_work_in_the_background(monkeypatch):
-    pids, fork = [], os.fork
-
-    def recorded():
-        pids.append(fork())
-        return pids[-1]
-
-    monkeypatch.setattr(os, "fork", recorded)
+def test_nothing_is_left_after_work_in_the_background(pids):
     with TWO.in_background(os.getpid) as found:
         TWO.give_back(TWO.array(100))
         assert TWO.map(abs, range(4)) == [0, 1, 2, 3]
