@@ -15,3 +15,15 @@ def test_logarithmic_axes_have_plain_numbers_where_they_are_few(low, high, expec
         assert any("10^" in text for text in texts)
     else:
         assert expected in texts and not any("10^" in text or "times" in text for text in texts)
+
+
+@pytest.mark.parametrize("extent", [2.5, 2.95, 4.0, 9.0])
+@pytest.mark.parametrize("low", [0.01, 0.0101, 0.0301, 0.051, 0.0701])
+def test_a_short_logarithmic_axis_has_two_numbers_at_least_and_no_crowd(low, extent):
+    figure, ax = new_figure()
+    ax.semilogx([low, low * extent], [0.0, 1.0])
+    ax.set_xlim(low, low * extent)
+    plain_ticks(figure).draw_without_rendering()
+    marks = [*ax.xaxis.get_major_ticks(), *ax.xaxis.get_minor_ticks()]
+    shown = {m.label1.get_text() for m in marks if low <= m.get_loc() <= low * extent} - {""}
+    assert 2 <= len(shown) <= (8 if extent < 2.9 else 5)

@@ -42,7 +42,6 @@ MOST_MODES = 200
 TABLES = ("title", "input_hold", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
-STRUCTURES["bar"] = STRUCTURES["rod"]  # two words for one thing
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
 PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio", "edges", "damping_ratio", "modes")
 EDGES = ("left", "right", "bottom", "top")
@@ -52,7 +51,6 @@ INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
 MORE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "beam": (("quantity", "patch"), ()),
     "rod": ((), ()),
-    "bar": ((), ()),
     "plate": (("quantity", "patch", "axis"), ("axis",)),
     "points": (("quantity", "axis", "direction"), ("axis", "direction")),
     "modal": ((), ()),
@@ -146,7 +144,7 @@ def _rig(table: dict[str, Any], path: Path) -> Rig:
 
 
 def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
-    kind = table.get("kind")
+    kind = "rod" if table.get("kind") == "bar" else table.get("kind")  # two words for one thing
     if not isinstance(kind, str) or kind not in STRUCTURES:
         raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {shown(kind)}")
     check_keys(table, STRUCTURES[kind], "[structure]")

@@ -25,7 +25,7 @@ MOST_INSTANTS = 700  # more than a picture has columns for
 def plot_displacements(
     responses: dict[str, Response], positions: dict[str, Sequence[float]], times: Sequence[float], x: np.ndarray
 ) -> Figure:
-    """The structure's displacement at several times, one column per design, one row a time; actuators marked."""
+    """The structure's displacement at several times, one column per design, one row per time; actuators marked."""
     figure, axes = new_figure(
         len(times), len(responses), width=10, height=1.55 * len(times), sharex=True, sharey=True, squeeze=False
     )
@@ -36,8 +36,8 @@ def plot_displacements(
             k = int(np.argmin(np.abs(response.time - time)))
             ax.plot(x, motion[:, k], color=COLOURS[0])
             ax.axhline(0.0, color=GREY, linewidth=0.8)
-            at = np.array(positions[name])
-            ax.plot(at, np.zeros(at.size), "x", color=COLOURS[1], markersize=7, mew=2, label="actuator")
+            where = positions[name]
+            ax.plot(where, np.zeros(len(where)), "x", color=COLOURS[1], markersize=7, mew=2, label="actuator")
             if column == 0:
                 ax.set_ylabel(f"w [m] at\nt = {time:g} s")
         axes[0, column].set_title(f"actuators at {name}")

@@ -15,6 +15,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 GREY = "#8a8a8a"
 MOST_POINTS = 4000  # of a curve, of which a page or a screen shows no more
 PLAIN_LEAST, PLAIN_DECADES = 1e-4, 1e6  # least value and widest range of a logarithmic axis with plain numbers
+FEWER_NUMBERS = 2.9  # extent of one beyond which 1, 2, 3, 5 and 7 are numbers enough: two of them lie in any such range
 
 SETTINGS: Any = {
     "axes.grid": True,
@@ -59,14 +60,14 @@ def plain_ticks(figure: Figure) -> Figure:
                 continue
             if high / low < PLAIN_DECADES and low >= PLAIN_LEAST and high <= 1.0 / PLAIN_LEAST:
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            axis.set_minor_formatter(FuncFormatter(_plain_minor) if high / low < 10 else NullFormatter())
+            axis.set_minor_formatter(_plain_minor(high / low) if high / low < 10 else NullFormatter())
     return figure
 
 
-def _plain_minor(value: float, _: int) -> str:
-    """Between the decades, as many numbers as there is room for: 2, 3 and 5 times them."""
-    text = f"{value:g}"
-    return text if text.strip("0.").startswith(("2", "3", "5")) and len(text.strip("0.")) == 1 else ""
+def _plain_minor(extent: float) -> FuncFormatter:
+    """Numbers between the decades: as few as there is room for, but at least two with those of the decades."""
+    shown = "2357" if extent > FEWER_NUMBERS else "23456789"
+    return FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in shown else "")
 
 
 def envelope(y: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Text tables: one row a sample, one column per signal; the first column is time where it is called so.
+"""Text tables: one row per sample, one column per signal; the first column is time where it is called so.
 
 Written here as CSV; read in whatever layout an instrument writes (`table_layout.py`). Numbers are parsed a block of
 lines at a time, so that a file of any length takes the memory of its numbers and of one block.

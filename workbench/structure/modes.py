@@ -278,7 +278,7 @@ Modes.__init__ = _taking_a_length(Modes.__init__)  # type: ignore[method-assign]
 
 
 class PointShapes:
-    """Shapes known at named points only: one row a point, one column per mode.
+    """Shapes known at named points only: one row per point, one column per mode.
 
     Attributes:
         values: (n_points, n_modes), mass-normalised, in the order of the points.

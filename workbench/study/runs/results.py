@@ -1,4 +1,4 @@
-"""The results of many cases as one table: a row per case, a column a quantity."""
+"""The results of many cases as one table: a row per case, a column per quantity."""
 
 import csv
 import io
