@@ -4,8 +4,10 @@ With a second process on the machine, OpenBLAS's threads spin for one another: s
 took 76 s of processor time with two threads and 7 s with one, 154 s and 10 s by the clock.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
+from threading import Lock
 from typing import ParamSpec, TypeVar
 
 import scipy.linalg  # noqa: F401  loads the BLAS of scipy, so that it is found beside that of numpy
@@ -23,7 +25,36 @@ def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> R:
-        with _LIBRARIES.limit(limits=1, user_api="blas"):
+        with _LIMIT.held():
             return function(*args, **kwargs)
 
     return limited
+
+
+class _Limit:
+    """One thread as long as any function asks for it.
+
+    Only the first asks OpenBLAS: in a process that was forked, and in the one that it was forked from, that starts its
+    threads anew, and each spins for 30 ms before it sleeps.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._holders = Lock(), 0
+        self._end: Callable[[], None] = lambda: None
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        with self._lock:
+            if self._holders == 0:
+                self._end = _LIBRARIES.limit(limits=1, user_api="blas").restore_original_limits
+            self._holders += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._holders -= 1
+                if self._holders == 0:
+                    self._end()
+
+
+_LIMIT = _Limit()
