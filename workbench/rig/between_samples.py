@@ -197,6 +197,12 @@ def _held(n_modes: int) -> Floats:
 
 def _ends(omega: Floats, damping: Floats, sample_time: float) -> Floats:
     """`ends` of forces that lead to the motion where the interval ends, as near to those where it begins as can be."""
+    return _known_ends(omega.tobytes(), damping.tobytes(), sample_time)
+
+
+@lru_cache(maxsize=64)
+def _known_ends(frequencies: bytes, dampings: bytes, sample_time: float) -> Floats:
+    omega, damping = np.frombuffer(frequencies), np.frombuffer(dampings)
     step = _propagators(omega, damping, sample_time)
     weight = np.array([1.0, sample_time])[:, None, None]
     by_force = np.moveaxis(weight * step[:, 2:], 2, 0)  # (n_modes, 2 motions, 2 forces)
@@ -208,6 +214,7 @@ def _ends(omega: Floats, damping: Floats, sample_time: float) -> Floats:
     missing[0, 3] = missing[1, 4] = 1.0
     ends: Floats = np.einsum("mfd,dsm->fsm", change, missing)
     ends[:, 2] += 1.0
+    ends.flags.writeable = False
     return ends
 
 

@@ -1,21 +1,29 @@
 """Simulation of a rig from rest: exact where it is linear, stepped with exact modes where it is not."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 
 import numpy as np
 from scipy.signal import lfilter
 
-from workbench.arrays import Complexes, Floats, Integers
+from workbench.arrays import Complexes, Flags, Floats, Integers
 from workbench.records.record import Record
 from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
 from workbench.rig.between_samples import BetweenSamples, Step
-from workbench.rig.linear import held_response, modal_motion, modal_poles, sinusoid_response, straight_response
+from workbench.rig.linear import (
+    ModalPoles,
+    held_response,
+    modal_motion,
+    modal_poles,
+    sinusoid_response,
+    straight_response,
+)
 from workbench.rig.rig import Rig, shape_error_of, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.domain import Between, Patch, PlaceError
+from workbench.structure.modes import Modes
 
 LAWS: dict[type[elements.PointElement], int] = {
     elements.LinearSpring: stepping.LINEAR_SPRING,
@@ -31,6 +39,8 @@ LAWS: dict[type[elements.PointElement], int] = {
     elements.UserLaw: stepping.USER,
 }
 QUANTITIES = ("displacement", "velocity", "acceleration")  # by derivative in time
+KEPT = 8  # rigs whose shapes at their actuators and sensors are remembered, from record to record
+DRIVES_KEPT, MOST_KEPT = 16, 2**18  # forces on substeps that are remembered likewise, and the most values of one
 NOTHING, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
 
 
@@ -215,8 +225,12 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
     return force
 
 
+@lru_cache(maxsize=KEPT)
 def participation_of(rig: Rig) -> np.ndarray:
-    """(n_modes, n_actuators), the actuators' gains left out: those belong to the path before the structure."""
+    """(n_modes, n_actuators), the actuators' gains left out: those belong to the path before the structure.
+
+    Remembered: not to be written to.
+    """
     shapes = np.empty((rig.modes.n_modes, len(rig.actuators)))
     kinds = [(a.kind, a.direction, isinstance(a.at, Between | Patch)) for a in rig.actuators]
     for kind, direction, apart in set(kinds):
@@ -239,7 +253,7 @@ def participation_of(rig: Rig) -> np.ndarray:
 
 def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: str) -> Motion:
     modes, participation = rig.modes, participation_of(rig)
-    system = modal_poles(modes.omega, modes.damping)
+    system = _poles(modes)
     n_samples = inputs.shape[1]
     responses: list[Complexes] = []
     acting = np.zeros_like(inputs)
@@ -272,6 +286,11 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
         responses.append(np.zeros((system.poles.size, n_samples), complex))
     q, v = modal_motion(system, reduce(np.add, responses))
     return Motion(q, v, on_modes, modes.omega[:, None] ** 2, modes.damping, steps, held)
+
+
+@lru_cache(maxsize=KEPT)
+def _poles(modes: Modes) -> ModalPoles:
+    return modal_poles(modes.omega, modes.damping)
 
 
 def _steps_within(
@@ -353,17 +372,22 @@ def follow(
     return errors
 
 
+@lru_cache(maxsize=KEPT)
 def reading_of(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """What the sensors read of the modes (n_sensors, n_modes), of which derivative in time (n_sensors,)."""
+    """What the sensors read of the modes (n_sensors, n_modes), of which derivative in time (n_sensors,).
+
+    Remembered: not to be written to.
+    """
     rows, orders = np.zeros((len(rig.sensors), rig.modes.n_modes)), np.zeros(len(rig.sensors), np.int64)
     for order, here, shapes in _shapes_at_sensors(rig):
         rows[here], orders[here] = shapes, order
     return np.array([sensor.gain for sensor in rig.sensors])[:, None] * rows, orders
 
 
-def _shapes_at_sensors(rig: Rig) -> Iterator[tuple[int, list[int], np.ndarray]]:
+@lru_cache(maxsize=KEPT)
+def _shapes_at_sensors(rig: Rig) -> list[tuple[int, list[int], np.ndarray]]:
     """Order in time, sensors and shapes (n_here, n_modes), of sensors of a kind at a time."""
-    measured = [(*MEASURED[sensor.quantity], sensor.direction) for sensor in rig.sensors]
+    found, measured = [], [(*MEASURED[sensor.quantity], sensor.direction) for sensor in rig.sensors]
     for derivative, order, direction in set(measured):
         here = [j for j, kind in enumerate(measured) if kind == (derivative, order, direction)]
         try:
@@ -373,7 +397,8 @@ def _shapes_at_sensors(rig: Rig) -> Iterator[tuple[int, list[int], np.ndarray]]:
             raise
         if any(rig.sensors[j].shape_error for j in here):
             shapes = shapes + [shape_error_of(rig.sensors[j], rig.modes.n_modes) for j in here]
-        yield order, here, shapes
+        found.append((order, here, shapes))
+    return found
 
 
 def _step(
@@ -394,22 +419,20 @@ def _step(
     """
     modes = rig.modes
     n_samples = inputs.shape[1]
-    on_substeps = _forces_on_substeps if input_hold == "zero" else _straight_forces_on_substeps
-    starts, ends, at_samples = on_substeps(rig, inputs, sample_time, substeps)
+    drives = _drives(rig.actuators, inputs, sample_time, substeps, input_hold)
+    driven, starts, ends, at_samples = drives.driven, drives.starts, drives.ends, drives.at_samples
     participation = participation_of(rig)
     for element in rig.elements:
         if isinstance(element, elements.PeriodicForce):
             mean, now = _sinusoid_on_substeps(element, n_samples, sample_time, substeps)
-            starts, ends = np.vstack([starts, mean]), np.vstack([ends, mean])
+            driven, starts, ends = np.append(driven, True), np.vstack([starts, mean]), np.vstack([ends, mean])
             at_samples = np.vstack([at_samples, now])
             participation = np.column_stack([participation, modes.phi_at(element.at)])
-    driven = starts.any(axis=1) | ends.any(axis=1)
-    points = [e for e in rig.elements if isinstance(e, elements.PointElement)]
     known, reading, orders = outputs, NOTHING, NO_ORDERS
     if outputs.size:
         reading, orders = reading_of(rig)
         known = _left_to_motion(rig, outputs, reading, orders, participation, at_samples)
-    of_the_users_own = any(isinstance(e, elements.UserLaw) for e in points)
+    of_the_users_own = any(isinstance(e, elements.UserLaw) for e in rig.elements)
     step: Callable[..., None] = stepping.stepper_with_laws() if of_the_users_own else stepping.step_record
     damping, coupling, spread = structure_arrays(rig)
     step(
@@ -419,11 +442,11 @@ def _step(
         sample_time,
         substeps,
         rig.stiffness_rate,
-        starts[driven],
-        ends[driven],
+        starts,
+        ends,
         np.ascontiguousarray(participation[:, driven]),
         *spread,
-        *law_arrays(rig, points),
+        *_laws(rig),
         known,
         orders,
         reading,
@@ -448,10 +471,12 @@ def _left_to_motion(
     return known
 
 
+@lru_cache(maxsize=KEPT)
 def structure_arrays(rig: Rig) -> tuple[Floats, Floats, tuple[float, Floats, Floats, Floats]]:
     """What acts all along, or couples the modes, as a stepper takes it: nothing is an array of no numbers.
 
-    One type and one layout of every argument: a stepper is compiled anew for any other.
+    One type and one layout of every argument: a stepper is compiled anew for any other. Remembered: not to be written
+    to.
 
     Returns:
         Damping (n_modes,) and its coupling of modes; and of what acts all along, the coefficient of stretching and
@@ -465,6 +490,11 @@ def structure_arrays(rig: Rig) -> tuple[Floats, Floats, tuple[float, Floats, Flo
     stretching = np.ascontiguousarray(stretching_of(rig)) if stretch else np.zeros((0, 0))
     coupling = np.ascontiguousarray(coupling) if coupling.any() else np.zeros((0, 0))
     return damping, coupling, (stretch, stretching, np.ascontiguousarray(shapes.T), drag * weights)
+
+
+@lru_cache(maxsize=KEPT)
+def _laws(rig: Rig) -> tuple[Integers, Floats, Floats]:
+    return law_arrays(rig, [e for e in rig.elements if isinstance(e, elements.PointElement)])
 
 
 def law_arrays(rig: Rig, points: Sequence[elements.PointElement]) -> tuple[Integers, Floats, Floats]:
@@ -491,8 +521,56 @@ def stretching_of(rig: Rig) -> Floats:
     return slopes.T @ (weights[:, None] * slopes)
 
 
+@dataclass(frozen=True, eq=False)
+class _Drives:
+    """Forces of the actuators on substeps.
+
+    Attributes:
+        driven: (n_actuators,) which of them are ever at work.
+        starts, ends: (n_driven, n_samples * substeps) of what runs straight over each substep as their forces do.
+        at_samples: (n_actuators, n_samples) all forces.
+    """
+
+    driven: Flags
+    starts: Floats
+    ends: Floats
+    at_samples: Floats
+
+
+class _Signals:
+    """Signals that never change, as a key: the array itself, not its values."""
+
+    def __init__(self, values: Floats) -> None:
+        self.values = values
+
+    def __hash__(self) -> int:
+        return id(self.values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Signals) and self.values is other.values
+
+
+def _drives(
+    actuators: tuple[Actuator, ...], inputs: Floats, sample_time: float, substeps: int, input_hold: str
+) -> _Drives:
+    """Remembered for the inputs of a record, which nobody can write to: structure and sensors change more often."""
+    is_lasting = inputs.base is None and not inputs.flags.writeable
+    known = _known_drives if is_lasting and inputs.size * substeps <= MOST_KEPT else _known_drives.__wrapped__
+    return known(actuators, _Signals(inputs), sample_time, substeps, input_hold)
+
+
+@lru_cache(maxsize=DRIVES_KEPT)
+def _known_drives(
+    actuators: tuple[Actuator, ...], inputs: _Signals, sample_time: float, substeps: int, input_hold: str
+) -> _Drives:
+    on_substeps = _forces_on_substeps if input_hold == "zero" else _straight_forces_on_substeps
+    starts, ends, at_samples = on_substeps(actuators, inputs.values, sample_time, substeps)
+    driven = np.logical_or(starts.any(axis=1), ends.any(axis=1))
+    return _Drives(driven, starts[driven], ends[driven], at_samples)
+
+
 def _forces_on_substeps(
-    rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int
+    actuators: tuple[Actuator, ...], inputs: np.ndarray, sample_time: float, substeps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What runs straight over each substep as each actuator's force does, start and end, and the force at each sample.
 
@@ -503,7 +581,7 @@ def _forces_on_substeps(
     rise = np.zeros_like(fine)  # half of it, over a substep
     now = np.empty_like(inputs)
     h = sample_time / substeps
-    for j, actuator in enumerate(rig.actuators):
+    for j, actuator in enumerate(actuators):
         held = np.repeat(actuator_force(actuator, inputs[j]), substeps)
         start = held
         if np.isfinite(actuator.rate_limit):
@@ -521,13 +599,13 @@ def _forces_on_substeps(
 
 
 def _straight_forces_on_substeps(
-    rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int
+    actuators: tuple[Actuator, ...], inputs: np.ndarray, sample_time: float, substeps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The same of inputs that run straight from sample to sample; after the last it stays."""
     h, n = sample_time / substeps, inputs.shape[1]
     time = h * np.arange(n * substeps + 1)
     edges = np.empty((inputs.shape[0], time.size))
-    for j, actuator in enumerate(rig.actuators):
+    for j, actuator in enumerate(actuators):
         force = np.interp(time, sample_time * np.arange(n), actuator_force(actuator, inputs[j]))
         if np.isfinite(actuator.rate_limit):
             _, start = stepping.ramped(np.r_[force[1:], force[-1]], actuator.rate_limit * h)

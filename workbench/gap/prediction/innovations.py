@@ -18,6 +18,7 @@ from workbench.structure.modes import Modes
 LOOSE = 0.01  # of the inputs: random forces that hold a rig beside the records
 DOUBLINGS = 12  # of the samples over which a corrected motion is seen to die away: eight are enough for most
 RUN_AWAY = 1e100  # squared norm of a power, whose square is a number still
+KEPT = 8  # rigs, as followers see them, that are remembered from record to record
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,14 +105,14 @@ class Follower:
             sample_time: s.
             substeps: of a sample, where damping couples the modes.
         """
-        sensors = tuple(Sensor(s.name, s.at, s.quantity, gain=s.gain, direction=s.direction) for s in rig.sensors)
-        bare = replace(rig, actuators=(), elements=(), sensors=sensors)
+        bare = _bare(rig)
         gain, no_inputs = self._gain_for(rig, sample_time), np.zeros((0, left.shape[1]))
         substeps = 1 if rig.modes.proportional else substeps
         errors = follow(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
         white: Floats = self.whitening @ errors
         return white
 
+    @lru_cache(maxsize=KEPT)  # noqa: B019  a follower is a few arrays
     def _gain_for(self, rig: Rig, sample_time: float) -> np.ndarray:
         """The gain, with none for modes that are more than it knows of.
 
@@ -126,6 +127,13 @@ class Follower:
             if _runs_away(rig, gain, sample_time):
                 gain[:] = 0.0
         return gain
+
+
+@lru_cache(maxsize=KEPT)
+def _bare(rig: Rig) -> Rig:
+    """The rig with nothing but its structure, and sensors that read as they should."""
+    sensors = tuple(Sensor(s.name, s.at, s.quantity, gain=s.gain, direction=s.direction) for s in rig.sensors)
+    return replace(rig, actuators=(), elements=(), sensors=sensors)
 
 
 def _alike(one: Sensor, other: Sensor) -> bool:
@@ -163,6 +171,7 @@ def _step_of(modes: Modes, sample_time: float) -> Floats:
     return step
 
 
+@lru_cache(maxsize=KEPT)
 def _unrounded(rig: Rig) -> Rig:
     """The rig itself where no sensor rounds."""
     if not any(sensor.step for sensor in rig.sensors):
@@ -170,6 +179,7 @@ def _unrounded(rig: Rig) -> Rig:
     return replace(rig, sensors=tuple(replace(s, step=0.0) if s.step else s for s in rig.sensors))
 
 
+@lru_cache(maxsize=KEPT)
 def _at_once(rig: Rig) -> Rig:
     """The rig itself where no sensor is late, lags or clips."""
     if not any(
