@@ -1,10 +1,15 @@
 """The library keeps linear algebra to one thread while it works, and gives back what it found."""
 
+import os
+import sys
+import time
+
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import workbench as wb
+from workbench.gap.prediction.workers import Workers
 from workbench.threads import one_blas_thread
 
 
@@ -45,3 +50,18 @@ def test_a_structure_is_solved_by_one(two, monkeypatch):
     beam = wb.Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
     np.testing.assert_allclose(beam.modes(3).omega, (np.pi * np.arange(1, 4)) ** 2, rtol=1e-9)
     assert seen and all(each == {1} for each in seen)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a diagnosis forks on Linux alone, where /proc counts threads")
+def test_a_forked_process_starts_no_threads_that_nobody_asks_for(two):
+    beam = wb.Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
+    beam.modes(3)
+
+    def solved(_: int) -> tuple[int, int]:
+        time.sleep(0.02)  # so that both processes take some
+        beam.modes(3)
+        return os.getpid(), len(os.listdir("/proc/self/task"))
+
+    found = dict(one_blas_thread(Workers(2).map)(solved, range(8)))
+    found.pop(os.getpid(), None)
+    assert list(found.values()) == [1]

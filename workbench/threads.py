@@ -4,6 +4,7 @@ With a second process on the machine, OpenBLAS's threads spin for one another: s
 took 76 s of processor time with two threads and 7 s with one, 154 s and 10 s by the clock.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -41,6 +42,9 @@ class _Limit:
     def __init__(self) -> None:
         self._lock, self._holders = Lock(), 0
         self._end: Callable[[], None] = lambda: None
+        if hasattr(os, "register_at_fork"):  # a lock that another thread holds would never open in the forked process
+            release = self._lock.release
+            os.register_at_fork(before=self._lock.acquire, after_in_parent=release, after_in_child=release)
 
     @contextmanager
     def held(self) -> Iterator[None]:
