@@ -102,9 +102,9 @@ def plant(index, seed, searched=False):
         "unexplained": possible.unexplained,
         "stable draws": found.proof.share_stable,
         "safe": found.safe,
-        "pays": found.pays,
-        "pays, no more work": bounded.pays,
-        "steps": [s.name for s in found.steps if s.kept] if found.pays else [],
+        "pays": found.improves,
+        "pays, no more work": bounded.improves,
+        "steps": [s.name for s in found.steps if s.kept] if found.improves else [],
         "sentence": found.sentence,
         **told,
     }

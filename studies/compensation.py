@@ -70,7 +70,7 @@ def plant(index, seed):
         told[name] = {
             "present": _figures(controlled(hidden, found.present)),
             "redesigned": _figures(controlled(hidden, found.redesigned)),
-            "pays": found.pays,
+            "pays": found.improves,
             "steps": [s.name for s in found.steps if s.kept],
         }
     told["saturation"]["soonest"] = _soonest(real, nominal.present, struck, test, free)

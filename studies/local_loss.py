@@ -111,21 +111,21 @@ def row(hidden: Hidden, found: LocatedDamage, level_db: float) -> dict:
     """What was found beside what is there."""
     x = CHECKED[np.abs(np.abs(CHECKED - hidden.centre) - 0.5 * WIDTH) > 0.01]
     low, high = found.best.stiffness.band(x)
-    loss, truth = found.lossy.loss, np.array([hidden.share, hidden.centre, WIDTH])
+    loss, truth = found.damaged.loss, np.array([hidden.share, hidden.centre, WIDTH])
     limits = found.interval()
     return {
         "kind": hidden.kind,
         "ends": f"{hidden.left}-{hidden.right}",
         "seed": hidden.seed,
         "level_db": level_db,
-        "found": found.found,
-        "evidence": found.evidence,
+        "found": found.detected,
+        "evidence": found.statistic,
         "explains": found.best.explains,
         "centre": hidden.centre,
         "error": abs(loss.centre - hidden.centre),
         "share": loss.share,
         "width": loss.width,
-        "standard_error": float(np.sqrt(found.lossy.covariance[-2, -2])),
+        "standard_error": float(np.sqrt(found.damaged.covariance[-2, -2])),
         "inside": ((limits[:, 0] <= truth) & (truth <= limits[:, 1])).tolist(),
         "terms": found.best.n_terms,
         "stiffness_inside": float(((low <= hidden.stiffness(x)) & (hidden.stiffness(x) <= high)).mean()),

@@ -11,6 +11,7 @@ FLOORS = {
     "arguments": -1,
     "arrays": -1,
     "deadline": -1,
+    "renamed": -1,
     "threads": -1,
     "structure": 0,
     "records": 1,

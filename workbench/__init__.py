@@ -79,7 +79,7 @@ RENAMED = {
     "finite_spillover": "design.spillover.spillover.finite_spillover",
     "free_decay": "identification.signal.synthesis.free_decay",
     "hermite_filter": "design.estimation.modal_filter.hermite_filter",
-    "how_many_modes": "design.placement.how_many.how_many_modes",
+    "how_many_modes": "design.placement.controlled_modes.controlled_mode_count",
     "impulse_record": "records.transfer_functions.impulse_record",
     "judge": "design.spillover.performance.performance",
     "judge_on_off": "design.spillover.performance.on_off_performance",

@@ -113,7 +113,9 @@ def test_identify_reads_transfer_functions(tmp_path):
     modes = json.loads(found.read_text())
     scores = (np.array(modes["frequencies_hz"]) - [8.0, 19.0]) / modes["frequencies_std_hz"]
     assert np.abs(scores).max() < 4.0 and modes["sensors"] == ["H 1", "H 2", "H 3"]
-    assert modes["full_hz"] == [] and not any(modes["doubtful"]) and "stopped at its limit" not in result.output
+    assert (
+        modes["order_limited_hz"] == [] and not any(modes["doubtful"]) and "stopped at its limit" not in result.output
+    )
     one = run("identify", path, "--outputs", "H 2", "--band-hz", 5, 12, "--json", found)
     assert one.exit_code == 0 and len(json.loads(found.read_text())["frequencies_hz"]) == 1
     few = run("identify", path, "--modes", 1)

@@ -119,7 +119,7 @@ def test_a_damaged_verdict_is_named(run, case, tmp_path, change, said):
         ("--draws", 0, "greater than or equal"),
         ("--draws", 10**9, "less than or equal to 10000"),
         ("--seed", -1, "greater than or equal"),
-        ("--aim", "fast", "cost or settling; got 'fast'"),
+        ("--criterion", "fast", "cost or settling; got 'fast'"),
         ("--impulse-at", 9.0, "lies outside the structure"),
         ("--impulse-at", "F9", "or name an input: F1, F2"),
         ("--impulse-at", 0, "moves none of the controlled modes"),

@@ -193,7 +193,7 @@ def test_points_that_disagree_make_one_mode_of_a_crowd():
     found = identify_transfer(h, lines, channels=tuple(Channel(f"p{j}", "acceleration") for j in range(10)))
     assert found.modes.n_modes == 3
     assert np.abs(found.modes.frequencies_hz / CROWDED_HZ - 1.0).max() < 3e-3
-    assert all(found.parts_hz)
+    assert all(found.cluster_hz)
 
 
 def test_close_modes_that_damping_couples_are_two():
@@ -210,7 +210,7 @@ def test_close_modes_that_damping_couples_are_two():
     found = identify_transfer(h, lines, channels=tuple(Channel(f"p{j}", "acceleration") for j in range(8)))
     poles = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [-np.diag(omega**2), -c]]))
     truth = np.sort(np.abs(poles[poles.imag > 0]))
-    assert found.modes.n_modes == 2 and not any(found.parts_hz)
+    assert found.modes.n_modes == 2 and not any(found.cluster_hz)
     assert np.abs(found.modes.omega - truth).max() < 4.0 * found.omega_std.max()
     assert found.modes.phase_collinearity.min() < 0.8
 

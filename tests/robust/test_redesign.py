@@ -109,7 +109,7 @@ def test_a_filter_through_which_residual_modes_diverge_is_made_slower(rig):
     for noise in (1e-7, 1e-9):
         fast = kalman(rig.modes, law, rig.sensors[:2], disturbance=1.0, noise=noise)
         found = redesign(possible(rig), fast, sample_time=DT, impulse_at=0.8, draws=2, placement=False)
-        assert found.pays and found.safe and "the present one on 0" in found.advice
+        assert found.improves and found.safe and "the present one on 0" in found.advice
         assert "otherwise unstable" in found.steps[1].what and found.steps[0].lost == "diverges"
         assert not control_plant(plant, found.present, n_samples=1500, struck="F1").stable
         assert control_plant(plant, found.redesigned, n_samples=1500, struck="F1").stable
@@ -154,17 +154,17 @@ def test_the_present_controller_is_kept_where_the_redesigned_does_no_better(
     sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
     present = told([True, True], [1.0, 1.0], [-1.0, -1.0])  # damping takes energy out
     found = replace(sure, present_proof=present, proof=told(stable, vibration, np.negative(work)), weight=0.5)
-    assert replace(found, more_work=np.inf).pays or max(vibration) > 0.99
+    assert replace(found, more_work=np.inf).improves or max(vibration) > 0.99
     found = replace(found, more_work=0.05)
-    assert found.pays is pays
+    assert found.improves is pays
     assert found.controller is (found.redesigned if pays else found.present)
     assert ("Keep the present controller" in found.sentence) is not pays
     assert found.advice.startswith("Use the redesigned" if pays else "Keep the present") and "inf" not in found.advice
     if max(vibration) < 1.0 and not pays:  # it is better, for more work: the sentence says how much to allow
         allowed = float(re.search(r"more_work = (\S+) allows it", found.sentence)[1])
-        assert replace(found, more_work=allowed).pays and not replace(found, more_work=allowed - 0.02).pays
+        assert replace(found, more_work=allowed).improves and not replace(found, more_work=allowed - 0.02).improves
     back = replace(sure, present_proof=found.proof, proof=present, weight=0.5)
-    assert back.pays or pays or stable == [True, True], "more stable draws come first"
+    assert back.improves or pays or stable == [True, True], "more stable draws come first"
 
 
 def test_a_law_is_judged_by_what_it_is_for(rig, controller):
@@ -172,7 +172,7 @@ def test_a_law_is_judged_by_what_it_is_for(rig, controller):
     law = plain_law("poles", rig, 2, damping=0.2)
     found = redesign(possible(rig), law, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
     by_weight = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
-    assert (found.aim, by_weight.aim) == ("settling", "cost")
+    assert (found.criterion, by_weight.criterion) == ("settling", "cost")
     one = np.ones(2)
     present = told([True, True], one, -one)
 
@@ -181,22 +181,22 @@ def test_a_law_is_judged_by_what_it_is_for(rig, controller):
         return replace(result, present_proof=present, proof=proof, weight=1.0)
 
     later = judged(found, 0.5, 1.2, 1.0)
-    assert not later.pays and judged(by_weight, 0.5, 1.2, 1.0).pays
+    assert not later.improves and judged(by_weight, 0.5, 1.2, 1.0).improves
     sooner = judged(found, 1.1, 0.7, 1.1)
-    assert sooner.pays and not judged(by_weight, 1.1, 0.7, 1.1).pays
+    assert sooner.improves and not judged(by_weight, 1.1, 0.7, 1.1).improves
     assert "settles the controlled modes in 0.7 s where the present one settles them in 1 s" in sooner.advice
     assert "for 1.1 times the effort (medians); it does better on 2 of 2 samples" in sooner.advice
     dear = judged(found, 1.0, 0.9, 1.5)
-    assert not dear.pays and "costs 20 % more, time and effort taken together: more_cost = 0.2" in dear.advice
+    assert not dear.improves and "costs 20 % more, time and effort taken together: more_cost = 0.2" in dear.advice
     asked = redesign(
-        possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False, aim="settling"
+        possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False, criterion="settling"
     )
-    assert asked.aim == "settling" and not judged(asked, 0.5, 1.2, 1.0).pays
+    assert asked.criterion == "settling" and not judged(asked, 0.5, 1.2, 1.0).improves
     with pytest.raises(ValueError, match="cost or settling; got 'speed'"):
-        redesign(possible(rig), controller, sample_time=DT, aim="speed")
+        redesign(possible(rig), controller, sample_time=DT, criterion="speed")
     short = LoopTest(100, DT, 0.8)
     cut = redesign(possible(rig), law, test=short, draws=1, placement=False)
-    assert cut.aim == "cost" and "give a longer test" in cut.notes[0]
+    assert cut.criterion == "cost" and "give a longer test" in cut.notes[0]
 
 
 def test_settling_and_effort_cost_least_where_the_poles_are_asked_for(rig):
@@ -327,7 +327,8 @@ def test_relays_that_a_dead_zone_silences_are_made_to_act_again(rig):
     sticking = possible(rig, effect("actuator_dead_zone", "all", width=0.9 * max(r.force for r in law.relays)))
     found = redesign(sticking, law, test=LoopTest(2500, DT, 0.8, 0.5, seed=0), draws=2, placement=False)
     assert found.after.effort > 1.5 * found.before.effort and found.weight == 0.0
-    assert found.pays and found.advice.startswith("Use the redesigned controller: it settles the controlled modes in")
+    assert found.improves
+    assert found.advice.startswith("Use the redesigned controller: it settles the controlled modes in")
     assert "for some instead of no effort" in found.advice and "some instead of no work" in found.sentence
 
 

@@ -31,9 +31,11 @@ def redesign(
         float | None, typer.Option("--rate-hz", help="Rate of the controller; that of the records unless given.")
     ] = None,
     impulse_at: options.ImpulseAt = None,
-    aim: Annotated[
+    criterion: Annotated[
         str | None,
         typer.Option(
+            "--criterion",
+            "--aim",
             metavar="cost|settling",
             help="What the controllers are judged by: the cost of the LQR, or settling and effort; by the law's kind"
             " unless given.",
@@ -70,15 +72,15 @@ def redesign(
     from workbench.design.export.export import check_name
     from workbench.design.laws.law import controlled_indices
     from workbench.robust.on_rig import Design, impulse_test
-    from workbench.robust.redesign import AIMS
+    from workbench.robust.redesign import CRITERIA
     from workbench.robust.redesign import redesign as run
     from workbench.study.pages.redesign_page import redesign_page
 
     check_target(json_path, to)
     if to is not None:
         check_name(to)
-    if aim not in (None, *AIMS):
-        raise ValueError(f"--aim is {' or '.join(AIMS)}; got {aim!r}")
+    if criterion not in (None, *CRITERIA):
+        raise ValueError(f"--criterion is {' or '.join(CRITERIA)}; got {criterion!r}")
     check_rate(rate_hz)
     found = read_case(case)
     rig, records = found.rig, (*found.fit, *found.validation)
@@ -102,13 +104,13 @@ def redesign(
             test=test,
             draws=draws,
             seed=seed,
-            aim=aim,
+            criterion=criterion,
             more_cost=more_cost,
             more_work=more_work,
             report=lambda what, share: report(what, 0.7 + 0.3 * share),
         )
-    say(f"{result.advice} {result.promise}".rstrip(), bold=True)
-    say(result.figures)
+    say(f"{result.advice} {result.guarantee}".rstrip(), bold=True)
+    say(result.comparison)
     steps = [(step.name, step.what, step.lost, "yes" if step.kept else "no") for step in result.steps]
     show_table(("step", "what", "loss", "kept"), steps)
     if result.relocation is not None:
@@ -118,7 +120,7 @@ def redesign(
     write_json(json_path, result.to_json())
     if to is not None:
         names = " and ".join(short(path) for path in result.export(to))
-        say(f"  controller {names}: {'the redesigned one' if result.pays else 'the present one, which is kept'}")
+        say(f"  controller {names}: {'the redesigned one' if result.improves else 'the present one, which is kept'}")
     target = page or Path("out") / f"{found.name}-redesign.html"
     shown = (found.validation or found.fit)[0]
     target = redesign_page(result, target, name=found.name, record=shown, folder=case, made_by=as_typed())

@@ -10,7 +10,7 @@ from matplotlib.ticker import NullFormatter
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.on_off_response import Switched
-from workbench.design.placement.how_many import HowMany
+from workbench.design.placement.controlled_modes import ControlledModeCount
 from workbench.design.placement.placement import Placement
 from workbench.design.placement.velocity_feedback import FeedbackPlacement
 from workbench.design.spillover.explain import Explanation
@@ -228,13 +228,13 @@ def plot_sensor_counts(margins: dict[str, np.ndarray], counts: dict[str, int | N
     return figure
 
 
-def plot_how_many(found: dict[str, HowMany], share: float | None = None) -> Figure:
+def plot_controlled_mode_count(found: dict[str, ControlledModeCount], share: float | None = None) -> Figure:
     """Energy left of each disturbance when the lowest n modes are controlled: in the others, and by spillover."""
     figure, axes = new_figure(1, len(found), width=11, height=4.5, sharey=True, squeeze=False)
     for ax, (name, result) in zip(axes[0], found.items(), strict=True):
-        untouched, spilled = result.untouched / result.energy.sum(), result.spilled / result.energy.sum()
-        ax.bar(result.counts, untouched, color=COLOURS[0], label="in residual modes")
-        ax.bar(result.counts, spilled, bottom=untouched, color=COLOURS[1], label="spillover")
+        uncontrolled, spilled = result.uncontrolled / result.energy.sum(), result.spillover / result.energy.sum()
+        ax.bar(result.counts, uncontrolled, color=COLOURS[0], label="in residual modes")
+        ax.bar(result.counts, spilled, bottom=uncontrolled, color=COLOURS[1], label="spillover")
         if share is not None:
             ax.axhline(share, color=GREY, linestyle="--", label=f"{share:.0%} may be left")
         if result.recommended:

@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.loop.closed_loop import Response
-from workbench.design.placement.how_many import HowMany
+from workbench.design.placement.controlled_modes import ControlledModeCount
 from workbench.design.placement.sensor_placement import SensorPlacement
 from workbench.design.placement.task import Placement
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.accuracy import plot_bands
-from workbench.draw.design import plot_how_many, plot_motion, plot_spillover_paths, plot_work
+from workbench.draw.design import plot_controlled_mode_count, plot_motion, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.robust import plot_prediction, plot_redesign
 from workbench.draw.sensors import plot_sensor_placement
@@ -46,8 +46,8 @@ MOST_INSTANTS = 5
 @singledispatch
 def plot(result: object) -> Figure:
     """A figure of a result: `Record`, `Modes`, `SampledModes`, estimates of modes, `Refined`, `Bands`, `Response`,
-    `Spillover`, `Explanation`, `HowMany`, `Placement`, `SensorPlacement`, `ModalFilter`, `Distortion`, `Verdict`,
-    `Redesign` or `Prediction`.
+    `Spillover`, `Explanation`, `ControlledModeCount`, `Placement`, `SensorPlacement`, `ModalFilter`, `Distortion`,
+    `Verdict`, `Redesign` or `Prediction`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -126,7 +126,9 @@ plot.register(SensorPlacement, plot_sensor_placement)
 plot.register(ModalEstimates, lambda result: plot(result.modes))
 plot.register(Bands, lambda result: plot_surface_bands(result) if result.x.ndim == 2 else plot_bands(result))
 plot.register(Spillover, lambda result: plot_work({"this design": result}))
-plot.register(HowMany, lambda result: plot_how_many({"energy left of this disturbance": result}))
+plot.register(
+    ControlledModeCount, lambda result: plot_controlled_mode_count({"energy left of this disturbance": result})
+)
 plot.register(Distortion, lambda result: plot_distortion([result]))
 
 

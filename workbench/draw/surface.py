@@ -67,8 +67,8 @@ def plot_surface_modes(
     if _held_edges(x, y, fields):
         handles.append(Line2D([], [], color=COLOURS[6], linewidth=4, label="edge that is held"))
     if places is not None:
-        told = "sensor" if values is None else "sensor, in the colour of what was found there"
-        handles.append(Line2D([], [], **DOT, label=told))
+        label = "sensor" if values is None else "sensor, in the colour of what was found there"
+        handles.append(Line2D([], [], **DOT, label=label))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
     return figure
 

@@ -24,6 +24,7 @@ from workbench.identification.signal.modal_estimates import SURE, ParticipatingM
 from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel
+from workbench.renamed import Renamed
 from workbench.rig.sensors import MEASURED
 from workbench.structure.domain import place_array
 from workbench.structure.modes import SampledModes, frozen
@@ -61,12 +62,12 @@ class TransferModes(ParticipatingModes):
             none was stated, of real and imaginary part each, in the unit of the output.
         evidence: (n_modes,) χ² of each mode in the noise.
         converged: whether the search ended because the step was small.
-        parts_hz: of each mode the other members of its cluster (`peak_shape`), Hz: points measured one after
+        cluster_hz: of each mode the other members of its cluster (`peak_shape`), Hz: points measured one after
             another are inconsistent there, or the mode drifts or depends on amplitude.
         scatter_hz: (n_modes,) rms by which the frequency of a mode scatters where its peak is not that of one pole
             (`peak_shape`), Hz; else 0: it drifts, depends on amplitude, or a window blurs it.
-        full_hz: bands (lowest, highest line) in which the search stopped at the most modes allowed: the residual is
-            not noise there; modes are missing, or the points are inconsistent.
+        order_limited_hz: bands (lowest, highest line) in which the search stopped at the most modes allowed: the
+            residual is not noise there; modes are missing, or the points are inconsistent.
         fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
         frequencies_hz: (n_frequencies,) those lines.
         remarks: what is doubtful, and what was left undone where the time was up.
@@ -75,12 +76,14 @@ class TransferModes(ParticipatingModes):
     misfit: np.ndarray
     evidence: np.ndarray
     converged: bool
-    parts_hz: tuple[tuple[float, ...], ...]
+    cluster_hz: tuple[tuple[float, ...], ...]
     scatter_hz: np.ndarray
-    full_hz: tuple[tuple[float, float], ...]
+    order_limited_hz: tuple[tuple[float, float], ...]
     fitted: np.ndarray
     frequencies_hz: np.ndarray
     remarks: tuple[str, ...] = ()
+
+    parts_hz, full_hz = Renamed("cluster_hz"), Renamed("order_limited_hz")
 
 
 def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:
@@ -235,7 +238,7 @@ def _modes_of(
     budget: Budget,
 ) -> TransferModes:
     """The modes of a band between its edges; the fit at the lines shown."""
-    fit, parts_hz = _clustered(lines, selected, channels)
+    fit, cluster_hz = _clustered(lines, selected, channels)
     found = peaks(lines, fit)
     scatter = np.where(found.uneven, found.scatter, 0.0)
     for pole, by in lines.changing:
@@ -265,9 +268,9 @@ def _modes_of(
         misfit=frozen(lines.misfit(fit)),
         evidence=frozen([evidence_of(fit, int(r)) for r in inside]),
         converged=fit.converged,
-        parts_hz=tuple(parts_hz[r] for r in inside),
+        cluster_hz=tuple(cluster_hz[r] for r in inside),
         scatter_hz=frozen(scatter[inside] / (2.0 * np.pi)),
-        full_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if selected.full else (),
+        order_limited_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if selected.full else (),
         fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
         frequencies_hz=frozen(shown_hz),
         remarks=(f"left out, as negatively damped or of unknown frequency: poles at {out} Hz",) if out else (),
@@ -296,14 +299,14 @@ def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) ->
     seen = SampledModes.of_poles(fit.poles, shapes, _places(channels))
     parts = parts_of(fit.poles, seen.phase_collinearity, selected.evidence)
     kept = np.setdiff1d(np.arange(fit.poles.size), [r for each in parts.values() for r in each])
-    parts_hz = [tuple(sorted(fit.poles.imag[parts.get(int(r), [])] / (2.0 * np.pi))) for r in kept]
+    cluster_hz = [tuple(sorted(fit.poles.imag[parts.get(int(r), [])] / (2.0 * np.pi))) for r in kept]
     if not parts:
-        return fit, parts_hz
+        return fit, cluster_hz
     middle = fit.poles.copy()
     for r, others in parts.items():
         cluster = [r, *(k for k in others if np.abs(fit.poles.real[k]) < PEAKS.narrow * np.abs(fit.poles.real[r]))]
         middle[r] = np.average(fit.poles[cluster], weights=selected.evidence[cluster])
-    return settled(lines, projected(lines, middle[kept], fit.participation[kept])), parts_hz
+    return settled(lines, projected(lines, middle[kept], fit.participation[kept])), cluster_hz
 
 
 def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> TransferModes:
@@ -324,9 +327,9 @@ def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> Tr
         misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in found]) ** 2)),
         evidence=frozen(np.concatenate([band.evidence for band in found])),
         converged=all(band.converged for band in found),
-        parts_hz=tuple(parts for band in found for parts in band.parts_hz),
+        cluster_hz=tuple(parts for band in found for parts in band.cluster_hz),
         scatter_hz=frozen(np.concatenate([band.scatter_hz for band in found])),
-        full_hz=tuple(full for band in found for full in band.full_hz),
+        order_limited_hz=tuple(full for band in found for full in band.order_limited_hz),
         fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
         frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
         remarks=tuple(remark for band in found for remark in band.remarks),

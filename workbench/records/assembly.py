@@ -282,7 +282,7 @@ def _of_times(path: Path, time: np.ndarray, *, mend: bool) -> Sampling:
 
 
 def _is_steady(time: np.ndarray, step: float) -> bool:
-    """Whether all steps are so near one that they are near their median too; told without a copy of a long record."""
+    """Whether all steps are so near one that they are near their median too; seen without a copy of a long record."""
     parts = (time[first : first + PART + 1] for first in range(0, time.size - 1, PART))
     return all((np.abs(np.diff(part) - step) <= 0.4 * UNIFORM * step).all() for part in parts)
 

@@ -187,10 +187,10 @@ class UncertainRig:
         for what, own in _nominal_json(nominal).items():
             if what in LATER and what not in written["nominal"]:
                 continue
-            told = written["nominal"][what]
-            if not _alike(told, own):
+            stated = written["nominal"][what]
+            if not _alike(stated, own):
                 raise ValueError(
-                    f"the verdict is of another rig: its {what.replace('_', ' ')} are {_listed(told)}, and here"
+                    f"the verdict is of another rig: its {what.replace('_', ' ')} are {_listed(stated)}, and here"
                     f" {_listed(own)}; diagnose this case again"
                 )
         effects = tuple(_effect(nominal, kinds[entry["kind"]], entry) for entry in written["effects"])
@@ -214,10 +214,10 @@ def _nominal_json(rig: Rig) -> dict[str, list[Any]]:
     }
 
 
-def _alike(told: Sequence[Any], own: Sequence[Any]) -> bool:
+def _alike(stated: Sequence[Any], own: Sequence[Any]) -> bool:
     if own and isinstance(own[0], float):
-        return len(told) == len(own) and bool(np.allclose(told, own, rtol=1e-6))
-    return list(told) == list(own)
+        return len(stated) == len(own) and bool(np.allclose(stated, own, rtol=1e-6))
+    return list(stated) == list(own)
 
 
 def _listed(values: Sequence[Any]) -> str:

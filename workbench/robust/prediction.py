@@ -148,8 +148,8 @@ def predict(
         truths.append(truth)
     time = np.asarray(start + period * np.arange(n_samples), float)
     name = inputs.name if isinstance(inputs, Record) else "prediction"
-    told = _banded(found, found.rig, truths, time, spread, rng, name)
-    return replace(told, notes=(*told.notes, *_too_fast(found.rig.modes, period)))
+    banded = _banded(found, found.rig, truths, time, spread, rng, name)
+    return replace(banded, notes=(*banded.notes, *_too_fast(found.rig.modes, period)))
 
 
 def _too_fast(modes: Modes, period: float) -> tuple[str, ...]:

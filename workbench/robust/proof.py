@@ -165,7 +165,7 @@ def verify(
     if strange:
         raise ValueError(f"controlled are modes 0 to {n_modes - 1} of the rigs, counted from zero; got {strange[0]}")
 
-    def told(rig: Rig, run: LoopRun) -> _Draw:
+    def drawn(rig: Rig, run: LoopRun) -> _Draw:
         poles, energy = loop_poles(rig, controller, modes_in_motion(rig, run)), run.response.energy
         with np.errstate(over="ignore", invalid="ignore"):
             total = energy.sum(axis=0)
@@ -181,7 +181,7 @@ def verify(
                 of_controlled=energy[index].sum(axis=0) if index else total,
             )
 
-    found = _Draw(*(list(values) for values in zip(*of_loops(rigs, controller, test, told))))
+    found = _Draw(*(list(values) for values in zip(*of_loops(rigs, controller, test, drawn))))
     margin, frequency = small_gain_margin(
         centre, controller, modes_in_motion(centre, run_loop(centre, controller, test))
     )

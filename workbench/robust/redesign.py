@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from warnings import warn
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, named, run_loop
 from workbench.gap.report.verdict import Verdict
+from workbench.renamed import Renamed
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
@@ -31,8 +33,8 @@ from workbench.threads import one_blas_thread
 Report = Callable[[str, float], None]
 
 AWAY = 1e3  # a loss from which on the motion is said to diverge
-LEAST_TOLD = 1e-4  # a loss below which its size says nothing
-PAYS = 0.005  # of the loss: what a step must take away; of the cost: less is no reason to change the controller
+LEAST_SHOWN = 1e-4  # a loss below which its size says nothing
+GAINED = 0.005  # of the loss: what a step must take away; of the cost: less is no reason to change the controller
 WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
 SLOWER = (1.0, 2.0, 5.0, 10.0)  # of the readings of its Kalman filter: noise over its own
 SOFTER = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the forces of a law that is unstable as it is designed: weight over its own
@@ -40,7 +42,7 @@ SLOWEST = tuple(10.0**k for k in np.arange(0.0, 9.1, 0.5))  # of the readings of
 SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # of the readings of a Kalman filter: noise over its own
 MORE_COST = 0.01  # of the present one's: what counts as no more
 AS_MUCH = "as much"
-AIMS = ("cost", "settling")  # what a law can be for
+CRITERIA = ("cost", "settling")  # what a law can be for
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class Step:
             kept before: of the vibration of controlled modes, of that of residual modes (over that of all modes), and
             of the effort, as shares; none is below zero, so that a gain in one makes up for no loss in another.
         loss: their sum.
-        cost: J / J₀ - 1, J₀ that of the same perfect loop; see `Redesign.aim`. Below zero the loop does better.
+        cost: J / J₀ - 1, J₀ that of the same perfect loop; see `Redesign.criterion`. Below zero the loop does better.
         kept: whether it paid.
     """
 
@@ -78,8 +80,8 @@ class Step:
     @property
     def lost(self) -> str:
         """The loss in words."""
-        if 0.0 < self.loss < LEAST_TOLD:
-            return f"below {100.0 * LEAST_TOLD:g} %"
+        if 0.0 < self.loss < LEAST_SHOWN:
+            return f"below {100.0 * LEAST_SHOWN:g} %"
         return "diverges" if self.diverges else f"{100.0 * self.loss:.3g} %"
 
 
@@ -97,8 +99,8 @@ class Redesign:
         before, after: the present and the redesigned controller on the corrected rig under test.
         present_proof, proof: both on the same draws.
         weight: ρ of the cost J; 0 for on-off control.
-        aim: what the law is for. "cost": J = 2 ∫ energy dt + ρ ∫ FᵀF dt, with ρ such that both terms are equal over
-            the controlled modes where actuators and sensors are perfect; "settling": J = t + ρ ∫ FᵀF dt with t the
+        criterion: what the law is for. "cost": J = 2 ∫ energy dt + ρ ∫ FᵀF dt, with ρ such that both terms are equal
+            over the controlled modes where actuators and sensors are perfect; "settling": J = t + ρ ∫ FᵀF dt with t the
             settling time of the controlled modes, at most that of the test, and ρ such that both are equal there.
         more_cost, more_work: shares by which the redesigned controller may cost more, J, and do more work, W, than the
             present one.
@@ -118,14 +120,17 @@ class Redesign:
     present_proof: Verification
     proof: Verification
     weight: float
-    aim: str = "cost"
+    criterion: str = "cost"
     more_cost: float = MORE_COST
     more_work: float = np.inf
     relocation: Relocation | None = None
     notes: tuple[str, ...] = ()
 
+    pays, aim = Renamed("improves"), Renamed("criterion")
+    promise, figures = Renamed("guarantee"), Renamed("comparison")
+
     @cached_property
-    def pays(self) -> bool:
+    def improves(self) -> bool:
         """Whether the redesigned controller does better than the present one, draw by draw.
 
         It is stable on more of the draws; or on as many, and on those that both keep stable it costs less or settles
@@ -162,12 +167,12 @@ class Redesign:
 
     def _settling(self, proof: Verification) -> np.ndarray:
         """Settling time of each draw (n_draws,), s: of the controlled modes where the law is for it."""
-        return proof.settling if self.aim == "cost" else proof.controlled_settling
+        return proof.settling if self.criterion == "cost" else proof.controlled_settling
 
     @property
     def _more(self) -> str:
         """What it takes more than is allowed, in words; empty for nothing."""
-        together = f"costs {{}} more, {'vibration' if self.aim == 'cost' else 'time'} and effort taken together"
+        together = f"costs {{}} more, {'vibration' if self.criterion == 'cost' else 'time'} and effort taken together"
         said = together, "takes {} more work"
         over = zip(said, np.array(self._over) - 1.0, ("cost", "work"), (self.more_cost, self.more_work))
         return ", and ".join(
@@ -191,7 +196,7 @@ class Redesign:
     def _cost(self, proof: Verification) -> np.ndarray:
         """J of each draw (n_draws,); inf where it is not stable."""
         settles = np.minimum(proof.controlled_settling, self.test.time[-1])
-        cost = 2.0 * proof.vibration if self.aim == "cost" else np.array(settles)
+        cost = 2.0 * proof.vibration if self.criterion == "cost" else np.array(settles)
         if self.weight:  # relays have none, and an effort may be infinite
             cost = cost + self.weight * proof.effort
         return np.asarray(np.where(proof.stable, cost, np.inf))
@@ -202,12 +207,12 @@ class Redesign:
 
     @property
     def controller(self) -> DigitalController:
-        """The one to use: the redesigned where it pays, else the present one."""
-        return self.redesigned if self.pays else self.present
+        """The one to use: the redesigned where it helps, else the present one."""
+        return self.redesigned if self.improves else self.present
 
     @property
     def _used(self) -> Verification:
-        return self.proof if self.pays else self.present_proof
+        return self.proof if self.improves else self.present_proof
 
     @property
     def mode(self) -> int:
@@ -218,11 +223,11 @@ class Redesign:
     @property
     def sentence(self) -> str:
         """The redesign in one sentence."""
-        kept = "" if self.pays and not self._neither else self._kept
-        return " ".join(part for part in (self.figures, kept, self.promise) if part)
+        kept = "" if self.improves and not self._neither else self._kept
+        return " ".join(part for part in (self.comparison, kept, self.guarantee) if part)
 
     @property
-    def figures(self) -> str:
+    def comparison(self) -> str:
         """What both controllers do on the real structure, in one sentence."""
         old, new = self.present_proof, self.proof
         unstable = old.n_draws - int(old.stable.sum())
@@ -280,12 +285,12 @@ class Redesign:
     @property
     def advice(self) -> str:
         """Which controller to use, and what it does after the test."""
-        if not self.pays or self._neither:
+        if not self.improves or self._neither:
             return self._kept
         difference = self._difference
         if self.present_proof.stable.sum() != self.proof.stable.sum():
             return f"Use the redesigned controller: it {difference}."
-        if max(1.0 - self._over[0], self._sooner_by) < PAYS:
+        if max(1.0 - self._over[0], self._sooner_by) < GAINED:
             return f"Either controller does: the redesigned {difference} (medians of the samples of the model)."
         forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
         after, before = (f"{force:.3g} N" for force in forces)
@@ -300,7 +305,7 @@ class Redesign:
         if new.stable.sum() != old.stable.sum():
             stable = _of(int(new.stable.sum()), new.n_draws)
             return f"is stable on {stable} samples, the present one on {int(old.stable.sum()):,}"
-        if self.aim == "settling":
+        if self.criterion == "settling":
             settles, effort = self._settles(new, " the controlled modes"), f"{_times(new.effort, old.effort)} effort"
             settles += f" where the present one {self._settles(old, ' them')}"
             return f"{settles}, for {effort}" if self._sooner else f"takes {effort} and {settles}"
@@ -335,8 +340,8 @@ class Redesign:
         return bool(self._used.stable.all() and (self.possible.explained or holds))
 
     @property
-    def promise(self) -> str:
-        """What can be promised where the gap is not explained; empty where it is."""
+    def guarantee(self) -> str:
+        """What stability is guaranteed where the gap is not explained; empty where it is."""
         if self.possible.explained:
             return ""
         share, margin = self.possible.unexplained, self._used.margin
@@ -374,8 +379,8 @@ class Redesign:
         return {
             "sentence": self.sentence,
             "safe": self.safe,
-            "pays": self.pays,
-            "aim": self.aim,
+            "improves": self.improves,
+            "criterion": self.criterion,
             "controlled": [r + 1 for r in self.controlled],
             "steps": [asdict(s) for s in self.steps],
             "present": self.present_proof.to_json(),
@@ -397,10 +402,11 @@ def redesign(
     draws: int = 200,
     seed: int = 0,
     placement: bool = True,
-    aim: str | None = None,
+    criterion: str | None = None,
     more_cost: float = MORE_COST,
     more_work: float = np.inf,
     report: Report = lambda text, share: None,
+    aim: str | None = None,
 ) -> Redesign:
     """A controller of the same kind, redesigned for the corrected rig, and both verified on the same samples of it.
 
@@ -418,20 +424,24 @@ def redesign(
         draws: possible rigs on which both are proved.
         seed: of the draws and of the sensors' noise.
         placement: whether to look where the actuators should stand instead.
-        aim: what it is judged by, "cost" or "settling", see `Redesign`; unless given "cost" for a law that minimises
-            it, and "settling" for one by poles or on-off.
+        criterion: what it is judged by, "cost" or "settling", see `Redesign`; unless given "cost" for a law that
+            minimises it, and "settling" for one by poles or on-off.
         more_cost: share by which the redesigned controller may cost more than the present one where it settles sooner.
         more_work: share by which it may do more work, W = Σ_r |W_r|: as much as it takes, unless given.
         report: called with (what, share done).
+        aim: former name of `criterion`.
 
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
             of them, or modes that cannot be controlled on the corrected rig.
         TypeError: no verdict, no design, no test, or no number where one is asked for.
-        ValueError: an impulse outside the structure, no draws, an unknown aim, or a share below zero.
+        ValueError: an impulse outside the structure, no draws, an unknown criterion, or a share below zero.
     """
-    if aim not in (None, *AIMS):
-        raise ValueError(f"a controller is judged by {' or '.join(AIMS)}; got {aim!r}")
+    if aim is not None:
+        warn("redesign(aim=...) is now redesign(criterion=...)", DeprecationWarning, 3)
+        criterion = aim
+    if criterion not in (None, *CRITERIA):
+        raise ValueError(f"a controller is judged by {' or '.join(CRITERIA)}; got {criterion!r}")
     for name, share in (("more_cost", more_cost), ("more_work", more_work)):
         if not number(share, name) >= 0:
             raise ValueError(f"{name} is a share of that of the present controller, 0 or more; got {share:g}")
@@ -461,7 +471,7 @@ def redesign(
     steps: tuple[Step, ...]
     for _ in range(2):  # elements are worth another stiffness in the smaller motion of the redesigned loop
         anew = designed_anew(loop, corrected, modes)
-        wanted = aim or ("cost" if _weighted(anew) else "settling")
+        wanted = criterion or ("cost" if _weighted(anew) else "settling")
         redesigned, steps, anew, weight, judged = _compensated(corrected, anew, test, present, wanted)
         after = run_loop(corrected, redesigned, test)
         if not corrected.elements or not after.bounded:
@@ -510,9 +520,9 @@ def _silent(controller: DigitalController) -> DigitalController:
 
 
 def _compensated(
-    rig: Rig, loop: Loop, test: LoopTest, present: DigitalController, aim: str
+    rig: Rig, loop: Loop, test: LoopTest, present: DigitalController, criterion: str
 ) -> tuple[DigitalController, tuple[Step, ...], Loop, float, str]:
-    """The redesigned controller: compensations one after the other, each kept where it pays; then sensors left out.
+    """The redesigned controller: compensations one after the other, each kept where it helps; then sensors left out.
 
     The last that are returned are ρ of the cost and what the law is judged by, see `Redesign`.
     """
@@ -522,15 +532,16 @@ def _compensated(
     loop, softened = _stabilised(perfect, loop, test)
     ideal = run_loop(perfect, compensated(perfect, loop, test.sample_time, ()), test)
     settles, controlled = _settling(ideal, loop.law.controlled), loop.law.controlled
-    aim = aim if settles < test.time[-1] else "cost"  # a test that does not tell how soon judges by vibration
+    if settles >= test.time[-1]:  # a test too short to show how soon it settles judges by vibration
+        criterion = "cost"
     # relays have forces of a given size, which nothing is traded for: they are judged by what they gain alone
-    weight = settles / max(ideal.effort, 1e-300) if aim == "settling" else force_weight(ideal, controlled)
+    weight = settles / max(ideal.effort, 1e-300) if criterion == "settling" else force_weight(ideal, controlled)
     weight = 0.0 if isinstance(loop.law, OnOffLaw) else weight
 
     def costing(run: LoopRun) -> float:
         if not run.bounded:
             return np.inf
-        return weight * run.effort + (_settling(run, controlled) if aim == "settling" else 2.0 * _vibration(run))
+        return weight * run.effort + (_settling(run, controlled) if criterion == "settling" else 2.0 * _vibration(run))
 
     optimum = max(costing(ideal), 1e-300)
 
@@ -555,9 +566,9 @@ def _compensated(
             continue
         trial = compensated(rig, loop, test.sample_time, (*kept, name))
         step = tried(name, what, trial)
-        pays = step.loss < now.loss - PAYS or not np.isfinite(now.loss)
-        steps.append(replace(step, kept=pays))
-        if pays:
+        helps = step.loss < now.loss - GAINED or not np.isfinite(now.loss)
+        steps.append(replace(step, kept=helps))
+        if helps:
             kept.append(name)
             best, now = trial, step
     # a limit holds the effort down: more gain wins vibration back for it, and a slower filter keeps residual modes,
@@ -574,11 +585,11 @@ def _compensated(
         trial = compensated(rig, other, test.sample_time, kept)
         step = tried(name, _tuning(loop, weight_by, noise_by), trial)
         if name == "gain":
-            pays = step.loss < now.loss - PAYS
+            helps = step.loss < now.loss - GAINED
         else:  # no trade: no part may be worse than under the present controller and before
             bearable = np.maximum(now.excess, steps[0].excess)
-            pays = step.cost < now.cost - PAYS and step.loss <= now.loss and bool((step.excess <= bearable).all())
-        if pays and loop_poles(rig, trial, loop.modes).spectral_radius < 1.0:
+            helps = step.cost < now.cost - GAINED and step.loss <= now.loss and bool((step.excess <= bearable).all())
+        if helps and loop_poles(rig, trial, loop.modes).spectral_radius < 1.0:
             steps = [*(s for s in steps if s.name != name), step]
             best, now, chosen = trial, step, other
     loop = chosen
@@ -590,12 +601,13 @@ def _compensated(
         except DesignError:
             continue  # the others cannot do without it
         step = tried(f"without {name}", f"{name} is not read", trial)
-        pays = step.loss < now.loss - PAYS
-        steps.append(replace(step, kept=pays))
-        if pays:
+        helps = step.loss < now.loss - GAINED
+        steps.append(replace(step, kept=helps))
+        if helps:
             removed.append(name)
             best, now = trial, step
-    return best, tuple(steps), designed_anew(loop, rig, loop.modes, removed) if removed else loop, weight, aim
+    last = designed_anew(loop, rig, loop.modes, removed) if removed else loop
+    return best, tuple(steps), last, weight, criterion
 
 
 def _stabilised(rig: Rig, loop: Loop, test: LoopTest) -> tuple[Loop, str]:

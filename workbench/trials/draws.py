@@ -239,8 +239,8 @@ def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
     moved = stands + step if inside(stands + step) else stands - step
     if not inside(moved):
         raise Unsuitable("the port would leave the structure")
-    told = np.round(moved, 4).tolist()
-    return {side: port.name, "at": told if isinstance(domain, Rectangle) else told[0]}
+    place = np.round(moved, 4).tolist()
+    return {side: port.name, "at": place if isinstance(domain, Rectangle) else place[0]}
 
 
 def _reading(name: str, make: Callable[[Scene, int, np.random.Generator], Number]) -> Draw:

@@ -181,13 +181,13 @@ def _case(
             ),
         }
     _check_visible(figures, effects)
-    told = [{"kind": UNKNOWN, "outside": e["kind"]} if e["kind"] in OUTSIDE else e for e in effects]
-    if any(e["kind"] == UNKNOWN for e in told):
-        told = [e for e in told if e["kind"] == UNKNOWN]
+    labelled = [{"kind": UNKNOWN, "outside": e["kind"]} if e["kind"] in OUTSIDE else e for e in effects]
+    if any(e["kind"] == UNKNOWN for e in labelled):
+        labelled = [e for e in labelled if e["kind"] == UNKNOWN]
     label = {
         "title": name,
         "snr_db": bench.snr_db,
-        "effects": told or [{"kind": NONE}],
+        "effects": labelled or [{"kind": NONE}],
         "length": extent(bench.rig.modes.domain),
         "budget": _budget(figures["validate"]),
         "records": figures,
@@ -374,18 +374,18 @@ def write_trials(
         draws = draw_dirty_kinds(n, seed, dirt=dirt, size=size)
     if kinds is not None:
         draws = [draw._replace(kinds=tuple(hidden)) for draw, hidden in zip(draws, kinds, strict=True)]
-    told = {}
+    labelled = {}
     for i, draw in enumerate(draws):
         name = f"case-{i + 1:03d}"
         pool = [k for k in KINDS if k not in MIMICS[draw.dirt] | NOT_ON[structure] | {"truncated_modes"}]
         how = {"like": like, "structure": structure, "name": name, "dirt": draw.dirt, "size": draw.size}
-        case, told[name], _ = find_trial_with_plant(
+        case, labelled[name], _ = find_trial_with_plant(
             np.random.default_rng([seed, i]), kinds=draw.kinds, others=pool, tries=MOST_SEEDS, **how
         )
         write_case(case, folder / name)
         report(name, (i + 1) / n)
     labels.parent.mkdir(parents=True, exist_ok=True)
-    labels.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    labels.write_text(json.dumps(labelled, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def find_trial_with_plant(

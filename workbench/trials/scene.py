@@ -79,7 +79,7 @@ class Scene:
     def _distinct(self, rng: np.random.Generator, between: bool) -> Where:
         """A named point, or two that something is between, where a force acts on the modes as nowhere else.
 
-        What a force does to the modes is told by its direction among them, weighted by how they move: a weaker one of
+        What a force does to the modes shows in its direction among them, weighted by how they move: a weaker one of
         the same direction is an equally good answer, so that what stands there has no one right place.
         """
         modes = self.bench.rig.modes

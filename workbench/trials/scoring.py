@@ -31,9 +31,9 @@ class Tally:
     """How a set of verdicts fared.
 
     Attributes:
-        counts: (hidden, told) -> how many cases, each a set of kinds joined by " + ".
+        counts: (hidden, named) -> how many cases, each a set of kinds joined by " + ".
         shares: of the cases that were named rightly: "single", "pair", "none", "unknown" -> (right, of).
-        misplaced: places told more than 2 % of the length off, of `placed` places.
+        misplaced: places named more than 2 % of the length off, of `placed` places.
         placed: how many effects at a point were named.
     """
 
@@ -64,14 +64,14 @@ def score(
         diagonal, 1 for another name; "positions": right, None without any; "shrinkage": by validation record}.
     """
     hidden = [e for e in label["effects"] if e["kind"] != NONE]
-    told = verdict["effects"]
-    kinds = sorted(e["kind"] for e in hidden) == sorted(e["kind"] for e in told)
-    pairs = _matched(hidden, told, domain) if kinds else []
+    named = verdict["effects"]
+    kinds = sorted(e["kind"] for e in hidden) == sorted(e["kind"] for e in named)
+    pairs = _matched(hidden, named, domain) if kinds else []
     channels = [_same_channel(h, t, inputs, outputs) for h, t in pairs if "input" in h or "output" in h]
     errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
     return {
         "hidden": _words(hidden),
-        "told": _words(told),
+        "told": _words(named),
         "family": _family(hidden),
         "kinds": kinds,
         "channels": all(channels) if channels else None,
@@ -108,27 +108,27 @@ def score_dirty(
         by effects; an alternative is right that has the kinds of what hides}.
     """
     hidden = [e for e in label["effects"] if e["kind"] not in (NONE, UNKNOWN)]
-    told = [e for e in verdict["effects"] if e["kind"] != UNKNOWN]
-    pairs = _found(hidden, told, domain, inputs, outputs)
+    named = [e for e in verdict["effects"] if e["kind"] != UNKNOWN]
+    pairs = _found(hidden, named, domain, inputs, outputs)
     errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
     covered = [inside for h, t in pairs for inside in _inside(h, t)]
     budget = verdict.get("budget", {}).get("unexplained")
-    complete = len(pairs) == len(hidden) == len(told)
+    complete = len(pairs) == len(hidden) == len(named)
     off = None if budget is None or not complete else abs(budget - label["budget"]["unexplained"])
     placed = all(error <= NEAR_IN_DIRT for error in errors)
-    in_part = len(hidden) == 3 and len(pairs) == len(told) == 2 and budget is not None and budget > HONEST
+    in_part = len(hidden) == 3 and len(pairs) == len(named) == 2 and budget is not None and budget > HONEST
     return {
         "class": label.get("class", ""),
         "size": label.get("size", 1.0),
         "hidden": _words(hidden),
         "told": _words(verdict["effects"]),
-        "named": (complete or in_part) and placed and len(told) == len(verdict["effects"]),
-        "wrong": len(pairs) < len(told),
-        "false_alarm": not hidden and bool(told),
+        "named": (complete or in_part) and placed and len(named) == len(verdict["effects"]),
+        "wrong": len(pairs) < len(named),
+        "false_alarm": not hidden and bool(named),
         "position_errors": errors,
         "covered": (sum(covered), len(covered)),
         "budget_error": off,
-        "claims": _claims(verdict, label, complete) if told and verdict.get("outcome") == "explained" else [],
+        "claims": _claims(verdict, label, complete) if named and verdict.get("outcome") == "explained" else [],
     }
 
 
@@ -183,32 +183,32 @@ def _share(flags: Sequence[bool]) -> float:
 
 def _found(
     hidden: list[dict[str, Any]],
-    told: list[dict[str, Any]],
+    named: list[dict[str, Any]],
     domain: Domain | float,
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Hidden effects beside those told of the same kind and channel, each once, the nearest first."""
+    """Hidden effects beside those named of the same kind and channel, each once, the nearest first."""
     alike = [
         (_off(h, t, domain), i, j)
         for i, h in enumerate(hidden)
-        for j, t in enumerate(told)
+        for j, t in enumerate(named)
         if h["kind"] == t["kind"] and _same_channel(h, t, inputs, outputs)
     ]
     pairs: list[tuple[int, int]] = []
     for _, i, j in sorted(alike):
         if all(i != k and j != m for k, m in pairs):
             pairs.append((i, j))
-    return [(hidden[i], told[j]) for i, j in pairs]
+    return [(hidden[i], named[j]) for i, j in pairs]
 
 
-def _off(hidden: dict[str, Any], told: dict[str, Any], domain: Domain | float) -> float:
-    """How far an effect is told off its place, over the length or the diagonal; 1 where a named point is another one.
+def _off(hidden: dict[str, Any], named: dict[str, Any], domain: Domain | float) -> float:
+    """How far an effect is named off its place, over the length or the diagonal; 1 where a named point is another one.
 
     A mass moves with its node, whichever direction of it is named.
     """
     places = as_domain(domain)
-    one, other = stands(hidden), stands(told)
+    one, other = stands(hidden), stands(named)
     if one is None or other is None:
         return 0.0
     if isinstance(places, NamedPoints) and hidden["kind"] == "point_mass":
@@ -216,10 +216,10 @@ def _off(hidden: dict[str, Any], told: dict[str, Any], domain: Domain | float) -
     return places.separation(one, other)
 
 
-def _inside(hidden: dict[str, Any], told: dict[str, Any]) -> Iterable[bool]:
+def _inside(hidden: dict[str, Any], named: dict[str, Any]) -> Iterable[bool]:
     """Whether each number that has a standard deviation is within its 95 % interval of the truth."""
-    deviations = {**told.get("parameters_std", {}), "at": told.get("at_std")}
-    values = {**told.get("parameters", {}), "at": told.get("at")}
+    deviations = {**named.get("parameters_std", {}), "at": named.get("at_std")}
+    values = {**named.get("parameters", {}), "at": named.get("at")}
     for name, deviation in deviations.items():
         if deviation and name in hidden and values.get(name) is not None:
             off = np.atleast_1d(values[name]) - np.atleast_1d(hidden[name])
@@ -257,9 +257,9 @@ def _words(effects: list[dict[str, Any]]) -> str:
 
 
 def _matched(
-    hidden: list[dict[str, Any]], told: list[dict[str, Any]], domain: Domain | float
+    hidden: list[dict[str, Any]], named: list[dict[str, Any]], domain: Domain | float
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Hidden and told effects of one kind side by side, two of a kind by their places."""
+    """Hidden and named effects of one kind side by side, two of a kind by their places."""
 
     def cost(order: Iterable[dict[str, Any]]) -> float:
         pairs = list(zip(hidden, order, strict=True))
@@ -267,14 +267,14 @@ def _matched(
             return float("inf")
         return sum(_off(h, t, domain) for h, t in pairs)
 
-    return list(zip(hidden, min(permutations(told), key=cost), strict=True)) if hidden else []
+    return list(zip(hidden, min(permutations(named), key=cost), strict=True)) if hidden else []
 
 
-def _same_channel(hidden: dict[str, Any], told: dict[str, Any], inputs: Sequence[str], outputs: Sequence[str]) -> bool:
+def _same_channel(hidden: dict[str, Any], named: dict[str, Any], inputs: Sequence[str], outputs: Sequence[str]) -> bool:
     for side, names in (("input", inputs), ("output", outputs)):
         if side in hidden:
             name = hidden[side]
             channels = {names[name] if isinstance(name, int) else name, hidden.get("with")}
-            source = hidden.get("from") == told.get("from")
-            return source and channels == {told.get(side), told.get("with")}
+            source = hidden.get("from") == named.get("from")
+            return source and channels == {named.get(side), named.get("with")}
     return True

@@ -65,7 +65,7 @@ def test_a_fifth_of_the_stiffness_lost_over_a_tenth_of_the_length_is_found(kind,
         mass_terms=[2],
         stiffness_terms=[2, 3],
     )
-    assert found.found and found.lossy.explains and not found.smooth.explains
+    assert found.detected and found.damaged.explains and not found.undamaged.explains
     assert abs(found.loss.centre - centre) < 0.005
     low, high = found.interval(0.999).T
     assert (low < [0.2, centre, 0.1]).all() and ([0.2, centre, 0.1] < high).all()
@@ -83,8 +83,8 @@ def test_nothing_is_found_where_nothing_is_lost(kind):
         mass_terms=[2],
         stiffness_terms=range(1, 4),
     )
-    assert not found.found and found.loss is None
-    assert found.best is found.smooth and found.smooth.explains
+    assert not found.detected and found.loss is None
+    assert found.best is found.undamaged and found.undamaged.explains
 
 
 def test_the_first_look_points_at_the_place():
@@ -127,7 +127,7 @@ def test_a_loss_is_found_where_few_terms_lead_to_a_false_place():
     study = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(study)
     hidden, found = study.tried("bar", study.FIRST_SEED, level_db=0.0)
-    assert found.found
+    assert found.detected
     assert found.loss.centre == pytest.approx(hidden.centre, abs=study.WITHIN)
     low, high = found.interval().T
     truth = [hidden.share, hidden.centre, study.WIDTH]

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from warnings import warn
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from workbench.design.export.source import command_words, reading_words
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import close_with
+from workbench.renamed import Renamed
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed
 
@@ -61,11 +61,7 @@ class SampledDesign(Printed):
         own = self.modes.omega[list(self.source.law.controlled)]
         return np.asarray(own * (0.5 * self.controller.sample_time + self.computing_delay))
 
-    @property
-    def phase_lost(self) -> np.ndarray:
-        """The earlier name of `phase_lag`."""
-        warn("phase_lost is now phase_lag; the old name goes with the next version", DeprecationWarning, 2)
-        return self.phase_lag
+    phase_lost = Renamed("phase_lag")
 
     @property
     def states(self) -> tuple[str, ...]:

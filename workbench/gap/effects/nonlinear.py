@@ -243,8 +243,8 @@ def _is_sudden(friction: Effect) -> bool:
 
 def _without_sudden(friction: Effect, _: Rig) -> dict[str, float]:
     """Its numbers, without a smoothing speed that the records do not tell from none."""
-    told = friction.numbers
-    return {name: v for name, v in told.items() if name != "smoothing_speed" or not _is_sudden(friction)}
+    numbers = friction.numbers
+    return {name: v for name, v in numbers.items() if name != "smoothing_speed" or not _is_sudden(friction)}
 
 
 def _sudden(friction: Effect) -> Effect:

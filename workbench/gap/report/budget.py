@@ -28,9 +28,9 @@ MOST = (
     ("shape", 10.0),
 )
 RUNAWAY = 1e30  # mean square of a motion that knows no bounds, in units of the signal's
-COMMON = 2.0  # times the scatter of delays: the mean from which on they are told as one delay of all
+COMMON = 2.0  # times the scatter of delays: the mean from which on they are reported as one delay of all
 DRAWS = 400  # of blocks, for the interval of what is closed
-# errors that are told in per cent, by group, as they are called
+# errors that are reported in per cent, by group, as they are called
 PLURAL = {
     "stiffness": "stiffness",
     "mass": "mass",

@@ -13,6 +13,7 @@ from workbench.gap.effects.structural import modes_of
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
+from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, NamedPoints, Where, same_place
@@ -40,18 +41,20 @@ class RecordsError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Readiness:
-    """What the records could tell, before anything is fitted.
+    """Which effects the records can show, and which they can tell apart, before anything is fitted.
 
     Attributes:
         strengths: label of an effect -> how far it would move the residual, in standard deviations, at the first
             strength that these records show, or at the one they show most.
-        invisible: labels of effects that these records show at no strength.
-        alike: pairs of labels whose responses are the same up to a factor, with their correlation.
+        undetectable: labels of effects that these records show at no strength.
+        indistinguishable: pairs of labels whose responses are the same up to a factor, with their correlation.
     """
 
     strengths: dict[str, float]
-    invisible: tuple[str, ...]
-    alike: tuple[tuple[str, str, float], ...]
+    undetectable: tuple[str, ...]
+    indistinguishable: tuple[tuple[str, str, float], ...]
+
+    invisible, alike = Renamed("undetectable"), Renamed("indistinguishable")
 
 
 def check_records(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> None:
@@ -241,8 +244,8 @@ def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) ->
     ]
     return Readiness(
         strengths=strengths,
-        invisible=tuple(label for label, size in strengths.items() if size**2 <= SEEN),
-        alike=tuple(sorted(alike, key=lambda pair: -pair[2])),
+        undetectable=tuple(label for label, size in strengths.items() if size**2 <= SEEN),
+        indistinguishable=tuple(sorted(alike, key=lambda pair: -pair[2])),
     )
 
 

@@ -232,8 +232,8 @@ class Verdict:
                 "corrected": _rounded(self.attribution.best.cost),
             },
             "check": {
-                "invisible": list(self.readiness.invisible),
-                "alike": [list(pair[:2]) for pair in self.readiness.alike],
+                "undetectable": list(self.readiness.undetectable),
+                "indistinguishable": [list(pair[:2]) for pair in self.readiness.indistinguishable],
             },
             "next_experiment": None if self.experiment is None else self.experiment.sentence,
             "budget": self.budget.to_json(),

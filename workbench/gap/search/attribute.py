@@ -185,7 +185,7 @@ def attribute(
     Args:
         found: before any effect is guessed.
         catalogue: kinds of effects to try.
-        report: told (what, share done) as the search proceeds.
+        report: called with (what, share done) as the search proceeds.
         free_nominal: fit errors of the nominal model beside every effect from the first, for a model that is known to
             be a little off; otherwise where no single effect explains the records without.
         tolerance: of the signal's rms: a smaller gap beyond the noise is not searched for causes.

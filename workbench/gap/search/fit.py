@@ -268,12 +268,12 @@ class _Problem:
         moves = [Move(free, self._moved(free, group), group, coarsely, of_sensors_alone=True) for group in groups]
         moves += (Move(free, self._moved(free, [j]), [j], coarsely) for j in alone)
         # where the rig cannot be: each number alone, and then to its other side
-        failed = [move for move, told in zip(moves, share(moves), strict=True) if not told]
+        failed = [move for move, can_be in zip(moves, share(moves), strict=True) if not can_be]
         self._columns[[j for move in failed for j in move.numbers]] = 0.0
         single = [j for move in failed if len(move.numbers) > 1 for j in move.numbers]
         moves = [Move(free, self._moved(free, [j]), [j], coarsely) for j in single]
         failed = [move for move in failed if len(move.numbers) == 1]
-        failed += (move for move, told in zip(moves, share(moves), strict=True) if not told)
+        failed += (move for move, can_be in zip(moves, share(moves), strict=True) if not can_be)
         share([Move(free, 2.0 * free - move.to, move.numbers, coarsely) for move in failed])
         if self.is_known:
             jacobian[residual.size - len(self.believed) :, self.believed] = np.diag(1.0 / self.prior_std)

@@ -29,7 +29,7 @@ def with_intervals(
     Webb, J. Applied Econometrics 38 (2023) 671). Noise of the logged inputs goes through the laws of the structure,
     which no filter of a linear one makes white, so it is drawn too: each draw changes what is left by δ, and the
     numbers by A⁻¹ Jᵀ δ. The joint covariance is no smaller than any of these in any direction. No number of an effect
-    is told to better than a part in ten thousand.
+    is known to better than a part in ten thousand.
 
     Args:
         rig: nominal.

@@ -54,6 +54,6 @@ def unless_another(search: Search, decision: Decision, evidence: Evidence) -> De
 
 def compared_with(law: Fit, search: Search, decision: Decision) -> Decision:
     """What is claimed where one force of another law explains the records: the likelier of it and of the decision's."""
-    told = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
-    best, rivals = ranked(search, [law, *told])
+    named = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
+    best, rivals = ranked(search, [law, *named])
     return Decision("unknown" if any_beyond(best.effects) else "explained", best, rivals=rivals)

@@ -64,7 +64,7 @@ class Screening:
         left = left[thin]
         moves = search.workers.array(len(starts), left.size)  # the one large array
 
-        def tells(some: range) -> list[bool]:
+        def moved_by(some: range) -> list[bool]:
             # errors of the model give way to many starts at once: their directions are large
             moved = np.zeros((len(some), before.size))
             for row, i in zip(moved, some, strict=True):
@@ -75,10 +75,10 @@ class Screening:
             return [bool(0 < moves[i] @ moves[i] < RUNAWAY * left.size) for i in some]
 
         for i in {start.kind: i for i, start in enumerate(starts) if start.kind not in CATALOGUE}.values():
-            tells(range(i, i + 1))  # a law of the user's own is compiled here, before processes that would each do so
+            moved_by(range(i, i + 1))  # a law of the user's own is compiled here, not in each process
         at_once = [range(i, min(i + SCREENING.at_once, len(starts))) for i in range(0, len(starts), SCREENING.at_once)]
-        told = [tell for some in search.workers.map(tells, at_once) for tell in some]
-        telling = [i for i, tell in enumerate(told) if tell]
+        shown = [shows for some in search.workers.map(moved_by, at_once) for shows in some]
+        telling = [i for i, shows in enumerate(shown) if shows]
         for row, i in enumerate(telling):  # those that tell nothing are closed up in place
             moves[row] = moves[i]
         moves = moves[: len(telling)]

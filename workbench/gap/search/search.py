@@ -35,7 +35,7 @@ class Search:
         quick: the two most telling of them.
         first: the most telling one.
         catalogue: kinds of effects to try.
-        report: told (what, share done).
+        report: called with (what, share done).
         workers: processes that share the work.
         nominal: (n_records, n_outputs) mean squares that the nominal rig leaves, in noise units.
         held: effects that every candidate stands beside, as they are.

@@ -326,7 +326,7 @@ class IntervalSettings:
     alike: float = 1e-4  # of a number, or of the extent: how far two numerical routes to the same records put it apart
     most_leverage: float = 0.5  # of a block on a direction that it alone tells: what there is no telling without it
     blocks: int = 12  # a record: long beside the correlation of what is left, many enough to scatter
-    draws: int = 48  # of noise of the logged inputs: a standard deviation of 48 is told to a tenth
+    draws: int = 48  # of noise of the logged inputs: a standard deviation of 48 is known to a tenth
 
 
 SEARCH = SearchSettings()

@@ -495,7 +495,7 @@ class Stepwise:
     def afresh(self, effects: tuple[Effect, ...]) -> Step:
         """The effects beside errors that start from none, fitted to all records.
 
-        Where frequencies are off, motions of whole records run out of step, and the way is told one sample ahead.
+        Where frequencies are off, motions of whole records run out of step; predictions one sample ahead show the way.
         """
         search = self.search
         none = on_their_sides(search, nominal_errors(search.rig, search.prior), effects)

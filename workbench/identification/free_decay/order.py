@@ -52,7 +52,7 @@ class OrderSettings:
     # of theirs: what they leave after the shorter transform is e^-25
     coarser: float = 4.0
     decided: float = 0.1  # χ² that a step promises, below which a fit that only decides has decided
-    least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be told from them
+    least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be distinguished from them
     resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths that a mode selected in whitened records may move when refined in the records as measured
     lost: float = 5.0

@@ -27,7 +27,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
 from typing import Any
-from warnings import warn
 
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
@@ -45,6 +44,7 @@ from workbench.identification.shapes.eigenfunctions import (
     mass_matrix,
 )
 from workbench.identification.signal.modal_estimates import ShapeEstimates, normalised_shapes
+from workbench.renamed import Renamed
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed, counted
 from workbench.structure.profile import ProfileLike
@@ -241,11 +241,7 @@ class Bands(Printed):
         line = f"bands of {counted(len(rows), 'eigenfunction')} at {counted(len(self.x), 'place')}, {self.level:.0%}"
         return line, headings, rows, ()
 
-    @property
-    def missed(self) -> np.ndarray:
-        """Former name of `interpolation_std`."""
-        warn("Bands.missed is now Bands.interpolation_std", DeprecationWarning, 2)
-        return self.interpolation_std
+    missed = Renamed("interpolation_std")
 
     @property
     def whole(self) -> tuple[np.ndarray, np.ndarray]:

@@ -6,8 +6,8 @@ in units of their standard errors. A loss is reported where it lowers
 
     χ² + n_terms ln n_data
 
-below that of the smooth explanation by more than noise would lower χ² anywhere along the structure, but for the chance
-of a false alarm. No measurement of the undamaged structure is needed.
+below that of the undamaged explanation by more than noise would lower χ² anywhere along the structure, but for the
+probability of a false alarm. No measurement of the undamaged structure is needed.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -25,6 +25,7 @@ from workbench.identification.updating.sensitivity import LocalLoss, SeriesStruc
 from workbench.identification.updating.structure_fit import MOST_TERMS, choose, with_spare_terms
 from workbench.identification.updating.structure_problem import Problem
 from workbench.identification.updating.structure_task import FittedStructure, Task
+from workbench.renamed import Renamed
 from workbench.structure.member import Bar, Beam
 from workbench.threads import one_blas_thread
 
@@ -53,37 +54,40 @@ class LocatedDamage:
     """What the modes say of a local loss of stiffness.
 
     Attributes:
-        smooth: the best explanation without one, or, where no number of terms comes near, that of most terms.
-        lossy: the best with one, believed or not.
-        evidence: what the loss lowers χ² + n_terms ln n_data by; in units of χ² / freedom where `lossy` does not
-            explain the modes either.
-        limit: what noise lowers it by with the chance of a false alarm.
+        undamaged: the best explanation without one, or, where no number of terms comes near, that of most terms.
+        damaged: the best with one, whether or not it is significant.
+        statistic: of the test: what the loss lowers χ² + n_terms ln n_data by; in units of χ² / freedom where `damaged`
+            does not explain the modes either.
+        threshold: what noise lowers it by with the probability of a false alarm.
     """
 
-    smooth: FittedStructure
-    lossy: FittedStructure
-    evidence: float
-    limit: float
+    undamaged: FittedStructure
+    damaged: FittedStructure
+    statistic: float
+    threshold: float
+
+    smooth, lossy, evidence = Renamed("undamaged"), Renamed("damaged"), Renamed("statistic")
+    limit, found = Renamed("threshold"), Renamed("detected")
 
     @property
-    def found(self) -> bool:
+    def detected(self) -> bool:
         """Whether there is a loss."""
-        return bool(self.evidence > self.limit)
+        return bool(self.statistic > self.threshold)
 
     @property
     def loss(self) -> LocalLoss | None:
         """Share, centre and width; None where there is none."""
-        return self.lossy.loss if self.found else None
+        return self.damaged.loss if self.detected else None
 
     @property
     def best(self) -> FittedStructure:
         """The explanation to take."""
-        return self.lossy if self.found else self.smooth
+        return self.damaged if self.detected else self.undamaged
 
     def interval(self, level: float = 0.95) -> np.ndarray:
         """Confidence intervals of share, centre and width, (3, 2); what of a loss passes an end does not count."""
-        likely, length = self.lossy.parameters[-3:], self.lossy.structure.length
-        rng, covariance = np.random.default_rng(0), self.lossy.covariance[-3:, -3:]
+        likely, length = self.damaged.parameters[-3:], self.damaged.structure.length
+        rng, covariance = np.random.default_rng(0), self.damaged.covariance[-3:, -3:]
         share, centre, width = rng.multivariate_normal(likely, covariance, LOSS.draws, method="eigh").T
         begin, end = np.clip([centre - 0.5 * width, centre + 0.5 * width], 0.0, length)
         tail = 0.5 * (1.0 - level)
@@ -117,35 +121,37 @@ def locate_damage(
     if not (terms[0] and terms[1]):
         raise ValueError("no number of terms was given for mass or stiffness; give at least one, 0 to keep the nominal")
     first = _from_anywhere(Problem.of(task, *(basis(few[: LOSS.first_terms][-1]) for few in terms)), None)
-    lossy = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
+    damaged = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
     fewer = 0
     for _ in range(LOSS.most_looks):
-        if lossy.explains or fewer >= max(lossy.n_terms):
+        if damaged.explains or fewer >= max(damaged.n_terms):
             break
-        at_least = (max(n - fewer, few[0]) for n, few in zip(lossy.n_terms, terms, strict=True))
-        again = _from_anywhere(Problem.of(task, *(basis(n) for n in at_least)), lossy)
-        if again.criterion < lossy.criterion - 1.0:
-            lossy, fewer = choose(task, basis, *terms, partial(_near_either, again), near=again), 0
+        at_least = (max(n - fewer, few[0]) for n, few in zip(damaged.n_terms, terms, strict=True))
+        again = _from_anywhere(Problem.of(task, *(basis(n) for n in at_least)), damaged)
+        if again.criterion < damaged.criterion - 1.0:
+            damaged, fewer = choose(task, basis, *terms, partial(_near_either, again), near=again), 0
         else:
             fewer += LOSS.fewer_terms  # many terms imitate a loss so well that few starts lead to it
     # three parameters, sought over as many places as stand apart
     limit = float(chi2_distribution.isf(false_alarm * LOSS.typical_width, 3))
-    smooth = _smooth(task, basis, terms, lossy, limit)
-    evidence = _evidence(task, smooth, lossy)
-    if evidence <= limit:
+    undamaged = _undamaged(task, basis, terms, damaged, limit)
+    statistic = _statistic(task, undamaged, damaged)
+    if statistic <= limit:
         # few terms may have led to a false place: look once more, beside what explains the modes without a loss
-        again = _from_anywhere(Problem.of(task, *(basis(n) for n in smooth.n_terms)), lossy)
-        if again.criterion < lossy.criterion - 1.0:
-            lossy = choose(task, basis, *terms, partial(_near_either, again), near=again)
-            smooth = _smooth(task, basis, terms, lossy, limit)
-            evidence = _evidence(task, smooth, lossy)
+        again = _from_anywhere(Problem.of(task, *(basis(n) for n in undamaged.n_terms)), damaged)
+        if again.criterion < damaged.criterion - 1.0:
+            damaged = choose(task, basis, *terms, partial(_near_either, again), near=again)
+            undamaged = _undamaged(task, basis, terms, damaged, limit)
+            statistic = _statistic(task, undamaged, damaged)
     # modes that not even a loss explains err by more than their standard errors, and count for less
-    return LocatedDamage(smooth, lossy, evidence if lossy.explains else evidence * lossy.freedom / lossy.chi2, limit)
+    return LocatedDamage(
+        undamaged, damaged, statistic if damaged.explains else statistic * damaged.freedom / damaged.chi2, limit
+    )
 
 
-def _evidence(task: Task, smooth: FittedStructure, lossy: FittedStructure) -> float:
+def _statistic(task: Task, undamaged: FittedStructure, damaged: FittedStructure) -> float:
     """What a loss lowers the criterion by, its own three parameters not counted: its limit allows for them."""
-    return smooth.criterion - lossy.criterion + _price(task)
+    return undamaged.criterion - damaged.criterion + _price(task)
 
 
 def _price(task: Task) -> float:
@@ -153,19 +159,23 @@ def _price(task: Task) -> float:
     return 3.0 * float(np.log(task.n_data))
 
 
-def _smooth(
-    task: Task, basis: Callable[[int], Basis], terms: tuple[list[int], list[int]], lossy: FittedStructure, limit: float
+def _undamaged(
+    task: Task,
+    basis: Callable[[int], Basis],
+    terms: tuple[list[int], list[int]],
+    damaged: FittedStructure,
+    limit: float,
 ) -> FittedStructure:
     """The best explanation without a loss; where one fit settles that it wins or cannot win, that one."""
 
     def alike(*n_terms: int) -> FittedStructure:
-        return Problem.of(task, *(basis(n) for n in n_terms)).fit(lossy)
+        return Problem.of(task, *(basis(n) for n in n_terms)).fit(damaged)
 
-    same = alike(*lossy.n_terms)
-    if same.chi2 - lossy.chi2 <= limit:
+    same = alike(*damaged.n_terms)
+    if same.chi2 - damaged.chi2 <= limit:
         return with_spare_terms(same, task, basis)
     most = alike(terms[0][-1], terms[1][-1])
-    if most.chi2 - lossy.criterion + _price(task) > limit:
+    if most.chi2 - damaged.criterion + _price(task) > limit:
         return most
     return choose(task, basis, terms[0], terms[1], lambda problem, near: problem.fit(near))
 
@@ -223,13 +233,13 @@ def _likely_losses(problem: Problem, whole: FittedStructure) -> list[LocalLoss]:
     return likely
 
 
-def scan(problem: Problem, smooth: FittedStructure) -> tuple[np.ndarray, np.ndarray]:
+def scan(problem: Problem, undamaged: FittedStructure) -> tuple[np.ndarray, np.ndarray]:
     """Places along the structure (n_places,) and what a small loss of each of `LOSS.widths` there would lower χ² by, to
     first order, (n_widths, n_places)."""
     task, series = problem.task, problem.series
     length = task.nominal.length
     places = (np.arange(LOSS.places) + 0.5) / LOSS.places * length
-    d, e = np.split(smooth.parameters, [smooth.n_terms[0]])
+    d, e = np.split(undamaged.parameters, [undamaged.n_terms[0]])
 
     def with_losses(x: np.ndarray) -> np.ndarray:
         own = series.stiffness.functions(x)

@@ -198,7 +198,7 @@ def plate_mass_and_stiffness(
     )
     stiffness = SurfaceDistribution(frozen(coefficients), stiffness_basis, prior_stiffness, misfit)
     if errors is not None:
-        # that of the mass is not told: near a free edge splines err alike in all modes, and the mass by twice as much
+        # not that of the mass: near a free edge splines err alike in all modes, and the mass by twice as much
         covariance = _stiffness_covariance(
             modes, errors, mass, stiffness, poisson_ratio, mass_basis.functions(*places.T)
         )

@@ -171,7 +171,7 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
         lines.append(f"modes {which}: implausibly damped; they may fit the residual, not the structure")
     at, apart = found.modes.frequencies_hz, found.modes.phase_collinearity < AGREED
     doubtful = np.zeros(at.size, bool)
-    for low, high in found.full_hz:
+    for low, high in found.order_limited_hz:
         here = (at >= low) & (at <= high)
         doubtful |= here & apart
         lines.append(
@@ -180,7 +180,7 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
             " collinearity); roving sensors or hammers, or a structure that changes, make data inconsistent like that:"
             " leave that band out by --band-hz, or take more --modes"
         )
-    for r, parts in enumerate(found.parts_hz):
+    for r, parts in enumerate(found.cluster_hz):
         if parts:
             others = ", ".join(f"{f:.4g}" for f in parts)
             lines.append(
@@ -211,8 +211,8 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
         "participation_imag": found.participation.imag,
         "misfit": found.misfit,
         "doubtful": doubtful,
-        "parts_hz": found.parts_hz,
-        "full_hz": found.full_hz,
+        "cluster_hz": found.cluster_hz,
+        "order_limited_hz": found.order_limited_hz,
         "converged": found.converged,
     }
     rows = [row for row, doubt in zip(rows_of(found), doubtful) if not doubt]

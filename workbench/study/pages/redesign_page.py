@@ -73,13 +73,13 @@ def redesign_page(
             [(s.name, s.what, s.lost, "yes" if s.kept else "no") for s in found.steps],
         ),
     ]
-    used = found.proof if found.pays else found.present_proof
+    used = found.proof if found.improves else found.present_proof
     moved = [] if found.relocation is None else [found.relocation.sentence]
     page_content = PageContent(
         title=f"Redesign for {name}",
-        lead=f"{found.advice} {found.promise}".rstrip(),
+        lead=f"{found.advice} {found.guarantee}".rstrip(),
         standing="bad" if used.share_stable < 0.95 else "good" if found.safe and not found.left_undamped else "part",
-        lines=[found.figures, *moved, *found.notes],
+        lines=[found.comparison, *moved, *found.notes],
         blocks=blocks,
         tables=tables,
         inputs={} if folder is None else case_inputs(folder),
@@ -92,7 +92,7 @@ def _figures(found: Redesign) -> list[tuple[str, ...]]:
     old, new = found.present_proof, found.proof
     rows: list[tuple[str, ...]] = [("stable samples", *(f"{int(p.stable.sum())} of {p.n_draws}" for p in (old, new)))]
     for r in found.controlled:
-        rows.append((f"damping ratio of mode {r + 1} [%]", *(_told(100.0 * p.damping[:, r]) for p in (old, new))))
+        rows.append((f"damping ratio of mode {r + 1} [%]", *(_rounded(100.0 * p.damping[:, r]) for p in (old, new))))
     each = (
         ("worst_damping", "least damping ratio of any mode [%]", 100.0),
         ("controlled_settling", "settling time of the controlled modes [s]", 1.0),
@@ -106,13 +106,15 @@ def _figures(found: Redesign) -> list[tuple[str, ...]]:
     for name, words, scale in each:
         # what a motion that grows comes to is a matter of the length of the test
         known = [name == "worst_damping" or p.share_stable >= 0.5 for p in (old, new)]
-        told = [_told(scale * getattr(p, name)) if k else "diverges" for p, k in zip((old, new), known, strict=True)]
-        rows.append((words, *told))
+        cells = [
+            _rounded(scale * getattr(p, name)) if k else "diverges" for p, k in zip((old, new), known, strict=True)
+        ]
+        rows.append((words, *cells))
     rows.append(("output uncertainty tolerated (small gain) [%]", *(_margin(p) for p in (old, new))))
     return rows
 
 
-def _told(values: np.ndarray) -> str:
+def _rounded(values: np.ndarray) -> str:
     middle, low, high = interval(values)
     return f"{middle:.3g} ({low:.3g} to {high:.3g})"
 

@@ -163,7 +163,7 @@ def case_inputs(folder: Path) -> dict[str, str]:
 
 def _could_show(verdict: Verdict) -> str:
     """What the records can and cannot show, in a line."""
-    hidden, alike = verdict.readiness.invisible, verdict.readiness.alike
+    hidden, alike = verdict.readiness.undetectable, verdict.readiness.indistinguishable
     count = len(verdict.readiness.strengths)
     text = f"Before any fit: these records can show {f'all but {len(hidden)} of' if hidden else 'all'} {count} effects"
     if hidden:

@@ -117,7 +117,7 @@ def unpacked(function: bytes) -> Callable[..., Any]:
 def here(
     function: Callable[..., Any], jobs: list[Job], awaiting: Callable[[int], None]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """One after the other, in this process; last those that another run was at, how many of them is told."""
+    """One after the other, in this process; last those that another run was at, with their number in a message."""
     for wait in (False, True):
         if wait and jobs:
             awaiting(len(jobs))
@@ -137,7 +137,8 @@ def processes(
     """In processes of this machine, in the order in which they end.
 
     A case whose process dies takes the others' processes with it. Those that were running then are computed again, each
-    on its own; what dies alone has only itself to blame. Cases that another run is at come last, how many is told.
+    on its own; what dies alone has only itself to blame. Cases that another run is at come last, with
+    their number in a message.
 
     Raises:
         StudyError: processes die before they begin a case.

@@ -6,7 +6,7 @@ import pytest
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
-from workbench.design.placement.how_many import how_many_modes
+from workbench.design.placement.controlled_modes import controlled_mode_count
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
 
@@ -18,25 +18,25 @@ def modes(n=12):
 def test_what_is_left_is_what_the_motion_shows():
     """Late in the controlled motion, with residual modes at rest at first, their energy is the spillover."""
     found, state = modes(), impulse_state(modes(), 6.3)
-    result = how_many_modes(found, state, weight=5.0)
+    result = controlled_mode_count(found, state, weight=5.0)
     places = [Actuator(f"F{i}", x) for i, x in enumerate((10 / 4, 5.0, 7.5))]
     rest = state.copy()
     rest[3:12] = rest[15:] = 0.0
     late = initial_response(close_loop(found, imsc(found, 3, places, weight=5.0)), rest, [1500.0]).energy[:, 0]
-    assert result.spilled[2] == pytest.approx(late[3:].sum(), rel=1e-6)
-    assert result.untouched[2] == pytest.approx(0.5 * (state[15:] ** 2).sum())
+    assert result.spillover[2] == pytest.approx(late[3:].sum(), rel=1e-6)
+    assert result.uncontrolled[2] == pytest.approx(0.5 * (state[15:] ** 2).sum())
 
 
 def test_the_least_number_is_recommended():
     found = modes()
     state = np.r_[np.zeros(12), 1.0, 0.5, 0.02 * np.ones(10)]
-    result = how_many_modes(found, state, weight=20.0, share=0.05)
-    assert result.recommended == 2 and result.left[0] > 0.05 * result.energy.sum()
-    assert how_many_modes(found, state, weight=20.0, share=1e-9).recommended is None
+    result = controlled_mode_count(found, state, weight=20.0, share=0.05)
+    assert result.recommended == 2 and result.residual[0] > 0.05 * result.energy.sum()
+    assert controlled_mode_count(found, state, weight=20.0, share=1e-9).recommended is None
 
 
 def test_refusals():
     with pytest.raises(DesignError, match="gives no mode any energy"):
-        how_many_modes(modes(), np.zeros(24), weight=1.0)
+        controlled_mode_count(modes(), np.zeros(24), weight=1.0)
     with pytest.raises(DesignError, match="no number of modes can be controlled"):
-        how_many_modes(modes(), impulse_state(modes(), 6.3), weight=1.0, places=lambda n: np.full(n, 0.0))
+        controlled_mode_count(modes(), impulse_state(modes(), 6.3), weight=1.0, places=lambda n: np.full(n, 0.0))

@@ -4,10 +4,10 @@ import numpy as np
 
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, impulse_state
-from workbench.design.placement.how_many import how_many_modes
+from workbench.design.placement.controlled_modes import controlled_mode_count
 from workbench.design.placement.placement import nodes_of_mode
 from workbench.design.spillover.spillover import finite_spillover
-from workbench.draw.design import plot_how_many
+from workbench.draw.design import plot_controlled_mode_count
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
 
@@ -31,13 +31,15 @@ def study(outcome, data=None):
     impulse = impulse_state(modes, 6.3)
     force = after_half_sine(modes, 6.3, 4.0)
     found = {
-        "an impulse, the same momentum for every mode": how_many_modes(modes, impulse, weight=WEIGHT, share=SHARE),
-        "a half-sine force of 4 s": how_many_modes(modes, force, weight=WEIGHT, share=SHARE),
+        "an impulse, the same momentum for every mode": controlled_mode_count(
+            modes, impulse, weight=WEIGHT, share=SHARE
+        ),
+        "a half-sine force of 4 s": controlled_mode_count(modes, force, weight=WEIGHT, share=SHARE),
     }
     for name, result in found.items():
         n = result.recommended
         outcome.say(
-            f"{name}: control {n} modes, which leave {result.left[n - 1] / result.energy.sum():.1%} of the energy"
+            f"{name}: control {n} modes, which leave {result.residual[n - 1] / result.energy.sum():.1%} of the energy"
             if n
             else f"{name}: no number up to {result.counts[-1]} leaves as little as {SHARE:.0%};"
             f" least is left with {result.least}"
@@ -46,8 +48,8 @@ def study(outcome, data=None):
             name.split(",")[0].replace(" ", "_"),
             {
                 "energy": result.energy,
-                "untouched": result.untouched,
-                "spilled": result.spilled,
+                "uncontrolled": result.uncontrolled,
+                "spillover": result.spillover,
                 "effort": result.effort,
                 "recommended": n,
                 "least": result.least,
@@ -61,7 +63,7 @@ def study(outcome, data=None):
     late = finite_spillover(close_loop(modes, law), rest, 2000.0)
     outcome.check(
         "spillover work of the recommended number, against the work up to 2000 s, relative",
-        abs(late.residual_total / gentle.spilled[n - 1] - 1.0),
+        abs(late.residual_total / gentle.spillover[n - 1] - 1.0),
         1e-6,
     )
     outcome.check(
@@ -72,10 +74,12 @@ def study(outcome, data=None):
     outcome.check("modes recommended for a force of 4 s", n, 6)
     outcome.check(
         "energy left with one mode fewer, over the limit",
-        gentle.left[n - 2] / (SHARE * gentle.energy.sum()),
+        gentle.residual[n - 2] / (SHARE * gentle.energy.sum()),
         1.0,
         at_least=True,
     )
     outcome.figure(
-        "energy", plot_how_many(found, SHARE), "Energy left when the lowest n modes are controlled, by what leaves it."
+        "energy",
+        plot_controlled_mode_count(found, SHARE),
+        "Energy left when the lowest n modes are controlled, by what leaves it.",
     )

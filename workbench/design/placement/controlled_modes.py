@@ -1,4 +1,4 @@
-"""How many modes to control: what the disturbance gives each, and the residual work of controlling n of them.
+"""The number of modes to control: what the disturbance gives each, and the residual work of controlling n of them.
 
 Controlling the lowest n leaves Σ_{r>n} E_r of the disturbance where it is (5.27 is what control takes out) and adds
 the spillover W_R (5.43). What is left either way is the yardstick.
@@ -15,19 +15,20 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.placement import nodes_of_mode
 from workbench.design.spillover.spillover import effort, spillover
+from workbench.renamed import Renamed
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, freeze
 
 
 @dataclass(frozen=True, eq=False)
-class HowMany:
+class ControlledModeCount:
     """What is left of a disturbance when the lowest n modes are controlled.
 
     Attributes:
         counts: (n_counts,) n; nan elsewhere where the actuators of that n cannot be placed.
         energy: (n_modes,) that the disturbance gives each mode, J.
-        untouched: (n_counts,) Σ_{r>n} E_r.
-        spilled: (n_counts,) W_R, residual modes at rest when control starts.
+        uncontrolled: (n_counts,) Σ_{r>n} E_r, J.
+        spillover: (n_counts,) W_R, J, residual modes at rest when control starts.
         effort: (n_counts,) ∫ FᵀF dt.
         recommended: least n that leaves no more than the share asked for; None where none does.
         least: n that leaves least.
@@ -35,23 +36,25 @@ class HowMany:
 
     counts: np.ndarray
     energy: Floats
-    untouched: Floats
-    spilled: Floats
+    uncontrolled: Floats
+    spillover: Floats
     effort: Floats
     recommended: int | None
     least: int
 
     def __post_init__(self) -> None:
-        freeze(self, "energy", "untouched", "spilled", "effort")
+        freeze(self, "energy", "uncontrolled", "spillover", "effort")
         freeze(self, "counts", dtype=int)
 
     @property
-    def left(self) -> Floats:
-        """Untouched and spilled together, (n_counts,)."""
-        return self.untouched + self.spilled
+    def residual(self) -> Floats:
+        """Energy of the modes that are not controlled and spillover work together, (n_counts,), J."""
+        return self.uncontrolled + self.spillover
+
+    untouched, spilled, left = Renamed("uncontrolled"), Renamed("spillover"), Renamed("residual")
 
 
-def how_many_modes(
+def controlled_mode_count(
     modes: Modes,
     state: np.ndarray,
     *,
@@ -59,7 +62,7 @@ def how_many_modes(
     share: float = 0.05,
     most: int | None = None,
     places: Callable[[int], ArrayLike] | None = None,
-) -> HowMany:
+) -> ControlledModeCount:
     """The number of modes in need of control.
 
     Args:
@@ -88,15 +91,15 @@ def how_many_modes(
         rest = state.copy()
         rest[n:n_modes] = rest[n_modes + n :] = 0.0
         spilled[i], spent[i] = spillover(modes, law, rest).residual_total, effort(modes, law, rest)
-    untouched = energy.sum() - np.cumsum(energy)[: counts.size]
-    left = untouched + spilled
+    uncontrolled = energy.sum() - np.cumsum(energy)[: counts.size]
+    left = uncontrolled + spilled
     if not np.isfinite(left).any():
         raise DesignError("no number of modes can be controlled from these places; give others")
     enough = counts[left <= share * energy.sum()]
-    return HowMany(
+    return ControlledModeCount(
         counts,
         energy,
-        untouched,
+        uncontrolled,
         spilled,
         spent,
         int(enough[0]) if enough.size else None,

@@ -1,0 +1,40 @@
+"""Former names of attributes: each gives the new one, and says so."""
+
+import importlib
+import pkgutil
+from dataclasses import fields, is_dataclass
+
+import pytest
+
+import workbench
+from workbench.renamed import Renamed
+
+
+def former_names():
+    """(class, former name, new name) of every former name in the package."""
+    for module in pkgutil.walk_packages(workbench.__path__, "workbench."):
+        if module.name.endswith("__main__"):
+            continue
+        for thing in vars(importlib.import_module(module.name)).values():
+            if isinstance(thing, type) and thing.__module__ == module.name:
+                yield from ((thing, old, r._new) for old, r in vars(thing).items() if isinstance(r, Renamed))
+
+
+def test_a_former_name_gives_the_new_attribute_with_a_warning():
+    class Beam:
+        span = Renamed("length")
+
+        def __init__(self):
+            self.length = 10.0
+
+    with pytest.warns(DeprecationWarning, match="Beam.span is now length; the old name goes with the next version"):
+        assert Beam().span == 10.0
+
+
+def test_every_former_name_leads_to_an_attribute_that_is_there():
+    found = list(former_names())
+    assert len(found) >= 18
+    for owner, old, new in found:
+        own = {f.name for f in fields(owner)} if is_dataclass(owner) else set()
+        assert new in own or hasattr(owner, new), f"{owner.__name__}.{old} leads to {new}, which is not there"
+        assert old not in own
