@@ -69,7 +69,7 @@ def plant(index, seed, searched=False):
     sure = UncertainRig(rig, true, np.zeros((_size(rig, true),) * 2))
     best = redesign(sure, law, test=test, draws=1, seed=index, placement=False)
     weight = force_weight(best.after, best.controlled)
-    struck = next(a for a in rig.actuators if a.direct or a.at == test.impulse_at).name
+    impulse_input = next(a for a in rig.actuators if a.direct or a.at == test.impulse_at).name
     bounded = replace(found, more_work=NO_MORE)
     used = {
         "nominal": found.present,
@@ -77,7 +77,7 @@ def plant(index, seed, searched=False):
         "true": best.controller,
         "no more work": bounded.controller,
     }
-    given = {"n_samples": test.n_samples, "struck": struck, "impulse": test.impulse}
+    given = {"n_samples": test.n_samples, "impulse_input": impulse_input, "impulse": test.impulse}
     runs, told = {}, {}  # a controller that two of them are runs once
     for name, controller in used.items():
         if controller not in runs:

@@ -49,11 +49,11 @@ def plant(index, seed):
     test = impulse_test(rig, range(CONTROLLED), case.fit[0].sample_time, level=level, seed=index)
     at = {"impulse_at": test.impulse_at, "impulse": test.impulse}
     law = plain_law(LAWS[index % len(LAWS)], rig, CONTROLLED, damping=DAMPING, **at)
-    struck = next(a for a in rig.actuators if a.direct or a.at == test.impulse_at).name
+    impulse_input = next(a for a in rig.actuators if a.direct or a.at == test.impulse_at).name
 
     def controlled(hidden, controller):
         noise = np.random.default_rng([seed, index, 7])
-        given = {"n_samples": test.n_samples, "struck": struck, "impulse": test.impulse}
+        given = {"n_samples": test.n_samples, "impulse_input": impulse_input, "impulse": test.impulse}
         return control_plant(hidden, controller, **given, rng=noise)
 
     def designed(*effects):
@@ -73,7 +73,7 @@ def plant(index, seed):
             "pays": found.improves,
             "steps": [s.name for s in found.steps if s.kept],
         }
-    told["saturation"]["soonest"] = _soonest(real, nominal.present, struck, test, free)
+    told["saturation"]["soonest"] = _soonest(real, nominal.present, impulse_input, test, free)
     return told
 
 
@@ -84,19 +84,19 @@ def _sizes(case, peak):
     return {"delay": LATE * low.sample_time, "dead zone": STICKS * rms, "saturation": LIMIT * peak}
 
 
-def _soonest(real, controller, struck, test, free):
+def _soonest(real, controller, impulse_input, test, free):
     """The least settling time of the controlled modes by any forces within the limit, s; see the top."""
     if free.settling(CONTROLLED) is None:
         return None
     first, last = 1, round(2.0 * free.settling(CONTROLLED) / test.sample_time)
     while last > first:
         middle = (first + last) // 2
-        left = _least_energy(real, controller, struck, test, free, middle)
+        left = _least_energy(real, controller, impulse_input, test, free, middle)
         first, last = (first, middle) if left <= SETTLED else (middle + 1, last)
     return last * test.sample_time
 
 
-def _least_energy(real, controller, struck, test, free, n_samples):
+def _least_energy(real, controller, impulse_input, test, free, n_samples):
     """The least energy of the controlled modes that any forces leave after some samples, over that of the impulse."""
     (omega2, damping, *_), *_ = real.system(test.sample_time)[0]
     omega, n = np.sqrt(omega2), omega2.size
@@ -109,7 +109,7 @@ def _least_energy(real, controller, struck, test, free, n_samples):
     gains = np.array([real.plant.actuators[j].gain for j in driven])
     into = np.vstack([np.outer(b[:2, 2], gains * real.at_actuators[driven, r]) for r, b in enumerate(blocks)])
     start = np.zeros(2 * n)
-    start[1::2] = test.impulse * real.at_actuators[actuators.index(struck)]
+    start[1::2] = test.impulse * real.at_actuators[actuators.index(impulse_input)]
     size = np.linalg.norm(start[: 2 * CONTROLLED])
 
     program = ca.Opti()

@@ -163,7 +163,7 @@ def study(outcome, data=None):
             {name: responses[name] for name in ("free", "controlled")},
             [time[i] for i in (40, 220, 480, 900, 1499)],
             actuators=SHAKERS,
-            struck=STRUCK_AT,
+            impulse_at=STRUCK_AT,
         ),
         "The panel after an impulse at the star, left alone and controlled from the four crosses.",
     )

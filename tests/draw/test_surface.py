@@ -47,7 +47,7 @@ def test_a_placement_is_drawn_over_the_nodal_lines_of_the_next_mode(size):
     task = placement_task(panel(), 2, impulse_at=(0.35, 0.3), weight=0.1, actuator=actuator)  # mode 3 is (1, 2)
     placed = {"here": task.placed([(0.3, 0.2), (0.8, 0.5)], ""), "there": task.placed([(0.3, 0.5), (0.9, 0.3)], "")}
     limits = Limits(effort=1.0, forbidden=(((0.5, 0.1), (0.7, 0.3)),))
-    figure = plot_surface_placement(task, placed, limits=limits, struck=(0.35, 0.3))
+    figure = plot_surface_placement(task, placed, limits=limits, impulse_at=(0.35, 0.3))
     left, right = figure.axes
     assert "nodal lines of mode 3" in left.get_title("left") and not left.lines[0].get_clip_on()
     assert "forbidden" in [text.get_text() for text in left.get_legend().get_texts()]
@@ -73,7 +73,7 @@ def test_sensors_are_drawn_where_they_stand_and_coloured_as_they_read():
 def test_motion_has_a_row_a_response_and_a_panel_an_instant():
     modes, time = panel(), np.linspace(0.0, 1.0, 11)
     response = Response(time, np.ones((8, 11)), np.zeros((1, 11)), modes)
-    figure = plot_surface_motion({"one": response, "two": response}, [0.0, 0.52, 1.0], struck=(0.2, 0.2))
+    figure = plot_surface_motion({"one": response, "two": response}, [0.0, 0.52, 1.0], impulse_at=(0.2, 0.2))
     titles = [ax.get_title("left") for ax in figure.axes]
     assert titles[:6] == ["0 s", "0.5 s", "1 s"] * 2 and figure.axes[3].get_ylabel() == "two"
 

@@ -81,7 +81,7 @@ def test_bands_of_a_controlled_test_hold_plants_of_another_numerical_route(plain
     for _ in range(6):
         real = gain_of(float(np.exp(SPREAD * rng.normal()))).apply(plain)
         plant = Plant(plain, real.actuators, real.sensors, plain.modes.n_modes).solved()
-        run = control_plant(plant, controller, n_samples=250, struck="F1", impulse=0.05, rng=rng)
+        run = control_plant(plant, controller, n_samples=250, impulse_input="F1", impulse=0.05, rng=rng)
         shares.append(told.coverage(run.outputs)[:, 0].mean())
     assert 0.90 < np.mean(shares) < 0.99
     certain = predict_loop(uncertain(plain, spread=0.0), controller, test, draws=60)

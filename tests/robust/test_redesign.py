@@ -111,8 +111,8 @@ def test_a_filter_through_which_residual_modes_diverge_is_made_slower(rig):
         found = redesign(possible(rig), fast, sample_time=DT, impulse_at=0.8, draws=2, placement=False)
         assert found.improves and found.safe and "the present one on 0" in found.advice
         assert "otherwise unstable" in found.steps[1].what and found.steps[0].lost == "diverges"
-        assert not control_plant(plant, found.present, n_samples=1500, struck="F1").stable
-        assert control_plant(plant, found.redesigned, n_samples=1500, struck="F1").stable
+        assert not control_plant(plant, found.present, n_samples=1500, impulse_input="F1").stable
+        assert control_plant(plant, found.redesigned, n_samples=1500, impulse_input="F1").stable
         chosen.append(found.redesigned)
     np.testing.assert_allclose(chosen[0].a, chosen[1].a, rtol=1e-6)
 
@@ -392,8 +392,8 @@ def test_a_motor_at_a_support_is_tested_by_an_impulse_that_moves_the_modes():
     )
     patch = wb.Actuator("patch", Patch(0.3, 0.3, 0.2, 0.2), kind="moment")
     rig = wb.Rig(plate.modes(4), (patch,), (wb.Sensor("a", (0.6, 0.3), "displacement"),))
-    struck = impulse_test(rig, (0, 1), 0.001).impulse_at
-    assert np.abs(rig.modes.phi([struck])[0, :2]).min() > 0.5
+    impulse_input = impulse_test(rig, (0, 1), 0.001).impulse_at
+    assert np.abs(rig.modes.phi([impulse_input])[0, :2]).min() > 0.5
 
 
 def test_what_cannot_be_redesigned_is_named(rig, controller):
@@ -494,14 +494,14 @@ def test_a_limit_is_made_up_for_where_residual_modes_fill_the_readings(hidden_pl
     level = np.max([np.abs(r.outputs).max(axis=1) for r in case.fit], axis=0)
     test = impulse_test(rig, controlled, case.fit[0].sample_time, level=level, seed=20)
     law = plain_law(kind, rig, 2, damping=0.35, impulse_at=test.impulse_at, impulse=test.impulse)
-    struck = next(a.name for a in rig.actuators if a.direct or a.at == test.impulse_at)
+    impulse_input = next(a.name for a in rig.actuators if a.direct or a.at == test.impulse_at)
 
     def designed(*effects):
         return redesign(possible(rig, *effects), law, test=test, draws=1, placement=False)
 
     def run(plant, controller):
         rng = np.random.default_rng(7)
-        return control_plant(plant, controller, n_samples=3000, struck=struck, impulse=test.impulse, rng=rng)
+        return control_plant(plant, controller, n_samples=3000, impulse_input=impulse_input, impulse=test.impulse, rng=rng)
 
     free = run(real, designed().present)
     limit = 0.5 * free.peak_force

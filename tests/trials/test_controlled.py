@@ -38,7 +38,7 @@ def test_two_numerical_routes_agree_on_a_controlled_structure(hinged_beam, drive
     real = replace(rig, sensors=sensors, actuators=(*(replace(a, **DRIVES[drive]) for a in inputs[:2]), inputs[2]))
     expected = run_loop(real, controller, LoopTest(300, DT, impulse_at=0.8), substeps=20)
     plant = Plant(rig, real.actuators, sensors, 4).solved()
-    found = control_plant(plant, controller, n_samples=300, struck="hammer")
+    found = control_plant(plant, controller, n_samples=300, impulse_input="hammer")
     energy = expected.response.energy.sum(axis=0)
     assert found.bounded and found.stable
     assert found.energy == pytest.approx(energy, abs=5e-3 * energy.max())

@@ -189,7 +189,7 @@ def _draw(
     from workbench.draw.surface import plot_surface_placement
 
     if isinstance(task.modes.domain, Rectangle):
-        figure = plot_surface_placement(task, placements, limits=limits, struck=struck)  # type: ignore[arg-type]
+        figure = plot_surface_placement(task, placements, limits=limits, impulse_at=struck)  # type: ignore[arg-type]
     else:
         figure = plot(next(iter(placements.values())))
     figure.savefig(path)

@@ -105,7 +105,7 @@ def size_and_errors(rows: Sequence[Mapping[str, Any]], errors: np.ndarray) -> Fi
     left.set_xticks(samples, [f"{n:,}" for n in samples])
     left.set_yticks([1, 3, 10, 30], ["1", "3", "10", "30"])
     left.minorticks_off()
-    left.set(xlim=(0.5 * samples.min(), 1.4 * samples.max()), ylim=(0.25 * spent.min(), 60.0))
+    left.set(xlim=(0.3 * samples.min(), 1.4 * samples.max()), ylim=(0.25 * spent.min(), 60.0))
     left.set(xlabel=f"samples of {rows[-1]['sensors']} sensors", ylabel="time to identify [s]")
     left.legend(loc="lower right")
     edges, x = np.linspace(-4.0, 4.0, 17), np.linspace(-4.0, 4.0, 201)
@@ -113,6 +113,7 @@ def size_and_errors(rows: Sequence[Mapping[str, Any]], errors: np.ndarray) -> Fi
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     right.plot(x, normal, color=GREY, lw=3, alpha=0.7, label="a method that attains the bound")
     right.set(xlabel="error of a mode [standard errors of the bound]", ylabel="density")
+    right.set_ylim(top=1.35 * right.get_ylim()[1])  # room for the legend
     right.legend(loc="upper left")
     return figure
 

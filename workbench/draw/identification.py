@@ -129,7 +129,7 @@ def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz:
 
 
 def measured_modes(bending: SampledModes, others: SampledModes, pairing: ModePairing, model: Modes) -> Figure:
-    """Measured shapes over the model's, one panel per mode; those that are not the model's last, in grey."""
+    """Measured shapes over the model's, one panel per mode; those that are not the model's last, in orange."""
     n = bending.n_modes + others.n_modes
     figure, axes = new_figure(int(np.ceil(n / 4)), 4, width=12, height=2.7 * np.ceil(n / 4), sharex=True, sharey=True)
     x = np.linspace(0.0, model.length, 200)
@@ -142,14 +142,21 @@ def measured_modes(bending: SampledModes, others: SampledModes, pairing: ModePai
         if is_model:
             shape = at_sensors[:, pairing.model[k]]
             scale = (values @ shape) / (shape @ shape)
-            ax.plot(x, scale * model.phi(x)[:, pairing.model[k]], color=GREY, lw=3, alpha=0.5)
-        ax.plot(modes.positions, values, "o" if is_model else "s", color=COLOURS[0] if is_model else COLOURS[1])
+            ax.plot(x, scale * model.phi(x)[:, pairing.model[k]], color=GREY, lw=3, alpha=0.5, label="beam model")
+        marker, colour, label = (
+            ("o", COLOURS[0], "measured") if is_model else ("s", COLOURS[1], "measured, not bending")
+        )
+        ax.plot(modes.positions, values, marker, color=colour, label=label)
         what = f"beam {pairing.scaled_hz[k]:.1f} Hz, MAC {pairing.mac[k]:.3f}" if is_model else "not bending"
         ax.set_title(f"{modes.frequencies_hz[k]:.1f} Hz: {what}", fontsize=9.5)
     for ax in axes.ravel()[n:]:
         ax.set_visible(False)
     for ax in np.atleast_2d(axes)[-1]:
         ax.set_xlabel("x / length")
+    for ax in np.atleast_2d(axes)[:, 0]:
+        ax.set_ylabel("mode shape, largest 1")
+    named = {label: line for ax in axes.ravel() for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named))
     return figure
 
 

@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
+from warnings import warn
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -106,6 +107,7 @@ def plot_surface_motion(
     times: Sequence[float],
     *,
     actuators: np.ndarray | None = None,
+    impulse_at: tuple[float, float] | None = None,
     struck: tuple[float, float] | None = None,
 ) -> Figure:
     """Displacement of a plate at some instants, a row a response, all in one scale of colour.
@@ -113,8 +115,10 @@ def plot_surface_motion(
     Args:
         times: s; the nearest instants of each response are drawn.
         actuators: (n_actuators, 2) places, m, marked by crosses.
-        struck: where the plate was hit, marked by a star.
+        impulse_at: where the impulse acted, marked by a star.
+        struck: its former name.
     """
+    impulse_at = _impulse_at(impulse_at, struck)
     first = next(iter(responses.values()))
     figure, grid = new_figure(
         len(responses), len(times), width=2.6 * len(times), height=2.1 * len(responses) + 0.3, squeeze=False
@@ -130,12 +134,14 @@ def plot_surface_motion(
             image = _coloured(ax, x, y, field, limit)
             if actuators is not None:
                 ax.plot(*actuators.T, "x", color="black", markersize=6, label="actuator")
-            if struck is not None:
-                ax.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=11, label="impulse")
+            if impulse_at is not None:
+                ax.plot(*impulse_at, "*", color=COLOURS[4], markeredgecolor="black", markersize=11, label="impulse")
             ax.set_title(f"{time:.3g} s", fontsize=10)
         row[0].set_ylabel(name, fontsize=11)
     for ax in grid.flat:
         _bare(ax, first.modes)
+    a, b = cast(Rectangle, first.modes.domain).length
+    grid[-1, 0].set(xticks=[0.0, a], yticks=[0.0, b], xlabel="x, y [m]")
     ticks = [tick for tick in MaxNLocator(5).tick_values(-limit, limit) if abs(tick) <= limit]
     figure.colorbar(image, ax=grid, label="displacement [m]", shrink=0.8, ticks=ticks)
     handles, labels = grid[0, 0].get_legend_handles_labels()
@@ -149,6 +155,7 @@ def plot_surface_placement(
     placements: Mapping[str, Placement],
     *,
     limits: Limits | None = None,
+    impulse_at: tuple[float, float] | None = None,
     struck: tuple[float, float] | None = None,
 ) -> Figure:
     """Actuators on a plate over mode n + 1, whose nodal lines are black, and the work in each residual mode beside.
@@ -158,8 +165,10 @@ def plot_surface_placement(
     Args:
         placements: by name, drawn in its colour.
         limits: of which the forbidden zones are hatched.
-        struck: where the impulse acts, marked by a star.
+        impulse_at: where the impulse acts, marked by a star.
+        struck: its former name.
     """
+    impulse_at = _impulse_at(impulse_at, struck)
     n, modes = task.n_controlled, task.modes
     assert isinstance(modes.domain, Rectangle)
     figure, (left, right) = new_figure(1, 2, width=11, height=4.2)
@@ -177,8 +186,8 @@ def plot_surface_placement(
             for middle in placement.positions:
                 left.fill(*(middle + half * CORNERS).T, facecolor=COLOURS[i], edgecolor=COLOURS[i], alpha=0.3, zorder=2)
         right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
-    if struck is not None:
-        left.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
+    if impulse_at is not None:
+        left.plot(*impulse_at, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
     first = f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, the lowest residual mode"
     left.set_title(f"{modes.domain}, with the nodal lines of {first}", fontsize=10)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), fontsize=9, ncols=2)
@@ -295,6 +304,13 @@ def _panels(modes: Modes, count: int, columns: int) -> tuple[Figure, list[Axes]]
     for ax in grid.flat[count:]:
         ax.set_visible(False)
     return figure, list(grid.flat[:count])
+
+
+def _impulse_at(given: tuple[float, float] | None, former: tuple[float, float] | None) -> tuple[float, float] | None:
+    if former is None:
+        return given
+    warn("struck=... is now impulse_at=...; the old name goes with the next version", DeprecationWarning, 3)
+    return former
 
 
 def _bare(ax: Axes, modes: Modes) -> None:

@@ -85,7 +85,7 @@ def impulse_test(
     omega = omega[omega > 0]
     if not omega.size:
         raise DesignError("the controlled modes are all rigid, so they have no period: give a test of your own")
-    impulse_at = _struck_at(rig, controlled, impulse_at)
+    impulse_at = _impulse_place(rig, controlled, impulse_at)
     shape = rig.modes.phi_at(impulse_at)
     n_samples = int(min(max(PERIODS * 2.0 * np.pi / omega.min() / sample_time, 64), MOST_SAMPLES))
     test = LoopTest(n_samples, sample_time, impulse_at, seed=seed)
@@ -106,7 +106,7 @@ def impulse_test(
     return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
 
 
-def _struck_at(rig: Rig, controlled: Sequence[int], given: Where | None) -> Where:
+def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> Where:
     """Where an impulse moves the controlled modes: the place given, or one that suits."""
     places = rig.modes.domain.grid(GRID)
     shapes = np.abs(rig.modes.phi(places))

@@ -66,18 +66,18 @@ def control_plant(
     controller: DigitalController,
     *,
     n_samples: int,
-    struck: str,
+    impulse_input: str,
     impulse: float = 1.0,
     rng: np.random.Generator | None = None,
     finest: float = FINEST,
 ) -> Controlled:
-    """The plant struck at one of its inputs, and controlled from then on.
+    """The plant after an impulse at one of its inputs, and controlled from then on.
 
     Args:
         real: the plant.
         controller: names the plant's sensors and actuators.
         n_samples: of the test, at the controller's sample time.
-        struck: name of the input at which the impulse acts.
+        impulse_input: name of the input at which the impulse acts.
         impulse: N s.
         rng: of the sensors' noise and of random forces; None for neither.
         finest: radians of the highest mode in one step.
@@ -91,7 +91,7 @@ def control_plant(
     held = real.random_forces(n_samples, dt, rng)
     size = 2 * n + m + system[3][0].shape[0]
     y, work = np.zeros(size), np.zeros((5, size))
-    y[n : 2 * n] = impulse * real.at_actuators[inputs.index(struck)]
+    y[n : 2 * n] = impulse * real.at_actuators[inputs.index(impulse_input)]
     omega2 = system[0][0]
     given = 0.5 * float(y[n : 2 * n] @ y[n : 2 * n])
     pieces = np.zeros((n_samples, 3, edges.size, n))
