@@ -50,7 +50,7 @@ def simulations(n_modes: int, n_samples: int) -> dict[str, float]:
     rig = Rig(beam.modes(n_modes), [Actuator("F", 2.1)], sensors)
     command = np.random.default_rng(0).normal(size=(1, n_samples))
     whole = FitData((simulate(rig, command, sample_time=0.02),), np.full(12, NOISE))
-    ahead = whole.following(rig)
+    ahead = whole.one_step_ahead(rig)
     sprung = replace(rig, elements=(CubicSpring(3.3, 1.0),))
     return {
         f"{rig_name}, {data_name}": least(lambda rig=rig, data=data: replace(data).residual(rig))

@@ -11,7 +11,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import follow, simulate
+from workbench.rig.simulate import prediction_errors, simulate
 from workbench.rig.statespace import state_space
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes, PointShapes
@@ -92,7 +92,7 @@ def test_a_filter_predicts_its_own_motion():
     outputs = simulate(model, u, sample_time=DT, input_hold="first").outputs
     gain = np.zeros((2, 3, 3))
     gain[0, :, 0] = gain[1, :, 1] = 0.05 * model.modes.phi_at("y")  # stable: pulled towards what is measured
-    errors = follow(model, u, outputs, gain, sample_time=DT, substeps=1, input_hold="first")
+    errors = prediction_errors(model, u, outputs, gain, sample_time=DT, substeps=1, input_hold="first")
     assert np.abs(errors).max() < 1e-9 * np.abs(outputs).max()
 
 

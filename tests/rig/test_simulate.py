@@ -24,7 +24,7 @@ from workbench.rig.elements import (
 )
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import follow, move, simulate
+from workbench.rig.simulate import move, prediction_errors, simulate
 from workbench.rig.statespace import state_space
 from workbench.rig.stepping import step_record
 from workbench.structure.damping import ModalDamping
@@ -316,5 +316,5 @@ def test_the_stepper_is_compiled_once():
     ):
         for u in (inputs, one_driven):
             outputs = simulate(rig(elements), u, sample_time=DT).outputs
-            follow(rig(elements), u, outputs, np.zeros((2, 6, 3)), sample_time=DT)
+            prediction_errors(rig(elements), u, outputs, np.zeros((2, 6, 3)), sample_time=DT)
     assert len(step_record.signatures) == 1

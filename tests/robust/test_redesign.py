@@ -501,7 +501,9 @@ def test_a_limit_is_made_up_for_where_residual_modes_fill_the_readings(hidden_pl
 
     def run(plant, controller):
         rng = np.random.default_rng(7)
-        return control_plant(plant, controller, n_samples=3000, impulse_input=impulse_input, impulse=test.impulse, rng=rng)
+        return control_plant(
+            plant, controller, n_samples=3000, impulse_input=impulse_input, impulse=test.impulse, rng=rng
+        )
 
     free = run(real, designed().present)
     limit = 0.5 * free.peak_force

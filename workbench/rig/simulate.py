@@ -343,7 +343,7 @@ def _move_finely(rig: Rig, inputs: Floats, sample_time: float, substeps: int, in
     return _move_in_steps(rig, finely, sample_time / substeps, 1, input_hold)
 
 
-def follow(
+def prediction_errors(
     rig: Rig,
     inputs: np.ndarray,
     outputs: np.ndarray,
@@ -353,10 +353,10 @@ def follow(
     substeps: int = 8,
     input_hold: str = "zero",
 ) -> np.ndarray:
-    """Errors (n_sensors, n_samples) of predictions one sample ahead, by a rig that every sample sets right.
+    """Errors (n_sensors, n_samples) of predictions one sample ahead, by a rig that every sample corrects.
 
     A motion that runs away from the measured one within a few periods, as that of a stiff contact a little out of place
-    does, is held beside it: the errors then go smoothly with every number of the rig.
+    does, is kept near it: the errors then go smoothly with every number of the rig.
 
     Args:
         rig: its sensors may have gain, bias and drift; lag, clipping and rounding are not seen.

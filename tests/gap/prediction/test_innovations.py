@@ -9,7 +9,7 @@ import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
-from workbench.gap.prediction.innovations import LOOSE, Follower, _grows
+from workbench.gap.prediction.innovations import LOOSE, Observer, _grows
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.gap.search.fit import cost_of
@@ -28,7 +28,7 @@ def test_exchanged_sensors_do_not_make_the_correction_run_away(hinged_rig, recor
     ):
         there = Effect(kind_named(kind), target, values)
         record = record_of(there.apply(rig), inputs, rng)
-        data = FitData((record,), noise).following(rig)
+        data = FitData((record,), noise).one_step_ahead(rig)
         assert cost_of(rig, (), data) > 100.0
         assert cost_of(rig, (there,), data) < 1.5
 
@@ -47,7 +47,7 @@ def test_errors_beside_the_forces_that_are_believed_are_white(hinged_rig, quanti
     outputs += noise[:, None] * rng.normal(size=outputs.shape)
     channels = tuple(Channel(s.name, s.quantity) for s in rig.sensors)
     record = Record(dt, outputs, channels, np.zeros((1, 20_000)), (Channel("F", "force"),))
-    errors = Follower.of(rig, noise, 1.0, dt).errors(rig, record, 1)[:, 1000:]
+    errors = Observer.of(rig, noise, 1.0, dt).errors(rig, record, 1)[:, 1000:]
     np.testing.assert_allclose(np.cov(errors), np.eye(4), atol=0.05)
     for lag in (1, 2, 5):
         assert np.abs(errors[:, lag:] @ errors[:, :-lag].T / errors.shape[1]).max() < 0.04
@@ -58,7 +58,7 @@ def test_records_and_motions_are_let_go(hinged_rig, record_of):
     rig, rng = hinged_rig(3), np.random.default_rng(1)
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
     delayed = Effect(kind_named("actuator_delay"), "all", {"delay": 1e-3}).apply(rig)
-    data = FitData((record_of(rig, rng.normal(size=(1, 300)), rng),), noise).following(rig)
+    data = FitData((record_of(rig, rng.normal(size=(1, 300)), rng),), noise).one_step_ahead(rig)
     data.residual(delayed)
     data.differences(rig)
     gone = weakref.ref(data)

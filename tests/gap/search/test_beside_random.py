@@ -11,7 +11,7 @@ from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.gap.effects.nominal import nominal_errors
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.innovations import Follower
+from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.beside_random import looks_random, random_beside, random_beside_errors
@@ -77,8 +77,8 @@ def test_what_a_right_law_leaves_beside_a_random_force_is_its_linear_answer(rig,
     (weak, *_), (plain, *_) = records(real, 0.05), records(rig, 0.05)
     quiet = simulate(replace(rig, actuators=rig.actuators[:1]), plain.inputs, sample_time=0.01).outputs
     truth = plain.outputs - quiet  # the same wind on the structure without the law
-    follower = Follower.of(told, noise, 0.1, 0.01, at=1.3, rms=0.05)
-    left = follower.left(told, weak, 8)
+    observer = Observer.of(told, noise, 0.1, 0.01, at=1.3, rms=0.05)
+    left = observer.left(told, weak, 8)
     whole = weak.outputs - simulate(told, weak.inputs, sample_time=0.01).outputs
     error = [np.sqrt(np.mean((r - truth) ** 2) / np.mean(truth**2)) for r in (left, whole)]
     assert error[0] < 0.02 < 0.1 < error[1]

@@ -67,7 +67,7 @@ def test_predictions_ahead_err_by_the_innovations_of_the_filter_where_all_is_lin
     forces = LOOSE * data.force_rms * np.sqrt(np.mean(rig.modes.phi(places) ** 2, axis=0))
     kalman = force_filter(sampled_model(rig.modes, rig.sensors, data.noise, DT), np.eye(6), forces**2)
     expected = whiten(kalman, data.residual(rig).reshape(4, -1) * NOISE)
-    np.testing.assert_allclose(data.following(rig).residual(rig).reshape(4, -1), expected, atol=1e-6)
+    np.testing.assert_allclose(data.one_step_ahead(rig).residual(rig).reshape(4, -1), expected, atol=1e-6)
     assert np.std(expected) > 2.0  # so that more than noise was compared
 
 
@@ -75,7 +75,7 @@ def test_predictions_ahead_lead_to_a_spring_beside_which_motions_run_apart(rig, 
     data = measured(replace(rig, elements=(CubicSpring(0.62, 4e4),)), level=0.5)
     away = (Effect(CUBIC, None, {"at": 0.56, "stiffness": 2.8e4}),)
     lost = fit(rig, away, data, iterations=30)
-    ahead = fit(rig, away, data.following(rig), iterations=15)
+    ahead = fit(rig, away, data.one_step_ahead(rig), iterations=15)
     found = fit(rig, ahead.effects, data.stepped(8), iterations=15)
     assert lost.cost > 1e4 and found.cost < 1.02
     assert found.effects[0].values["at"] == pytest.approx(0.62, abs=1e-4)

@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.innovations import Follower
+from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import Fit, fit, slopes
@@ -19,7 +19,7 @@ from workbench.gap.search.search import Search
 from workbench.gap.search.selection import one_more, pairs_at_once
 from workbench.gap.search.settings import SELECTION
 from workbench.rig.elements import CubicSpring
-from workbench.rig.simulate import follow
+from workbench.rig.simulate import prediction_errors
 from workbench.structure.domain import Interval
 
 NOISE, DT = 1e-5, 0.01
@@ -91,13 +91,13 @@ def test_errors_ahead_of_a_linear_rig_are_those_of_steps_through_time(rig, recor
     """A linear rig is set right in closed form, by what its errors over the whole record leave of themselves."""
     rng = np.random.default_rng(2)
     record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng)
-    follower = Follower.of(rig, np.full(4, NOISE), 1.0, DT)
+    observer = Observer.of(rig, np.full(4, NOISE), 1.0, DT)
     softer = kind_named("modulus_error").apply(rig, None, {"factor": 0.9})
     for other in (softer, GAIN.apply(softer, "d2", {"gain": 1.3})):
         data = FitData((record,), np.full(4, NOISE))
-        ahead = follower.errors_of_linear(other, data.residual(other).reshape(4, -1) * NOISE, DT, 1)
-        stepped = follow(other, record.inputs, record.outputs, follower.gain, sample_time=DT, substeps=1)
-        np.testing.assert_allclose(ahead, follower.whitening @ stepped, atol=1e-6 * np.abs(ahead).max())
+        ahead = observer.errors_of_linear(other, data.residual(other).reshape(4, -1) * NOISE, DT, 1)
+        stepped = prediction_errors(other, record.inputs, record.outputs, observer.gain, sample_time=DT, substeps=1)
+        np.testing.assert_allclose(ahead, observer.whitening @ stepped, atol=1e-6 * np.abs(ahead).max())
 
 
 def test_two_of_a_kind_beside_one_another_explain_nothing(search):

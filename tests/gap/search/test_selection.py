@@ -11,7 +11,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import fit
 from workbench.gap.search.search import Search
-from workbench.gap.search.selection import followed
+from workbench.gap.search.selection import by_continuation
 from workbench.rig.elements import CubicSpring
 
 CUBIC, NOISE = kind_named("cubic_spring"), 1e-5
@@ -43,7 +43,7 @@ def test_rigs_let_go_by_degrees_come_to_whole_records_where_those_let_go_at_once
     for stiffness, level, seed in ((2e5, 2.0, 3), (2e5, 2.0, 4), (4e4, 2.0, 4), (1e5, 2.0, 5), (1e5, 1.0, 3)):
         one = search(stiffness, level, seed)
         start = (Effect(CUBIC, None, {"at": 0.6, "stiffness": 0.8 * stiffness}),)
-        ahead = fit(rig, start, one.data.following(rig).stepped(8), iterations=8, tolerance=1e-4)
+        ahead = fit(rig, start, one.data.one_step_ahead(rig).stepped(8), iterations=8, tolerance=1e-4)
         at_once += fit(rig, ahead.effects, one.data.stepped(8), iterations=25).cost < 2.0
-        by_degrees += followed(one, start, 25).cost < 2.0
+        by_degrees += by_continuation(one, start, 25).cost < 2.0
     assert by_degrees >= at_once + 2

@@ -1,4 +1,4 @@
-"""Predictions one sample ahead: a rig, with all its laws, that every sample of a record sets right."""
+"""Innovations: a rig, with all its laws, predicts one sample ahead, and every sample of a record corrects it."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -11,19 +11,19 @@ from workbench.gap.prediction.unmodelled_force import driven, force_filter, samp
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import follow, move, read, reading_of
+from workbench.rig.simulate import move, prediction_errors, read, reading_of
 from workbench.structure.domain import Interval, Where
 from workbench.structure.modes import Modes
 
-LOOSE = 0.01  # of the inputs: random forces that hold a rig beside the records
+LOOSE = 0.01  # of the inputs: random forces, by which an observer corrects a rig's motion
 DOUBLINGS = 12  # of the samples over which a corrected motion is seen to die away: eight are enough for most
 RUN_AWAY = 1e100  # squared norm of a power, whose square is a number still
 KEPT = 8  # rigs, as followers see them, that are remembered from record to record
 
 
 @dataclass(frozen=True, eq=False)
-class Follower:
-    """What holds a rig beside the records: a steady Kalman filter of its modes, under random forces on all of them.
+class Observer:
+    """A steady-state Kalman filter of a rig's modes, under random forces on all of them.
 
     Attributes:
         gain: (2, n_modes, n_outputs) of their displacements and velocities.
@@ -46,7 +46,7 @@ class Follower:
         at: Where | None = None,
         rms: float = 0.0,
         loose: float = LOOSE,
-    ) -> "Follower":
+    ) -> "Observer":
         """For sensors of that noise (n_outputs,), and inputs of that rms, N; and a random force at a place, N.
 
         Args:
@@ -68,9 +68,9 @@ class Follower:
     def errors(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
         """Errors (n_outputs, n_samples) of a rig whose predictions are stepped through time, of unit covariance.
 
-        What sensors lose by delay, lag or clipping is not followed: it is made up for as the whole record has it.
+        What sensors lose by delay, lag or clipping is not observed: it is made up for as the whole record has it.
         """
-        errors: Floats = self.whitening @ self._followed(rig, record, substeps)
+        errors: Floats = self.whitening @ self._one_step_errors(rig, record, substeps)
         return errors
 
     def left(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
@@ -79,13 +79,13 @@ class Follower:
         The laws then make no more of what else is missing than they really did: what is left is the structure's linear
         answer to it. That of a rig without laws is measured less predicted.
         """
-        errors = self._followed(rig, record, substeps)
+        errors = self._one_step_errors(rig, record, substeps)
         model = sampled_model(rig.modes, _at_once(rig).sensors, np.ones(len(rig.sensors)), record.sample_time)
         gain = self._gain_for(rig, record.sample_time).reshape(-1, errors.shape[0])
         # every correction goes on to be a motion
         return errors + model.output @ driven(model.transition, model.transition @ gain @ errors)[:, :-1]
 
-    def _followed(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+    def _one_step_errors(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
         """Errors one sample ahead, in the sensors' units."""
         slow, measured, dt = _unrounded(rig), record.outputs, record.sample_time
         quick = _at_once(slow)
@@ -94,7 +94,9 @@ class Follower:
             measured = measured + read(quick, motion, sample_time=dt) - read(slow, motion, sample_time=dt)
         gain = self._gain_for(rig, dt)
         hold = record.input_hold
-        return follow(quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps, input_hold=hold)
+        return prediction_errors(
+            quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps, input_hold=hold
+        )
 
     def errors_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
         """What the errors of a linear rig over a whole record leave of themselves when every sample sets it right.
@@ -108,11 +110,11 @@ class Follower:
         bare = _bare(rig)
         gain, no_inputs = self._gain_for(rig, sample_time), np.zeros((0, left.shape[1]))
         substeps = 1 if rig.modes.proportional else substeps
-        errors = follow(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
+        errors = prediction_errors(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
         white: Floats = self.whitening @ errors
         return white
 
-    @lru_cache(maxsize=KEPT)  # noqa: B019  a follower is a few arrays
+    @lru_cache(maxsize=KEPT)  # noqa: B019  an observer is a few arrays
     def _gain_for(self, rig: Rig, sample_time: float) -> np.ndarray:
         """The gain, with none for modes that are more than it knows of.
 

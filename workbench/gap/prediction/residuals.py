@@ -11,7 +11,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.deadline import NEVER, Deadline
-from workbench.gap.prediction.innovations import LOOSE, Follower
+from workbench.gap.prediction.innovations import LOOSE, Observer
 from workbench.gap.prediction.unmodelled_force import ForceFilter, whiten
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -32,11 +32,11 @@ class FitData:
         lead: samples at the start of each record that are simulated but not counted, while the rig settles from the
             rest that the simulation assumes to the motion it really had.
         whiteners: filter of random forces on the structure, by record, through which its residual is seen; none where
-            there are none. With a follower, laws then act on the motion that was measured: that of the rig has no such
+            there are none. With a observer, laws then act on the motion that was measured: that of the rig has no such
             force.
         given_way: (n_values, k) W: a residual r becomes r - W Wᵀ r, for uncertain parameters that are re-estimated
             with every candidate to first order; None where none are.
-        follower: what holds the rig beside the records, so that its predictions are of one sample ahead; None where
+        observer: of the rig's state by the records, so that its predictions are of one sample ahead; None where
             they are of the whole record.
         heat: mean square of a residual that counts as noise, for now.
         deadline: of the search that these records are for; fits end with the best that they have when it is past.
@@ -48,7 +48,7 @@ class FitData:
     lead: int = 0
     whiteners: Mapping[str, ForceFilter] = field(default_factory=dict)
     given_way: Floats | None = None
-    follower: Follower | None = None
+    observer: Observer | None = None
     heat: float = 1.0
     deadline: Deadline = NEVER
     _memory: OrderedDict[Any, tuple[Modes, Motion]] = field(default_factory=OrderedDict, repr=False, init=False)
@@ -84,9 +84,9 @@ class FitData:
         """The same yardstick with that mean square as noise."""
         return replace(self, heat=heat)
 
-    def through(self, whitener: ForceFilter, follower: Follower) -> "FitData":
+    def through(self, whitener: ForceFilter, observer: Observer) -> "FitData":
         """The same yardstick beside a random force."""
-        return replace(self, whiteners={record.name: whitener for record in self.records}, follower=follower)
+        return replace(self, whiteners={record.name: whitener for record in self.records}, observer=observer)
 
     def beside_inputs(self, whiteners: Mapping[str, ForceFilter]) -> "FitData":
         """The same yardstick beside noise of the logged inputs."""
@@ -106,16 +106,16 @@ class FitData:
         root = np.sqrt(1.0 + sizes**2)
         return replace(self, given_way=sensitivity @ (turned.T / np.sqrt(root * (root + 1.0))))
 
-    def following(self, rig: Rig, loose: float = LOOSE) -> "FitData":
-        """The same yardstick on predictions one sample ahead, by a rig held beside the records as this one would be.
+    def one_step_ahead(self, rig: Rig, loose: float = LOOSE) -> "FitData":
+        """The same yardstick on predictions one sample ahead, by the observer gain of this rig.
 
         Args:
             loose: random forces on it, as a share of the inputs: the less, the more it goes its own way.
         """
-        if self.follower is not None:  # innovations beside a random force are errors one sample ahead as they are
+        if self.observer is not None:  # innovations beside a random force are errors one sample ahead as they are
             return replace(self, given_way=None)
-        follower = Follower.of(rig, self.noise, self.force_rms, self.records[0].sample_time, loose=loose)
-        return replace(self, follower=follower, whiteners={}, given_way=None)
+        observer = Observer.of(rig, self.noise, self.force_rms, self.records[0].sample_time, loose=loose)
+        return replace(self, observer=observer, whiteners={}, given_way=None)
 
     @cached_property
     def force_rms(self) -> float:
@@ -177,19 +177,19 @@ class FitData:
         return self if self.given_way is None else replace(self, given_way=None)
 
     def _left(self, rig: Rig) -> np.ndarray:
-        follower = self.follower
+        observer = self.observer
         if self.whiteners:
-            each = zip(self.records, self.left_beside(rig, follower), strict=True)
+            each = zip(self.records, self.left_beside(rig, observer), strict=True)
             return np.concatenate([whiten(self.whiteners[record.name], left).ravel() for record, left in each])
-        if follower is None:
+        if observer is None:
             return np.concatenate([(r / self.noise[:, None]).ravel() for r in self.differences(rig)])
         if is_stepped(rig) or steps_exactly(rig):
             substeps = self.substeps if is_stepped(rig) else 1
-            ahead = [follower.errors(rig.in_record(record.name), record, substeps) for record in self.records]
+            ahead = [observer.errors(rig.in_record(record.name), record, substeps) for record in self.records]
         else:
             whole = zip(self.records, self._from_the_first_sample.differences(rig), strict=True)
             ahead = [
-                follower.errors_of_linear(rig.in_record(record.name), left, record.sample_time, self.substeps)
+                observer.errors_of_linear(rig.in_record(record.name), left, record.sample_time, self.substeps)
                 for record, left in whole
             ]
         return np.concatenate([errors[:, self.lead :].ravel() for errors in ahead])
@@ -205,19 +205,19 @@ class FitData:
     @property
     def mixes_sensors(self) -> bool:
         """Whether values of the residual are of several sensors at once."""
-        return bool(self.whiteners) or self.follower is not None or self.given_way is not None
+        return bool(self.whiteners) or self.observer is not None or self.given_way is not None
 
     @cached_property
     def sources(self) -> np.ndarray:
         """The number of the sensor that each value of the residual is of, (n_values,)."""
         return np.concatenate([np.repeat(np.arange(len(r.outputs)), r.n_samples) for r in self.counted])
 
-    def left_beside(self, rig: Rig, follower: Follower | None) -> list[np.ndarray]:
-        """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a follower."""
-        if follower is None or not is_stepped(rig) or rig.stiffness_rate:
+    def left_beside(self, rig: Rig, observer: Observer | None) -> list[np.ndarray]:
+        """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a observer."""
+        if observer is None or not is_stepped(rig) or rig.stiffness_rate:
             return self.differences(rig)
         return [
-            follower.left(rig.in_record(record.name), record, self.substeps)[:, self.lead :] for record in self.records
+            observer.left(rig.in_record(record.name), record, self.substeps)[:, self.lead :] for record in self.records
         ]
 
     def differences(self, rig: Rig) -> list[np.ndarray]:

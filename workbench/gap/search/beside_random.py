@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import Effect, apply_all, names_in, place_valu
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NominalPrior
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.innovations import Follower
+from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
 from workbench.gap.search.finish import finished, plainest, ranked, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit
@@ -59,7 +59,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     alone = with_random(search, _nothing(search), evidence)
     if not search.near(alone[0], RANDOM.near) or alone[1].tonal > TONAL:
         return None, []
-    beside = search.through(model_filter(evidence.model, search.rig, alone[1]), _follower(search, search.rig, alone[1]))
+    beside = search.through(model_filter(evidence.model, search.rig, alone[1]), _observer(search, search.rig, alone[1]))
     search.report("beside a random disturbance", 0.2)
     gaining = beside.side_by_side(simplest, _gaining(search, beside, evidence)[: RANDOM.tried])
     if any(search.explains(finished(search, single)) for single in gaining):
@@ -99,7 +99,7 @@ def random_beside_errors(search: Search, step: Step, *, surely: bool = True) -> 
     for _ in range(RANDOM.turns):
         before = random.cost
         beside = search.through(
-            model_filter(evidence.model, evidence.rig, random), _follower(search, search.rig, random)
+            model_filter(evidence.model, evidence.rig, random), _observer(search, search.rig, random)
         )
         step = fit_jointly(beside, step.effects, step.errors)
         evidence = _beside(search, step.fit)
@@ -186,30 +186,30 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
         evidence = _beside(search, given)
     found = _random_beside(search, given, evidence)
     if given.effects and not found[1].holds and search.near(found[0], RANDOM.near):
-        follower = _follower(search, evidence.rig, found[1])
-        data = search.data.through(model_filter(evidence.model, evidence.rig, found[1]), follower)
+        observer = _observer(search, evidence.rig, found[1])
+        data = search.data.through(model_filter(evidence.model, evidence.rig, found[1]), observer)
         refitted = fit(search.rig, given.effects, data, iterations=8)
         rig = apply_all(search.rig, refitted.effects)
         again = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
         evidence = search.evidence_of(rig)
-        evidence = _by_laws_on_measured_motion(search, evidence, follower)
+        evidence = _by_laws_on_measured_motion(search, evidence, observer)
         found = _random_beside(search, again, evidence)
     return found
 
 
-def _follower(search: Search, rig: Rig, found: RandomForceFit | None = None) -> Follower:
-    """What holds a rig beside the records, a random force and all."""
+def _observer(search: Search, rig: Rig, found: RandomForceFit | None = None) -> Observer:
+    """The observer of a rig beside a random force."""
     data = search.data
     force, at = (0.0, None) if found is None else (found.rms, found.at)
-    return Follower.of(rig, data.noise, data.force_rms, data.records[0].sample_time, at=at, rms=force)
+    return Observer.of(rig, data.noise, data.force_rms, data.records[0].sample_time, at=at, rms=force)
 
 
-def _by_laws_on_measured_motion(search: Search, evidence: Evidence, follower: Follower | None = None) -> Evidence:
+def _by_laws_on_measured_motion(search: Search, evidence: Evidence, observer: Observer | None = None) -> Evidence:
     """The evidence as it is where laws have not made much else of a force that the rig lacks."""
     if not is_stepped(evidence.rig):
         return evidence
-    follower = follower or _follower(search, evidence.rig)
-    return replace(evidence, residuals=tuple(search.data.left_beside(evidence.rig, follower)))
+    observer = observer or _observer(search, evidence.rig)
+    return replace(evidence, residuals=tuple(search.data.left_beside(evidence.rig, observer)))
 
 
 def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, RandomForceFit]:

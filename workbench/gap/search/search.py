@@ -12,7 +12,7 @@ from workbench.gap.effects.effect import Effect, Kind
 from workbench.gap.effects.nominal import NominalPrior
 from workbench.gap.effects.record_to_record import STIFFNESS
 from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
-from workbench.gap.prediction.innovations import Follower
+from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.logged_inputs import input_filters, logging_noise_power
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
@@ -121,9 +121,9 @@ class Search:
         nominal = self.nominal * (self.data.noise / noise) ** 2
         return replace(self, data=data, quick=quick, first=first, nominal=nominal)
 
-    def through(self, whitener: ForceFilter, follower: Follower) -> "Search":
+    def through(self, whitener: ForceFilter, observer: Observer) -> "Search":
         """The same search beside a random force."""
-        data, quick, first = (data.through(whitener, follower) for data in (self.data, self.quick, self.first))
+        data, quick, first = (data.through(whitener, observer) for data in (self.data, self.quick, self.first))
         return replace(self, data=data, quick=quick, first=first)
 
     def beside_inputs(self, rig: Rig, share: float) -> "Search":
@@ -199,7 +199,7 @@ class Search:
         return cost_of(self.rig, self.held, self.ahead)
 
     def _ahead(self, data: FitData) -> FitData:
-        data = data.following(self.rig)
+        data = data.one_step_ahead(self.rig)
         if not self.held or finite_residual(self.rig, self.held, data) is None:  # predictions run away beside errors
             return data
         return data.giving_way(sensitivity(self.rig, self.held, data, self.workers))

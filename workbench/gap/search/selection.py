@@ -114,12 +114,13 @@ def on_whole_records(
     close = [f for f in ahead[:most] if f.cost < SELECTION.close * ahead[0].cost]
     simpler = contained(close[0].effects, search.rig) if close else set()
     first = [f for f in close if f is close[0] or f.key in simpler]
-    fits = search.workers.map(lambda f: followed(search, f.effects, at_first), first)
+    fits = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), first)
     rest = [f for f in close if f not in first]
     if any(search.explains(f) for f in fits):
         rest = [f for f in rest if f.cost < ahead[0].cost + SEARCH.rival]
     others = _none_that_contains(search, fits, rest)
-    fits = sorted((*fits, *search.workers.map(lambda f: followed(search, f.effects, at_first), others)), key=promise)
+    more = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), others)
+    fits = sorted((*fits, *more), key=promise)
     fits = _none_that_contains(search, fits, fits)
     to_cost = min([to_cost, *(f.cost + SEARCH.rival for f in fits if search.explains(f))])
     running = [f for f in fits if f.falling and promise(f) < SELECTION.running * promise(fits[0])]
@@ -134,19 +135,19 @@ def _none_that_contains(search: Search, fits: Sequence[Fit], others: Sequence[Fi
     return [f for f in others if enough.isdisjoint(contained(f.effects, search.rig))]
 
 
-def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
+def by_continuation(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
     """The set fitted to predictions one sample ahead, which go smoothly with its numbers, then to whole records.
 
     Where a stiff law lets motions run apart, half a percent of a place is too far for whole records to tell the way;
-    where a thousandth of a percent is, the rig is let go by degrees.
+    where a thousandth of a percent is, the observer gain is lowered by steps (continuation).
 
     Args:
         iterations: on whole records, at most.
     """
     rig = apply_all(search.rig, effects)
-    if is_stepped(rig) and not search.held and search.data.follower is None:
+    if is_stepped(rig) and not search.held and search.data.observer is None:
         for loose in SELECTION.continuation:
-            data = search.data.following(rig, loose).finely(SELECTION.fine)
+            data = search.data.one_step_ahead(rig, loose).finely(SELECTION.fine)
             held = fit(search.rig, effects, data, iterations=8, tolerance=1e-4)
             effects = held.effects
             if (

@@ -66,7 +66,7 @@ class SelectionSettings:
     # cost more than a small noise: more is left by no set that explains the records
     promising: float = 5.0
     promising_share: float = 0.05
-    # how loosely rigs are held beside the records, one after the other
+    # random forces of the observers of a continuation, one after the other: the less, the lower the gain
     continuation: tuple[float, ...] = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)
     at_hand: float = 10.0  # times the noise: so near, whole records tell the way
     close: float = 2.0  # times the least cost ahead: what may still come first on whole records
