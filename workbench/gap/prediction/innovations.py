@@ -1,5 +1,6 @@
 """Innovations: a rig, with all its laws, predicts one sample ahead, and every sample of a record corrects it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -11,7 +12,7 @@ from workbench.gap.prediction.unmodelled_force import driven, force_filter, samp
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import move, prediction_errors, read, reading_of
+from workbench.rig.simulate import Motion, move, prediction_errors, read, reading_of
 from workbench.structure.domain import Interval, Where
 from workbench.structure.modes import Modes
 
@@ -65,12 +66,18 @@ class Observer:
         whitening = np.linalg.inv(np.linalg.cholesky(found.innovation))
         return cls(gain.reshape(2, n, -1).copy(), whitening, rig.sensors)
 
-    def errors(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+    def errors(self, rig: Rig, record: Record, substeps: int, motion: Callable[[], Motion] | None = None) -> np.ndarray:
         """Errors (n_outputs, n_samples) of a rig whose predictions are stepped through time, of unit covariance.
 
         What sensors lose by delay, lag or clipping is not observed: it is made up for as the whole record has it.
+
+        Args:
+            rig: with its laws.
+            record: of its inputs and outputs.
+            substeps: of a sample.
+            motion: of the whole record, by these substeps, where it may be at hand.
         """
-        errors: Floats = self.whitening @ self._one_step_errors(rig, record, substeps)
+        errors: Floats = self.whitening @ self._one_step_errors(rig, record, substeps, motion)
         return errors
 
     def left(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
@@ -85,13 +92,18 @@ class Observer:
         # every correction goes on to be a motion
         return errors + model.output @ driven(model.transition, model.transition @ gain @ errors)[:, :-1]
 
-    def _one_step_errors(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+    def _one_step_errors(
+        self, rig: Rig, record: Record, substeps: int, motion: Callable[[], Motion] | None = None
+    ) -> np.ndarray:
         """Errors one sample ahead, in the sensors' units."""
         slow, measured, dt = _unrounded(rig), record.outputs, record.sample_time
         quick = _at_once(slow)
         if quick is not slow:
-            motion = move(rig, record.inputs, sample_time=dt, substeps=substeps, input_hold=record.input_hold)
-            measured = measured + read(quick, motion, sample_time=dt) - read(slow, motion, sample_time=dt)
+            if motion is None:
+                moved = move(rig, record.inputs, sample_time=dt, substeps=substeps, input_hold=record.input_hold)
+            else:
+                moved = motion()
+            measured = measured + read(quick, moved, sample_time=dt) - read(slow, moved, sample_time=dt)
         gain = self._gain_for(rig, dt)
         hold = record.input_hold
         return prediction_errors(

@@ -1,9 +1,9 @@
-"""The fit records as a yardstick: how far a rig's prediction stands from them, in units of the noise."""
+"""The residual of the fit records: measured less predicted, in units of the noise."""
 
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from threading import Lock
 from typing import Any
 
@@ -60,36 +60,36 @@ class FitData:
         return sum(record.outputs.size for record in self.counted)
 
     def only(self, names: tuple[str, ...]) -> "FitData":
-        """The same yardstick on some of the records."""
+        """The same residual on some of the records."""
         return replace(self, records=tuple(r for r in self.records if r.name in names))
 
     def of_outputs(self, names: tuple[str, ...]) -> "FitData":
-        """The same yardstick on some of the outputs."""
+        """The same residual on some of the outputs."""
         kept = [self.records[0].output_names.index(name) for name in names]
         return replace(self, records=tuple(r.only(names) for r in self.records), noise=self.noise[kept])
 
     def stepped(self, substeps: int) -> "FitData":
-        """The same yardstick with other substeps."""
+        """The same residual with other substeps."""
         return replace(self, substeps=substeps)
 
     def finely(self, substeps: int) -> "FitData":
-        """The same yardstick with at least so many substeps."""
+        """The same residual with at least so many substeps."""
         return self.stepped(max(substeps, self.substeps))
 
     def with_noise(self, noise: np.ndarray) -> "FitData":
-        """The same yardstick with other standard deviations of the sensors' noise (n_outputs,)."""
+        """The same residual with other standard deviations of the sensors' noise (n_outputs,)."""
         return replace(self, noise=noise)
 
     def tempered(self, heat: float) -> "FitData":
-        """The same yardstick with that mean square as noise."""
+        """The same residual with that mean square as noise."""
         return replace(self, heat=heat)
 
     def through(self, whitener: ForceFilter, observer: Observer) -> "FitData":
-        """The same yardstick beside a random force."""
+        """The same residual beside a random force."""
         return replace(self, whiteners={record.name: whitener for record in self.records}, observer=observer)
 
     def beside_inputs(self, whiteners: Mapping[str, ForceFilter]) -> "FitData":
-        """The same yardstick beside noise of the logged inputs."""
+        """The same residual beside noise of the logged inputs."""
         return replace(self, whiteners=whiteners)
 
     def giving_way(self, sensitivity: np.ndarray) -> "FitData":
@@ -107,7 +107,7 @@ class FitData:
         return replace(self, given_way=sensitivity @ (turned.T / np.sqrt(root * (root + 1.0))))
 
     def one_step_ahead(self, rig: Rig, loose: float = LOOSE) -> "FitData":
-        """The same yardstick on predictions one sample ahead, by the observer gain of this rig.
+        """The same residual on predictions one sample ahead, by the observer gain of this rig.
 
         Args:
             loose: random forces on it, as a share of the inputs: the less, the more it goes its own way.
@@ -173,7 +173,7 @@ class FitData:
 
     @cached_property
     def standing(self) -> "FitData":
-        """The same yardstick without uncertain parameters."""
+        """The same residual without uncertain parameters."""
         return self if self.given_way is None else replace(self, given_way=None)
 
     def _left(self, rig: Rig) -> np.ndarray:
@@ -184,8 +184,10 @@ class FitData:
         if observer is None:
             return np.concatenate([(r / self.noise[:, None]).ravel() for r in self.differences(rig)])
         if is_stepped(rig) or steps_exactly(rig):
-            substeps = self.substeps if is_stepped(rig) else 1
-            ahead = [observer.errors(rig.in_record(record.name), record, substeps) for record in self.records]
+            substeps, first = self.substeps if is_stepped(rig) else 1, self._from_the_first_sample
+            rigs = [(rig.in_record(record.name), record) for record in self.records]
+            # a sensor's fault does not change the motion, which may be known
+            ahead = [observer.errors(r, record, substeps, partial(first._motion, r, record)) for r, record in rigs]
         else:
             whole = zip(self.records, self._from_the_first_sample.differences(rig), strict=True)
             ahead = [

@@ -1,4 +1,4 @@
-"""What ails the records themselves, which no effect explains: said beside a verdict."""
+"""Faults of the records themselves, which no effect explains: reported with a verdict."""
 
 from collections.abc import Sequence
 

@@ -499,12 +499,12 @@ def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: 
         return None
     louder = search.with_noise(noise)
 
-    def heard(candidate: Fit) -> Fit:
+    def in_louder(candidate: Fit) -> Fit:
         by_channel = candidate.cost_by_channel * (stated / noise) ** 2
         return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
 
-    promising = [f for f in map(heard, singles) if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
-    decision = _without_a_second(louder, heard(start), promising)[0] if promising else None
+    promising = [f for f in map(in_louder, singles) if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
+    decision = _without_a_second(louder, in_louder(start), promising)[0] if promising else None
     if decision is None or decision.outcome != "explained":
         return None
     return decision._replace(noise=noise)

@@ -24,8 +24,8 @@ def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Sear
     rig = apply_all(search.rig, fitted.effects)
     left, found = search.data.differences(rig), search.with_noise(np.sqrt(sensor_noise) * search.data.noise)
     # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
-    heard = [likeliest_share(rig, s.data, left) for s in (search, found)]
-    (share, _, is_beyond), louder = min(zip(heard, (search, found), strict=True), key=lambda each: each[0].loss)
+    shares = [likeliest_share(rig, s.data, left) for s in (search, found)]
+    (share, _, is_beyond), louder = min(zip(shares, (search, found), strict=True), key=lambda each: each[0].loss)
     if share < LEAST_LOGGED or is_beyond:
         return None
     beside = louder.beside_inputs(rig, share)

@@ -77,8 +77,10 @@ def random_beside(search: Search, found: Sequence[Fit]) -> Decision | None:
         unclipped, evidence = _without_clipped(search, given.effects, evidence)
         evidence = _by_laws_on_measured_motion(unclipped, evidence)
         if looks_random(evidence):
-            heard = replace(given, cost_by_channel=unclipped.data.by_channel(unclipped.data.residual(evidence.rig)))
-            tried.append(with_random(unclipped, heard, evidence))
+            unclipped_fit = replace(
+                given, cost_by_channel=unclipped.data.by_channel(unclipped.data.residual(evidence.rig))
+            )
+            tried.append(with_random(unclipped, unclipped_fit, evidence))
     return _likeliest(search, tried)
 
 

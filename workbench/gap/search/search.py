@@ -66,7 +66,7 @@ class Search:
     def explains(self, candidate: Fit) -> bool:
         """Whether what is left is noise, in every record, up to the error of integration.
 
-        Effects that crowd about one place stand for one law that the catalogue does not hold.
+        Effects that cluster about one place stand for one law that the catalogue does not hold.
         """
         if self.clustered(candidate.effects):
             return False

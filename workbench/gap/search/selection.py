@@ -36,7 +36,7 @@ def one_more(
 
 
 def _exchanged(found: Sequence[Fit], screened: Screening) -> list[Effect]:
-    """Linear kinds of the structure, each where the likeliest of others stand; what else may ail the likeliest port."""
+    """Linear kinds of the structure, each where the likeliest of others stand; other faults of the likeliest port."""
 
     def is_linear(effect: Effect) -> bool:
         return effect.kind.path == "structure" and not effect.kind.nonlinear and effect.at is not None

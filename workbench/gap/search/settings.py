@@ -271,8 +271,8 @@ class StepwiseSettings:
     excluded: float = 1e-3  # probability below which another set that explains the records is no rival
     # share of the nominal gap's power from which on a fit that began one sample ahead may have gone astray
     astray: float = 0.02
-    # times the noise of the sensors that a set must leave above it for noise of the inputs to be heard in it; less of
-    # it does no harm to a mean square
+    # times the noise of the sensors that a set must leave above it for noise of the inputs to be estimated from it;
+    # less of it does no harm to a mean square
     loud: float = 0.5
     # mean square, white, beside noise of the inputs, for less of which that was not what was left
     too_white: float = 0.8

@@ -43,7 +43,7 @@ class Stepwise:
         at_first: the search without noise of the logged inputs.
         steps: the sets found, each with one effect more or one less than the last.
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
-        is_beyond: whether effects crowd about one place, as they do where a law is beyond the catalogue.
+        is_beyond: whether effects cluster about one place, as they do where a law is beyond the catalogue.
         is_tried: whether an effect has been tried beside noise of the logged inputs, which may stand for it.
         is_finer: whether it goes on by finer substeps than it began with.
         is_run: whether effects have been added as long as that pays.
@@ -167,9 +167,9 @@ class Stepwise:
             if step is None:
                 break
             self.steps.append(step)
-            heard = self.search.logged
+            estimated = self.search.logged
             self._with_input_noise(step)
-            if heard and not self.search.logged:  # what stood beside a noise that is none stands anew
+            if estimated and not self.search.logged:  # what stood beside a noise that is none stands anew
                 self.steps[-1] = self._chosen_again(replace(self.last, others=step.others))
             self.steps.append(self._finely(self._without_needless(self.last)))
             if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
@@ -226,7 +226,7 @@ class Stepwise:
         if beside is None:
             return None
         fitted = fit_jointly(beside, step.effects, step.errors)
-        if fitted.fit.cost < STEPWISE.too_white:  # errors had bent to that noise, so it was heard too loud
+        if fitted.fit.cost < STEPWISE.too_white:  # errors had bent to that noise, so it was estimated too loud
             beside = beside_inputs(search, fitted.fit, plain.sensor_noise)
             if beside is None:
                 return None
