@@ -181,7 +181,7 @@ class _Member(Printed):
                     springs.append((value, row))
         for spring, row in springs:
             rigidity += spring * row.T @ row
-        free = np.setdiff1d(np.arange(segments.n_functions), held)
+        free = np.delete(np.arange(segments.n_functions), held)
         if n_modes > free.size:
             raise ValueError(f"{n_modes} modes asked of {free.size} functions")
         mass, rigidity = mass[np.ix_(free, free)], rigidity[np.ix_(free, free)]

@@ -103,10 +103,7 @@ class Segments:
 
     def scales(self, segment: int) -> np.ndarray:
         """Factors (degree + 1,) that turn a local slope into a slope per metre."""
-        factors = np.ones(self.degrees[segment] + 1)
-        if self.continuity == 1:
-            factors[[1, 3]] = 0.5 * (self.nodes[segment + 1] - self.nodes[segment])
-        return factors
+        return _scales(self.degrees[segment], self.continuity, self.nodes[segment + 1] - self.nodes[segment])
 
     def evaluation(self, x: ArrayLike, derivative: int = 0) -> np.ndarray:
         """The matrix (n_points, n_functions) that maps coefficients to values (or derivatives) at x, read-only."""
@@ -120,19 +117,8 @@ class Segments:
             (n_points,), (n_points,) and (n_points, degree + 1); the rule is exact for squares times a polynomial of
             the seventh degree.
         """
-        known = self._tabulated.get((segment, derivative))
-        if known is not None:
-            return known
-        degree, h = self.degrees[segment], self.nodes[segment + 1] - self.nodes[segment]
-        points, weights, tables = tabulated_basis(degree, self.continuity, degree + 4)
-        table = tables[derivative] * self.scales(segment) * (2.0 / h) ** derivative
-        found = self.nodes[segment] + 0.5 * h * (points + 1.0), 0.5 * h * weights, table
-        self._tabulated[segment, derivative] = found
-        return found
-
-    @cached_property
-    def _tabulated(self) -> dict[tuple[int, int], tuple[Floats, Floats, Floats]]:
-        return {}
+        ends = float(self.nodes[segment]), float(self.nodes[segment + 1])
+        return _tabulated(*ends, self.degrees[segment], self.continuity, derivative)
 
     def tables(self, derivatives: Iterable[int]) -> tuple[Floats, Floats, list[Floats]]:
         """Gauss points of all segments (n_points,), m, their weights, and derivatives of all functions there.
@@ -174,6 +160,27 @@ class Segments:
         largest = np.abs(coefficients).max(axis=0)
         tail = [np.abs(coefficients[self.indices(s)[nodal:][-2:]]).max(axis=0) for s in range(self.n_segments)]
         return float((np.max(tail, axis=0) / largest).max())
+
+
+def _scales(degree: int, continuity: int, width: float) -> Floats:
+    factors = np.ones(degree + 1)
+    if continuity == 1:
+        factors[[1, 3]] = 0.5 * width
+    return factors
+
+
+@lru_cache(maxsize=512)
+def _tabulated(
+    start: float, end: float, degree: int, continuity: int, derivative: int
+) -> tuple[Floats, Floats, Floats]:
+    """`Segments.tabulated`, remembered: a structure that is changed a little is solved on the same segments."""
+    h = end - start
+    points, weights, tables = tabulated_basis(degree, continuity, degree + 4)
+    table = tables[derivative] * _scales(degree, continuity, h) * (2.0 / h) ** derivative
+    found = start + 0.5 * h * (points + 1.0), 0.5 * h * weights, table
+    for array in found:
+        array.flags.writeable = False
+    return found
 
 
 @lru_cache(maxsize=512)
