@@ -133,7 +133,7 @@ def told(stable, vibration, work, **figures):
     none = {name: np.ones(n) for name in others} | figures
     return Verification(
         stable=stable, damping=np.ones((n, 2)), work=np.array(work)[:, None], controlled=(0,), vibration=vibration,
-        energy=np.ones((3, 2)), margin=1.0, margin_frequency_hz=1.0, **none,
+        energy=np.ones((3, 2)), small_gain_margin=1.0, margin_frequency_hz=1.0, **none,
     )  # fmt: skip
 
 
@@ -344,9 +344,9 @@ def test_moving_the_actuators_is_offered_where_it_pays(rig):
 def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, controller):
     sure = possible(rig, unexplained=0.01, outcome="unknown")
     found = redesign(sure, controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False)
-    assert found.proof.margin > 0.01 and found.safe
+    assert found.proof.small_gain_margin > 0.01 and found.safe
     assert found.sentence.endswith("so stability is guaranteed while no frequency is off by more.")
-    proofs = {name: replace(getattr(found, name), margin=1.004) for name in ("present_proof", "proof")}
+    proofs = {name: replace(getattr(found, name), small_gain_margin=1.004) for name in ("present_proof", "proof")}
     certain = replace(found, **proofs)  # whichever controller is the one to use
     assert (
         "the small-gain margin is 100 %" in certain.sentence and "1 % of the output is unexplained" in certain.sentence

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from workbench.arguments import whole
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, of_loops, run_loop
+from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
@@ -36,8 +37,8 @@ class Verification:
             test.
         controlled_settling: the same of the energy of the controlled modes; of all where none is named.
         energy: (3, n_samples) of all modes: median over the draws, and lower and upper end of the 95 % interval.
-        margin: relative uncertainty of all outputs at once, of any phase, that the loop surely tolerates; 0 where it is
-            not stable, inf where nothing is fed back, nan where it has no linear part.
+        small_gain_margin: relative uncertainty of all outputs at once, of any phase, that the loop surely tolerates; 0
+            where it is not stable, inf where nothing is fed back, nan where it has no linear part.
         margin_frequency_hz: where the least of it is.
     """
 
@@ -52,8 +53,10 @@ class Verification:
     settling: np.ndarray
     controlled_settling: np.ndarray
     energy: np.ndarray
-    margin: float
+    small_gain_margin: float
     margin_frequency_hz: float
+
+    margin = Renamed("small_gain_margin")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stable", frozen(self.stable, bool))
@@ -105,7 +108,7 @@ class Verification:
         return {
             "draws": self.n_draws,
             "stable": int(self.stable.sum()),
-            "margin": _plain(self.margin),
+            "small_gain_margin": _plain(self.small_gain_margin),
             "margin_frequency_hz": _plain(self.margin_frequency_hz),
             "damping": [[_plain(v) for v in interval(self.damping[:, r])] for r in self.controlled],
             **{name: [_plain(v) for v in interval(values)] for name, values in figures.items()},
@@ -145,7 +148,7 @@ def verify(
         controlled: zero-based modes whose work is W_C.
         draws: how many rigs, where they are not drawn yet.
         seed: of the draws.
-        centre: the rig whose margin is stated; the first where rigs are given.
+        centre: the rig whose small-gain margin is stated; the first where rigs are given.
 
     Raises:
         TypeError: no uncertain rig, no sampled controller or no test, or no number where one is asked for.
@@ -199,7 +202,7 @@ def verify(
             settling=_settlings(found.energy, found.stable, dt),
             controlled_settling=_settlings(found.of_controlled, found.stable, dt),
             energy=_band(found.energy),
-            margin=margin,
+            small_gain_margin=margin,
             margin_frequency_hz=frequency,
         )
 
@@ -221,7 +224,7 @@ def _check_kinds(possible: object, controller: object, test: object, centre: obj
         )
     check_loop_kinds(controller, test)
     if not isinstance(centre, Rig | None):
-        raise TypeError(f"centre is the rig whose margin is stated; got {type(centre).__name__}")
+        raise TypeError(f"centre is the rig whose small-gain margin is stated; got {type(centre).__name__}")
 
 
 def check_loop_kinds(controller: object, test: object) -> None:

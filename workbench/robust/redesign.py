@@ -335,7 +335,7 @@ class Redesign:
     @property
     def safe(self) -> bool:
         """Whether the controller to use is stable on every draw, and bears an error as large as is unexplained."""
-        margin = self._used.margin
+        margin = self._used.small_gain_margin
         holds = margin > self.possible.unexplained or np.isnan(margin)
         return bool(self._used.stable.all() and (self.possible.explained or holds))
 
@@ -344,7 +344,7 @@ class Redesign:
         """What stability is guaranteed where the gap is not explained; empty where it is."""
         if self.possible.explained:
             return ""
-        share, margin = self.possible.unexplained, self._used.margin
+        share, margin = self.possible.unexplained, self._used.small_gain_margin
         error = f"{_percent(share)} of the output is unexplained"
         if np.isnan(margin):
             return f"No stability guarantee: {error}, and on-off control has no small-gain margin."

@@ -120,7 +120,7 @@ def _rounded(values: np.ndarray) -> str:
 
 
 def _margin(proof: Verification) -> str:
-    return "no linear bound" if np.isnan(proof.margin) else f"{100.0 * proof.margin:.3g}"
+    return "no linear bound" if np.isnan(proof.small_gain_margin) else f"{100.0 * proof.small_gain_margin:.3g}"
 
 
 def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
