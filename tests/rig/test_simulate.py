@@ -318,3 +318,28 @@ def test_the_stepper_is_compiled_once():
             outputs = simulate(rig(elements), u, sample_time=DT).outputs
             prediction_errors(rig(elements), u, outputs, np.zeros((2, 6, 3)), sample_time=DT)
     assert len(step_record.signatures) == 1
+
+
+@pytest.mark.parametrize("input_hold", ["zero", "first"])
+@pytest.mark.parametrize("elements", [(), (CubicSpring(3.1, 5.0),)], ids=["linear", "stepped"])
+def test_nothing_remembered_outlives_what_it_was_found_for(elements, input_hold):
+    """Inputs that are written to, other inputs, other places and another structure: each as if asked for first."""
+    first, u = rig(elements), drive()
+    given = {"sample_time": DT, "input_hold": input_hold}
+    once = simulate(first, u, **given).outputs
+    np.testing.assert_array_equal(simulate(first, u, **given).outputs, once)
+    u *= 2.0
+    twice = simulate(first, u, **given).outputs
+    np.testing.assert_array_equal(twice, simulate(first, 2.0 * drive(), **given).outputs)
+    assert np.abs(twice - once).max() > 0.5 * np.abs(once).max()
+    recorded = simulate(first, drive(seed=1), **given)  # nobody can write to the inputs of a record
+    for others in (
+        {"actuators": (Actuator("F1", 3.0), Actuator("F2", 6.3))},
+        {"sensors": tuple(Sensor(n, at) for n, at in (("d", 3.5), ("v", 4.4), ("a", 7.0)))},
+        {"modes": beam(attachments=(PointDamper(4.0, 0.3),)).modes(6)},
+    ):
+        again = [
+            simulate(rig(elements, **others), inputs, **given).outputs for inputs in (recorded.inputs, drive(seed=1))
+        ]
+        np.testing.assert_array_equal(again[0], again[1])
+        assert np.abs(again[0] - recorded.outputs).max() > 0.01 * np.abs(recorded.outputs).max()

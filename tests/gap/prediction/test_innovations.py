@@ -1,4 +1,4 @@
-"""A rig held beside the records by every sample of them."""
+"""Innovations of a rig that every sample of a record corrects."""
 
 import gc
 import weakref
@@ -77,3 +77,20 @@ def test_a_motion_grows_where_an_eigenvalue_is_beyond_one(radius):
         step = rng.standard_normal((12, 12))
         step *= radius / np.abs(np.linalg.eigvals(step)).max()
         assert _grows(step) is (radius > 1.0)
+
+
+@pytest.mark.parametrize("law", [(), (("cubic_spring", {"at": 0.7, "stiffness": 30.0}),)], ids=["linear", "stepped"])
+def test_a_fault_of_a_sensor_on_a_motion_that_is_known_leaves_the_same_errors(hinged_rig, record_of, law):
+    rig, rng = hinged_rig(4), np.random.default_rng(2)
+    for kind, values in law:
+        rig = Effect(kind_named(kind), None, values).apply(rig)
+    late = Effect(kind_named("sensor_delay"), "all", {"delay": 2.3e-3}).apply(rig)
+    wrong = Effect(kind_named("sensor_gain"), rig.sensors[0].name, {"gain": 1.2}).apply(late)
+    records = tuple(replace(record_of(rig, rng.normal(size=(1, 300)), rng), name=name) for name in ("one", "other"))
+    noise = np.array([sensor.noise_std for sensor in rig.sensors])
+    for lead in (0, 40):
+        ahead = FitData(records, noise, lead=lead).one_step_ahead(rig)
+        known = [ahead.residual(each) for each in (late, wrong, late)]
+        for each, residual in zip((late, wrong, late), known, strict=True):
+            np.testing.assert_array_equal(residual, replace(ahead).residual(each))
+        assert np.abs(known[0] - known[1]).max() > 1.0
