@@ -1,3 +1,4 @@
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -212,3 +213,21 @@ def test_combinations_of_outputs_share_no_noise_and_keep_a_decay():
     np.testing.assert_allclose(left.std(axis=1), 1.0, atol=0.05)
     seen = mixed.outputs - left  # the decay alone, seen through the same combinations
     assert np.linalg.matrix_rank(seen, tol=1e-6 * np.linalg.norm(seen)) == 1
+
+
+def test_correlation_of_many_outputs_takes_no_more_room_than_their_lines():
+    """The median over bands of what outputs share, entry by entry as it is defined, without all bands at once."""
+    rng, m, n = np.random.default_rng(4), 120, 12_800
+    left = [np.linalg.cholesky(np.eye(m) + 0.4) @ rng.standard_normal((m, n)) for _ in range(2)]
+    lines = [np.fft.rfft(each * np.hanning(n), axis=1)[:, 1:].reshape(m, -1, 32) for each in left]
+    bands = np.concatenate([np.moveaxis(each, 1, 0) for each in lines])
+    powers = np.real(bands @ bands.conj().swapaxes(1, 2))
+    size = np.sqrt(np.diagonal(powers, axis1=1, axis2=2))
+    values, vectors = np.linalg.eigh(np.median(powers / (size[:, :, None] * size[:, None, :]), axis=0))
+    expected = (vectors * np.maximum(values, 1e-3)) @ vectors.T
+    tracemalloc.start()
+    found = correlation(left)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(found, expected / np.sqrt(np.outer(np.diag(expected), np.diag(expected))), atol=1e-12)
+    assert np.triu(found, 1).any() and peak < 4 * sum(each.nbytes for each in left)

@@ -29,7 +29,7 @@ from scipy.linalg import cho_factor, cho_solve, qr, solve_toeplitz, solve_triang
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from workbench.arrays import Floats
+from workbench.arrays import Complexes, Floats
 from workbench.records.record import Record
 
 
@@ -48,6 +48,7 @@ class ProjectionSettings:
     own: float = 1e-3  # share of an output's noise, at least, that no other output has
     band: int = 32  # lines in which the correlation of noise is taken
     harmless: float = 1.2  # variance of the combination that shares most, over that of an output: less alters nothing
+    at_once: int = 2**21  # products of outputs, in all bands, that are held at once: 16 MB
     of_median: float = 0.25  # samples that the median over bands is worth, of the mean without a window
     order: int = 12  # of the autoregressive model of coloured noise
     samples_each: int = 40  # for each of its coefficients; for each output, where noise that they share is asked for
@@ -276,8 +277,19 @@ def correlation(left: Sequence[np.ndarray]) -> Floats:
     """
     if len(left[0]) == 1:
         return np.eye(1)
-    # by Hann's window, as modes not found yet leak far into other bands
-    return correlation_of_lines([rfft(each * np.hanning(each.shape[1]), axis=1)[:, 1:] for each in left])
+    return correlation_of_lines([_lines_of(each) for each in left])
+
+
+def _lines_of(signals: np.ndarray) -> Complexes:
+    """Lines of signals, but for the first, by Hann's window: modes not found yet leak far into other bands without it.
+
+    One signal after the other: the windows of all of them would be as much again.
+    """
+    n_signals, n_samples = signals.shape
+    lines, window = np.empty((n_signals, n_samples // 2), complex), np.hanning(n_samples)
+    for row, signal in zip(lines, signals, strict=True):
+        row[:] = rfft(signal * window)[1:]
+    return lines
 
 
 def correlation_of_lines(left: Sequence[np.ndarray]) -> Floats:
@@ -289,18 +301,32 @@ def correlation_of_lines(left: Sequence[np.ndarray]) -> Floats:
     m, size = len(left[0]), 2 * sum(each.shape[1] for each in left)
     if m == 1 or min(each.shape[1] for each in left) < PROJECTION.band or size < PROJECTION.samples_each * m:
         return np.eye(m)
-    bands = []
-    for each in left:
-        lines = each[:, : each.shape[1] // PROJECTION.band * PROJECTION.band].reshape(m, -1, PROJECTION.band)
-        powers = np.einsum("jbk,lbk->bjl", lines, lines.conj()).real
-        own = np.sqrt(np.einsum("bjj->bj", powers)) + 1e-300
-        bands.append(powers / (own[:, :, None] * own[:, None, :]))
-    values, vectors = np.linalg.eigh(np.median(np.concatenate(bands), axis=0))
+    values, vectors = np.linalg.eigh(_median_correlation(left))
     shared: Floats = (vectors * np.maximum(values, PROJECTION.own)) @ vectors.T
     shared /= np.sqrt(np.outer(np.diag(shared), np.diag(shared)))
     lost = -(PROJECTION.of_median * size - (2 * m + 5) / 6.0) * np.linalg.slogdet(shared)[1]
     none = lost < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2) or values[-1] < PROJECTION.harmless
     return np.eye(m) if none else shared
+
+
+def _median_correlation(left: Sequence[np.ndarray]) -> Floats:
+    """The median over bands of the correlation of lines (n_outputs, n_lines) a record; the lower triangle of it."""
+    m, band = len(left[0]), 2 * PROJECTION.band
+    # real and imaginary parts beside each other: the real part of a product with a conjugate is their scalar product
+    bands = [np.ascontiguousarray(each).view(float) for each in left]
+    bands = [each[:, : each.shape[1] // band * band].reshape(m, -1, band).transpose(1, 0, 2) for each in bands]
+    own = [np.sqrt(np.einsum("bjk,bjk->bj", each, each)) + 1e-300 for each in bands]
+    median, n_bands = np.zeros((m, m)), sum(map(len, bands))
+    some = max(PROJECTION.at_once // (n_bands * m), 1)  # a few outputs beside all, in all bands
+    for start in range(0, m, some):
+        rows, columns = slice(start, min(start + some, m)), slice(0, min(start + some, m))
+        each = zip(bands, own, strict=True)
+        products = [
+            np.matmul(b[:, rows], b[:, columns].transpose(0, 2, 1)) / (o[:, rows, None] * o[:, None, columns])
+            for b, o in each
+        ]
+        median[rows, columns] = np.median(np.concatenate(products), axis=0, overwrite_input=True)
+    return median
 
 
 def disturbed(shared: Floats, amplitudes: np.ndarray) -> Floats:
