@@ -55,7 +55,7 @@ from workbench.draw.surface import plot_surface_motion""",
         {"controlled": tried.response},
         DESIGN.final_time * np.array([0.0, 0.1, 0.25, 0.5, 1.0]),
         actuators=np.array(DESIGN.actuators),
-        struck=DESIGN.impulse_at,
+        impulse_at=DESIGN.impulse_at,
     )
     outcome.figure("motion", figure, "Displacement after the impulse (star), controlled (crosses are actuators).")
 """,

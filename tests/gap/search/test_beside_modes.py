@@ -57,6 +57,7 @@ def test_nothing_is_named_where_nothing_hides(rig, measured):
     assert verdict.outcome == "none" and verdict.sentence.startswith("There is no gap beyond small errors")
 
 
+@pytest.mark.slow
 def test_a_law_is_named_beside_them_and_its_interval_holds(rig, measured):
     *fitted, kept = measured(CubicSpring(AT, STIFFNESS))
     verdict = diagnose(rig, fitted, validation=[kept])

@@ -43,9 +43,10 @@ def blows():
     return force
 
 
+@pytest.mark.slow
 def test_noise_of_a_force_channel_makes_no_modes(blows):
     logged = blows + NOISE * np.random.default_rng(1).normal(size=N)
-    found = identify_driven(record_of(logged, answer(blows)), delays=0.0)
+    found = identify_driven(record_of(logged, answer(blows)), delays=0.0, seconds=200.0)
     assert found.modes.n_modes == 3
     assert found.modes.frequencies_hz == pytest.approx(HZ, rel=1e-4)
     assert found.modes.zeta == pytest.approx(ZETA, rel=1e-2)
