@@ -39,7 +39,7 @@ LAWS: dict[type[elements.PointElement], int] = {
     elements.UserLaw: stepping.USER,
 }
 QUANTITIES = ("displacement", "velocity", "acceleration")  # by derivative in time
-KEPT = 8  # rigs whose shapes at their actuators and sensors are remembered, from record to record
+KEPT = 8  # rigs of which what all records share is remembered
 DRIVES_KEPT, MOST_KEPT = 16, 2**18  # forces on substeps that are remembered likewise, and the most values of one
 NOTHING, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
 

@@ -1,7 +1,7 @@
 """The number of modes to control: what the disturbance gives each, and the residual work of controlling n of them.
 
 Controlling the lowest n leaves Σ_{r>n} E_r of the disturbance where it is (5.27 is what control takes out) and adds
-the spillover W_R (5.43). What is left either way is the yardstick.
+the spillover W_R (5.43). A number of modes is judged by what is left, of both together.
 """
 
 from collections.abc import Callable

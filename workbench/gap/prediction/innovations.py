@@ -12,14 +12,13 @@ from workbench.gap.prediction.unmodelled_force import driven, force_filter, samp
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import Motion, move, prediction_errors, read, reading_of
+from workbench.rig.simulate import KEPT, Motion, move, prediction_errors, read, reading_of
 from workbench.structure.domain import Interval, Where
 from workbench.structure.modes import Modes
 
 LOOSE = 0.01  # of the inputs: random forces, by which an observer corrects a rig's motion
 DOUBLINGS = 12  # of the samples over which a corrected motion is seen to die away: eight are enough for most
 RUN_AWAY = 1e100  # squared norm of a power, whose square is a number still
-KEPT = 8  # rigs, as followers see them, that are remembered from record to record
 
 
 @dataclass(frozen=True, eq=False)

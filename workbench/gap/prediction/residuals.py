@@ -32,7 +32,7 @@ class FitData:
         lead: samples at the start of each record that are simulated but not counted, while the rig settles from the
             rest that the simulation assumes to the motion it really had.
         whiteners: filter of random forces on the structure, by record, through which its residual is seen; none where
-            there are none. With a observer, laws then act on the motion that was measured: that of the rig has no such
+            there are none. With an observer, laws then act on the motion that was measured: that of the rig has no such
             force.
         given_way: (n_values, k) W: a residual r becomes r - W Wᵀ r, for uncertain parameters that are re-estimated
             with every candidate to first order; None where none are.
@@ -215,7 +215,7 @@ class FitData:
         return np.concatenate([np.repeat(np.arange(len(r.outputs)), r.n_samples) for r in self.counted])
 
     def left_beside(self, rig: Rig, observer: Observer | None) -> list[np.ndarray]:
-        """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a observer."""
+        """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with an observer."""
         if observer is None or not is_stepped(rig) or rig.stiffness_rate:
             return self.differences(rig)
         return [
