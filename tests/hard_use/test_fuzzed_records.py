@@ -3,6 +3,7 @@
 Case folders have theirs in `test_damaged_cases.py`.
 """
 
+from functools import partial
 from importlib import import_module
 
 import h5py
@@ -141,7 +142,8 @@ def tried(path, rng: np.random.Generator) -> bool:
 @pytest.mark.parametrize("ending", KINDS)
 def test_whatever_is_in_a_file_it_is_read_or_refused(tmp_path, monkeypatch, ending, count=60):
     for name in ("mat_file", "hdf5_file", "uff_file"):
-        monkeypatch.setattr(f"workbench.records.{name}.load_confined", in_this_process)
+        module = f"workbench.records.{name}"
+        monkeypatch.setattr(f"{module}.arrays", partial(in_this_process, module))
     read = 0
     for seed in range(count):
         rng = np.random.default_rng([KINDS.index(ending), seed])

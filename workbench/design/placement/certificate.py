@@ -76,7 +76,7 @@ class Certificate:
 
 
 def _listed(places: np.ndarray) -> str:
-    each = [place_text(place_actuators) for place_actuators in listed(places)]
+    each = [place_text(place) for place in listed(places)]
     return "; ".join(each) if places.ndim > 1 else ", ".join(each)
 
 
