@@ -19,14 +19,11 @@ def task(hinged_modes):
 
 def bound_of(task, table, cell, half, effort):
     values, vectors = np.linalg.eigh(task.force_gramian)
-    shapes = tuple(
-        np.ascontiguousarray(part[cell])
-        for part in (table.value, table.slope, table.bend, table.most_bend, table.most_rate)
-    )
+    tables = (table.value, table.slope, table.bend, table.most_bend, table.most_rate)
     root = np.ascontiguousarray((vectors / np.sqrt(values)).T)
-    transforms = np.ascontiguousarray(task.roots)
-    square = np.array(task.force_gramian)  # of the type that a search hands on, so nothing is compiled twice
-    return dual_bound(half, shapes, transforms, square, root, np.sqrt(effort), SINGULAR, np.empty(cell.size))
+    # of the types that a search hands on, so that nothing is compiled twice
+    transforms, square = np.array(task.roots, order="C"), np.array(task.force_gramian)
+    return dual_bound(cell, half, tables, transforms, square, root, np.sqrt(effort), SINGULAR, np.empty(cell.size))
 
 
 def drawn(rng, level):

@@ -76,7 +76,7 @@ def test_ratios_of_all_choices_are_those_of_the_inverse(n, apart):
         found = [exact_ratio(b[np.arange(n), choice], w[np.arange(n), choice]) for choice in choices]
         values = [ratio * sign for ratio, sign in found]
         i, chosen = int(np.argmin(values)), np.zeros(n, np.int64)
-        least, sign = least_ratio(b, w, 1.0, -np.inf, SINGULAR * np.abs(b).max(), chosen)
+        least, sign = least_ratio(b, w, b.shape[1], 1.0, -np.inf, SINGULAR * np.abs(b).max(), chosen)
         if np.isfinite(least):
             finite += 1
             assert least == pytest.approx(values[i], rel=ROUND_OFF)
@@ -93,7 +93,7 @@ def test_ratios_are_exact_enough_where_several_pivots_are_small(hinged_modes):
         at = points[cell, rng.integers(0, 4, n)]
         b, w = at[:, :n].copy(), at[:, n:] @ rng.normal(size=(task.modes.n_modes - n, n))
         least, sign = least_ratio(
-            b[:, None], w[:, None], 1.0, -np.inf, SINGULAR * np.abs(b).max(), np.zeros(n, np.int64)
+            b[:, None], w[:, None], 1, 1.0, -np.inf, SINGULAR * np.abs(b).max(), np.zeros(n, np.int64)
         )
         if np.isfinite(least):
             finite += 1

@@ -51,6 +51,7 @@ def measured(rig, record_of):
     return make
 
 
+@pytest.mark.slow
 def test_nothing_is_named_where_nothing_hides(rig, measured):
     *fitted, kept = measured()
     verdict = diagnose(rig, fitted, validation=[kept])

@@ -20,9 +20,10 @@ import numpy as np
 from numba import njit
 
 from workbench.arrays import Flags, Floats, Integers
-from workbench.design.placement.dual_bound import dual_bound, inverse_of
+from workbench.design.placement.dual_bound import dual_bound
 from workbench.design.placement.hull_bound import HullBound
 from workbench.design.placement.limits import Limits
+from workbench.design.placement.small_matrices import inverse_of
 from workbench.design.placement.task import PlacementTask
 from workbench.structure.modes import frozen
 
@@ -122,7 +123,7 @@ class CellBounds:
             table.bend,
             table.most_bend,
             table.most_rate,
-            np.ascontiguousarray(task.roots),
+            np.array(task.roots, order="C"),  # never read-only: that would be another type, compiled anew
             roots,
             np.array([matrix for matrix, _ in squares]).reshape(-1, n, n),
             inverses,
@@ -177,6 +178,16 @@ def _least_linear(cost: Floats, h: Floats, direction: Floats, slack: float) -> f
 
 
 @njit(cache=True, nogil=True)
+def _largest(score: Floats) -> int:
+    """Index of the largest, the first of equals."""
+    largest = 0
+    for j in range(1, score.size):
+        if score[j] > score[largest]:
+            largest = j
+    return largest
+
+
+@njit(cache=True, nogil=True)
 def _bounds(
     cells: Integers,
     halves: Floats,
@@ -213,7 +224,7 @@ def _bounds(
     least_y, shift, cost, score = np.empty((n_residual, n_columns)), np.empty(n), np.empty(n), np.empty(n)
     directions, slacks = np.empty((n_squares + 1, n)), np.empty(n_squares + 1)
     weighted, u, v, carried = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
-    limits = np.empty(n_squares)
+    limits, tables = np.empty(n_squares), (value, slope, bend, most_bend, most_rate)
     for cell in range(n_cells):
         node = cells[cell]
         lower[cell], work[cell] = 0.0, np.inf
@@ -243,13 +254,12 @@ def _bounds(
                 limits[s] = condition / least_frame
 
         # by duality, under each limit
-        shapes = (value[node], slope[node], bend[node], most_bend[node], most_rate[node])
         nearest = -np.inf
         for s in range(n_squares):
             if regular[s] and np.isfinite(limits[s]):
-                bound = dual_bound(h, shapes, transforms, squares[s], inverses[s], limits[s], SINGULAR, score)
+                bound = dual_bound(node, h, tables, transforms, squares[s], inverses[s], limits[s], SINGULAR, score)
                 if bound > nearest:
-                    nearest, axis[cell] = bound, np.argmax(score)
+                    nearest, axis[cell] = bound, _largest(score)
         lower[cell] = max(nearest, 0.0)
         if np.isinf(lower[cell]) or not inverse_of(matrix, m, SINGULAR * largest):
             continue
@@ -271,7 +281,7 @@ def _bounds(
                 score[j] = 0.0
                 for i in range(n):
                     score[j] += change[i, j]
-            axis[cell] = np.argmax(score)
+            axis[cell] = _largest(score)
 
         # Neumann's series, where it converges: (I - Ē) w = 1 with w > 0 makes I - Ē an M-matrix
         for i in range(n):

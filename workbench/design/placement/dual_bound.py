@@ -17,92 +17,69 @@ within the limit, by the method of Frank and Wolfe.
 import numpy as np
 from numba import njit
 
-from workbench.arrays import Floats
+from workbench.arrays import Floats, Integers
+from workbench.design.placement.small_matrices import inner, inverse_of, multiply, multiply_transposed
 
 STEPS = 4  # of Frank and Wolfe
 BARELY = 1e-6  # share of L² that T leaves at least, for the sake of t
 ROUND_OFF = 1e-8  # share of g that no Λ can be said to leave: a cell of one place leaves nothing
 
 
+Tables = tuple[
+    Floats, Floats, Floats, Floats, Floats
+]  # value, slope, bend, most bend and most rate, (n_nodes, n_modes)
+
+
 @njit(cache=True, nogil=True)
-def inverse_of(matrix: Floats, inverse: Floats, least: float) -> bool:
-    """Gauss-Jordan with pivots; whether every pivot is above the least. The matrix is destroyed."""
-    n = matrix.shape[0]
-    for i in range(n):
-        for j in range(n):
-            inverse[i, j] = 1.0 if i == j else 0.0
-    for k in range(n):
-        best = k
-        for i in range(k + 1, n):
-            if abs(matrix[i, k]) > abs(matrix[best, k]):
-                best = i
-        pivot = matrix[best, k]
-        if not abs(pivot) > least:
-            return False
-        if best != k:
-            for j in range(n):
-                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
-                inverse[k, j], inverse[best, j] = inverse[best, j], inverse[k, j]
-        for j in range(n):
-            matrix[k, j] /= pivot
-            inverse[k, j] /= pivot
+def _responses(residual: Floats, transforms: Floats, forces: Floats, found: Floats) -> None:
+    """T_rᵀ Σ_j φ_r(x_j) f_j of each residual mode, (n_residual, n_columns), into `found`."""
+    n_residual, n, n_columns = transforms.shape
+    for r in range(n_residual):
+        for q in range(n_columns):
+            found[r, q] = 0.0
         for i in range(n):
-            factor = matrix[i, k]
-            if i != k and factor != 0.0:
-                for j in range(n):
-                    matrix[i, j] -= factor * matrix[k, j]
-                    inverse[i, j] -= factor * inverse[k, j]
-    return True
+            total = 0.0
+            for k in range(residual.shape[0]):
+                total += residual[k, r] * forces[k, i]
+            for q in range(n_columns):
+                found[r, q] += transforms[r, i, q] * total
 
 
 @njit(cache=True, nogil=True)
-def product(a: Floats, b: Floats) -> Floats:
-    """Of two small matrices: a call of BLAS takes longer than their products."""
-    found = np.zeros((a.shape[0], b.shape[1]))
-    for i in range(a.shape[0]):
-        for k in range(a.shape[1]):
-            for j in range(b.shape[1]):
-                found[i, j] += a[i, k] * b[k, j]
-    return found
-
-
-@njit(cache=True, nogil=True)
-def _of_each(matrices: Floats, vectors: Floats) -> Floats:
-    """Each matrix (n_residual, n, m) by its vector (n_residual, m), (n_residual, n)."""
-    found = np.zeros(matrices.shape[:2])
-    for r in range(matrices.shape[0]):
-        for i in range(matrices.shape[1]):
-            for j in range(matrices.shape[2]):
-                found[r, i] += matrices[r, i, j] * vectors[r, j]
-    return found
-
-
-@njit(cache=True, nogil=True)
-def _rest_of(
-    h: Floats, shapes: tuple[Floats, Floats, Floats, Floats, Floats], both: Floats, root: Floats, score: Floats
-) -> float:
+def _rest_of(node: Integers, h: Floats, tables: Tables, both: Floats, root: Floats, score: Floats) -> float:
     """(Σ_j max_x ‖S^-½ (g(x) - Λᵀ b(x))‖²)^½, for φ(x) over all modes times `both`, (-Λ, then the weights).
 
     Args:
-        h: (n_actuators,).
-        shapes: value, slope and bend at the centres, most bend and most rate, each (n_actuators, n_modes).
+        node, h: (n,) intervals and their half-widths.
+        tables: of the shapes on all intervals.
         both: (n_modes, n).
         root: (n, n) S^-½.
-        score: (n_actuators,) set to what each interval adds by its width.
+        score: (n,) set to what each interval adds by its width.
     """
-    value, slope, bend, most_bend, most_rate = shapes
-    weighted = both @ root.T
-    size = np.abs(both) @ np.abs(root.T)
-    centre, steep, bent = value @ weighted, slope @ weighted, bend @ weighted
-    rate, most = most_rate @ size, most_bend @ size
+    value, slope, bend, most_bend, most_rate = tables
+    n_modes, n = both.shape
+    weighted, size = np.empty((n_modes, n)), np.empty((n_modes, n))
+    for i in range(n_modes):
+        for c in range(n):
+            weighted[i, c], size[i, c] = 0.0, 0.0
+            for k in range(n):
+                weighted[i, c] += both[i, k] * root[c, k]
+                size[i, c] += abs(both[i, k] * root[c, k])
     total = 0.0
-    for j in range(h.size):
+    for j in range(n):
         at, low, high, beyond = 0.0, 0.0, 0.0, 0.0
-        for c in range(root.shape[0]):
-            at += centre[j, c] ** 2
-            low += (centre[j, c] - h[j] * steep[j, c]) ** 2
-            high += (centre[j, c] + h[j] * steep[j, c]) ** 2
-            beyond += min(abs(bent[j, c]) + h[j] * rate[j, c], most[j, c]) ** 2
+        for c in range(n):
+            centre, steep, bent, rate, most = 0.0, 0.0, 0.0, 0.0, 0.0
+            for i in range(n_modes):
+                centre += value[node[j], i] * weighted[i, c]
+                steep += slope[node[j], i] * weighted[i, c]
+                bent += bend[node[j], i] * weighted[i, c]
+                rate += most_rate[node[j], i] * size[i, c]
+                most += most_bend[node[j], i] * size[i, c]
+            at += centre**2
+            low += (centre - h[j] * steep) ** 2
+            high += (centre + h[j] * steep) ** 2
+            beyond += min(abs(bent) + h[j] * rate, most) ** 2
         # the linear part is largest at an end: a norm is convex
         largest = (np.sqrt(max(low, high)) + 0.5 * h[j] ** 2 * np.sqrt(beyond)) ** 2
         score[j] = largest - at
@@ -112,8 +89,9 @@ def _rest_of(
 
 @njit(cache=True, nogil=True)
 def dual_bound(
+    node: Integers,
     h: Floats,
-    shapes: tuple[Floats, Floats, Floats, Floats, Floats],
+    tables: Tables,
     transforms: Floats,
     square: Floats,
     root: Floats,
@@ -124,60 +102,94 @@ def dual_bound(
     """Lower bound of √W_R in a cell under one limit; inf where none in it keeps the limit, -inf if none is found.
 
     Args:
-        h: (n,) half-widths of the intervals.
-        shapes: value, slope and bend at their centres, most bend and most rate in them, each (n, n_modes).
+        node, h: (n,) intervals and their half-widths.
+        tables: of the shapes on all intervals.
         transforms: T (n_residual, n, n_columns).
         square, root, limit: S (n, n), S^-½ and L.
         singular: pivot of D over its largest entry.
         score: (n,) set to how much each interval weakens the bound.
     """
-    n = h.size
-    n_modes = shapes[0].shape[1]
-    ends = np.empty((2 * n, n_modes))
+    value, slope = tables[0], tables[1]
+    n, n_modes = h.size, value.shape[1]
+    n_residual, _, n_columns = transforms.shape
+    c, residual = np.empty((2 * n, n)), np.empty((2 * n, n_residual))
     for j in range(n):
-        for k in range(n_modes):
-            ends[j, k] = shapes[0][j, k]
-            ends[n + j, k] = h[j] * shapes[1][j, k]
-    c, residual = np.ascontiguousarray(ends[:, :n]), np.ascontiguousarray(ends[:, n:])
-    gram, d = c.T @ c, np.empty((n, n))
-    pivot = singular * np.abs(gram).max()
+        for k in range(n):
+            c[j, k], c[n + j, k] = value[node[j], k], h[j] * slope[node[j], k]
+        for r in range(n_residual):
+            residual[j, r], residual[n + j, r] = value[node[j], n + r], h[j] * slope[node[j], n + r]
+    gram, d, least = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    multiply_transposed(c, c, gram)
+    pivot = 0.0
+    for i in range(n):
+        pivot = max(pivot, singular * gram[i, i])  # of a Gramian, the largest entry is on the diagonal
     exact = inverse_of(gram.copy(), d, pivot)
-    # any D refuses a cell: where D⁻¹ is singular to round-off, as beside a support, a ridge makes one
-    if not exact and not inverse_of(gram + 2.0 * pivot * np.eye(n), d, pivot):
-        return -np.inf
-    least = d @ square
-    both = np.zeros((n_modes, n))
-    t = np.trace(least)
-    if t >= limit**2:
-        both[:n] = -least
-        if t > limit * _rest_of(h, shapes, both, root, score):
-            return np.inf
+    if not exact:  # any D refuses a cell: where D⁻¹ is singular to round-off, as beside a support, a ridge makes one
+        for i in range(n):
+            gram[i, i] += 2.0 * pivot
+        if not inverse_of(gram, d, pivot):
+            return -np.inf
+    multiply(d, square, least)
+    both, t = np.zeros((n_modes, n)), 0.0
+    for i in range(n):
+        t += least[i, i]
+        for k in range(n):
+            both[i, k] = -least[i, k]
+    if t >= limit**2 and t > limit * _rest_of(node, h, tables, both, root, score):
+        return np.inf
     if not exact:
         return -np.inf
     left = np.sqrt(max(limit**2 - t, BARELY * limit**2))
-    forces, other = c @ d, root.T @ root
-    of_forces = transforms.transpose(0, 2, 1)
-    y = _of_each(of_forces, residual.T @ forces)
-    size, outside = 0.0, 0.0
-    multiplier, weights = np.zeros((n, n)), np.zeros((n_modes - n, n))
+    forces, pushed, other = np.empty((2 * n, n)), np.empty((2 * n, n)), np.empty((n, n))
+    g, rest, weighted = np.empty((2 * n, n)), np.empty((2 * n, n)), np.empty((2 * n, n))
+    weights, projected, multiplier = np.empty((n_residual, n)), np.empty((n, n)), np.empty((n, n))
+    y, change = np.empty((n_residual, n_columns)), np.empty((n_residual, n_columns))
+    multiply(c, d, forces)
+    multiply_transposed(root, root, other)
+    _responses(residual, transforms, forces, y)
+    outside = 0.0
     for step in range(STEPS + 1):
-        size = np.sqrt((y**2).sum())
+        size = np.sqrt(inner(y, y))
         if size == 0.0:
             return -np.inf
-        weights = _of_each(transforms, y / size)
-        g = residual @ weights
-        multiplier = d @ (c.T @ g)
-        rest = g - c @ multiplier
-        weighted = rest @ other
-        outside = np.sqrt((rest * weighted).sum())
-        if step == STEPS or outside <= ROUND_OFF * np.sqrt(((g @ other) * g).sum()):
+        for r in range(n_residual):
+            for i in range(n):
+                weights[r, i] = 0.0
+                for q in range(n_columns):
+                    weights[r, i] += transforms[r, i, q] * y[r, q] / size
+        multiply(residual, weights, g)
+        multiply_transposed(c, g, projected)
+        multiply(d, projected, multiplier)
+        multiply(c, multiplier, rest)
+        for j in range(2 * n):
+            for i in range(n):
+                rest[j, i] = g[j, i] - rest[j, i]
+        multiply(g, other, weighted)
+        of_all = np.sqrt(inner(g, weighted))
+        multiply(rest, other, weighted)
+        outside = np.sqrt(max(inner(rest, weighted), 0.0))
+        if step == STEPS or outside <= ROUND_OFF * of_all:
             break
-        change = _of_each(of_forces, residual.T @ (forces - left / outside * weighted)) - y
-        a = (change**2).sum()
+        for j in range(2 * n):
+            for i in range(n):
+                pushed[j, i] = forces[j, i] - left / outside * weighted[j, i]
+        _responses(residual, transforms, pushed, change)
+        for r in range(n_residual):
+            for q in range(n_columns):
+                change[r, q] -= y[r, q]
+        a = inner(change, change)
         if a == 0.0:
             break
-        y = y + min(max(-(y * change).sum() / a, 0.0), 1.0) * change
-    multiplier = multiplier + outside / left * least
-    both[:n] = -multiplier
-    both[n:] = weights
-    return float((np.trace(multiplier) - limit * _rest_of(h, shapes, both, root, score)) / np.sqrt(2.0))
+        share = min(max(-inner(y, change) / a, 0.0), 1.0)
+        for r in range(n_residual):
+            for q in range(n_columns):
+                y[r, q] += share * change[r, q]
+    trace = 0.0
+    for i in range(n):
+        for k in range(n):
+            both[i, k] = -(multiplier[i, k] + outside / left * least[i, k])
+        trace -= both[i, i]
+    for r in range(n_residual):
+        for i in range(n):
+            both[n + r, i] = weights[r, i]
+    return float((trace - limit * _rest_of(node, h, tables, both, root, score)) / np.sqrt(2.0))

@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit
 
 from workbench.arrays import Floats, Integers
-from workbench.design.placement.dual_bound import inverse_of, product
+from workbench.design.placement.small_matrices import inner, inverse_of, multiply
 from workbench.design.placement.task import PlacementTask
 
 STEPS = 4  # of Frank and Wolfe: sixteen prove no more cells
@@ -70,7 +70,7 @@ class HullBound:
             remainder,
             np.maximum(sizes, 0.0) ** 2,
             (doubts**2).sum(axis=2),
-            np.ascontiguousarray(task.roots),
+            np.array(task.roots, order="C"),
             roots,
             inverses,
             limits,
@@ -114,32 +114,34 @@ def _raise_to(
                 limit = condition / np.sqrt(size)
             eta = limit * np.sqrt(doubt)
             least = np.sqrt(2.0) * wanted
-            if eta < 1.0 and is_excluded(
-                points[node], remainder[node], transforms, roots[s], inverses[s], limit, eta, least
-            ):
+            if eta < 1.0 and is_excluded(node, points, remainder, transforms, roots[s], inverses[s], limit, eta, least):
                 lower[cell] = wanted
                 break
 
 
 @njit(cache=True, nogil=True)
 def least_ratio(
-    b: Floats, w: Floats, sign: float, stop: float, singular: float, chosen: Integers
+    b: Floats, w: Floats, n_points: int, sign: float, stop: float, singular: float, chosen: Integers
 ) -> tuple[float, float]:
-    """Least sign G_k / |D_k| over all choices of one point an actuator, and the sign of that D_k.
+    """Least sign G_k / |D_k| over all choices of one of the first points an actuator, and the sign of that D_k.
 
     By Gauss's elimination in dual numbers, a column at a time, so that choices share what they have in common.
 
     Args:
-        b, w: (n, n_points, n) columns of B and of W.
+        b, w: (n, n_points or more, n) columns of B and of W.
+        n_points: how many of an actuator are chosen from.
         sign: of D at the centre.
         stop: the first ratio below ends the search.
         singular: a first pivot of this size or less ends it too, with -inf; later ones likewise, by as much more as the
             round-off has grown.
         chosen: (n,) set to the choice.
     """
-    n, n_points, _ = b.shape
+    n = len(b)
     bs, ws = np.empty((n, n, n_points, n)), np.empty((n, n, n_points, n))
-    bs[0], ws[0] = b, w
+    for j in range(n):
+        for k in range(n_points):
+            for i in range(n):
+                bs[0, j, k, i], ws[0, j, k, i] = b[j, k, i], w[j, k, i]
     d, g, least_pivot = np.ones(n), np.zeros(n), np.full(n, singular)
     at = np.full(n, -1)
     least, of_least = np.inf, 1.0
@@ -167,7 +169,8 @@ def least_ratio(
                 det *= d[depth]
                 if change < least * abs(det):
                     least, of_least = change / abs(det), np.sign(det)
-                    chosen[:] = at
+                    for j in range(n - 1):
+                        chosen[j] = at[j]
                     chosen[n - 1] = k
                     if least < stop:
                         return least, of_least
@@ -200,20 +203,24 @@ def least_ratio(
 
 
 @njit(cache=True, nogil=True)
+def _distance(a: float, b: float, c: float, t: float, limit: float) -> float:
+    """Square of how far ‖(1 - t) u + t v‖ is beyond a limit, over it; of ‖u‖², ⟨u, v⟩, ‖v‖²."""
+    s = 1.0 - t
+    size = np.sqrt(max(s * s * a + 2.0 * s * t * b + t * t * c, 0.0)) / limit
+    return float(max(size - 1.0, 0.0) ** 2)
+
+
+@njit(cache=True, nogil=True)
 def _step(y: Floats, new_y: Floats, f: Floats, new_f: Floats, least: float, limit: float) -> float:
     """Share of the way to the new point at which the distance to what the limits leave is least."""
-    a, b, c = (y * y).sum(), (y * new_y).sum(), (new_y * new_y).sum()
-    p, q, r = (f * f).sum(), (f * new_f).sum(), (new_f * new_f).sum()
+    a, b, c = inner(y, y), inner(y, new_y), inner(new_y, new_y)
+    p, q, r = inner(f, f), inner(f, new_f), inner(new_f, new_f)
     low, high = 0.0, 1.0
     for _ in range(LINE):
         first, second = low + (high - low) * 0.4, low + (high - low) * 0.6
-        distances = np.empty(2)
-        for i, t in enumerate((first, second)):
-            s = 1.0 - t
-            size = np.sqrt(max(s * s * a + 2.0 * s * t * b + t * t * c, 0.0)) / least
-            force = np.sqrt(max(s * s * p + 2.0 * s * t * q + t * t * r, 0.0)) / limit
-            distances[i] = max(size - 1.0, 0.0) ** 2 + max(force - 1.0, 0.0) ** 2
-        if distances[0] < distances[1]:
+        near = _distance(a, b, c, first, least) + _distance(p, q, r, first, limit)
+        far = _distance(a, b, c, second, least) + _distance(p, q, r, second, limit)
+        if near < far:
             high = second
         else:
             low = first
@@ -232,18 +239,74 @@ def _evaluate(
     f: Floats,
 ) -> bool:
     """B⁻¹ of columns (n, n_modes), and by the sign Y (n_residual, n_columns) and B⁻¹ S^½; whether B is regular."""
-    n = columns.shape[0]
-    if not inverse_of(columns[:, :n].T.copy(), inverse, singular):
+    n_residual, n, n_columns = transforms.shape
+    matrix = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            matrix[i, j] = columns[j, i]
+    if not inverse_of(matrix, inverse, singular):
         return False
-    f[:] = sign * product(inverse, root)
-    z = sign * product(columns[:, n:].T, inverse)
-    for r in range(y.shape[0]):
-        y[r] = product(z[r : r + 1], transforms[r])[0]
+    multiply(inverse, root, f)
+    for i in range(n):
+        for j in range(n):
+            f[i, j] *= sign
+    for r in range(n_residual):
+        for q in range(n_columns):
+            y[r, q] = 0.0
+        for i in range(n):
+            z = 0.0
+            for j in range(n):
+                z += columns[j, n + r] * inverse[j, i]
+            for q in range(n_columns):
+                y[r, q] += sign * z * transforms[r, i, q]
     return True
 
 
 @njit(cache=True, nogil=True)
+def _left_of(
+    node: Integers,
+    points: Floats,
+    remainder: Floats,
+    inverse_root: Floats,
+    w: Floats,
+    weights: Floats,
+    multiplier: Floats,
+) -> tuple[float, float]:
+    """Sizes of S^-½ (w - Λᵀ b) at the points, and of S^-½ (e_w - Λᵀ e), for Λ the multiplier."""
+    n, n_points, n_residual = len(node), points.shape[1], len(weights)
+    v, at_points, of_remainder = np.empty(n), 0.0, 0.0
+    for j in range(n):
+        largest = 0.0
+        for k in range(n_points):
+            for c in range(n):
+                v[c] = w[j, k, c]
+                for i in range(n):
+                    v[c] -= points[node[j], k, i] * multiplier[i, c]
+            size = 0.0
+            for e in range(n):
+                total = 0.0
+                for c in range(n):
+                    total += inverse_root[e, c] * v[c]
+                size += total**2
+            largest = max(largest, size)
+        at_points += largest
+        for c in range(n):
+            v[c] = 0.0
+            for i in range(n):
+                v[c] += remainder[node[j], i] * abs(multiplier[i, c])
+            for r in range(n_residual):
+                v[c] += remainder[node[j], n + r] * abs(weights[r, c])
+        for e in range(n):
+            total = 0.0
+            for c in range(n):
+                total += abs(inverse_root[e, c]) * v[c]
+            of_remainder += total**2
+    return float(np.sqrt(at_points)), float(np.sqrt(of_remainder))
+
+
+@njit(cache=True, nogil=True)
 def is_excluded(
+    node: Integers,
     points: Floats,
     remainder: Floats,
     transforms: Floats,
@@ -256,56 +319,97 @@ def is_excluded(
     """Whether no placement in the cell that keeps the limit has a ‖Y‖ below the least.
 
     Args:
-        points: (n, 4, n_modes) of Bernstein, of the cubics.
-        remainder: (n, n_modes) by how much the shapes differ from the cubics at most.
+        node: (n,) intervals.
+        points: (n_intervals, 4, n_modes) of Bernstein, of the cubics.
+        remainder: (n_intervals, n_modes) by how much the shapes differ from the cubics at most.
         transforms: T (n_residual, n, n_columns).
         root, inverse_root, limit, eta: S^½ and S^-½ (n, n), L, and η < 1.
     """
-    n, n_points, n_modes = points.shape
-    n_residual, _, n_columns = transforms.shape
-    centre = 0.125 * (points[:, 0] + points[:, 1]) + 0.375 * (points[:, 2] + points[:, 3])
-    singular = SINGULAR * np.abs(centre[:, :n]).max()
+    n_points, n_modes = points.shape[1:]
+    n_residual, n, n_columns = transforms.shape
+    centre, choice, b, middle = (
+        np.empty((n, n_modes)),
+        np.empty((n, n_modes)),
+        np.empty((n, n_points, n)),
+        np.empty((n, 1, n)),
+    )
+    largest = 0.0
+    for j in range(n):
+        own = points[node[j]]
+        for i in range(n_modes):
+            centre[j, i] = 0.125 * (own[0, i] + own[1, i]) + 0.375 * (own[2, i] + own[3, i])
+        for i in range(n):
+            middle[j, 0, i] = centre[j, i]
+            largest = max(largest, abs(centre[j, i]))
+            for k in range(n_points):
+                b[j, k, i] = own[k, i]
+    singular = SINGULAR * largest
     y, f = np.empty((n_residual, n_columns)), np.empty((n, n))
     new_y, new_f = np.empty((n_residual, n_columns)), np.empty((n, n))
     inverse, ignored = np.empty((n, n)), np.empty((n, n))
     if not _evaluate(centre, transforms, root, 1.0, singular, inverse, y, f):
         return False
-    chosen, choice = np.zeros(n, np.int64), np.empty((n, n_modes))
-    b = np.ascontiguousarray(points[:, :, :n])
-    ends, every = b[:, :2].copy(), points.reshape(-1, n_modes)
-    middle = centre[:, :n].copy().reshape(n, 1, n)
-    _, sign = least_ratio(middle, middle, 1.0, -np.inf, singular, chosen)
+    chosen, w = np.zeros(n, np.int64), np.empty((n, n_points, n))
+    weights, constant, at_centre, multiplier = (
+        np.empty((n_residual, n)),
+        np.empty((n, n)),
+        np.empty(n),
+        np.empty((n, n)),
+    )
+    _, sign = least_ratio(middle, middle, middle.shape[1], 1.0, -np.inf, singular, chosen)
     for _ in range(STEPS):
-        size_y, size_f = np.sqrt((y**2).sum()), np.sqrt((f**2).sum())
+        size_y, size_f = np.sqrt(inner(y, y)), np.sqrt(inner(f, f))
         alpha, beta = max(size_y / least - 1.0, 0.0) / least, max(size_f / limit - 1.0, 0.0) / limit
         if alpha == 0.0 and beta == 0.0:
             return False  # a mean of choices is where a better placement might be
-        weights = np.zeros((n_residual, n))
-        if alpha > 0.0:
-            for r in range(n_residual):
-                weights[r] = alpha / size_y * product(y[r : r + 1], transforms[r].T)[0]
-        constant = beta / size_f * product(f, root.T)
-        w = product(every[:, n:], weights).reshape(n, n_points, n) + constant.reshape(n, 1, n)
+        for r in range(n_residual):
+            for i in range(n):
+                weights[r, i] = 0.0
+                for q in range(n_columns):
+                    if alpha > 0.0:
+                        weights[r, i] += alpha / size_y * transforms[r, i, q] * y[r, q]
+        for j in range(n):
+            for c in range(n):
+                constant[j, c] = 0.0
+                for i in range(n):
+                    if beta > 0.0:
+                        constant[j, c] += beta / size_f * f[j, i] * root[c, i]
+                for k in range(n_points):
+                    w[j, k, c] = constant[j, c]
+                    for r in range(n_residual):
+                        w[j, k, c] += points[node[j], k, n + r] * weights[r, c]
         needed = (1.0 + ROUND_OFF) * (alpha * least + beta * limit)
-        ratio, of_choice = least_ratio(ends, w[:, :2].copy(), sign, -np.inf, singular, chosen)
-        if ratio >= needed:  # at the ends of the intervals alone, which takes little time
-            multiplier = product(inverse.T, product(centre[:, n:], weights) + constant)
-            left = product(w.reshape(-1, n) - product(every[:, :n], multiplier), inverse_root.T)
-            change = 0.0
+        # at the ends of the intervals alone first, the former half of the points, which takes little time
+        ratio, of_choice = least_ratio(b, w, n_points // 2, sign, -np.inf, singular, chosen)
+        if ratio >= needed:
+            for i in range(n):
+                for c in range(n):
+                    multiplier[i, c] = 0.0
             for j in range(n):
-                change += (left[n_points * j : n_points * (j + 1)] ** 2).sum(axis=1).max()
-            rest = product(remainder[:, n:], np.abs(weights)) + product(remainder[:, :n], np.abs(multiplier))
-            rest = product(rest, np.abs(inverse_root.T))
-            needed += limit * (np.sqrt((rest**2).sum()) + eta / (1.0 - eta) * np.sqrt(change))
-            ratio, of_choice = least_ratio(b, w, sign, needed, singular, chosen)
+                for c in range(n):
+                    at_centre[c] = constant[j, c]
+                    for r in range(n_residual):
+                        at_centre[c] += centre[j, n + r] * weights[r, c]
+                for i in range(n):
+                    for c in range(n):
+                        multiplier[i, c] += inverse[j, i] * at_centre[c]
+            at_points, of_remainder = _left_of(node, points, remainder, inverse_root, w, weights, multiplier)
+            needed += limit * (of_remainder + eta / (1.0 - eta) * at_points)
+            ratio, of_choice = least_ratio(b, w, n_points, sign, needed, singular, chosen)
             if ratio >= needed:
                 return True
         for j in range(n):
-            choice[j] = points[j, chosen[j]]
+            for i in range(n_modes):
+                choice[j, i] = points[node[j], chosen[j], i]
         if np.isinf(ratio) or not _evaluate(
             choice, transforms, root, sign * of_choice, singular, ignored, new_y, new_f
         ):
             return False
         t = _step(y, new_y, f, new_f, least, limit)
-        y, f = (1.0 - t) * y + t * new_y, (1.0 - t) * f + t * new_f
+        for r in range(n_residual):
+            for q in range(n_columns):
+                y[r, q] = (1.0 - t) * y[r, q] + t * new_y[r, q]
+        for i in range(n):
+            for c in range(n):
+                f[i, c] = (1.0 - t) * f[i, c] + t * new_f[i, c]
     return False
