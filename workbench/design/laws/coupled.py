@@ -36,6 +36,8 @@ def coupled_lqr(
 ) -> Law:
     """The regulator that minimises ∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt over the actuator forces F.
 
+    The displacement of a rigid mode costs nothing, so none of its gains answers to it, as in `imsc`.
+
     Args:
         modes, controlled, actuators: as for `imsc`; fewer actuators than modes will do.
         weight: R, scalar, (n_actuators,) or (n_actuators, n_actuators).
@@ -50,11 +52,12 @@ def coupled_lqr(
     else:
         controllable_input(modes, [r for r in index if modes.damping[r, r] <= 0], actuators)
     a, b = controlled_plant(modes, index, actuators)
-    q = np.diag(np.r_[modes.omega[list(index)] ** 2, np.ones(len(index))])
-    size = len(actuators)
+    omega, size = modes.omega[list(index)], len(actuators)
+    states = np.flatnonzero(np.r_[omega > 0, np.full(omega.size, True)])
+    q = np.diag(np.r_[omega**2, np.ones(omega.size)][states])
     r = positive_definite(weight, size, f"the control weight must be positive definite, {size} by {size}")
     try:
-        gain, _, poles = control.lqr(a, b, q, r)
+        found, _, poles = control.lqr(a[np.ix_(states, states)], b[states], q, r)
     except (np.linalg.LinAlgError, ValueError, control.ControlSlycot) as error:
         raise DesignError(
             f"no regulator stabilises modes {[i + 1 for i in index]} from these places: {error}"
@@ -63,7 +66,9 @@ def coupled_lqr(
         raise DesignError(
             f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator"
         )
-    return Law(np.asarray(gain), index, actuators, "coupled LQR", partial(coupled_lqr, weight=weight))
+    gain = np.zeros((size, 2 * omega.size))
+    gain[:, states] = found
+    return Law(gain, index, actuators, "coupled LQR", partial(coupled_lqr, weight=weight))
 
 
 def coupled_poles(

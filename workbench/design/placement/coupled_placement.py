@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, solve_continuous_are, solve_continuous_lyapunov
 from scipy.optimize import OptimizeResult, minimize
 
+from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.peak import largest
@@ -98,15 +99,15 @@ def coupled_costs(
     positions = np.sort(np.asarray(positions, float))
     n, m = n_controlled, positions.size
     shapes = modes.phi(positions).T
-    omega = modes.omega[:n]
-    a = modal_state_matrix(omega**2, np.zeros(n))
-    b = np.vstack([np.zeros((n, m)), shapes[:n]])
-    start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]]
+    states, a, costs = _weighed(modes.omega[:n])
+    b = np.vstack([np.zeros((n, m)), shapes[:n]])[states]
+    start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]][states]
     try:
-        p = solve_continuous_are(a, b, np.diag(np.r_[omega**2, np.ones(n)]), weight * np.eye(m))
+        p = solve_continuous_are(a, b, np.diag(costs), weight * np.eye(m))
     except (LinAlgError, ValueError):
         return _impossible(positions, modes.n_modes - n)
-    gain = b.T @ p / weight
+    gain, whole = b.T @ p / weight, np.zeros((m, 2 * n))
+    whole[:, states] = gain
     loop = a - b @ gain
     values, vectors = np.linalg.eig(loop)
     if not values.real.max() < -ON_THE_AXIS * np.abs(values).max():
@@ -117,7 +118,7 @@ def coupled_costs(
     gramian = solve_continuous_lyapunov(loop, -np.outer(start, start))
     return Placement(
         positions=positions,
-        law=Law(gain, tuple(range(n)), forces_at(positions), "coupled LQR"),
+        law=Law(whole, tuple(range(n)), forces_at(positions), "coupled LQR"),
         residual_work=float(by_mode.sum()),
         by_mode=by_mode,
         effort=float(np.trace(gain @ gramian @ gain.T)),
@@ -125,6 +126,14 @@ def coupled_costs(
         condition=float(np.linalg.norm(np.linalg.pinv(shapes[:n])) * np.linalg.norm(shapes[:n])),
         status="coupled LQR",
     )
+
+
+def _weighed(omega: Floats) -> tuple[Integers, Floats, Floats]:
+    """The states whose motion costs anything, their A and their costs: the displacement of a rigid mode does not."""
+    n = len(omega)
+    states = np.flatnonzero(np.r_[omega > 0, np.full(n, True)])
+    a = modal_state_matrix(omega**2, np.zeros(n))
+    return states, a[np.ix_(states, states)], np.r_[omega**2, np.ones(n)][states]
 
 
 def forces_at(positions: np.ndarray) -> tuple[Actuator, ...]:
@@ -146,23 +155,23 @@ def coupled_batch(
     """
     n, count = n_controlled, len(positions)
     shapes = modes.phi(positions.ravel()).reshape(*positions.shape, modes.n_modes)
-    omega = modes.omega[:n]
-    a = modal_state_matrix(omega**2, np.zeros(n))
-    b = np.zeros((count, 2 * n, positions.shape[1]))
-    b[:, n:] = shapes[:, :, :n].transpose(0, 2, 1)
-    hamiltonian = np.zeros((count, 4 * n, 4 * n))
-    hamiltonian[:, : 2 * n, : 2 * n], hamiltonian[:, 2 * n :, 2 * n :] = a, -a.T
-    hamiltonian[:, : 2 * n, 2 * n :] = -b @ b.transpose(0, 2, 1) / weight
-    hamiltonian[:, 2 * n :, : 2 * n] = -np.diag(np.r_[omega**2, np.ones(n)])
+    states, a, costs = _weighed(modes.omega[:n])
+    size = len(states)
+    b = np.zeros((count, size, positions.shape[1]))
+    b[:, size - n :] = shapes[:, :, :n].transpose(0, 2, 1)
+    hamiltonian = np.zeros((count, 2 * size, 2 * size))
+    hamiltonian[:, :size, :size], hamiltonian[:, size:, size:] = a, -a.T
+    hamiltonian[:, :size, size:] = -b @ b.transpose(0, 2, 1) / weight
+    hamiltonian[:, size:, :size] = -np.diag(costs)
     values, vectors = np.linalg.eig(hamiltonian)
-    stable = np.argsort(values.real, axis=1)[:, : 2 * n]
+    stable = np.argsort(values.real, axis=1)[:, :size]
     poles = np.take_along_axis(values, stable, axis=1)
     vectors = np.take_along_axis(vectors, stable[:, None, :], axis=2)
-    start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]].astype(complex)
-    works = poles.real.max(axis=1) < -ON_THE_AXIS * omega.max()
-    upper = np.where(works[:, None, None], vectors[:, : 2 * n], np.eye(2 * n))
-    held = np.linalg.solve(upper, np.broadcast_to(start[:, None], (count, 2 * n, 1)))[:, :, 0]
-    amplitudes = -(b.transpose(0, 2, 1) @ vectors[:, 2 * n :]) * held[:, None, :] / weight
+    start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]][states].astype(complex)
+    works = poles.real.max(axis=1) < -ON_THE_AXIS * modes.omega[n - 1]
+    upper = np.where(works[:, None, None], vectors[:, :size], np.eye(size))
+    held = np.linalg.solve(upper, np.broadcast_to(start[:, None], (count, size, 1)))[:, :, 0]
+    amplitudes = -(b.transpose(0, 2, 1) @ vectors[:, size:]) * held[:, None, :] / weight
     force = amplitudes @ (1.0 / (1j * modes.omega[n:] - poles[:, :, None]))
     work = 0.5 * (np.abs(np.einsum("par,par->pr", shapes[:, :, n:], force)) ** 2).sum(axis=1)
     decay = np.where(works[:, None, None], -(poles.conj()[:, :, None] + poles[:, None, :]), 1.0)

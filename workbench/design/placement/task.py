@@ -94,8 +94,8 @@ class PlacementTask(Printed):
         roots: (n_residual, n, n_columns) real T_r with T_r T_rᵀ = E Re f̂ f̂ᴴ at the residual frequency.
         force_gramian: (n, n) E ∫ f fᵀ dt.
         forces: (n, n_instants) modal forces at instants of every disturbance, for their peak.
-        poles: (2n,) of the controlled modes, rad/s.
-        amplitudes: (n_places, n, 2n) of the modal forces after an impulse at each place, f = Re Σ_k a_k e^{λ_k t}.
+        poles: (n_poles,) of the controlled modes, rad/s: two of each, of a rigid one that of its velocity.
+        amplitudes: (n_places, n, n_poles) of the modal forces after an impulse at each place, f = Re Σ_k a_k e^{λ_k t}.
         span: s, over which their peak is sought.
         envelope: (n,) C_j of ω√E|f̂_j(iω)|² <= C_j above the last frequency; inf where there is no such bound.
         weight: R of IMSC, (n,).
@@ -273,14 +273,17 @@ def placement_task(
     rate = g2 + np.diag(modes.damping)[:n]  # of the closed loop: s² + rate s + ω² + g1
     rates = impulse * modes.phi(places)[:, :n] * np.sqrt(shares)[:, None]
     s = 1j * modes.omega[n:, None]
-    unit = -(g1 + g2 * s) / (s**2 + rate * s + omega**2 + g1)
-    a = modal_state_matrix(omega**2 + g1, rate)
-    gains = np.hstack([np.diag(g1), np.diag(g2)])
+    # where a rigid mode has come to rest is left alone and asks for no force: its displacement is no state here
+    rigid = omega**2 + g1 == 0
+    states = np.r_[~rigid, np.full(n, True)]
+    unit = -np.where(rigid, g2 / (s + rate), (g1 + g2 * s) / np.where(rigid, 1.0, s**2 + rate * s + omega**2 + g1))
+    a = modal_state_matrix(omega**2 + g1, rate)[np.ix_(states, states)]
+    gains = np.hstack([np.diag(g1), np.diag(g2)])[:, states]
     slowest = -np.linalg.eigvals(a).real.max()
     if np.isfinite(final_time):
         # what is left of the loop at t_f answers no more
         end = expm(a * final_time)
-        left = np.array([-gains @ np.linalg.solve(si * np.eye(2 * n) - a, end[:, n:]) for si in s[:, 0]])
+        left = np.array([-gains @ np.linalg.solve(si * np.eye(len(a)) - a, end[:, -n:]) for si in s[:, 0]])
         unit = unit[:, :, None] * np.eye(n) - left * np.exp(-s * final_time)[:, :, None]
     else:
         unit = unit[:, :, None] * np.eye(n)
@@ -296,11 +299,11 @@ def placement_task(
     span = min(final_time, -np.log(SETTLED) / slowest)
     # the rate jumps at the impulse and the forces with it: instants lie close at first
     instants = span * np.linspace(0.0, 1.0, SHOWN_INSTANTS) ** 2
-    starts = np.vstack([np.zeros((n, len(places))), (rates / np.sqrt(np.maximum(shares, 1e-300))[:, None]).T])
+    starts = np.vstack([np.zeros((len(a) - n, len(places))), (rates / np.sqrt(np.maximum(shares, 1e-300))[:, None]).T])
     values, vectors = np.linalg.eig(a)
     held = np.linalg.solve(vectors, starts[:, shares > 0].astype(complex))
     motion = np.einsum("ik,kt,kp->ipt", vectors, np.exp(np.outer(values, instants)), held).real
-    forces = -(gains @ motion.reshape(2 * n, -1))
+    forces = -(gains @ motion.reshape(len(a), -1))
     gramian = _force_gramian(a, gains, rates, final_time)
     amplitudes = -(gains @ vectors) * held.T[:, None, :]
     amplitudes.flags.writeable = values.flags.writeable = False
@@ -355,7 +358,7 @@ def participation_along(modes: Modes, actuator: Actuator, x: Floats, derivative:
 
 def _force_gramian(a: Floats, gains: Floats, rates: Floats, final_time: float) -> Floats:
     n = rates.shape[1]
-    start = np.vstack([np.zeros((n, rates.shape[0])), rates.T])
+    start = np.vstack([np.zeros((len(a) - n, rates.shape[0])), rates.T])
     gramian: Floats = solve_continuous_lyapunov(a, -start @ start.T)
     if np.isfinite(final_time):
         end = expm(a * final_time)

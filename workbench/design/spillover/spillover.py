@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
 
-from workbench.arrays import Complexes, Floats
+from workbench.arrays import Complexes, Flags, Floats
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
@@ -87,13 +87,13 @@ def force_transform(modes: Modes, law: Law, state: Floats, s: Complexes) -> Comp
         state: (2 n_modes,) at t = 0, all modes; only the controlled ones matter.
         s: (n_s,) complex, rad/s.
     """
-    loop, start = _controlled_loop(modes, law, state)
+    loop, start, gain, _ = _controlled_loop(modes, law, state)
     values, vectors = np.linalg.eig(loop)
     if np.linalg.cond(vectors) < 1e6:
-        weights = -(law.gain @ vectors) * np.linalg.solve(vectors, start.astype(complex))
+        weights = -(gain @ vectors) * np.linalg.solve(vectors, start.astype(complex))
         return np.asarray(weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None])))
     eye = np.eye(loop.shape[0])
-    return np.array([-law.gain @ np.linalg.solve(si * eye - loop, start) for si in np.asarray(s)]).T
+    return np.array([-gain @ np.linalg.solve(si * eye - loop, start) for si in np.asarray(s)]).T
 
 
 def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
@@ -126,11 +126,17 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
     return Spillover(work, law.controlled, np.inf)
 
 
-def _controlled_loop(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats]:
-    """A - B K of the controlled modes alone, and their part (2 n_controlled,) of a state of all modes."""
+def _controlled_loop(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats, Floats, Flags]:
+    """A - B K of the controlled modes alone, their part of a state of all modes, K, and the states that these are of.
+
+    The displacement of a rigid mode to which no gain answers moves nothing, and is left out.
+    """
     a, b = controlled_plant(modes, law.controlled, law.actuators)
     index = list(law.controlled)
-    return a - b @ law.gain, np.r_[state[index], state[[modes.n_modes + r for r in index]]]
+    loop = a - b @ law.gain
+    kept = loop.any(axis=0)
+    start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
+    return loop[np.ix_(kept, kept)], start[kept], law.gain[:, kept], kept
 
 
 def check_final_time(final_time: float) -> None:
@@ -194,26 +200,27 @@ def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
 
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
     """∫ Fᵀ F dt over all time, exact modal coordinates fed back, by a Lyapunov equation."""
-    return float(np.trace(law.gain @ _gramian(modes, law, state) @ law.gain.T))
+    gramian, gain, _ = _gramian(modes, law, state)
+    return float(np.trace(gain @ gramian @ gain.T))
 
 
-def _gramian(modes: Modes, law: Law, state: Floats) -> Floats:
-    """∫ x xᵀ dt over all time of the controlled modes, (2 n_controlled, 2 n_controlled)."""
-    loop, start = _controlled_loop(modes, law, state)
+def _gramian(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats, Flags]:
+    """∫ x xᵀ dt over all time of the controlled modes, with K and which of their states these are."""
+    loop, start, gain, kept = _controlled_loop(modes, law, state)
     gramian: Floats = solve_continuous_lyapunov(loop, -np.outer(start, start))
-    return gramian
+    return gramian, gain, kept
 
 
 def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np.ndarray) -> float:
-    """∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt of the controlled modes over all time: the same yardstick for every law.
+    """∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt of the controlled modes over all time: one measure for every law.
 
     Args:
         weight: R, a number or (n_actuators, n_actuators); R BᵀB weighs modal forces, R fᵀf.
     """
-    index, gain = list(law.controlled), law.gain
+    index, (gramian, gain, kept) = list(law.controlled), _gramian(modes, law, state)
     r = gain.T @ weight @ gain if isinstance(weight, np.ndarray) and weight.ndim else weight * gain.T @ gain
-    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))]) + r
-    return float(np.trace(q @ _gramian(modes, law, state)))
+    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))][kept]) + r
+    return float(np.trace(q @ gramian))
 
 
 def modal_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> float:
