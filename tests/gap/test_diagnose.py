@@ -201,6 +201,7 @@ def test_a_clean_pair_is_found_before_errors_of_the_model_are_asked_for(hinged_r
     assert "all pairs at once" in told and not any("small errors" in text for text in told)
 
 
+@pytest.mark.slow
 def test_a_nearest_set_that_makes_the_gap_of_others_larger_corrects_nothing(hinged_rig, record_of):
     """A mass that is no part of it bends to what is there, and the record held out is of another beam."""
     rig, rng = hinged_rig(3), np.random.default_rng(3)
