@@ -35,9 +35,9 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure
         piece = slice(int(smooth.argmax()), int(smooth.argmax()) + width)
         channel = record.output_channels[j]
         time = record.time[piece]
-        ax.plot(time, record.outputs[j, piece], color=COLOURS[6], label="measured", linewidth=2.6, alpha=0.35)
+        ax.plot(time, record.outputs[j, piece], color=COLOURS[6], label="measured", linewidth=5.0, alpha=0.35)
         for (name, values), colour, style in zip(outputs.items(), (COLOURS[1], COLOURS[0]), ("--", "-")):
-            ax.plot(time, values[j, piece], color=colour, label=name, linestyle=style)
+            ax.plot(time, values[j, piece], color=colour, label=name, linestyle=style, linewidth=1.4)
         ax.set(title=f"record {record.name}, sensor {channel.name}", ylabel=in_units(channel.quantity, channel.unit))
     axes[-1, 0].set_xlabel("time [s]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
@@ -183,11 +183,11 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str = "m", force: str = "
         (axes[0], place.displacement, f"displacement [{length}]"),
         (axes[1], place.velocity, f"velocity [{length}/s]"),
     ):
-        ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=2, alpha=0.5)
+        ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=3, alpha=0.6)
         ax.set_xlabel(f"{name} {there}")
         law = _law(chosen, series, name)
-        if law is not None:
-            ax.plot(*law, color=COLOURS[1], linewidth=2.2, label="fitted law")
+        if law is not None:  # beneath the points, which it would hide where they follow it
+            ax.plot(*law, color=COLOURS[1], linewidth=5.0, alpha=0.6, zorder=1, label="fitted law")
             ax.legend()
     axes[0].set(ylabel=f"unmodelled force [{force}]", title="unmodelled force, no law assumed")
     return figure

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.gap.effects.effect import label_in_words
 from workbench.structure.printed import counted
 from workbench.trials.scoring import Reliability, Tally
 
@@ -122,4 +123,4 @@ def _order(name: str) -> tuple[int, str]:
 
 
 def _plain(name: str) -> str:
-    return {"none": "nothing", "unknown": "something else"}.get(name, name.replace("_", " "))
+    return {"none": "nothing", "unknown": "something else"}.get(name, label_in_words(name))

@@ -37,6 +37,11 @@ def counted(number: int, word: str) -> str:
     return f"{number} {word}{'s' * (number != 1)}"
 
 
+def joined_in_words(parts: Sequence[str]) -> str:
+    """Such as: a, b and c; empty where there are none."""
+    return " and ".join(part for part in (", ".join(parts[:-1]), *parts[-1:]) if part)
+
+
 def place_text(place: object) -> str:
     """A place: x in m, (x, y), a name, or two of these, a patch of a plate; empty where unknown."""
     if isinstance(place, Patch):

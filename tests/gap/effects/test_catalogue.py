@@ -152,7 +152,7 @@ def test_exchanged_channels_are_named_by_both():
     np.testing.assert_array_equal(exchanged, plain[[2, 1, 0]])
     assert effect.label == "swapped_outputs[d, d2]"
     assert effect_json(effect, nominal) == {"kind": "swapped_outputs", "parameters": {}, "output": "d", "with": "d2"}
-    assert _described(effect, nominal) == "two outputs that are exchanged, d and d2"
+    assert _described(effect, nominal) == "two outputs that are exchanged (d and d2)"
     inputs = Effect(kind_named("swapped_inputs"), ("F1", "F2"), {})
     swapped = simulate(inputs.apply(nominal), drive(), sample_time=DT).outputs
     np.testing.assert_allclose(swapped, simulate(nominal, drive()[[1, 0, 2]], sample_time=DT).outputs, atol=1e-12)
@@ -192,7 +192,7 @@ def test_cross_talk_adds_a_share_of_another_reading():
     plain, leaking = (simulate(r, drive(), sample_time=DT).outputs for r in (nominal, effect.apply(nominal)))
     np.testing.assert_allclose(leaking, plain + np.array([[0.2], [0.0], [0.0]]) * plain[1], atol=1e-12)
     assert effect_json(effect, nominal)["from"] == "v"
-    assert _described(effect, nominal) == "cross-talk between sensors (share 0.2), d from v"
+    assert _described(effect, nominal) == "cross-talk between sensors (d from v: share 0.2)"
 
 
 def test_a_number_whose_deviation_exceeds_it_does_not_stand_out():
@@ -296,9 +296,9 @@ def test_a_spring_beside_a_hinge_resists_turning_if_it_resists_at_all(stiffness)
 
 def test_sets_are_named_in_words():
     assert (
-        in_words("coulomb_friction + actuator_bias[F2]") == "a friction force and a constant force of an actuator, F2"
+        in_words("coulomb_friction + actuator_bias[F2]") == "a friction force and a constant force of an actuator (F2)"
     )
-    assert in_words("swapped_outputs[d1, d2]").endswith(", d1, d2") and in_words("own_law") == "own law"
+    assert in_words("swapped_outputs[d1, d2]").endswith(" (d1, d2)") and in_words("own_law") == "own law"
     mine = replace(kind_named("cubic_spring"), name="own_law", phrase="a quadratic spring")
     assert in_words("own_law", [mine]) == "a quadratic spring"
 

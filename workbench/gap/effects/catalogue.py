@@ -26,6 +26,7 @@ from workbench.gap.effects.environment import KINDS as OF_THE_ENVIRONMENT
 from workbench.gap.effects.nonlinear import KINDS as NONLINEAR
 from workbench.gap.effects.ports import KINDS as OF_PORTS
 from workbench.gap.effects.structural import KINDS as STRUCTURAL
+from workbench.structure.printed import joined_in_words
 
 CATALOGUE: tuple[Kind, ...] = (*STRUCTURAL, *NONLINEAR, *OF_PORTS, *OF_THE_ENVIRONMENT)
 
@@ -43,7 +44,7 @@ def kind_named(name: str, catalogue: tuple[Kind, ...] = CATALOGUE) -> Kind:
 
 
 def in_words(labels: str, catalogue: Iterable[Kind] = CATALOGUE) -> str:
-    """A set as a sentence names it, of its labels: "coulomb_friction + actuator_bias[F2]", say.
+    """A set as a sentence names it, "a friction force and a constant force of an actuator (F2)", of its labels.
 
     Kinds that the catalogue does not hold are named by their own names.
     """
@@ -51,5 +52,5 @@ def in_words(labels: str, catalogue: Iterable[Kind] = CATALOGUE) -> str:
     words = []
     for label in labels.split(" + "):
         name, _, target = label.rstrip("]").partition("[")
-        words.append(", ".join(filter(None, (phrases.get(name, name.replace("_", " ")), target))))
-    return " and ".join(words)
+        words.append(phrases.get(name, name.replace("_", " ")) + (f" ({target})" if target else ""))
+    return joined_in_words(words)

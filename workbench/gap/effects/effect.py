@@ -325,8 +325,8 @@ def names_in(target: Any) -> tuple[str, ...]:
 
 
 def label_in_words(label: str) -> str:
-    """A label as a figure or a note shows it: actuator gain (F2)."""
-    return label.replace("[", " (").replace("]", ")").replace("_", " ")
+    """A label as a figure or a note shows it: actuator gain (F2), Bouc-Wen."""
+    return label.replace("[", " (").replace("]", ")").replace("_", " ").replace("bouc wen", "Bouc-Wen")
 
 
 def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from workbench.gap.report.record_to_record import RecordToRecord
 from workbench.gap.search.attribute import Attribution
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.printed import joined_in_words
 
 NEAR = 0.05  # of the gap: a set that closes less is not near
 SHOWN = 0.005  # of the gap: what is less is not worth a word
@@ -102,7 +103,7 @@ class Verdict:
     def sentence(self) -> str:
         """The verdict in one sentence."""
         named = [_described(effect, self.nominal) for effect in self._told]
-        words = " and ".join(named)
+        words = joined_in_words(named)
         if self.outcome == "none":
             louder = self.budget.noise_ratio > REMARKED and self.budget.unexplained < SHOWN
             if self.nominal_errors is None and (self.where.beyond_noise == 0 or louder):
@@ -124,7 +125,7 @@ class Verdict:
             if len(named) == 1:
                 text = f"{words} causes {_percent(shares[0])} of the gap"
             else:
-                each = " and ".join(_percent(share) for share in shares)
+                each = joined_in_words([_percent(share) for share in shares])
                 text = f"{words} cause {_percent(sum(shares))} of the gap ({each})"
             if any(effect.kind.remainder for effect in self.effects):
                 text += ", part of which nothing can predict"
@@ -305,7 +306,7 @@ def where_json(where: Where) -> dict[str, Any]:
 
 
 def _described(effect: Effect, nominal: Rig) -> str:
-    """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
+    """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01; a wrong sensor gain (d4: gain 0.93)."""
     stated = effect.stated(nominal)
     units = {p.name: p.unit for p in effect.parameters(nominal) if p.name in stated}
     numbers = [
@@ -314,12 +315,12 @@ def _described(effect: Effect, nominal: Rig) -> str:
         if name not in COORDINATES
     ]
     kind, text = effect.kind, effect.kind.words
-    if kind.remark is not None:
-        text += f" ({kind.remark(effect, nominal)})"
-    elif numbers:
-        text += f" ({', '.join(n.strip() for n in numbers)})"
+    inside = kind.remark(effect, nominal) if kind.remark is not None else ", ".join(n.strip() for n in numbers)
     if kind.path in ("actuator", "sensor"):
-        text += ", all of them" if effect.target == ALL else f", {kind.joined.join(names_in(effect.target))}"
+        target = effect.target if effect.target == ALL else kind.joined.join(names_in(effect.target))
+        inside = f"{target}: {inside}" if inside else str(target)
+    if inside:
+        text += f" ({inside})"
     if kind.stands is not None:
         text += f" {kind.stands(effect, nominal)[1]}"
     elif effect.at is not None:

@@ -27,11 +27,12 @@ var workbench = (function () {
     at.back = function (p) { var v = a + (p - from) / (to - from) * (b - a); return log ? Math.pow(10, v) : v; };
     return at;
   }
-  function shown(v, step) {
+  // of a tick, by powers of ten where the largest of its axis is
+  function shown(v, step, largest) {
     if (v === null || v === undefined || !isFinite(v)) return "–";
     if (v === 0 || (step && Math.abs(v) < 1e-9 * step)) return "0";
-    var size = Math.abs(v);
-    if (size >= 1e5 || size < 1e-4) return power(v, step ? Math.max(0, Math.min(4, Math.floor(Math.log10(size) + 1e-9) - Math.floor(Math.log10(step) + 1e-9))) : 3);
+    var size = Math.abs(v), most = largest || size;
+    if (most >= 1e5 || most < (step ? 1e-3 : 1e-4)) return power(v, step ? Math.max(0, Math.min(4, Math.floor(Math.log10(size) + 1e-9) - Math.floor(Math.log10(step) + 1e-9))) : 3);
     if (!step) return String(parseFloat(v.toPrecision(5))).replace("-", "−");
     var digits = Math.max(0, Math.min(8, -Math.floor(Math.log10(step) + 1e-9)));
     return v.toFixed(digits).replace("-", "−");
@@ -54,7 +55,7 @@ var workbench = (function () {
     var raw = (high - low) / wanted, unit = Math.pow(10, Math.floor(Math.log10(raw)));
     var step = unit * (raw / unit > 5 ? 10 : raw / unit > 2 ? 5 : raw / unit > 1 ? 2 : 1);
     for (v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) {
-      if (!axis.log || v > 0) found.push([v, shown(v, step)]);
+      if (!axis.log || v > 0) found.push([v, shown(v, step, Math.max(Math.abs(low), Math.abs(high)))]);
     }
     return found.length < 2 && wanted < 9 ? ticks(axis, limits, wanted + 1) : found;
   }

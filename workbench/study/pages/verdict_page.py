@@ -104,7 +104,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     """Effects, gaps and rivals of a verdict as JSON: those of these tables that have a row."""
     effects = [
         [
-            effect["kind"].replace("_", " "),
+            label_in_words(effect["kind"]),
             name.replace("_", " "),
             *to_its_error(value, effect.get("parameters_std", {}).get(name)),
             effect.get("at", ""),
