@@ -75,6 +75,20 @@ def test_a_design_says_which_loops_are_unstable(tmp_path):
     page = write_page(tmp_path / "p.html", shown).read_text(encoding="utf-8")
     assert '<p class="lead part">' in page
     assert [row[-1] for row in shown.tables[1][2]] == ["stable", "unstable"]
+    sensed[1] |= {
+        "limited_by": "mode 5: +0.2 1/s",
+        "path": "sensor at 6 to F2",
+        "poles_real": [0.2],
+        "poles_imag": [3.0],
+    }
+    shown = page_content_in(written(tmp_path, {**DESIGNED, "through_sensors": sensed}))
+    _, heads, rows = shown.tables[1]
+    assert heads[3:] == ("residual mode that limits it", "path") and rows[1][3:] == [
+        "mode 5: +0.2 1/s",
+        "sensor at 6 to F2",
+    ]
+    [marks] = [p["marks"] for p in shown.blocks[2]["figure"]["panels"]]
+    assert [(m["x"], m["y"]) for m in marks if m["kind"] == "line"] == [([0.2], [3.0])]
 
 
 def test_a_placement_shows_where_and_how_surely(tmp_path):

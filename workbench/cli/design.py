@@ -78,12 +78,15 @@ def design(
         share = None if perturbed is None else stable_share(perturbed, controller)
         robust = [] if share is None else [f"{share:.0%}"]
         margin = f"{explained.margin:.3g}" + ("" if explained.loop.stable else " unstable")
-        sensed.append((controller.name, margin, *_limit(explained), *robust))
+        limiting, path = _limit(explained)
+        sensed.append((controller.name, margin, limiting, path, *robust))
         written.append(
             {
                 "design": controller.name,
                 "margin": explained.margin,
                 "stable": explained.loop.stable,
+                "limited_by": limiting,
+                "path": path,
                 "robustness": share,
                 "poles_real": explained.poles.real,
                 "poles_imag": explained.poles.imag,

@@ -187,7 +187,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     laws = content["laws"]
     controlled = set(content.get("controlled", ()))
     works = {law["law"]: np.array([w for r, w in enumerate(law["work"]) if r not in controlled], float) for law in laws}
-    poles = {law["law"]: np.array(law["poles_real"], float) + 1j * np.array(law["poles_imag"], float) for law in laws}
+    poles = {law["law"]: _poles_of(law) for law in laws}
     rows = [
         [
             law["law"],
@@ -197,33 +197,46 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         ]
         for law in laws
     ]
+    through = [one for one in content.get("through_sensors", ()) if "stable" in one]
     sensed = [
         [
             one["design"],
             _short(one["margin"]),
             "stable" if one["stable"] else "unstable",
+            *_words([one.get("limited_by", ""), one.get("path", "")]),
             "" if one.get("robustness") is None else one["robustness"],
         ]
-        for one in content.get("through_sensors", ())
-        if "stable" in one
+        for one in through
     ]
-    heads: tuple[str, ...] = ("controller", "margin [1/s]", "loop", "share of perturbed models stable")
-    if sensed and all(row[-1] == "" for row in sensed):
-        heads, sensed = heads[:-1], [row[:-1] for row in sensed]
+    heads: tuple[str, ...] = ("controller", "margin [1/s]", "loop", "residual mode that limits it", "path")
+    heads += ("share of perturbed models stable",)
+    filled = [i for i in range(len(heads)) if i < 3 or any(row[i] != "" for row in sensed)]
+    heads, sensed = tuple(heads[i] for i in filled), [[row[i] for i in filled] for row in sensed]
+    seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}
     unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if row[2] == "unstable"]
     loops = [row[0] for row in (*rows, *sensed)]
     return {
+        "title": "Control design",
         "lead": "" if not sensed else _stability(loops, unstable),
         "standing": "" if not sensed else "bad" if len(unstable) == len(loops) else "part" if unstable else "good",
         "blocks": [
             block(plot_two_works(works, first=len(controlled)), "Spillover work of each law in each residual mode."),
-            block(plot_poles(poles), "Closed-loop poles."),
+            block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
+            *(
+                [block(plot_poles(seen), "Closed-loop poles through sensors, those of the estimators too.")]
+                if seen
+                else []
+            ),
         ],
         "tables": [
             ("Laws", ("law", "cost", "effort [N² s]", "peak force [N]", "W_R [J]", "loop"), rows),
             *([("With sensors", heads, sensed)] if sensed else []),
         ],
     }
+
+
+def _poles_of(row: Mapping[str, Any]) -> np.ndarray:
+    return np.array(row["poles_real"], float) + 1j * np.array(row["poles_imag"], float)
 
 
 def _loop(poles: np.ndarray) -> str:
