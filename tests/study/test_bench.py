@@ -255,7 +255,7 @@ def test_it_can_be_played_on(bench, look, drawn, moves, until, width, tmp_path):
     def bars():
         return len(browser.find_elements("css selector", "#work .marks rect"))
 
-    assert card("residual") == "1.499e−3" and card("stable") == "undamped" and bars() == 5
+    assert card("residual") == "0.001499" and card("stable") == "undamped" and bars() == 5
     assert moves(browser.find_element("css selector", ".stand .track"))
 
     second = browser.find_elements("css selector", ".handle.actuators")[1]

@@ -49,7 +49,7 @@
 
   // numbers
   var cards = {};
-  [["residual", "W_R, spillover work"], ["effort", "effort ∫ FᵀF dt"], ["peak_force", "largest force"], ["stable", "closed loop"]].forEach(function (card) {
+  [["residual", "W_R, spillover work [J]"], ["effort", "effort ∫ FᵀF dt"], ["peak_force", "largest force"], ["stable", "closed loop"]].forEach(function (card) {
     var box = html("div", {}, document.querySelector(".cards"));
     cards[card[0]] = html("b", { id: card[0] }, box, "–");
     html("span", {}, box, card[1]);
@@ -344,7 +344,7 @@
     var n = answer.by_mode.length, numbers = answer.by_mode.map(function (_, i) { return i + 1; }).slice(design.controlled);
     var work = answer.by_mode.slice(design.controlled).map(function (w) { return w || 0; }), top = Math.max.apply(null, work.concat([1e-300]));
     figure("work", { x: axis("residual mode", [design.controlled + 0.4, Math.max(n, design.controlled + 1) + 0.6], false, numbers.map(function (v) { return [v, String(v)]; })),
-      y: axis("spillover work, W_r", [Math.min(0, 1.1 * Math.min.apply(null, work.concat([0]))), 1.1 * top]), title: work.length ? "spillover work by residual mode" : "no residual mode",
+      y: axis("spillover work, W_r [J]", [Math.min(0, 1.1 * Math.min.apply(null, work.concat([0]))), 1.1 * top]), title: work.length ? "spillover work by residual mode" : "no residual mode",
       marks: [{ kind: "bars", boxes: work.map(function (w, i) { return [numbers[i] - 0.35, numbers[i] + 0.35, 0, w]; }), colours: [COLOURS[0]], label: "W_r" }] });
     var re = answer.poles.map(function (p) { return p[0]; }), im = answer.poles.map(function (p) { return p[1]; });
     var left = Math.min.apply(null, re), right = Math.max.apply(null, re), pad = 0.08 * (right - left || 1);
@@ -352,7 +352,7 @@
       title: "closed-loop poles", marks: [{ kind: "rule", axis: "x", at: 0, colour: "#8a8a8a", width: 1, dash: "", alpha: 1 },
         { kind: "line", x: re, y: im, width: 0, marker: "x", size: 9, colour: COLOURS[1], alpha: 1, label: "poles" }] });
     var energy = answer.energy.map(function (v) { return v > 0 ? v : null; }), seen = energy.filter(function (v) { return v; });
-    figure("energy", { x: axis("time [s]", [0, answer.time[answer.time.length - 1]]), y: axis("energy of all modes", [0.7 * Math.min.apply(null, seen), 1.4 * Math.max.apply(null, seen)], true),
+    figure("energy", { x: axis("time [s]", [0, answer.time[answer.time.length - 1]]), y: axis("energy of all modes [J]", [0.7 * Math.min.apply(null, seen), 1.4 * Math.max.apply(null, seen)], true),
       title: "energy after the impulse", marks: [curve(answer.time, energy, 2)] });
     var forces = [].concat.apply([], answer.forces), most = 1.1 * Math.max.apply(null, forces.map(Math.abs).concat([1e-300]));
     figure("forces", { x: axis("time [s]", [0, answer.time[answer.time.length - 1]]), y: axis("force", [-most, most]), title: "actuator forces", legend: answer.forces.length > 1,
@@ -361,7 +361,7 @@
   // four digits, with a power of ten where there would be many zeros
   function figures(v) {
     if (v === null) return "∞";
-    return Math.abs(v) >= 0.01 && Math.abs(v) < 1e5 ? String(parseFloat(v.toPrecision(4))) : v.toExponential(3).replace("e+0", "").replace("e-", "e−");
+    return workbench.shown(+v.toPrecision(4));
   }
   function axis(label, limits, log, ticks) { var a = { label: label, limits: limits, log: !!log, group: 0 }; if (ticks) a.ticks = ticks; return a; }
   function curve(x, y, i) { return { kind: "line", x: x, y: y, width: 1.8, dash: "", colour: COLOURS[i % COLOURS.length], alpha: 1, label: "" }; }
