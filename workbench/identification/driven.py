@@ -6,7 +6,7 @@ of that noise is estimated from the residual, and the modes from it in turn (`in
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from warnings import warn
 
@@ -17,6 +17,7 @@ from scipy.stats import chi2
 
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.force_window import force_window
+from workbench.identification.input_output.held_out import unpredictive_remarks, without_unpredictive
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, added_misfit, only, projected, scaled_vectors, settled
@@ -42,6 +43,7 @@ class DrivenSettings:
     learnt: int = 4  # times that noise and modes are estimated in turn
     apart: int = 2  # times that modes are looked for in combinations of outputs that share no noise
     spare: int = 20  # states of a subspace model beyond two for each of the most modes: for noise
+    final: float = 3.0  # s of processor time for the last check of modes, whatever the search has left
 
 
 DRIVEN = DrivenSettings()
@@ -237,6 +239,7 @@ def identify_driven(
             " inputs and outputs belong together"
         )
     data, selected, changing = _as_constant(data, selected, budget)
+    selected = _predictive(data, selected, Budget(DRIVEN.final))
     selected, remarks = _without_artefacts(data, selected, budget)
     if delays is None:
         remarks = (*_late_remarks(data), *remarks)
@@ -245,6 +248,7 @@ def identify_driven(
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     late = budget.spent("check of modes that change within the record")
     changes = () if late else change_remarks(data, fit, changing)
+    changes = (*changes, *unpredictive_remarks(fit, selected.beside))
     return _report(records, data, selected, (*windowed, *remarks, *overlap, *changes, *budget.remarks))
 
 
@@ -303,7 +307,14 @@ def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selec
         start = fit_of_poles(data, poles, how["false_alarm"])
     few = _few(how)
     few["most_modes"] = max(few["most_modes"], start.poles.size)
-    return select_modes(data, start=start, **few)
+    return _predictive(data, select_modes(data, start=start, **few), how["budget"])
+
+
+def _predictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
+    """Without modes that make the prediction of what is held out worse; about these no further mode is looked for."""
+    fit, beside = without_unpredictive(data, selected.fit, budget)
+    selected = selected if fit is selected.fit else selected.refitted(fit)
+    return replace(selected, beside=(*data.shunned, *beside))
 
 
 def _few(how: dict[str, Any]) -> dict[str, Any]:
@@ -336,6 +347,7 @@ def _selected(
     """The modes, the strongest first; in combinations of the outputs that share no noise where these share some."""
     how["budget"] = budget
     strongest = _strongest(data, **how) if strongest is None else strongest
+    data = data.shunning(strongest.beside)
     apart = data.apart(strongest.fit)
     if apart is None:
         return _in_noise(data, strongest, how)
@@ -441,8 +453,8 @@ def _with_noise(
             break
         if budget.spent("estimation of the noise spectrum"):
             break
-        weighted = data.weighted_by(line_std)
-        anew = select_modes(weighted, start=selected.fit, **how)
+        weighted = data.shunning(selected.beside).weighted_by(line_std)
+        anew = _predictive(weighted, select_modes(weighted, start=selected.fit, **how), budget)
         # A search that was ended early is no better than the one before.
         if budget.spent("estimation of the noise spectrum") and anew.fit.poles.size < selected.fit.poles.size:
             break

@@ -17,6 +17,7 @@ exact. Noise that is not white is weighted line by line of the cosine transform 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import factorial
 from typing import Any
 
@@ -56,6 +57,7 @@ class KnownInputs:
         line_std: relative noise of each line, one (n_rows, n_outputs) a record, of unit rms over all.
         beside: (n_samples, n_columns) of all records, fixed columns beside those of the inputs and the constants.
         changing: poles of the modes that move along these.
+        shunned: poles about which no further mode is looked for.
     """
 
     def __init__(
@@ -70,7 +72,9 @@ class KnownInputs:
         line_std: Sequence[np.ndarray] | None = None,
         beside: Floats | None = None,
         changing: tuple[complex, ...] = (),
+        shunned: tuple[complex, ...] = (),
     ) -> None:
+        self.shunned = shunned
         self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
         self.dt, self.places = records[0].sample_time, records[0].positions
         self.delays = np.zeros(records[0].n_inputs) if delays is None else np.asarray(delays, float)
@@ -127,6 +131,22 @@ class KnownInputs:
         """The same records without further fixed columns."""
         return self._with(beside=None, changing=())
 
+    def unweighted(self) -> "KnownInputs":
+        """The same records as samples of equal weight, without further fixed columns."""
+        return self._with(line_std=None, beside=None, changing=())
+
+    def first_half(self) -> "KnownInputs":
+        """Likewise, of the first half of each record."""
+        halves = [
+            replace(r, outputs=r.outputs[:, : r.n_samples // 2], inputs=r.inputs[:, : r.n_samples // 2])
+            for r in self.records
+        ]
+        return self._with(records=halves, line_std=None, beside=None, changing=())
+
+    def shunning(self, poles: tuple[complex, ...]) -> "KnownInputs":
+        """The same records, no further mode being looked for about these poles."""
+        return self if poles == self.shunned else self._with(shunned=poles)
+
     def delayed_by(self, delays: np.ndarray, any_fraction: bool = False) -> "KnownInputs":
         """The same records with inputs that act late by these delays, samples; lines weighted as before."""
         found = self._with(delays=delays, any_fraction=any_fraction, line_std=None)
@@ -168,6 +188,7 @@ class KnownInputs:
             "line_std": self.line_std,
             "beside": self.beside,
             "changing": self.changing,
+            "shunned": self.shunned,
         }
         return KnownInputs(**{**same, **changed})
 

@@ -1,0 +1,129 @@
+"""Modes that a record seems to hold, and that do not predict the rest of it.
+
+What a structure does beside its linear modes, where something is nonlinear, is no noise of the sensors: it stands in
+the lines about a resonance, often far above that noise, and modes fitted to these lines explain it there and nowhere
+else. So the modes are fitted to the first half of each record and carried on through the second, with and without those
+about each stronger one: what is there makes the prediction better, what is not makes it worse.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.arrays import Flags, Floats
+from workbench.identification.input_output.known_inputs import KnownInputs
+from workbench.identification.input_output.modal_fit import Fit, columns, only, projected, settled
+from workbench.identification.input_output.model_order import evidence_of_each
+from workbench.identification.signal.searches import SELECTION, Budget
+
+
+@dataclass(frozen=True)
+class HeldOutSettings:
+    """Constants of the prediction of what is held out."""
+
+    reach: float = 0.15  # of the frequency of a mode, within which weaker ones may stand for what else it does
+    # of the square of the error with these modes: what the error without them is below. In noise of the sensors alone
+    # true modes make it a multiple, and needless ones change it by less than a tenth
+    worse: float = 0.8
+    least: float = 0.1  # share of the energy of the stronger mode that either half must hold, to tell anything
+    rows: int = 4  # samples of a half for each column of a fit, at least
+    # times the median power of a line of what all modes leave, that stands about them on the mean: of less it is noise,
+    # and two modes a line apart, of which half a record tells nothing, may be two
+    loud: float = 10.0
+
+
+HELD_OUT = HeldOutSettings()
+
+
+def without_unpredictive(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[Fit, tuple[complex, ...]]:
+    """The fit without modes that make the prediction of what is held out worse, and the poles that these stood about.
+
+    The weaker modes about each stronger one are tried together, and where they stay, those of all that ring on through
+    the record, or grow, one by one: a single line is all that they fit.
+    """
+    whole, half = data.unweighted(), data.first_half()
+    n, strength, hertz = fit.poles.size, evidence_of_each(fit), fit.poles.imag
+    too_short = len(half.values) < HELD_OUT.rows * (2 * n + half.fixed.shape[1])
+    if n < 2 or too_short or half.fixed.shape[1] != whole.fixed.shape[1]:  # inputs that rest through a first half
+        return fit, ()
+    all_modes = projected(whole, fit.poles, fit.participation)
+    noise, left_by_all = all_modes.noise, [_power(all_modes.residual[rows] / all_modes.noise) for rows in whole.rows]
+    known: dict[bytes, list[Floats] | None] = {}
+
+    def missed(kept: Flags) -> list[Floats] | None:
+        """Power of the error over the second half of each record, (n_lines,), outputs in units of their noise."""
+        try:
+            start = projected(half, fit.poles[kept], fit.participation[kept])
+            found = settled(half, start, SELECTION.few_steps, budget)
+            with np.errstate(over="ignore", invalid="ignore"):
+                predicted = columns(whole, found.poles, found.participation)[0] @ found.coefficients
+                left = (whole.values - predicted) / noise
+        except np.linalg.LinAlgError:
+            return None
+        seconds = [left[a.start + b.stop - b.start : a.stop] for a, b in zip(whole.rows, half.rows)]
+        if not all(np.isfinite(each).all() for each in seconds):
+            return None
+        return [_power(each) for each in seconds]
+
+    def error(kept: Flags, lowest: float, highest: float) -> float:
+        """Of the lines between two frequencies, rad/s."""
+        key = kept.tobytes()
+        if key not in known:
+            known[key] = missed(kept)
+        found = known[key]
+        return np.inf if found is None else float(_between(found, whole.highest, lowest, highest).sum())
+
+    kept, beside = np.ones(n, bool), []
+    reach = HELD_OUT.reach * hertz
+    tries = [(r, np.abs(hertz - hertz[r]) < reach[r], True) for r in np.argsort(-strength)]
+    tries += [(r, np.arange(n) == r, False) for r in np.argsort(strength) if -fit.poles[r].real < 0.5 * data.resolution]
+    for r, near, are_weaker in tries:
+        group = kept & near & ((strength < strength[r]) | (not are_weaker))
+        if not (kept[r] and group.any() and (kept & ~group).any() and _is_in_both(whole, fit, r)):
+            continue
+        if budget.spent("check of modes by what they predict"):
+            break
+        band = hertz[group].min() - 0.5 * reach[r], hertz[group].max() + 0.5 * reach[r]
+        about = _between(left_by_all, whole.highest, *band)
+        if not about.size or about.mean() < HELD_OUT.loud * np.median(np.concatenate(left_by_all)):
+            continue
+        if error(kept & ~group, *band) < HELD_OUT.worse * error(kept, *band):
+            kept &= ~group
+            if are_weaker:
+                beside.append(complex(fit.poles[r]))
+    if kept.all():
+        return fit, ()
+    return settled(data, only(data, fit, kept), SELECTION.few_steps, budget), tuple(beside)
+
+
+def _is_in_both(data: KnownInputs, fit: Fit, r: int) -> bool:
+    """Whether both halves of the records hold a fair share of the energy of a mode."""
+    halves = []
+    for z in data.modal_coordinate(fit.poles[r], fit.participation[r]):
+        power = np.abs(z) ** 2
+        halves.append((float(power[: z.size // 2].sum()), float(power[z.size // 2 :].sum())))
+    return sum(map(min, halves)) > HELD_OUT.least * sum(map(sum, halves))
+
+
+def _power(samples: Floats) -> Floats:
+    """Of each line, outputs together, (n_lines,), of samples (n_samples, n_outputs)."""
+    return np.asarray((np.abs(np.fft.rfft(samples, axis=0)) ** 2).sum(axis=1))
+
+
+def _between(powers: list[Floats], highest_line: float, lowest: float, highest: float) -> Floats:
+    """The lines of all records between two frequencies, rad/s."""
+    lines = [np.linspace(0.0, highest_line, len(power)) for power in powers]
+    return np.concatenate([p[(at >= lowest) & (at <= highest)] for p, at in zip(powers, lines, strict=True)])
+
+
+def unpredictive_remarks(fit: Fit, beside: tuple[complex, ...]) -> tuple[str, ...]:
+    """A remark on the modes about which others were left out, as these predict nothing."""
+    if not beside or not fit.poles.size:
+        return ()
+    nearest = sorted({int(np.argmin(np.abs(fit.poles - pole))) for pole in beside})
+    which = ", ".join(f"mode {r + 1} ({np.abs(fit.poles[r]) / (2.0 * np.pi):.4g} Hz)" for r in nearest)
+    return (
+        f"modes change within the record, perhaps with amplitude, or something is nonlinear: more is seen about {which}"
+        " than a linear mode makes, and no further mode predicts it; such a mode is the mean of what it was: identify"
+        " parts of the record, or levels one by one",
+    )
