@@ -43,7 +43,7 @@ class DrivenSettings:
     learnt: int = 4  # times that noise and modes are estimated in turn
     apart: int = 2  # times that modes are looked for in combinations of outputs that share no noise
     spare: int = 20  # states of a subspace model beyond two for each of the most modes: for noise
-    final: float = 3.0  # s of processor time for the last check of modes, whatever the search has left
+    final: float = 5.0  # s of processor time for the last check of modes, whatever the search has left
 
 
 DRIVEN = DrivenSettings()

@@ -30,15 +30,16 @@ class HeldOutSettings:
     # times the median power of a line of what all modes leave, that stands about them on the mean: of less it is noise,
     # and two modes a line apart, of which half a record tells nothing, may be two
     loud: float = 10.0
+    faint: float = 0.01  # of the power of the outputs: what a mode with no other about it makes, to be taken for a line
 
 
 HELD_OUT = HeldOutSettings()
 
 
 def without_unpredictive(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[Fit, tuple[complex, ...]]:
-    """The fit without modes that make the prediction of what is held out worse, and the poles that these stood about.
+    """The fit without modes that make the prediction worse, and the poles that these stood about.
 
-    The weaker modes about each stronger one are tried together, and where they stay, those of all that ring on through
+    The weaker modes about each stronger one are tried together, and where they stay, faint ones that ring on through
     the record, or grow, one by one: a single line is all that they fit.
     """
     whole, half = data.unweighted(), data.first_half()
@@ -76,7 +77,10 @@ def without_unpredictive(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[F
     kept, beside = np.ones(n, bool), []
     reach = HELD_OUT.reach * hertz
     tries = [(r, np.abs(hertz - hertz[r]) < reach[r], True) for r in np.argsort(-strength)]
-    tries += [(r, np.arange(n) == r, False) for r in np.argsort(strength) if -fit.poles[r].real < 0.5 * data.resolution]
+    lines = -fit.poles.real < 0.5 * data.resolution
+    tries += [
+        (r, np.arange(n) == r, False) for r in np.argsort(strength) if lines[r] and _is_faint(whole, all_modes, r)
+    ]
     for r, near, are_weaker in tries:
         group = kept & near & ((strength < strength[r]) | (not are_weaker))
         if not (kept[r] and group.any() and (kept & ~group).any() and _is_in_both(whole, fit, r)):
@@ -103,6 +107,13 @@ def _is_in_both(data: KnownInputs, fit: Fit, r: int) -> bool:
         power = np.abs(z) ** 2
         halves.append((float(power[: z.size // 2].sum()), float(power[z.size // 2 :].sum())))
     return sum(map(min, halves)) > HELD_OUT.least * sum(map(sum, halves))
+
+
+def _is_faint(data: KnownInputs, fit: Fit, r: int) -> bool:
+    """Whether a mode makes next to nothing of the outputs."""
+    z = np.concatenate(data.modal_coordinate(fit.poles[r], fit.participation[r]))
+    made = np.abs(fit.amplitudes[:, r]) ** 2 * 0.5 * (np.abs(z) ** 2).mean()
+    return bool((made < HELD_OUT.faint * data.values.var(axis=0)).all())
 
 
 def _power(samples: Floats) -> Floats:

@@ -144,8 +144,9 @@ class KnownInputs:
         return self._with(records=halves, line_std=None, beside=None, changing=())
 
     def shunning(self, poles: tuple[complex, ...]) -> "KnownInputs":
-        """The same records, no further mode being looked for about these poles."""
-        return self if poles == self.shunned else self._with(shunned=poles)
+        """The same records, no further mode being looked for about these poles either."""
+        new = tuple(pole for pole in poles if pole not in self.shunned)
+        return self._with(shunned=(*self.shunned, *new)) if new else self
 
     def delayed_by(self, delays: np.ndarray, any_fraction: bool = False) -> "KnownInputs":
         """The same records with inputs that act late by these delays, samples; lines weighted as before."""

@@ -210,7 +210,8 @@ class _Modes:
         whole = model = self.settled(start)
         while model.poles.size and not self.budget.spent("check of each mode"):
             evidence = np.where(_spurious(self.data, model), 0.0, whole_evidence_of(model))
-            weak = np.flatnonzero(evidence < [self.threshold(model, pole) for pole in model.poles])
+            is_weak = evidence < [self.threshold(model, pole) for pole in model.poles]
+            weak = np.flatnonzero(is_weak & ~_changes(self.data, model.poles))
             if not weak.size:
                 break
             out = weak[np.argsort(evidence[weak])[: (weak.size + 1) // 2]]
@@ -221,7 +222,10 @@ class _Modes:
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
         """Those that are spurious, weak, or close to another."""
         spurious, whole_evidence = _spurious(self.data, model), whole_evidence_of(model)
+        changes = _changes(self.data, model.poles)
         for r, pole in enumerate(model.poles):
+            if changes[r]:
+                continue
             near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf) < SELECTION.close * abs(pole.real)
             threshold = self.threshold(model, pole)
             doubtful = near and whole_evidence[r] < ORDER.distinct * threshold
@@ -251,6 +255,14 @@ def _is_shunned(data: Measurement, poles: np.ndarray) -> np.ndarray:
     for pole in data.shunned:
         about = max(ORDER.shunned_rates * abs(pole.real), ORDER.shunned_share * pole.imag)
         out |= (np.abs(poles.imag - pole.imag) < about) | (-poles.real < 0.5 * data.resolution)
+    return out
+
+
+def _changes(data: Measurement, poles: np.ndarray) -> np.ndarray:
+    """Which poles are those of modes that are more than linear: in what else these do, no evidence is left of them."""
+    out = np.zeros(poles.size, bool)
+    for pole in data.shunned:
+        out[np.argmin(np.abs(poles - pole))] = True
     return out
 
 
