@@ -498,7 +498,6 @@ def test_most_modes_that_change_with_amplitude_are_one():
     assert np.mean([is_seen_to_stiffen(identify_driven(stiffening(seed))) for seed in range(10, 20)]) >= 0.5
 
 
-@pytest.mark.slow
 def hardening(seed, n_outputs, n=3000, fine=4):
     """A chain of three masses, the last on a spring that hardens, driven by band-limited noise; readings at 60 dB."""
     rng = np.random.default_rng(seed)
@@ -533,6 +532,7 @@ def test_what_a_hardening_spring_adds_to_each_resonance_is_no_mode(n_outputs):
     assert any("something is nonlinear" in remark and "mode 1 (" in remark for remark in found.remarks)
 
 
+@pytest.mark.slow
 def test_modes_that_stay_have_no_such_remark():
     plant = system()
     for seed in range(20):
