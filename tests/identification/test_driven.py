@@ -9,8 +9,11 @@ from scipy.stats import binom
 
 from workbench.identification.driven import identify_driven
 from workbench.identification.input_output import time_variance
+from workbench.identification.input_output.held_out import without_unpredictive
+from workbench.identification.input_output.known_inputs import KnownInputs
+from workbench.identification.input_output.modal_fit import projected
 from workbench.identification.rig_from import rig_from
-from workbench.identification.signal.searches import FALSE_ALARM
+from workbench.identification.signal.searches import FALSE_ALARM, Budget
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -440,6 +443,20 @@ def test_a_change_far_above_the_noise_makes_no_further_modes(change, seed, n, sn
     assert any("mode 2" in remark and "change within the record" in remark for remark in found.remarks)
 
 
+def marched(pull, u, fine):
+    """Motion (3, n) from rest of x'' = pull(x, x', u) by the method of Runge and Kutta, u held between samples."""
+    x, v, h, found = np.zeros(3), np.zeros(3), DT / fine, np.zeros((3, u.size))
+    for k, force in enumerate(u):
+        found[:, k] = x
+        for _ in range(fine):
+            a1 = pull(x, v, force)
+            a2 = pull(x + 0.5 * h * v, v + 0.5 * h * a1, force)
+            a3 = pull(x + 0.5 * h * (v + 0.5 * h * a1), v + 0.5 * h * a2, force)
+            a4 = pull(x + h * (v + 0.5 * h * a2), v + h * a3, force)
+            x, v = x + h * (v + h * (a1 + a2 + a3) / 6), v + h * (a1 + 2 * a2 + 2 * a3 + a4) / 6
+    return found
+
+
 def stiffening(seed, change=0.02, n=2000, snr=40.0, fine=8):
     """Two outputs of three modes driven by noise; the second frequency rises with the square of its amplitude.
 
@@ -447,23 +464,13 @@ def stiffening(seed, change=0.02, n=2000, snr=40.0, fine=8):
     """
     rng = np.random.default_rng(seed)
     omega, zeta = 2 * np.pi * np.array([1.3, 4.1, 9.7]), np.array([0.01, 0.008, 0.01])
-    u, shapes, h = rng.standard_normal(n), np.array([[1.0, 0.6, 0.3], [0.5, -1.0, 0.7]]), DT / fine
+    u, shapes = rng.standard_normal(n), np.array([[1.0, 0.6, 0.3], [0.5, -1.0, 0.7]])
 
     def motion(a):
-        q, v, found = np.zeros(3), np.zeros(3), np.zeros((3, n))
-
         def pull(q, v, force):
             return force * omega**2 - 2 * zeta * omega * v - omega**2 * (1 + a * q**2) ** 2 * q
 
-        for k in range(n):
-            found[:, k] = q
-            for _ in range(fine):
-                a1 = pull(q, v, u[k])
-                a2 = pull(q + 0.5 * h * v, v + 0.5 * h * a1, u[k])
-                a3 = pull(q + 0.5 * h * (v + 0.5 * h * a1), v + 0.5 * h * a2, u[k])
-                a4 = pull(q + h * (v + 0.5 * h * a2), v + h * a3, u[k])
-                q, v = q + h * (v + h * (a1 + a2 + a3) / 6), v + h * (a1 + 2 * a2 + 2 * a3 + a4) / 6
-        return found
+        return marched(pull, u, fine)
 
     linear = motion(np.zeros(3))
     y = shapes @ motion(np.array([0.0, change / np.abs(linear[1]).max() ** 2, 0.0]))
@@ -502,22 +509,14 @@ def hardening(seed, n_outputs, n=3000, fine=4):
     """A chain of three masses, the last on a spring that hardens, driven by band-limited noise; readings at 60 dB."""
     rng = np.random.default_rng(seed)
     stiffness = 2000.0 * np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.5]])
-    damping, h = 0.0004 * stiffness + 0.05 * np.eye(3), DT / fine
+    damping = 0.0004 * stiffness + 0.05 * np.eye(3)
     u = sosfiltfilt(butter(4, [1.0, 30.0], btype="band", fs=1.0 / DT, output="sos"), rng.standard_normal(n))
     u *= 10.0 / u.std()
-    x, v, y = np.zeros(3), np.zeros(3), np.zeros((3, n))
 
     def pull(x, v, force):
         return np.array([force, 0.0, -1e5 * x[2] ** 3]) - stiffness @ x - damping @ v
 
-    for k in range(n - 1):
-        for _ in range(fine):
-            a1 = pull(x, v, u[k])
-            a2 = pull(x + 0.5 * h * v, v + 0.5 * h * a1, u[k])
-            a3 = pull(x + 0.5 * h * (v + 0.5 * h * a1), v + 0.5 * h * a2, u[k])
-            a4 = pull(x + h * (v + 0.5 * h * a2), v + h * a3, u[k])
-            x, v = x + h * (v + h * (a1 + a2 + a3) / 6), v + h * (a1 + 2 * a2 + 2 * a3 + a4) / 6
-        y[:, k + 1] = x
+    y = marched(pull, u, fine)
     y = y[:n_outputs] + 1e-3 * y[:n_outputs].std(axis=1, keepdims=True) * rng.standard_normal((n_outputs, n))
     outputs = tuple(Channel(f"x{j}", "displacement") for j in range(n_outputs))
     return Record(DT, y, outputs, u[None], (Channel("F", "force"),), name="hardening")
@@ -530,6 +529,13 @@ def test_what_a_hardening_spring_adds_to_each_resonance_is_no_mode(n_outputs):
     assert found.modes.frequencies_hz == pytest.approx([4.75, 9.47, 12.97], rel=0.004)
     assert found.modes.zeta == pytest.approx([0.0085, 0.0123, 0.0166], rel=0.15)
     assert any("something is nonlinear" in remark and "mode 1 (" in remark for remark in found.remarks)
+
+
+def test_half_a_record_that_ends_before_the_inputs_act_tells_nothing():
+    record = measured(system(), excitation("noise", n=100))
+    data = KnownInputs([record], at_rest=False, straight=False, feedthrough=True, delays=np.full(2, 60.0))
+    fit = projected(data, POLES, np.ones((4, data.n_excitations), complex))
+    assert without_unpredictive(data, fit, np.arange(4.0), Budget()) == (fit, ())
 
 
 @pytest.mark.slow

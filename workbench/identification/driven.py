@@ -248,7 +248,7 @@ def identify_driven(
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     late = budget.spent("check of modes that change within the record")
     changes = () if late else change_remarks(data, fit, changing)
-    changes = (*changes, *unpredictive_remarks(fit, selected.beside))
+    changes = (*changes, *unpredictive_remarks(fit, selected.distorted))
     return _report(records, data, selected, (*windowed, *remarks, *overlap, *changes, *budget.remarks))
 
 
@@ -312,9 +312,9 @@ def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selec
 
 def _predictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
     """Without modes that make the prediction of what is held out worse; about these no further mode is looked for."""
-    fit, beside = without_unpredictive(data, selected.fit, budget)
+    fit, distorted = without_unpredictive(data, selected.fit, selected.evidence, budget)
     selected = selected if fit is selected.fit else selected.refitted(fit)
-    return replace(selected, beside=(*data.shunned, *beside))
+    return replace(selected, distorted=(*data.distorted, *distorted))
 
 
 def _few(how: dict[str, Any]) -> dict[str, Any]:
@@ -347,7 +347,7 @@ def _selected(
     """The modes, the strongest first; in combinations of the outputs that share no noise where these share some."""
     how["budget"] = budget
     strongest = _strongest(data, **how) if strongest is None else strongest
-    data = data.shunning(strongest.beside)
+    data = data.with_distorted(strongest.distorted)
     apart = data.apart(strongest.fit)
     if apart is None:
         return _in_noise(data, strongest, how)
@@ -453,7 +453,7 @@ def _with_noise(
             break
         if budget.spent("estimation of the noise spectrum"):
             break
-        weighted = data.shunning(selected.beside).weighted_by(line_std)
+        weighted = data.with_distorted(selected.distorted).weighted_by(line_std)
         anew = _predictive(weighted, select_modes(weighted, start=selected.fit, **how), budget)
         # A search that was ended early is no better than the one before.
         if budget.spent("estimation of the noise spectrum") and anew.fit.poles.size < selected.fit.poles.size:

@@ -14,6 +14,7 @@ from workbench.design.laws.law import (
     controlled_indices,
     participation,
     positive_definite,
+    weighed_states,
 )
 from workbench.design.laws.pole_assignment import assign
 from workbench.rig.actuators import Actuator
@@ -53,7 +54,7 @@ def coupled_lqr(
         controllable_input(modes, [r for r in index if modes.damping[r, r] <= 0], actuators)
     a, b = controlled_plant(modes, index, actuators)
     omega, size = modes.omega[list(index)], len(actuators)
-    states = np.flatnonzero(np.r_[omega > 0, np.full(omega.size, True)])
+    states = weighed_states(omega)
     q = np.diag(np.r_[omega**2, np.ones(omega.size)][states])
     r = positive_definite(weight, size, f"the control weight must be positive definite, {size} by {size}")
     try:

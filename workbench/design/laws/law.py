@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arrays import Floats, Integers
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix
@@ -99,6 +100,14 @@ def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[i
             f"controlled modes {list(index)} are not distinct modes of the {modes.n_modes} at hand (from 0)"
         )
     return index
+
+
+def weighed_states(omega: Floats) -> Integers:
+    """Which of the states (q_1..q_n, q_1'..q_n') have an energy: the displacement of a rigid mode has none.
+
+    A law that minimises energies leaves it where it is, so it is no state of the closed loop.
+    """
+    return np.flatnonzero(np.r_[omega > 0, np.full(omega.size, True)])
 
 
 def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> np.ndarray:

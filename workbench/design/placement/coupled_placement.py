@@ -12,7 +12,7 @@ from scipy.linalg import LinAlgError, solve_continuous_are, solve_continuous_lya
 from scipy.optimize import OptimizeResult, minimize
 
 from workbench.arrays import Floats, Integers
-from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.law import DesignError, Law, weighed_states
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.peak import largest
 from workbench.design.placement.task import Placement
@@ -131,7 +131,7 @@ def coupled_costs(
 def _weighed(omega: Floats) -> tuple[Integers, Floats, Floats]:
     """The states whose motion costs anything, their A and their costs: the displacement of a rigid mode does not."""
     n = len(omega)
-    states = np.flatnonzero(np.r_[omega > 0, np.full(n, True)])
+    states = weighed_states(omega)
     a = modal_state_matrix(omega**2, np.zeros(n))
     return states, a[np.ix_(states, states)], np.r_[omega**2, np.ones(n)][states]
 

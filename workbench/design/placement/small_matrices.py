@@ -52,7 +52,7 @@ def multiply(a: Floats, b: Floats, found: Floats) -> None:
 
 @njit(cache=True, nogil=True)
 def multiply_transposed(a: Floats, b: Floats, found: Floats) -> None:
-    """Aᵀ B, into `found`."""
+    """Aᵀ B, into `found`; a transposed view would be another type, for which all that takes it is compiled anew."""
     for i in range(a.shape[1]):
         for j in range(b.shape[1]):
             total = 0.0

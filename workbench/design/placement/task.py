@@ -16,7 +16,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from workbench.arrays import Floats, symmetric_root
 from workbench.design.laws.imsc import imsc, riccati_gains
-from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.law import DesignError, Law, weighed_states
 from workbench.design.placement.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.rig.actuators import Actuator
@@ -273,9 +273,7 @@ def placement_task(
     rate = g2 + np.diag(modes.damping)[:n]  # of the closed loop: s² + rate s + ω² + g1
     rates = impulse * modes.phi(places)[:, :n] * np.sqrt(shares)[:, None]
     s = 1j * modes.omega[n:, None]
-    # where a rigid mode has come to rest is left alone and asks for no force: its displacement is no state here
-    rigid = omega**2 + g1 == 0
-    states = np.r_[~rigid, np.full(n, True)]
+    states, rigid = weighed_states(omega), omega == 0
     unit = -np.where(rigid, g2 / (s + rate), (g1 + g2 * s) / np.where(rigid, 1.0, s**2 + rate * s + omega**2 + g1))
     a = modal_state_matrix(omega**2 + g1, rate)[np.ix_(states, states)]
     gains = np.hstack([np.diag(g1), np.diag(g2)])[:, states]

@@ -13,7 +13,7 @@ import numpy as np
 from workbench.arrays import Flags, Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, only, projected, settled
-from workbench.identification.input_output.model_order import evidence_of_each
+from workbench.identification.input_output.time_variance import IS_MEAN, named_near
 from workbench.identification.signal.searches import SELECTION, Budget
 
 
@@ -36,16 +36,28 @@ class HeldOutSettings:
 HELD_OUT = HeldOutSettings()
 
 
-def without_unpredictive(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[Fit, tuple[complex, ...]]:
+def without_unpredictive(
+    data: KnownInputs, fit: Fit, strength: Floats, budget: Budget
+) -> tuple[Fit, tuple[complex, ...]]:
     """The fit without modes that make the prediction worse, and the poles that these stood about.
 
     The weaker modes about each stronger one are tried together, and where they stay, faint ones that ring on through
     the record, or grow, one by one: a single line is all that they fit.
+
+    Args:
+        strength: (n_modes,) evidence of each mode.
     """
-    whole, half = data.unweighted(), data.first_half()
-    n, strength, hertz = fit.poles.size, evidence_of_each(fit), fit.poles.imag
+    n, omega = fit.poles.size, fit.poles.imag
+    reach = HELD_OUT.reach * omega
+    weaker = (np.abs(np.subtract.outer(omega, omega)) < reach[:, None]) & (strength < strength[:, None])
+    lines = -fit.poles.real < 0.5 * data.resolution
+    shortest = min(record.n_samples // 2 for record in data.records)
+    if n < 2 or not (weaker.any() or lines.any()) or shortest <= data.first:
+        return fit, ()
+    whole = data.unweighted()
+    half = whole.first_half()
     too_short = len(half.values) < HELD_OUT.rows * (2 * n + half.fixed.shape[1])
-    if n < 2 or too_short or half.fixed.shape[1] != whole.fixed.shape[1]:  # inputs that rest through a first half
+    if too_short or half.fixed.shape[1] != whole.fixed.shape[1]:  # inputs that rest through a first half
         return fit, ()
     all_modes = projected(whole, fit.poles, fit.participation)
     noise, left_by_all = all_modes.noise, [_power(all_modes.residual[rows] / all_modes.noise) for rows in whole.rows]
@@ -74,30 +86,26 @@ def without_unpredictive(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[F
         found = known[key]
         return np.inf if found is None else float(_between(found, whole.highest, lowest, highest).sum())
 
-    kept, beside = np.ones(n, bool), []
-    reach = HELD_OUT.reach * hertz
-    tries = [(r, np.abs(hertz - hertz[r]) < reach[r], True) for r in np.argsort(-strength)]
-    lines = -fit.poles.real < 0.5 * data.resolution
-    tries += [
-        (r, np.arange(n) == r, False) for r in np.argsort(strength) if lines[r] and _is_faint(whole, all_modes, r)
-    ]
-    for r, near, are_weaker in tries:
-        group = kept & near & ((strength < strength[r]) | (not are_weaker))
+    kept, distorted = np.ones(n, bool), []
+    tries = [(r, weaker[r]) for r in np.argsort(-strength)]
+    tries += [(r, np.arange(n) == r) for r in np.argsort(strength) if lines[r] and _is_faint(whole, all_modes, r)]
+    for r, modes in tries:
+        group = kept & modes
         if not (kept[r] and group.any() and (kept & ~group).any() and _is_in_both(whole, fit, r)):
             continue
         if budget.spent("check of modes by what they predict"):
             break
-        band = hertz[group].min() - 0.5 * reach[r], hertz[group].max() + 0.5 * reach[r]
+        band = omega[group].min() - 0.5 * reach[r], omega[group].max() + 0.5 * reach[r]
         about = _between(left_by_all, whole.highest, *band)
         if not about.size or about.mean() < HELD_OUT.loud * np.median(np.concatenate(left_by_all)):
             continue
         if error(kept & ~group, *band) < HELD_OUT.worse * error(kept, *band):
             kept &= ~group
-            if are_weaker:
-                beside.append(complex(fit.poles[r]))
+            if kept[r]:
+                distorted.append(complex(fit.poles[r]))
     if kept.all():
         return fit, ()
-    return settled(data, only(data, fit, kept), SELECTION.few_steps, budget), tuple(beside)
+    return settled(data, only(data, fit, kept), SELECTION.few_steps, budget), tuple(distorted)
 
 
 def _is_in_both(data: KnownInputs, fit: Fit, r: int) -> bool:
@@ -127,14 +135,12 @@ def _between(powers: list[Floats], highest_line: float, lowest: float, highest: 
     return np.concatenate([p[(at >= lowest) & (at <= highest)] for p, at in zip(powers, lines, strict=True)])
 
 
-def unpredictive_remarks(fit: Fit, beside: tuple[complex, ...]) -> tuple[str, ...]:
+def unpredictive_remarks(fit: Fit, distorted: tuple[complex, ...]) -> tuple[str, ...]:
     """A remark on the modes about which others were left out, as these predict nothing."""
-    if not beside or not fit.poles.size:
+    if not distorted or not fit.poles.size:
         return ()
-    nearest = sorted({int(np.argmin(np.abs(fit.poles - pole))) for pole in beside})
-    which = ", ".join(f"mode {r + 1} ({np.abs(fit.poles[r]) / (2.0 * np.pi):.4g} Hz)" for r in nearest)
+    which = ", ".join(named_near(fit, distorted).values())
     return (
         f"modes change within the record, perhaps with amplitude, or something is nonlinear: more is seen about {which}"
-        " than a linear mode makes, and no further mode predicts it; such a mode is the mean of what it was: identify"
-        " parts of the record, or levels one by one",
+        f" than a linear mode makes, and no further mode predicts it; {IS_MEAN}",
     )

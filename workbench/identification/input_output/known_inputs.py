@@ -57,7 +57,7 @@ class KnownInputs:
         line_std: relative noise of each line, one (n_rows, n_outputs) a record, of unit rms over all.
         beside: (n_samples, n_columns) of all records, fixed columns beside those of the inputs and the constants.
         changing: poles of the modes that move along these.
-        shunned: poles about which no further mode is looked for.
+        distorted: poles about which no further mode is looked for.
     """
 
     def __init__(
@@ -72,9 +72,9 @@ class KnownInputs:
         line_std: Sequence[np.ndarray] | None = None,
         beside: Floats | None = None,
         changing: tuple[complex, ...] = (),
-        shunned: tuple[complex, ...] = (),
+        distorted: tuple[complex, ...] = (),
     ) -> None:
-        self.shunned = shunned
+        self.distorted = distorted
         self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
         self.dt, self.places = records[0].sample_time, records[0].positions
         self.delays = np.zeros(records[0].n_inputs) if delays is None else np.asarray(delays, float)
@@ -136,17 +136,17 @@ class KnownInputs:
         return self._with(line_std=None, beside=None, changing=())
 
     def first_half(self) -> "KnownInputs":
-        """Likewise, of the first half of each record."""
+        """The first half of each of such records."""
         halves = [
             replace(r, outputs=r.outputs[:, : r.n_samples // 2], inputs=r.inputs[:, : r.n_samples // 2])
             for r in self.records
         ]
-        return self._with(records=halves, line_std=None, beside=None, changing=())
+        return self._with(records=halves)
 
-    def shunning(self, poles: tuple[complex, ...]) -> "KnownInputs":
+    def with_distorted(self, poles: tuple[complex, ...]) -> "KnownInputs":
         """The same records, no further mode being looked for about these poles either."""
-        new = tuple(pole for pole in poles if pole not in self.shunned)
-        return self._with(shunned=(*self.shunned, *new)) if new else self
+        new = tuple(pole for pole in poles if pole not in self.distorted)
+        return self._with(distorted=(*self.distorted, *new)) if new else self
 
     def delayed_by(self, delays: np.ndarray, any_fraction: bool = False) -> "KnownInputs":
         """The same records with inputs that act late by these delays, samples; lines weighted as before."""
@@ -189,7 +189,7 @@ class KnownInputs:
             "line_std": self.line_std,
             "beside": self.beside,
             "changing": self.changing,
-            "shunned": self.shunned,
+            "distorted": self.distorted,
         }
         return KnownInputs(**{**same, **changed})
 

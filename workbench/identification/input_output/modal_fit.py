@@ -37,7 +37,7 @@ class Measurement(Protocol):
         highest: rad/s, beyond which no pole is searched.
         n_inputs: of the excitations, that are no initial states.
         cells: number of poles that could be distinguished, for the chance of a false alarm.
-        shunned: poles of modes that are more than linear ones; about these no further mode is looked for.
+        distorted: poles of modes that are more than linear ones; about these no further mode is looked for.
     """
 
     values: np.ndarray
@@ -47,7 +47,7 @@ class Measurement(Protocol):
     highest: float
     n_inputs: int
     cells: int
-    shunned: tuple[complex, ...]
+    distorted: tuple[complex, ...]
 
     def responses(self, pole: complex) -> Pair:
         """Real and imaginary parts of x_p(λ), (n_rows, n_excitations) each."""

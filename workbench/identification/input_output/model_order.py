@@ -33,10 +33,10 @@ class OrderSettings:
     distinct: float = 10.0  # times the threshold, from which on two modes close to one another are two
     floor: float = 1e-5  # of each output, taken for noise in any case: -100 dB
     collinear: float = 1e-10  # of the energy of each column, lest poles that are one be singular
-    # shunned_rates, shunned_share: decay rates, and share of the frequency, to either side of a mode that is more than
-    # a linear one, within which no further mode is looked for: a spring that hardens by 3 % fills five bandwidths
-    shunned_rates: float = 10.0
-    shunned_share: float = 0.03
+    # distorted_rates, distorted_share: decay rates, and share of the frequency, to either side of a mode that is more
+    # than a linear one, within which no further mode is looked for: a spring that hardens by 3 % fills five bandwidths
+    distorted_rates: float = 10.0
+    distorted_share: float = 0.03
 
 
 ORDER = OrderSettings()
@@ -51,14 +51,14 @@ class Selected:
         evidence: (n_modes,) χ² of each.
         limit: what noise alone exceeds by false alarm.
         full: whether more might be there, the most modes being taken.
-        beside: poles about which further modes were left out, as they predict nothing.
+        distorted: poles about which further modes were left out, as they predict nothing.
     """
 
     fit: Fit
     evidence: np.ndarray
     limit: float
     full: bool
-    beside: tuple[complex, ...] = ()
+    distorted: tuple[complex, ...] = ()
 
     def refitted(self, fit: Fit) -> "Selected":
         """The modes of another fit, with their evidence in it."""
@@ -196,8 +196,7 @@ class _Modes:
         return self.limit * self.data.noise_ratio(model.residual / model.noise, pole)
 
     def splits(self, model: Fit, trial: Fit) -> bool:
-        new = trial.poles[-1:] if trial.poles.size > model.poles.size else trial.poles[:0]
-        return bool(_spurious(self.data, trial).any() or _is_shunned(self.data, new).any())
+        return bool(_spurious(self.data, trial).any() or _is_about_distorted(self.data, trial.poles[-1:]).any())
 
     def settled(self, model: Fit) -> Fit:
         return settled(self.data, model, budget=self.budget)
@@ -243,25 +242,25 @@ def _to_try(data: Measurement, fit: Fit) -> np.ndarray:
     width = np.maximum(np.abs(fit.poles.real), 0.5 * data.resolution)
     beside = [fit.poles + 1j * k * width for k in (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)]
     tries = np.concatenate([data.candidates(fit.residual / fit.noise), *beside])
-    return np.asarray(tries[_can_ring(data, tries) & ~_is_shunned(data, tries)])
+    return np.asarray(tries[_can_ring(data, tries) & ~_is_about_distorted(data, tries)])
 
 
-def _is_shunned(data: Measurement, poles: np.ndarray) -> np.ndarray:
+def _is_about_distorted(data: Measurement, poles: np.ndarray) -> np.ndarray:
     """Which poles stand about modes that are more than linear, or beside such ring on through the record.
 
     What else a nonlinear structure does is seen as lines here and there, which rise far above noise of the sensors.
     """
-    out = np.zeros(poles.size, bool)
-    for pole in data.shunned:
-        about = max(ORDER.shunned_rates * abs(pole.real), ORDER.shunned_share * pole.imag)
-        out |= (np.abs(poles.imag - pole.imag) < about) | (-poles.real < 0.5 * data.resolution)
-    return out
+    out = (-poles.real < 0.5 * data.resolution) & bool(data.distorted)
+    for pole in data.distorted:
+        about = max(ORDER.distorted_rates * abs(pole.real), ORDER.distorted_share * pole.imag)
+        out |= np.abs(poles.imag - pole.imag) < about
+    return np.asarray(out)
 
 
 def _changes(data: Measurement, poles: np.ndarray) -> np.ndarray:
     """Which poles are those of modes that are more than linear: in what else these do, no evidence is left of them."""
     out = np.zeros(poles.size, bool)
-    for pole in data.shunned:
+    for pole in data.distorted:
         out[np.argmin(np.abs(poles - pole))] = True
     return out
 

@@ -53,7 +53,7 @@ class Lines:
         changing: tuple[tuple[complex, float], ...] = (),
     ) -> None:
         self.h, self.powers, self.stated = h, powers, noise
-        self.shunned: tuple[complex, ...] = ()
+        self.distorted: tuple[complex, ...] = ()
         self.guessed, self.beside, self.changing = guessed, beside, changing
         self.omega, (_, self.refs, self.lines) = omega, h.shape
         self.n_inputs = self.refs

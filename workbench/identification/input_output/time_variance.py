@@ -12,7 +12,7 @@ z' = (λ + α t + κ |z|²) z + l u, its motion is the series of Volterra in α 
 the modes are searched beside these columns up to the third order.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -52,6 +52,7 @@ class ChangingSettings:
 
 
 CHANGING = ChangingSettings()
+IS_MEAN = "such a mode is the mean of what it was: identify parts of the record, or levels one by one"
 
 
 class Change(NamedTuple):
@@ -240,20 +241,25 @@ def _pairs_alike(fit: Fit) -> list[tuple[int, int]]:
     return sorted(((int(r), int(s)) for r, s in both), key=lambda pair: apart[pair])
 
 
+def named_near(fit: Fit, poles: Iterable[complex]) -> dict[int, str]:
+    """The modes of a fit nearest to some poles, in their order, by index: mode 2 (4.1 Hz)."""
+    nearest = sorted({int(np.argmin(np.abs(fit.poles - pole))) for pole in poles})
+    return {r: f"mode {r + 1} ({np.abs(fit.poles[r]) / (2.0 * np.pi):.4g} Hz)" for r in nearest}
+
+
 def change_remarks(data: KnownInputs, fit: Fit, changing: tuple[complex, ...] = ()) -> tuple[str, ...]:
     """A remark on the modes that change within a record: evenly with time, or, near the poles named, in another way."""
     if not fit.poles.size:
         return ()
     change = changes_in_time(data, fit)
-    names = [f"mode {r + 1} ({np.abs(pole) / (2.0 * np.pi):.4g} Hz)" for r, pole in enumerate(fit.poles)]
+    names = named_near(fit, fit.poles)
     sure = change.sure & (np.abs(change.frequency) < CHANGING.reach)
-    words = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure)]
-    others = sorted({names[r] for pole in changing if not sure[r := int(np.argmin(np.abs(fit.poles - pole)))]})
-    end = "such a mode is the mean of what it was: identify parts of the record, or levels one by one"
+    words = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure).tolist()]
+    others = sorted(name for r, name in named_near(fit, changing).items() if not sure[r])
     remarks = []
     if words:
-        evenly = f"frequencies change within the record, from its beginning to its end: {'; '.join(words)}; {end}"
+        evenly = f"frequencies change within the record, from its beginning to its end: {'; '.join(words)}; {IS_MEAN}"
         remarks.append(evenly)
     if others:
-        remarks.append(f"modes change within the record, perhaps with amplitude: {', '.join(others)}; {end}")
+        remarks.append(f"modes change within the record, perhaps with amplitude: {', '.join(others)}; {IS_MEAN}")
     return tuple(remarks)
