@@ -430,6 +430,7 @@ def test_the_change_of_modes_is_found_once_for_each_fit(monkeypatch):
     ("change", "seed", "n", "snr"),
     [
         (0.02, 4, 1000, 50.0),
+        (0.02, 5, 1000, 50.0),
         *(
             pytest.param(*each, marks=pytest.mark.slow)
             for each in ((0.005, 3, 1500, 60.0), (0.005, 7, 3000, 60.0), (0.02, 7, 3000, 60.0))
@@ -441,6 +442,15 @@ def test_a_change_far_above_the_noise_makes_no_further_modes(change, seed, n, sn
     found = identify_driven(drifting(change, seed, n=n, snr=snr))
     assert found.modes.frequencies_hz == pytest.approx([1.3, 4.1, 9.7], rel=6e-3)
     assert any("mode 2" in remark and "change within the record" in remark for remark in found.remarks)
+
+
+def test_noise_that_is_louder_at_low_frequencies_is_no_change_of_a_mode():
+    """What is left about a low mode stood ten times above its median."""
+    (record, clean), _ = many_modes(209, 5, 0.0, n=4000)
+    noise = lfilter([1.0], [1.0, -0.95], np.random.default_rng(1).standard_normal(clean.shape))
+    noise *= 0.03 * clean.std(axis=1, keepdims=True) / noise.std(axis=1, keepdims=True)
+    found = identify_driven(replace(record, outputs=clean + noise), at_rest=True)
+    assert found.modes.n_modes == 5 and not found.remarks
 
 
 def marched(pull, u, fine):

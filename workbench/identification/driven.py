@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.force_window import force_window
-from workbench.identification.input_output.held_out import unpredictive_remarks, without_unpredictive
+from workbench.identification.input_output.held_out import left_about, unpredictive_remarks, without_unpredictive
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, added_misfit, only, projected, scaled_vectors, settled
@@ -247,8 +247,9 @@ def identify_driven(
     selected = selected if fit is selected.fit else selected.refitted(fit)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     late = budget.spent("check of modes that change within the record")
-    changes = () if late else change_remarks(data, fit, changing)
-    changes = (*changes, *unpredictive_remarks(fit, selected.distorted))
+    changes, named = ((), ()) if late else change_remarks(data, fit, changing)
+    left = [pole for pole in left_about(data, fit) if pole not in named]
+    changes = (*changes, *unpredictive_remarks(fit, (*selected.distorted, *left)))
     return _report(records, data, selected, (*windowed, *remarks, *overlap, *changes, *budget.remarks))
 
 

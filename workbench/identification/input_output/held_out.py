@@ -6,6 +6,7 @@ else. So the modes are fitted to the first half of each record and carried on th
 about each stronger one: what is there makes the prediction better, what is not makes it worse.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,7 @@ class HeldOutSettings:
     # and two modes a line apart, of which half a record tells nothing, may be two
     loud: float = 10.0
     faint: float = 0.01  # of the power of the outputs: what a mode with no other about it makes, to be taken for a line
+    matters: float = 1e-3  # of the power about a mode: what is left of it to be remarked, 3 % of its amplitude
 
 
 HELD_OUT = HeldOutSettings()
@@ -60,7 +62,7 @@ def without_unpredictive(
     if too_short or half.fixed.shape[1] != whole.fixed.shape[1]:  # inputs that rest through a first half
         return fit, ()
     all_modes = projected(whole, fit.poles, fit.participation)
-    noise, left_by_all = all_modes.noise, [_power(all_modes.residual[rows] / all_modes.noise) for rows in whole.rows]
+    noise, left_by_all = all_modes.noise, _lines(whole, all_modes.residual / all_modes.noise)
     known: dict[bytes, list[Floats] | None] = {}
 
     def missed(kept: Flags) -> list[Floats] | None:
@@ -124,6 +126,11 @@ def _is_faint(data: KnownInputs, fit: Fit, r: int) -> bool:
     return bool((made < HELD_OUT.faint * data.values.var(axis=0)).all())
 
 
+def _lines(data: KnownInputs, samples: Floats) -> list[Floats]:
+    """`_power` of each record."""
+    return [_power(samples[rows]) for rows in data.rows]
+
+
 def _power(samples: Floats) -> Floats:
     """Of each line, outputs together, (n_lines,), of samples (n_samples, n_outputs)."""
     return np.asarray((np.abs(np.fft.rfft(samples, axis=0)) ** 2).sum(axis=1))
@@ -135,12 +142,33 @@ def _between(powers: list[Floats], highest_line: float, lowest: float, highest: 
     return np.concatenate([p[(at >= lowest) & (at <= highest)] for p, at in zip(powers, lines, strict=True)])
 
 
-def unpredictive_remarks(fit: Fit, distorted: tuple[complex, ...]) -> tuple[str, ...]:
-    """A remark on the modes about which others were left out, as these predict nothing."""
-    if not distorted or not fit.poles.size:
+def left_about(data: KnownInputs, fit: Fit) -> tuple[complex, ...]:
+    """The poles of a fit about which far more is left than beside them, and enough of the response there to matter."""
+    whole, found = data.unweighted(), []
+    all_modes = projected(whole, fit.poles, fit.participation)
+    window = np.concatenate([np.hanning(rows.stop - rows.start) for rows in whole.rows])[:, None] / all_modes.noise
+    left, seen = _lines(whole, window * all_modes.residual), _lines(whole, window * whole.values)
+    usual = float(np.median(np.concatenate(left)))
+
+    def power(lines: list[Floats], lowest: float, highest: float) -> float:
+        between = _between(lines, whole.highest, lowest, highest)
+        return float(between.mean()) if between.size else np.inf
+
+    for pole in fit.poles:
+        below, lowest, highest, above = pole.imag * (1.0 + HELD_OUT.reach * np.array([-1.5, -0.5, 0.5, 1.5]))
+        beside = max(usual, min(power(left, below, lowest), power(left, highest, above)))  # noise need not be white
+        least = max(HELD_OUT.loud * beside, HELD_OUT.matters * power(seen, lowest, highest))
+        if least < power(left, lowest, highest) < np.inf:
+            found.append(complex(pole))
+    return tuple(found)
+
+
+def unpredictive_remarks(fit: Fit, poles: Iterable[complex]) -> tuple[str, ...]:
+    """A remark on the modes next to these poles, about which more is seen than they make."""
+    which = ", ".join(named_near(fit, poles).values())
+    if not which:
         return ()
-    which = ", ".join(named_near(fit, distorted).values())
     return (
-        f"modes change within the record, perhaps with amplitude, or something is nonlinear: more is seen about {which}"
-        f" than a linear mode makes, and no further mode predicts it; {IS_MEAN}",
+        "modes change within the record, perhaps with amplitude, something is nonlinear, or a force is not measured:"
+        f" more is seen about {which} than a linear mode makes of the inputs; {IS_MEAN}",
     )

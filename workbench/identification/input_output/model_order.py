@@ -206,7 +206,7 @@ class _Modes:
 
         The weaker half of them goes, then half of those that are left; one that goes in error is found again.
         """
-        whole = model = self.settled(start)
+        model = settled(self.data, start, SELECTION.few_steps, self.budget, ORDER.decided)
         while model.poles.size and not self.budget.spent("check of each mode"):
             evidence = np.where(_spurious(self.data, model), 0.0, whole_evidence_of(model))
             is_weak = evidence < [self.threshold(model, pole) for pole in model.poles]
@@ -216,7 +216,7 @@ class _Modes:
             out = weak[np.argsort(evidence[weak])[: (weak.size + 1) // 2]]
             rest = np.delete(np.arange(model.poles.size), out)
             model = settled(self.data, only(self.data, model, rest), SELECTION.few_steps, self.budget, ORDER.decided)
-        return model if model is whole else self.settled(model)
+        return self.settled(model)
 
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
         """Those that are spurious, weak, or close to another."""

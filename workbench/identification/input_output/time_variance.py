@@ -247,19 +247,26 @@ def named_near(fit: Fit, poles: Iterable[complex]) -> dict[int, str]:
     return {r: f"mode {r + 1} ({np.abs(fit.poles[r]) / (2.0 * np.pi):.4g} Hz)" for r in nearest}
 
 
-def change_remarks(data: KnownInputs, fit: Fit, changing: tuple[complex, ...] = ()) -> tuple[str, ...]:
-    """A remark on the modes that change within a record: evenly with time, or, near the poles named, in another way."""
+def change_remarks(
+    data: KnownInputs, fit: Fit, changing: tuple[complex, ...] = ()
+) -> tuple[tuple[str, ...], tuple[complex, ...]]:
+    """A remark on the modes that change within a record: evenly with time, or, near the poles named, in another way.
+
+    Returns:
+        The remarks, and the poles of the modes they name.
+    """
     if not fit.poles.size:
-        return ()
+        return (), ()
     change = changes_in_time(data, fit)
     names = named_near(fit, fit.poles)
     sure = change.sure & (np.abs(change.frequency) < CHANGING.reach)
     words = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure).tolist()]
-    others = sorted(name for r, name in named_near(fit, changing).items() if not sure[r])
+    others = [r for r in named_near(fit, changing) if not sure[r]]
     remarks = []
     if words:
         evenly = f"frequencies change within the record, from its beginning to its end: {'; '.join(words)}; {IS_MEAN}"
         remarks.append(evenly)
     if others:
-        remarks.append(f"modes change within the record, perhaps with amplitude: {', '.join(others)}; {IS_MEAN}")
-    return tuple(remarks)
+        which = ", ".join(names[r] for r in others)
+        remarks.append(f"modes change within the record, perhaps with amplitude: {which}; {IS_MEAN}")
+    return tuple(remarks), tuple(fit.poles[[*np.flatnonzero(sure), *others]].tolist())
