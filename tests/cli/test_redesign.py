@@ -38,7 +38,7 @@ def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
     options = ("--verdict", verdict, "--damping", 0.3, "--draws", 6, "--page", page, "--json", told, "--to", code)
     done = run("redesign", folder, *options)
     assert done.exit_code == 0, done.output
-    assert "stable on 6 of 6 draws" in done.output and "F1: delay 40 ms" in done.output
+    assert "stable on 6 of 6 Monte Carlo samples" in done.output and "F1: delay 40 ms" in done.output
     found = json.loads(told.read_text())
     assert found["safe"] and found["redesigned"]["stable"] == 6
     assert found["steps"][-1]["loss"] < 0.5 * found["steps"][0]["loss"]

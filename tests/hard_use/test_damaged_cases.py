@@ -188,7 +188,7 @@ def check_told(case: Case, folder) -> None:
         assert (part.name, part.at, part.direct) == (entry["name"], entry["at"], entry["kind"] == "hammer")
     for part, entry in zip(rig.sensors, table["output"], strict=True):
         assert (part.name, part.at, part.quantity) == (entry["name"], entry["at"], entry["quantity"])
-        assert part.noise_std == entry["noise_std"]
+        assert part.noise_std == entry.get("noise_std", 0.0)
     for use, records in (("fit", case.fit), ("validate", case.validation)):
         entries = [entry for entry in table["record"] if entry["use"] == use]
         for record, entry in zip(records, entries, strict=True):

@@ -323,6 +323,15 @@ def test_inputs_that_act_late(delays, straight, feedthrough, close, at_rest):
     assert error.max() < 0.5 * fraction
 
 
+def test_a_late_input_that_no_output_feels_at_once():
+    """Its costs were added over inputs instead of outputs."""
+    plant = real_system(0.0)
+    record = measured_late(plant, excitation("noise"), (2.35, 0.0), straight=False, fraction=0.001)
+    found = identify_driven(record, at_rest=True, feedthrough=False)
+    assert found.modes.n_modes == 4 and not found.feedthrough.any()
+    assert np.abs(found.delays / DT - (2.35, 0.0)).max() < 0.02
+
+
 def test_inputs_that_act_in_time_are_not_said_to_act_late():
     record = measured(system(), excitation("noise"), fraction=0.01)
     found = identify_driven(record)

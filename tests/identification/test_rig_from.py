@@ -91,6 +91,16 @@ def test_points_of_a_plate_keep_their_places_and_answer_to_a_mass_as_the_plate()
     plot(found.modes).draw_without_rendering()
 
 
+def test_a_first_response_that_noise_hides_is_no_delay(bench):
+    """Of a held force the next sample feels little: it was said to act a whole sample late, and shapes were far off."""
+    rng = np.random.default_rng(10)
+    quiet = simulate(bench, rng.normal(size=(1, 400)), sample_time=0.05)
+    noise = 0.002 * rng.normal(size=(2, *quiet.outputs.shape))[1]
+    record = replace(quiet, outputs=quiet.outputs + noise)
+    found = identify_driven(record, at_rest=True, feedthrough=False, most_modes=3)
+    assert not found.delays.any() and not found.remarks
+
+
 @pytest.mark.slow
 def test_the_spread_of_shapes_over_many_records_is_what_their_covariance_says(bench):
     rng = np.random.default_rng(10)

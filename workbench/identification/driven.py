@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
+from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.force_window import force_window
 from workbench.identification.input_output.held_out import left_about, unpredictive_remarks, without_unpredictive
@@ -281,16 +282,38 @@ def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownIn
     fit = selected.fit
     if fit.poles.size == 0:
         return in_time if in_time is not None else (data.delayed_by(whole), selected)
-    derivative = time_derivatives(data.records[0].output_channels)[:, None]
-    fraction = np.where(act_later(data, fit), fractions(data, fit, derivative), 0.0)
+    whole, fraction = _lateness(data, fit, whole, budget)
     if not whole.any() and not fraction.any() and not budget.spent("search for delays of the inputs"):
         if in_time is not None:
             return in_time
         return _selected(punctual, budget, _strongest(punctual, fit, budget=budget, **how), **how)
-    turned = fit.participation.copy()
-    turned[:, : data.n_inputs] *= np.exp(np.outer(fit.poles, fraction) * data.dt)
     late = data.delayed_by(whole + fraction)
-    return late, selected.refitted(settled(late, projected(late, fit.poles, turned), budget=budget))
+    return late, selected.refitted(settled(late, _moved_to(late, data, fit), budget=budget))
+
+
+def _lateness(data: KnownInputs, fit: Fit, whole: Floats, budget: Budget) -> tuple[Floats, Floats]:
+    """Whole samples and the fraction of one by which each input acts late, from modes beside any fraction.
+
+    The first response seen comes a sample too late where the one before was too faint to be seen.
+    """
+    derivative = time_derivatives(data.records[0].output_channels)[:, None]
+    fraction = np.where(act_later(data, fit), fractions(data, fit, derivative), 0.0)
+    doubtful = (whole > 0) & (fraction == 0)
+    while doubtful.any() and not budget.spent("search for delays of the inputs"):
+        sooner = data.delayed_by(whole - doubtful, any_fraction=True)
+        fit = settled(sooner, _moved_to(sooner, data, fit), SELECTION.few_steps, budget, ORDER.decided)
+        found = np.where(act_later(sooner, fit), fractions(sooner, fit, derivative), 0.0)
+        taken = doubtful & (found < 1.0)
+        whole, fraction, data = whole - taken, np.where(taken, found, fraction), sooner
+        doubtful = taken & (whole > 0) & (fraction == 0)
+    return whole, fraction
+
+
+def _moved_to(other: KnownInputs, data: KnownInputs, fit: Fit) -> Fit:
+    """Modes of inputs of one delay, turned to those of another."""
+    turned = fit.participation.copy()
+    turned[:, : data.n_inputs] *= np.exp(np.outer(fit.poles, other.delays - data.delays) * data.dt)
+    return projected(other, fit.poles, turned)
 
 
 def _late(data: KnownInputs, selected: Selected, budget: Budget) -> bool:

@@ -184,12 +184,16 @@ def _selected(
         return _beside_changing(lines, how)
     few = how | {"most_modes": min(TRANSFER.strongest, how["most_modes"])}
     lines, selected = _beside_changing(lines, few)
-    left = lines.left(selected.fit).reshape(len(h), -1)
-    mixing = mixing_of(correlation_of_lines([left]))
+    left = lines.left(selected.fit)
+    guessed = noise_with_size(left, lines.fitted(selected.fit))
+    # What the modes miss of the response is smooth from line to line, noise is not; and among lines of all sizes a few
+    # large ones show any correlation.
+    rough = np.diff(left if guessed is None else left / guessed, 2)
+    mixing = mixing_of(correlation_of_lines([rough.reshape(len(h), -1)]))
     if mixing is None:
         return _in_noise(lines, selected, how)
     # noise that outputs share makes peaks in all of them
-    mixed = np.tensordot(mixing / np.sqrt((np.abs(left) ** 2).mean(axis=1)), h, 1)
+    mixed = np.tensordot(mixing / np.sqrt((np.abs(left) ** 2).mean(axis=(1, 2))), h, 1)
     apart, selected = _in_noise(*_beside_changing(lines.of(mixed), few), how)
     lines = apart.of(h)
     fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)

@@ -109,6 +109,13 @@ def test_random_structures_are_told_rightly_in_noise_of_any_tail(tail, kind):
         assert told(found, omega, zeta)[0] == found.modes.n_modes == omega.size
 
 
+def test_two_close_modes_in_noise_that_falls_with_frequency_are_two():
+    """Half the record did not tell them apart, and noise ten times above its median passed for what something does."""
+    omega, zeta = 2 * np.pi * np.array([1.0, 3.0, 3.2, 20.0]), np.array([0.02, 0.01, 0.015, 0.01])
+    found = identify_driven(driven(np.random.default_rng(0), omega, zeta, tails=(0.95,) * OUTPUTS, draw=11))
+    assert told(found, omega, zeta)[0] == found.modes.n_modes == omega.size and not found.remarks
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("tail", [0.8, 0.95])
 def test_intervals_cover_in_noise_of_any_tail(tail):

@@ -10,12 +10,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import f as variance_ratio
 
 from workbench.arrays import Flags, Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, only, projected, settled
 from workbench.identification.input_output.time_variance import IS_MEAN, named_near
-from workbench.identification.signal.searches import SELECTION, Budget
+from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget
 
 
 @dataclass(frozen=True)
@@ -28,11 +29,13 @@ class HeldOutSettings:
     worse: float = 0.8
     least: float = 0.1  # share of the energy of the stronger mode that either half must hold, to tell anything
     rows: int = 4  # samples of a half for each column of a fit, at least
-    # times the median power of a line of what all modes leave, that stands about them on the mean: of less it is noise,
-    # and two modes a line apart, of which half a record tells nothing, may be two
+    # times the median power of a line of what all modes leave, and the mean below or above them, that stands about them
+    # on the mean: of less it is noise, and two modes a line apart, of which half a record tells nothing, may be two
     loud: float = 10.0
+    free: float = 4.0 / 3.0  # degrees of freedom of a line through Hann's window, which shares them with its neighbours
     faint: float = 0.01  # of the power of the outputs: what a mode with no other about it makes, to be taken for a line
-    matters: float = 1e-3  # of the power about a mode: what is left of it to be remarked, 3 % of its amplitude
+    # of the response about a mode, 3 % of its amplitude, and of what is left about another: what is left to be remarked
+    matters: float = 1e-3
 
 
 HELD_OUT = HeldOutSettings()
@@ -62,7 +65,7 @@ def without_unpredictive(
     if too_short or half.fixed.shape[1] != whole.fixed.shape[1]:  # inputs that rest through a first half
         return fit, ()
     all_modes = projected(whole, fit.poles, fit.participation)
-    noise, left_by_all = all_modes.noise, _lines(whole, all_modes.residual / all_modes.noise)
+    noise, left_by_all = all_modes.noise, _Left(whole, all_modes)
     known: dict[bytes, list[Floats] | None] = {}
 
     def missed(kept: Flags) -> list[Floats] | None:
@@ -98,8 +101,7 @@ def without_unpredictive(
         if budget.spent("check of modes by what they predict"):
             break
         band = omega[group].min() - 0.5 * reach[r], omega[group].max() + 0.5 * reach[r]
-        about = _between(left_by_all, whole.highest, *band)
-        if not about.size or about.mean() < HELD_OUT.loud * np.median(np.concatenate(left_by_all)):
+        if not left_by_all.stands_out(*band):
             continue
         if error(kept & ~group, *band) < HELD_OUT.worse * error(kept, *band):
             kept &= ~group
@@ -126,11 +128,6 @@ def _is_faint(data: KnownInputs, fit: Fit, r: int) -> bool:
     return bool((made < HELD_OUT.faint * data.values.var(axis=0)).all())
 
 
-def _lines(data: KnownInputs, samples: Floats) -> list[Floats]:
-    """`_power` of each record."""
-    return [_power(samples[rows]) for rows in data.rows]
-
-
 def _power(samples: Floats) -> Floats:
     """Of each line, outputs together, (n_lines,), of samples (n_samples, n_outputs)."""
     return np.asarray((np.abs(np.fft.rfft(samples, axis=0)) ** 2).sum(axis=1))
@@ -142,25 +139,46 @@ def _between(powers: list[Floats], highest_line: float, lowest: float, highest: 
     return np.concatenate([p[(at >= lowest) & (at <= highest)] for p, at in zip(powers, lines, strict=True)])
 
 
+class _Left:
+    """What a fit leaves of each record, lines of Hann's window, outputs in units of their noise."""
+
+    def __init__(self, data: KnownInputs, fit: Fit) -> None:
+        window = np.concatenate([np.hanning(rows.stop - rows.start) for rows in data.rows])[:, None] / fit.noise
+        self.lines, self.response = (
+            [_power((window * y)[rows]) for rows in data.rows] for y in (fit.residual, data.values)
+        )
+        self.usual, self.highest = float(np.median(np.concatenate(self.lines))), data.highest
+
+    def stands_out(self, lowest: float, highest: float) -> bool:
+        """Whether it is far more between two frequencies, rad/s, than elsewhere, below or above them and by chance."""
+        about, width = _between(self.lines, self.highest, lowest, highest), highest - lowest
+        if not about.size or about.mean() < HELD_OUT.loud * self.usual:
+            return False
+        for first in (lowest - width, highest):  # noise need not be white
+            beside = _between(self.lines, self.highest, first, first + width)
+            if beside.size:
+                chance = variance_ratio.isf(FALSE_ALARM, HELD_OUT.free * about.size, HELD_OUT.free * beside.size)
+                if about.mean() > max(HELD_OUT.loud, chance) * beside.mean():
+                    return True
+        return False
+
+    def between(self, lowest: float, highest: float) -> tuple[float, float]:
+        """What is left, and the response, between two frequencies."""
+        left, response = (_between(each, self.highest, lowest, highest).sum() for each in (self.lines, self.response))
+        return float(left), float(response)
+
+
 def left_about(data: KnownInputs, fit: Fit) -> tuple[complex, ...]:
-    """The poles of a fit about which far more is left than beside them, and enough of the response there to matter."""
-    whole, found = data.unweighted(), []
-    all_modes = projected(whole, fit.poles, fit.participation)
-    window = np.concatenate([np.hanning(rows.stop - rows.start) for rows in whole.rows])[:, None] / all_modes.noise
-    left, seen = _lines(whole, window * all_modes.residual), _lines(whole, window * whole.values)
-    usual = float(np.median(np.concatenate(left)))
+    """The poles of a fit about which far more is left than beside them, and enough of the response there to matter.
 
-    def power(lines: list[Floats], lowest: float, highest: float) -> float:
-        between = _between(lines, whole.highest, lowest, highest)
-        return float(between.mean()) if between.size else np.inf
-
-    for pole in fit.poles:
-        below, lowest, highest, above = pole.imag * (1.0 + HELD_OUT.reach * np.array([-1.5, -0.5, 0.5, 1.5]))
-        beside = max(usual, min(power(left, below, lowest), power(left, highest, above)))  # noise need not be white
-        least = max(HELD_OUT.loud * beside, HELD_OUT.matters * power(seen, lowest, highest))
-        if least < power(left, lowest, highest) < np.inf:
-            found.append(complex(pole))
-    return tuple(found)
+    Where very much is left about one mode, least squares leave a little about the others too: these do not count.
+    """
+    whole = data.unweighted()
+    left = _Left(whole, projected(whole, fit.poles, fit.participation))
+    bands = fit.poles.imag[:, None] * (1.0 + 0.5 * HELD_OUT.reach * np.array([-1.0, 1.0]))
+    about, response = np.array([left.between(*band) for band in bands]).reshape(-1, 2).T
+    enough = about > HELD_OUT.matters * np.maximum(response, about.max(initial=0.0))
+    return tuple(complex(fit.poles[r]) for r in np.flatnonzero(enough) if left.stands_out(*bands[r]))
 
 
 def unpredictive_remarks(fit: Fit, poles: Iterable[complex]) -> tuple[str, ...]:

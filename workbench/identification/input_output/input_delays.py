@@ -131,7 +131,7 @@ def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray
             across = weight[1] * left[0] - weight[0] * left[1]
             cost[k] = (across**2 / ((weight[1] * noise[0]) ** 2 + (weight[0] * noise[1]) ** 2)).sum(axis=1)
         else:
-            cost[k] = ((left / noise) ** 2).sum(axis=(0, 1))
+            cost[k] = ((left / noise) ** 2).sum(axis=(0, 2))
         turned = 2.0 * (phase + fit.poles.imag[:, None] * f * data.dt)
         cost[k] -= DELAYS.real_modes * (known * np.cos(turned)).sum(axis=0)
     return np.asarray(TRIED[np.argmin(cost, axis=0)])
