@@ -33,7 +33,7 @@ EXCITED_TO_HZ = 15.0
 KEPT = 2  # of so many samples one is kept to learn from: 15 Hz are excited
 BEYOND_HZ, BEYOND_ZETA = (1.0, 17.5, 30.0), 0.05  # modes that stand for those below and above, to start from
 STEP, ROUNDS, TO_THE_END = 1e-4, 11, 30  # of a number over its size, for slopes; of a fit; of one of a single level
-STIFFNESS, TRAVEL = np.geomspace(1e6, 1e7, 3), (1e-5, 3e-5, 1e-4)  # N/m and m: starts of a law between two points
+STIFFNESS, TRAVEL = np.geomspace(1e4, 1e7, 7), (1e-5, 3e-5, 1e-4)  # N/m and m: starts of a law between two points
 REACH = (0.3, 3.0, 10.0, 10.0)  # of logarithms of frequencies and damping ratios, of shapes over their size, of laws
 SUBSTEPS, RUNAWAY = 2, 1e6  # steps of a sample; m/s²
 
