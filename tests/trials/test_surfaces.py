@@ -29,6 +29,7 @@ from workbench.trials.scoring import score
 CHANNELS = ("kind", "input", "output", "with", "from", "at", "between")
 
 ATTACHED = {"point_mass", "ground_spring"}
+LOCKING = {"coulomb_friction", "two_way_friction"}
 
 
 def _plate(edges, **changes) -> Plate:
@@ -155,10 +156,12 @@ def _check_against_predictor(structure: str, kinds: tuple[str, ...], seed: int) 
         figures = label["records"][record.name]
         predicted = simulate(rig, record.inputs, sample_time=record.sample_time, substeps=16).outputs
         gap = np.sqrt(np.mean(((record.outputs - predicted) / record.outputs.std(axis=1, keepdims=True)) ** 2))
-        # what stands on a frame moves modes beyond those that are known at its points
-        left = 0.1 * figures["gap"] if structure == "frames" and set(kinds) & ATTACHED else 0.0
+        # what stands on a frame moves modes beyond those known at its points; friction that all but locks, a little
+        share = 0.1 if set(kinds) & ATTACHED else 2e-3 if set(kinds) & LOCKING else 0.0
+        left = share * figures["gap"] if structure == "frames" else 0.0
         assert gap == pytest.approx(figures["true_model"], rel=0.05, abs=left), record.name
-    assert max(f["gap"] / f["noise_floor"] for f in label["records"].values()) > 2.0
+    if "sensor_quantisation" not in kinds:  # which hides within the noise on some benches
+        assert max(f["gap"] / f["noise_floor"] for f in label["records"].values()) > 2.0
 
 
 @pytest.mark.parametrize("kind", ["cubic_spring", "point_mass", "sensor_misplacement"])
