@@ -29,7 +29,7 @@ from workbench.trials.scoring import score
 CHANNELS = ("kind", "input", "output", "with", "from", "at", "between")
 
 ATTACHED = {"point_mass", "ground_spring"}
-LOCKING = {"coulomb_friction", "two_way_friction"}
+LOCKING = {"two_way_friction"}
 
 
 def _plate(edges, **changes) -> Plate:

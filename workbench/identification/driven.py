@@ -296,17 +296,27 @@ def _lateness(data: KnownInputs, fit: Fit, whole: Floats, budget: Budget) -> tup
 
     The first response seen comes a sample too late where the one before was too faint to be seen.
     """
-    derivative = time_derivatives(data.records[0].output_channels)[:, None]
-    fraction = np.where(act_later(data, fit), fractions(data, fit, derivative), 0.0)
+    fraction = _fraction(data, fit)
     doubtful = (whole > 0) & (fraction == 0)
     while doubtful.any() and not budget.spent("search for delays of the inputs"):
-        sooner = data.delayed_by(whole - doubtful, any_fraction=True)
-        fit = settled(sooner, _moved_to(sooner, data, fit), SELECTION.few_steps, budget, ORDER.decided)
-        found = np.where(act_later(sooner, fit), fractions(sooner, fit, derivative), 0.0)
+        data, fit = _beside_any_fraction(data, fit, whole - doubtful, budget)
+        found = _fraction(data, fit)
         taken = doubtful & (found < 1.0)
-        whole, fraction, data = whole - taken, np.where(taken, found, fraction), sooner
+        whole, fraction = whole - taken, np.where(taken, found, fraction)
         doubtful = taken & (whole > 0) & (fraction == 0)
     return whole, fraction
+
+
+def _fraction(data: KnownInputs, fit: Fit) -> Floats:
+    """Of a sample by which each input acts later than `data` says, 0 where it does not, (n_inputs,)."""
+    derivative = time_derivatives(data.records[0].output_channels)[:, None]
+    return np.where(act_later(data, fit), fractions(data, fit, derivative), 0.0)
+
+
+def _beside_any_fraction(data: KnownInputs, fit: Fit, delays: Floats, budget: Budget) -> tuple[KnownInputs, Fit]:
+    """The inputs delayed by whole samples and any fraction, and the modes fitted to these as far as decides."""
+    other = data.delayed_by(delays, any_fraction=True)
+    return other, settled(other, _moved_to(other, data, fit), SELECTION.few_steps, budget, ORDER.decided)
 
 
 def _moved_to(other: KnownInputs, data: KnownInputs, fit: Fit) -> Fit:
@@ -318,9 +328,7 @@ def _moved_to(other: KnownInputs, data: KnownInputs, fit: Fit) -> Fit:
 
 def _late(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
     """Whether these modes leave what the inputs a sample earlier explain."""
-    other = data.delayed_by(data.delays, any_fraction=True)
-    trial = projected(other, selected.fit.poles, selected.fit.participation)
-    trial = settled(other, trial, SELECTION.few_steps, budget, ORDER.decided)
+    other, trial = _beside_any_fraction(data, selected.fit, data.delays, budget)
     return bool(act_later(other, trial).any())
 
 

@@ -186,8 +186,8 @@ def _selected(
     lines, selected = _beside_changing(lines, few)
     left = lines.left(selected.fit)
     guessed = noise_with_size(left, lines.fitted(selected.fit))
-    # What the modes miss of the response is smooth from line to line, noise is not; and among lines of all sizes a few
-    # large ones show any correlation.
+    # What the modes miss of the response is smooth from line to line, noise is not: so second differences, Hann's
+    # window of the impulse response, are asked. Among lines of all sizes a few large ones show any correlation.
     rough = np.diff(left if guessed is None else left / guessed, 2)
     mixing = mixing_of(correlation_of_lines([rough.reshape(len(h), -1)]))
     if mixing is None:

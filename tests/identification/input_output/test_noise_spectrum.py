@@ -109,9 +109,12 @@ def test_random_structures_are_told_rightly_in_noise_of_any_tail(tail, kind):
         assert told(found, omega, zeta)[0] == found.modes.n_modes == omega.size
 
 
+TWO_CLOSE = 2 * np.pi * np.array([1.0, 3.0, 3.2, 20.0]), np.array([0.02, 0.01, 0.015, 0.01])
+
+
 def test_two_close_modes_in_noise_that_falls_with_frequency_are_two():
     """Half the record did not tell them apart, and noise ten times above its median passed for what something does."""
-    omega, zeta = 2 * np.pi * np.array([1.0, 3.0, 3.2, 20.0]), np.array([0.02, 0.01, 0.015, 0.01])
+    omega, zeta = TWO_CLOSE
     found = identify_driven(driven(np.random.default_rng(0), omega, zeta, tails=(0.95,) * OUTPUTS, draw=11))
     assert told(found, omega, zeta)[0] == found.modes.n_modes == omega.size and not found.remarks
 
@@ -120,7 +123,7 @@ def test_two_close_modes_in_noise_that_falls_with_frequency_are_two():
 @pytest.mark.parametrize("tail", [0.8, 0.95])
 def test_intervals_cover_in_noise_of_any_tail(tail):
     """1600 intervals of 95 %, of four modes over a tail that falls by 19 or 32 dB."""
-    omega, zeta = 2 * np.pi * np.array([1.0, 3.0, 3.2, 20.0]), np.array([0.02, 0.01, 0.015, 0.01])
+    omega, zeta = TWO_CLOSE
     errors = []
     for seed in range(200):
         record = driven(np.random.default_rng(0), omega, zeta, tails=(tail,) * OUTPUTS, draw=seed)
