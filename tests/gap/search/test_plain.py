@@ -13,7 +13,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import fit
 from workbench.gap.search.jointly import fit_jointly
-from workbench.gap.search.plain import common_as_errors, in_place_of_errors, may_be_error, one_late
+from workbench.gap.search.plain import common_as_errors, in_place_of_errors, late_effects, may_be_error, other_causes
 from workbench.gap.search.search import Search
 from workbench.trials.make import make_trial
 from workbench.trials.scoring import score_dirty
@@ -21,6 +21,7 @@ from workbench.trials.scoring import score_dirty
 DAMPER = Effect(kind_named("point_damper"), None, {"at": 1.2, "coefficient": 0.06})
 MODULUS = Effect(kind_named("modulus_error"), None, {"factor": 1.008})
 DAMPING = Effect(kind_named("modal_damping"), None, {"factor": 1.12})
+SENSORS_LATE = {"sensor_lag": "time_constant", "actuator_delay": "delay"}  # kinds, and the number that says by how much
 VARIED = 5e-4  # relative, of two waves
 TRIED = ("point_damper", "point_mass", "modulus_error", "modal_damping", "sensor_gain")
 
@@ -136,12 +137,46 @@ def test_hidden_effects_that_errors_could_stand_in_for_are_named(seed, kinds, di
 def test_one_sensor_late_alone_is_an_effect(hinged_rig, late, alone):
     prior = NominalPrior(delay=0.3, sample_time=0.01)
     errors = nominal_errors(hinged_rig(n_modes=4), prior, {f"delay_{name}": delay for name, delay in late.items()})
-    found = one_late(errors)
-    assert (found and found.target) == alone
-    assert found is None or found.values["delay"] == pytest.approx(0.005)
+    found = late_effects(hinged_rig(n_modes=4), errors)
+    assert [effect.target for effect in found] == ([alone] if alone else [])
+    assert all(effect.values["delay"] == pytest.approx(0.005) for effect in found)
 
 
 @pytest.mark.parametrize(("deviation", "is_late"), [(0.02, True), (0.2, False)])
 def test_a_sensor_is_late_where_it_is_surely_so(hinged_rig, deviation, is_late):
     errors = nominal_errors(hinged_rig(n_modes=4), NominalPrior(delay=0.3, sample_time=0.01), {"delay_d2": 0.5})
-    assert (one_late(replace(errors, deviations={"delay_d2": deviation})) is not None) is is_late
+    errors = replace(errors, deviations={"delay_d2": deviation})
+    assert bool(late_effects(hinged_rig(n_modes=4), errors)) is is_late
+
+
+@pytest.mark.parametrize(
+    ("delays", "deviation", "has_one_cause"),
+    [
+        ((0.2, 0.21, 0.2, 0.2), 0.0, True),
+        ((0.2, 0.3, 0.2, 0.25), 0.0, False),  # each by itself
+        ((0.2, 0.2, 0.2, 0.2), 0.02, False),  # which may be so of them
+        ((-0.2, -0.2, -0.2, -0.2), 0.0, False),  # nothing is ahead of its command
+    ],
+)
+def test_sensors_that_are_all_late_alike_are_so_for_one_cause(hinged_rig, delays, deviation, has_one_cause):
+    names = [f"delay_d{i + 1}" for i in range(4)]
+    prior = NominalPrior(delay=0.3, sample_time=0.01)
+    errors = nominal_errors(hinged_rig(n_modes=4), prior, dict(zip(names, delays, strict=True)))
+    errors = replace(errors, deviations=dict.fromkeys(names, deviation))
+    found = late_effects(hinged_rig(n_modes=4), errors)
+    causes = [("sensor_lag", "all"), ("actuator_lag", "F"), ("actuator_delay", "F")] if has_one_cause else []
+    assert [(effect.kind.name, effect.target) for effect in found] == causes
+    assert all(list(effect.values.values()) == pytest.approx([0.002], rel=0.02) for effect in found)
+
+
+@pytest.mark.parametrize("kind", ["sensor_lag", "actuator_delay"])
+def test_a_delay_of_all_sensors_is_the_effect_that_it_is(search, kind):
+    """Straight lines between samples say as much of a lag; a trifle of noise tells it from a delay of the force."""
+    late = Effect(kind_named(kind), "all" if kind == "sensor_lag" else "F", {SENSORS_LATE[kind]: 0.003})
+    one = search((late, MODULUS, DAMPING))
+    prior = replace(one.prior, interpolated=kind == "sensor_lag")
+    step = fit_jointly(one, (), nominal_errors(one.rig, prior))
+    found = in_place_of_errors(one, step)
+    named = [effect for effect in found.effects if effect.kind.name == kind]
+    assert len(named) == 1 and named[0].values[SENSORS_LATE[kind]] == pytest.approx(0.003, rel=0.02)
+    assert all(p < 0.01 for _, p in other_causes(one, found))

@@ -8,10 +8,10 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, nominal_errors
-from workbench.gap.effects.ports import SENSOR_DELAY
+from workbench.gap.effects.ports import ACTUATOR_DELAY, ACTUATOR_LAG, SENSOR_DELAY, SENSOR_LAG
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.prediction.residuals import FitData
-from workbench.gap.search.finish import finished
+from workbench.gap.search.finish import finished, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import Step, on_their_sides, surely_late
 from workbench.gap.search.screening import Screening
@@ -23,6 +23,8 @@ from workbench.structure.member import Structure
 
 COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
 OF_PORTS = ("delay", "gain", "place")  # groups of errors that are no mode's and no wave's
+# what makes all sensors late by as much, and the number that says by how much
+OF_ALL = {SENSOR_LAG: "time_constant", ACTUATOR_LAG: "time_constant", ACTUATOR_DELAY: "delay"}
 
 
 def are_common(effects: Sequence[Effect]) -> bool:
@@ -105,9 +107,9 @@ def _in_place(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]], 
     named = {effect.kind for effect in effects}
     common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON if kind not in named)
     if not effects:
-        both = _explaining(search, [(*common, *kept)], step)
-        if both is not None and SENSOR_DELAY in {effect.kind for effect in both.effects}:
-            return both  # one sensor late alone is an effect beside common errors
+        both = _explaining(search, [(*common, *ports) for ports in _for_one_cause(search.rig, kept)], step)
+        if both is not None and {SENSOR_DELAY, *OF_ALL} & {effect.kind for effect in both.effects}:
+            return both  # one sensor late alone, or all alike, are an effect beside common errors
         # beside noise of the inputs that an effect made seem louder, common errors may explain what they do not cause
         more = _one_more(search, (*common, *kept), (), step) if both is None or search.logged else None
         return _one_common(search, common, kept, both, step) if more is None and both is not None else more
@@ -115,7 +117,7 @@ def _in_place(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]], 
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
         fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
-    found = _explaining(search, [(*s, *kept) for s in sets], step)
+    found = _explaining(search, [(*s, *ports) for s in sets for ports in _for_one_cause(search.rig, kept)], step)
     return found or _one_more(search, (*effects, *kept), common, step)
 
 
@@ -143,6 +145,13 @@ def _at_ports(errors: Effect) -> Iterator[tuple[Effect, ...]]:
         yield (replace(errors, target=kept, values=values),) if values else ()
 
 
+def _for_one_cause(rig: Rig, kept: tuple[Effect, ...]) -> Iterator[tuple[Effect, ...]]:
+    """Errors at the ports, and each effect that all their delays may be of; of one, see `_with_late`."""
+    yield kept
+    if len(kept) == 1 and kept[0].target.groups == ("delay",):
+        yield from ((effect,) for effect in late_effects(rig, kept[0]) if effect.kind in OF_ALL)
+
+
 def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]], step: Step) -> Fit | None:
     """The simplest of sets that leaves only noise, or another that is surely likelier and no more of the same.
 
@@ -168,7 +177,7 @@ def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]], step: Step) 
         explains = search.explains(found) and not _is_worse(search, found, step, whole)
         if explains and (best is None or search.surely_better(found, best.cost, more)):
             best = found
-    return None if best is None else _with_one_late(search, finished(search, best))
+    return None if best is None else _with_late(search, finished(search, best))
 
 
 def _is_worse(search: Search, found: Fit, step: Step, data: FitData) -> bool:
@@ -192,24 +201,53 @@ def _on_their_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Effect
     return (*others, *late)
 
 
-def _with_one_late(search: Search, found: Fit) -> Fit:
-    """The fit with a delay as the effect that it is where one of several sensors is late alone."""
+def _with_late(search: Search, found: Fit) -> Fit:
+    """The fit with a delay as the effect that it is where one of several sensors is late alone, or all are alike."""
     late = next((e for e in found.effects if e.kind is NOMINAL_ERRORS), None)
-    delay = None if late is None or late.target.groups != ("delay",) else one_late(late)
-    if delay is None:
+    if late is None or late.target.groups != ("delay",):
         return found
-    alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.finely(SELECTION.fine))
-    return alone if search.explains(alone) else found
+    others, whole = [e for e in found.effects if e is not late], search.data.finely(SELECTION.fine)
+    each = search.workers.map(lambda e: fit(search.rig, (*others, e), whole), late_effects(search.rig, late))
+    return min((f for f in each if search.explains(f)), key=lambda f: f.cost, default=found)
 
 
-def one_late(errors: Effect) -> Effect | None:
-    """The delay of one of several sensors, where errors of the nominal model say that it alone is late."""
+def other_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], ...]:
+    """What else may make all sensors as late as a set says, with probabilities, where that explains the records too."""
+    late = next((e for e in found.effects if e.kind in OF_ALL and e.target == e.kind.targets(search.rig)[0]), None)
+    if late is None:
+        return ()
+    others, whole = [e for e in found.effects if e is not late], search.data.finely(SELECTION.fine)
+    causes = [e for e in _common(search.rig, late.values[OF_ALL[late.kind]]) if e.kind is not late.kind]
+    each = search.workers.map(lambda e: fit(search.rig, (*others, e), whole), causes)
+    best, rivals = ranked(search, [found, *(f for f in each if search.explains(f))])
+    return rivals if best is found else ()
+
+
+def _common(rig: Rig, late: float) -> tuple[Effect, ...]:
+    """Every effect that makes all sensors late by that time, s."""
+    kinds = ((kind, name, kind.targets(rig)) for kind, name in OF_ALL.items())
+    return tuple(Effect(kind, at[0], {name: late}) for kind, name, at in kinds if at)
+
+
+def late_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
+    """What sensors that errors of the nominal model say to be late are instead, each by itself; empty for errors.
+
+    One of several that is late alone is so by a delay of its own. All that are as late as one another, which is hardly
+    so by chance, are behind one lag, their own or that of the actuators, or a delay of these.
+    """
     delays = {name.removeprefix("delay_"): float(v) for name, v in errors.values.items() if group_of(name) == "delay"}
-    least = {name: max(PLAIN.punctual, PLAIN.sure * errors.deviations.get(f"delay_{name}", 0.0)) for name in delays}
-    off = [name for name, delay in delays.items() if abs(delay) > least[name]]
-    if len(delays) < PLAIN.several or len(off) != 1 or delays[off[0]] < 0:
-        return None
-    return Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * errors.target.sample_time})
+    doubt = {name: PLAIN.sure * errors.deviations.get(f"delay_{name}", 0.0) for name in delays}
+    off = [name for name, delay in delays.items() if abs(delay) > max(PLAIN.punctual, doubt[name])]
+    sample_time = errors.target.sample_time
+    if len(delays) >= PLAIN.several and len(off) == 1 and delays[off[0]] > 0:
+        return (Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * sample_time}),)
+    if len(delays) < 2 or len(off) < len(delays) or min(delays.values()) < 0:
+        return ()
+    common = float(np.mean([*delays.values()]))
+    apart = max(max(abs(delay - common), doubt[name]) for name, delay in delays.items())
+    if (2.0 * apart / dict(JOINT.widest)["delay"]) ** (len(delays) - 1) > PLAIN.by_chance:
+        return ()
+    return _common(rig, common * sample_time)
 
 
 def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...], step: Step) -> Fit | None:

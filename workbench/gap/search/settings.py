@@ -152,6 +152,7 @@ class PlainSettings:
     near: float = 2.0  # times the noise power that a fit may leave of the quick records, to be fitted to all
     needless: float = 6.0  # twice the log-likelihood that one number more may gain by chance
     several: int = 3  # sensors, of which one alone is hardly late by chance
+    by_chance: float = 1e-3  # probability that sensors, each late by itself, are as late as one another
     likeliest: int = 4  # kinds of the one more that are tried
     # logarithm of a gain: more is an effect of its own, where it is `outlying` times the rms of the others besides. Of
     # ten gains calibrated to 2 %, one is so by chance in 1.7 % of draws, and beyond 5 % alone in 12 %; to 1 %, in none

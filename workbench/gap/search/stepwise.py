@@ -23,7 +23,7 @@ from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened, size_of
-from workbench.gap.search.plain import COMMON, in_place_of_errors, is_slight, one_late
+from workbench.gap.search.plain import COMMON, in_place_of_errors, is_slight, late_effects, other_causes
 from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
 from workbench.gap.search.selection import fitted_ahead, one_more
 from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
@@ -153,7 +153,7 @@ class Stepwise:
             self.plain = self._without_errors(self.last)
         if self.plain is not None:
             return
-        self.steps.append(self._promoted(self.last))
+        self.steps.append(self._with_late(self._promoted(self.last)))
         if self.last.effects:
             self.steps.append(fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, to_the_end=True))
 
@@ -291,7 +291,8 @@ class Stepwise:
         """What the effects of the last set explain."""
         beside = self.search if self.search.logged or self.is_finer else None
         if self.plain is not None:
-            return Decision("explained", self.plain, noise=self.search.data.noise, beside=beside)
+            rivals = self._rivals_of_plain
+            return Decision("explained", self.plain, rivals=rivals, noise=self.search.data.noise, beside=beside)
         effects, left = self.last.effects, self.unexplained
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
         closed = self.is_closed or (len(effects) > 1 and left < STEPWISE.in_part)
@@ -300,6 +301,10 @@ class Stepwise:
         if self.is_nothing:
             return Decision("none", self.last.fit, noise=noise, beside=beside)
         return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise, beside=beside)
+
+    @cached_property
+    def _rivals_of_plain(self) -> tuple[tuple[Fit, float], ...]:
+        return () if self.plain is None else other_causes(self.search, self.plain)
 
     def _others(self) -> list[Step]:
         """The set that the effects of the last were chosen as, and other sets that leave only noise, or as little."""
@@ -679,7 +684,7 @@ class Stepwise:
         return self._with_wrong_gains(found, most - 1)
 
     def _promoted(self, step: Step) -> Step:
-        """The set with errors too large to be small and common to all, and one sensor late alone, as effects."""
+        """The set with errors too large to be small and common to all as effects."""
         values = step.errors.values
         damping = float(np.mean([v for n, v in values.items() if group_of(n) == "damping"] or [0.0]))
         stiffness = values.get("stiffness_0", 0.0) - values.get("mass_0", 0.0)
@@ -691,10 +696,28 @@ class Stepwise:
         if abs(stiffness) > most["modulus_error"] and MODULUS_ERROR not in named:
             added.append(Effect(MODULUS_ERROR, None, {"factor": float(np.exp(stiffness))}))
             reset.update({"stiffness_0": 0.0, "mass_0": 0.0})
-        late = one_late(step.errors)
-        if late is not None and late.kind not in named and self._matter([late], [*step.effects, late]):
-            added.append(late)
-            reset.update({n: 0.0 for n in values if group_of(n) == "delay"})
         if not added:
             return step
         return fit_jointly(self.search, (*step.effects, *added), replace(step.errors, values=reset), rounds=2)
+
+    def _with_late(self, step: Step) -> Step:
+        """The set with sensors that are late for one cause as that effect, where this leaves no more.
+
+        A trifle of the gap whose cause is in doubt stays an error.
+        """
+        search, target, named = self.search, step.errors.target, {effect.kind for effect in step.effects}
+        late = [effect for effect in late_effects(search.rig, step.errors) if effect.kind not in named]
+        late = [effect for effect in late if self._matter([effect], [*step.effects, effect])]
+        if not late:
+            return step
+        punctual = {n: 0.0 if group_of(n) == "delay" else v for n, v in step.errors.values.items()}
+        errors = nominal_errors(search.rig, replace(target, late=(), early=(), interpolated=False), punctual)
+        each = search.workers.map(lambda e: fit_jointly(search, (*step.effects, e), errors, rounds=2), late)
+        best, *others = sorted(each, key=lambda s: s.fit.cost)
+        if self._is_likelier(step, best):
+            return step
+        if others and not self._is_likelier(best, others[0]):
+            share = cost_of(search.rig, (*step.effects, errors), search.data) - best.fit.cost
+            if share < STEPWISE.explained * self._gap:
+                return step
+        return replace(best, others=(best, *others))
