@@ -475,29 +475,56 @@ def advance(
     point, earlier, w, z = points
     spread = work[5]
     modes_kept, points_kept, rates, parts_of = kept
-    if not _rubs(kinds):
-        _advance_once(linear, drives, elements, along, motion, points, work)
-        return
-    for r in range(q.size):
-        modes_kept[0, r], modes_kept[1, r], modes_kept[2, r], modes_kept[3, r] = q[r], v[r], old[r], spread[r]
-    for i in range(kinds.size):
-        points_kept[0, i], points_kept[1, i], points_kept[2, i], points_kept[3, i] = point[i], earlier[i], w[i], z[i]
-        rates[0, i] = _rate(shapes, i, v)
-    _advance_once(linear, drives, elements, along, motion, points, work)
-    for i in range(kinds.size):
-        rates[1, i] = _rate(shapes, i, v)
-    if not _turns(kinds, parameters, rates):
-        return
-    for r in range(q.size):
-        q[r], v[r], old[r], spread[r] = modes_kept[0, r], modes_kept[1, r], modes_kept[2, r], modes_kept[3, r]
-    for i in range(kinds.size):
-        point[i], earlier[i], w[i], z[i] = points_kept[0, i], points_kept[1, i], points_kept[2, i], points_kept[3, i]
-    for part in range(PARTS):
+    rubs = _rubs(kinds)
+    if rubs:
         for r in range(q.size):
-            rise = (end[r] - start[r]) / PARTS
-            parts_of[0, r] = start[r] + part * rise
-            parts_of[1, r] = parts_of[0, r] + rise
-        _advance_once(finely, (parts_of[0], parts_of[1]), elements, along, motion, points, work)
+            modes_kept[0, r], modes_kept[1, r], modes_kept[2, r], modes_kept[3, r] = q[r], v[r], old[r], spread[r]
+        for i in range(kinds.size):
+            points_kept[0, i], points_kept[1, i], points_kept[2, i], points_kept[3, i] = (
+                point[i],
+                earlier[i],
+                w[i],
+                z[i],
+            )
+            rates[0, i] = _rate(shapes, i, v)
+    parts, part = 1, 0
+    while part < parts:
+        # called in one place alone, as it is compiled anew wherever it is called
+        whole = parts == 1
+        _advance_once(
+            linear if whole else finely,
+            drives if whole else (parts_of[0], parts_of[1]),
+            elements,
+            along,
+            motion,
+            points,
+            work,
+        )
+        part += 1
+        if rubs and whole:
+            for i in range(kinds.size):
+                rates[1, i] = _rate(shapes, i, v)
+            if _turns(kinds, parameters, rates):
+                for r in range(q.size):
+                    q[r], v[r], old[r], spread[r] = (
+                        modes_kept[0, r],
+                        modes_kept[1, r],
+                        modes_kept[2, r],
+                        modes_kept[3, r],
+                    )
+                for i in range(kinds.size):
+                    point[i], earlier[i], w[i], z[i] = (
+                        points_kept[0, i],
+                        points_kept[1, i],
+                        points_kept[2, i],
+                        points_kept[3, i],
+                    )
+                parts, part = PARTS, 0
+        if parts > 1:
+            for r in range(q.size):
+                rise = (end[r] - start[r]) / PARTS
+                parts_of[0, r] = start[r] + part * rise
+                parts_of[1, r] = parts_of[0, r] + rise
 
 
 @njit(cache=True, nogil=True)
