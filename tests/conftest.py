@@ -1,4 +1,4 @@
-"""One thread of linear algebra a worker, the order of the tests, a hinged beam, the same by elements, a plate."""
+"""One core a worker, the order of the tests, a hinged beam, the same by elements, a plate."""
 
 import os
 from collections.abc import Callable
@@ -17,7 +17,10 @@ from workbench.structure.modes import Modes
 from workbench.structure.plate import Plate
 
 if "PYTEST_XDIST_WORKER" in os.environ:
-    threadpool_limits(1, user_api="blas")  # one worker a core; inner functions that tests call do not limit threads
+    # One worker a core; inner functions that tests call do not limit threads. What would share its work with processes
+    # on other cores would wait for those of other workers
+    threadpool_limits(1, user_api="blas")
+    os.environ["LOKY_MAX_CPU_COUNT"] = "1"
 
 
 HERE = Path(__file__).parent

@@ -22,7 +22,7 @@ LONG |= {"local_loss", "identification_order", "identification_peers", "identifi
 LONG |= {"identification_records", "diagnosis_speed", "silverbox", "patch_pairs", "emps", "f16", "frame_gap"}
 LONG |= {"placement", "ruler", "robustness_to_identification", "arm_change", "identification_ambient_peers"}
 LONG |= {"bench_trials", "closing_the_loop", "compensation", "imsc_vs_coupled", "plate_control", "bar_identification"}
-LONG |= {"ablation", "beam_control"}
+LONG |= {"ablation", "beam_control", "spillover_explained"}
 STUDIES = [
     pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in LONG else [])
     for path in sorted((ROOT / "studies").glob("*.py"))

@@ -1,4 +1,4 @@
-"""One BLAS thread where matrices are small: two that wait for each other cost more than they give.
+"""Cores at hand, and one BLAS thread where matrices are small: two that wait for each other cost more than they give.
 
 With a second process on the machine, OpenBLAS's threads spin for one another: selecting the number of modes of a record
 took 76 s of processor time with two threads and 7 s with one, 154 s and 10 s by the clock.
@@ -19,6 +19,16 @@ R = TypeVar("R")
 
 # Looked for once, and early: while libraries are looked for, another thread that imports one may block both.
 _LIBRARIES = ThreadpoolController()
+
+
+def cores() -> int:
+    """Cores that this process may use: fewer than the machine has in a container, a job of a cluster or by affinity.
+
+    `LOKY_MAX_CPU_COUNT` in the environment makes them fewer still.
+    """
+    from joblib import cpu_count
+
+    return int(cpu_count())
 
 
 def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:

@@ -26,6 +26,7 @@ def write_exchanged(case, folder):
     return write_case(replace(case, fit=wired(case.fit[:2]), validation=wired(case.validation[:1])), folder)
 
 
+@pytest.mark.slow
 def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_path, monkeypatch, nothing_hidden):
     write_exchanged(nothing_hidden, tmp_path / "crossed")
     stopped = run("diagnose", tmp_path / "crossed", "--page", tmp_path / "p.html")

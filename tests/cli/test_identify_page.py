@@ -48,6 +48,7 @@ def test_the_page_says_how_it_was_made_in_the_words_of_the_command(run, decay, t
     assert content["blocks"][0]["motion"]["label"] == "sensor"
 
 
+@pytest.mark.slow
 def test_the_page_of_transfer_functions_shows_the_band_that_was_fitted(run, tmp_path):
     from scipy.io import savemat
 

@@ -54,6 +54,7 @@ def test_a_planned_test_is_predicted_from_its_inputs_alone(run, case):
     assert "95 % bands from 40 draws" in (case / "out" / "late-prediction.html").read_text()
 
 
+@pytest.mark.slow
 def test_tests_are_checked_and_logged_beside_the_case(run, case):
     for name, holds in (("friday", True), ("monday", False)):
         options = ("--verdict", "verdict.json", "--draws", 60, "--json", "told.json")

@@ -55,6 +55,7 @@ def case(tmp_path_factory):
     return read_case(folder)
 
 
+@pytest.mark.slow
 def test_noise_that_is_not_stated_is_taken_from_the_records(case, tmp_path):
     folder = tmp_path / "silent"
     write_case(case, folder)

@@ -294,7 +294,7 @@ def test_a_table_of_too_many_rows_is_refused_where_they_are_counted(tmp_path):
         read_record(path, limits=limits)
 
 
-@pytest.mark.parametrize("ending", [".npz", ".h5", ".csv"])
+@pytest.mark.parametrize("ending", [*(pytest.param(e, marks=pytest.mark.slow) for e in (".npz", ".h5")), ".csv"])
 def test_thousands_of_channels_are_seen_in_seconds(tmp_path, ending):
     """Time linear in channels: 9,998 of them, by name, in a few seconds of processor time."""
     rng, path = np.random.default_rng(0), tmp_path / f"x{ending}"

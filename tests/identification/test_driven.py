@@ -303,7 +303,7 @@ def real_system(feedthrough):
     [
         ((2.35, 0.0), False, 0.0, 0.02),
         ((1.0, 3.6), False, 0.1, 0.02),
-        ((0.4, 0.4), False, 0.1, 0.02),
+        pytest.param((0.4, 0.4), False, 0.1, 0.02, marks=pytest.mark.slow),
         ((1.75, 0.25), True, 0.1, 0.02),
     ],
 )
@@ -420,6 +420,7 @@ def test_a_mode_that_changes_within_the_record_is_one_mode_with_a_remark(change,
     assert by == pytest.approx(100 * change, rel=0.25)
 
 
+@pytest.mark.slow
 def test_the_change_of_modes_is_found_once_for_each_fit(monkeypatch):
     """The remark asked for it again where the check for two modes in place of one had it."""
     asked, found = [], time_variance.changes_in_time
@@ -439,10 +440,9 @@ def test_the_change_of_modes_is_found_once_for_each_fit(monkeypatch):
     ("change", "seed", "n", "snr"),
     [
         (0.02, 4, 1000, 50.0),
-        (0.02, 5, 1000, 50.0),
         *(
             pytest.param(*each, marks=pytest.mark.slow)
-            for each in ((0.005, 3, 1500, 60.0), (0.005, 7, 3000, 60.0), (0.02, 7, 3000, 60.0))
+            for each in ((0.02, 5, 1000, 50.0), (0.005, 3, 1500, 60.0), (0.005, 7, 3000, 60.0), (0.02, 7, 3000, 60.0))
         ),
     ],
 )
@@ -541,7 +541,8 @@ def hardening(seed, n_outputs, n=3000, fine=4):
     return Record(DT, y, outputs, u[None], (Channel("F", "force"),), name="hardening")
 
 
-@pytest.mark.parametrize("n_outputs", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n_outputs", [1, 3])
 def test_what_a_hardening_spring_adds_to_each_resonance_is_no_mode(n_outputs):
     """4.66, 9.44 and 12.96 Hz where it is small. Narrow and growing modes stood about the first, seven in all."""
     found = identify_driven(hardening(3, n_outputs), seconds=200.0)  # the answer, not how fast this host is

@@ -59,7 +59,7 @@ def test_modes_of_the_band_whatever_lies_beyond(quantity):
     assert 0.3 < (np.array(errors) ** 2).mean() < 2.2
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_noise_that_outputs_share_is_no_mode(seed):
     """As of what shakes the whole bench: its peaks counted once an output."""
     rng = np.random.default_rng(seed)
@@ -83,6 +83,7 @@ def test_noise_told_in_any_unit_counts_between_lines_alone():
         assert np.allclose(k * other.misfit, told[1].misfit, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_errors_grow_where_what_is_left_is_louder():
     """Noise ten times as loud about mode 3: by the bound of even noise its squared scores would average near 6."""
     modes, h, channels = beam("acceleration")
@@ -98,6 +99,7 @@ def test_errors_grow_where_what_is_left_is_louder():
     assert 0.1 < np.mean(np.square(scores)) < 3.3  # χ² of 8, one chance in a thousand either way
 
 
+@pytest.mark.slow
 def test_noise_that_goes_with_the_size_needs_not_be_told():
     """As if even it gave twenty modes too many, one beside another about each peak."""
     modes, h, channels = beam("acceleration")
@@ -114,6 +116,7 @@ def test_noise_that_goes_with_the_size_needs_not_be_told():
     assert np.allclose(found.misfit, rms, rtol=0.1)  # in the unit of the outputs
 
 
+@pytest.mark.slow
 def test_many_lines_are_fitted_band_after_band():
     """The same cantilever on 1600 lines: what the bands say together, with modes at their edges found once."""
     structure = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free")
@@ -312,7 +315,7 @@ def test_one_sensor_tells_a_mode_that_changes_after_a_blow_from_two(law, seed):
     assert any("peaks of mode 2 (" in remark for remark in found.remarks)
 
 
-@pytest.mark.parametrize("apart", [0.008, 0.02])
+@pytest.mark.parametrize("apart", [0.008, pytest.param(0.02, marks=pytest.mark.slow)])
 def test_one_sensor_tells_two_close_modes_as_two(apart):
     hz = [21.0, 57.0, 57.0 * (1.0 + apart)]
     lines, h = struck(np.random.default_rng(3), hz, steady)

@@ -102,6 +102,7 @@ def test_a_loop_that_a_long_delay_destabilises_is_made_stable(rig, controller):
     assert "the present controller is unstable on 8 of 8 samples" in found.sentence
 
 
+@pytest.mark.slow
 def test_a_filter_through_which_residual_modes_diverge_is_made_slower(rig):
     """Whatever noise the filter was designed for, the one that all modes vibrate least under; seen on another route."""
     law, chosen = imsc(rig.modes, 2, rig.actuators, weight=0.02), []
@@ -486,7 +487,9 @@ def hidden_plant():
     return find_trial_with_plant(np.random.default_rng([20301, 20]), dirt="clean", size=0.5)
 
 
-@pytest.mark.parametrize(("kind", "vibrates", "near"), [("imsc", 0.3, 1.0), ("poles", 0.6, 1.02)])
+@pytest.mark.parametrize(
+    ("kind", "vibrates", "near"), [("imsc", 0.3, 1.0), pytest.param("poles", 0.6, 1.02, marks=pytest.mark.slow)]
+)
 def test_a_limit_is_made_up_for_where_residual_modes_fill_the_readings(hidden_plant, kind, vibrates, near):
     """On a hidden plant: 97 % of the vibration is of modes that are not controlled, and the commands follow them."""
     case, _, real = hidden_plant

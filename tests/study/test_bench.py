@@ -287,7 +287,7 @@ def test_it_can_be_played_on(bench, look, drawn, moves, until, width, tmp_path):
     assert errors == []
 
 
-@pytest.mark.parametrize("width", [390, 1200])
+@pytest.mark.parametrize("width", [390, pytest.param(1200, marks=pytest.mark.slow)])
 def test_actuators_are_dragged_over_a_plate(plate, opened, until, width, tmp_path):
     from selenium.webdriver import ActionChains, Keys
 
@@ -380,7 +380,7 @@ def test_a_design_saved_on_a_frame_is_a_study_that_runs_and_agrees(frame, tmp_pa
     assert outcome.holds and len(outcome.checks) == 3
 
 
-@pytest.mark.parametrize("width", [390, 1200])
+@pytest.mark.parametrize("width", [390, pytest.param(1200, marks=pytest.mark.slow)])
 def test_actuators_are_dragged_from_point_to_point_of_a_frame(frame, opened, until, width, tmp_path):
     from selenium.webdriver import ActionChains, Keys
 
@@ -428,7 +428,11 @@ def apart(look, until, tmp_path):
     return checked
 
 
-SCREENS = [(390, "light"), (390, "dark"), (1400, "light"), (1400, "dark")]
+SCREENS = [
+    (390, "dark"),
+    (1400, "light"),
+    *(pytest.param(*screen, marks=pytest.mark.slow) for screen in ((390, "light"), (1400, "dark"))),
+]
 
 
 @pytest.mark.parametrize(("width", "scheme"), SCREENS)

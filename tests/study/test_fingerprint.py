@@ -114,6 +114,7 @@ def test_it_follows_closures_parts_and_methods():
     assert fingerprint(functools.lru_cache(outer(1))) != fingerprint(functools.lru_cache(outer(2)))
 
 
+@pytest.mark.slow
 def test_it_is_the_same_in_every_process(tmp_path):
     loaded(tmp_path, SOURCE)
     script = (

@@ -54,7 +54,8 @@ def kept(folder) -> list[Path]:
     return list(folder.rglob("*.json")) if folder.is_dir() else []
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [1, 10])
 def test_a_run_killed_at_random_moments_ends_in_the_same_table(tmp_path, kills):
     n, pause, moments = 10 + 25 * kills, 0.04, random.Random(kills)
     # an edit while this runs would rightly make it another workbench
@@ -120,6 +121,7 @@ def slow_case(at, log, seed):
     return {"at_third": at / 3, "seed_half": seed / 2}
 
 
+@pytest.mark.slow
 def test_a_cluster_loses_a_worker_and_no_case(tmp_path, dask_cluster):
     address, log, n = dask_cluster.address(), tmp_path / "log", 60
     cases = study.grid(at=range(n), log=[str(log)])

@@ -41,7 +41,7 @@ def started(tmp_path, n, pause, workers):
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
 
 
-@pytest.mark.parametrize(("n", "pause", "workers"), [(9, 0.2, 1), (13, 0.2, 2)])
+@pytest.mark.parametrize(("n", "pause", "workers"), [(9, 0.2, 1), pytest.param(13, 0.2, 2, marks=pytest.mark.slow)])
 def test_runs_at_once_share_their_cases(tmp_path, n, pause, workers):
     runs = [started(tmp_path, n, pause, workers) for _ in range(2)]
     assert [run.communicate()[0].strip() for run in runs] == [str([at / 3 for at in range(n)])] * 2

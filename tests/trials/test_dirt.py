@@ -40,7 +40,10 @@ def test_stated_noise_is_too_small():
     assert label["budget"]["noise"] == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize(("size", "memory"), [(0.5, 0.81), (1.0, 0.9), (2.0, 0.9**0.5)])
+@pytest.mark.parametrize(
+    ("size", "memory"),
+    [(0.5, 0.81), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((1.0, 0.9), (2.0, 0.9**0.5)))],
+)
 def test_coloured_noise_has_its_size_and_its_memory(size, memory):
     left, _, _ = _residuals("coloured", size)
     np.testing.assert_allclose(left.std(axis=1), 1.0, rtol=0.25)

@@ -170,6 +170,7 @@ def test_of_sixty_forty_hide_one_ten_a_pair_five_none_five_something_else():
     assert {k for kinds in drawn if len(kinds) == 1 for k in kinds} >= set(KINDS), "every kind stands alone once"
 
 
+@pytest.mark.slow
 def test_labels_lie_outside_the_cases(tmp_path):
     with pytest.raises(ValueError, match="seal them elsewhere"):
         write_trials(tmp_path / "cases", tmp_path / "cases" / "labels.json", 1, 1)

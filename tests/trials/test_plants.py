@@ -173,7 +173,10 @@ def _reference(solved, forces, extra) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("kind", list(LAWS))
+QUICK = ("clearance", "coulomb_friction", "bouc_wen")
+
+
+@pytest.mark.parametrize("kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in LAWS])
 def test_laws_at_a_point_agree_with_an_adaptive_integrator(rig, commands, kind):
     solved = hide(Plant.of(rig), [{"kind": kind, "at": 0.8, **EFFECTS[kind]}]).solved()
     shape, law = solved.at_laws[0], LAWS[kind]

@@ -164,7 +164,9 @@ def _check_against_predictor(structure: str, kinds: tuple[str, ...], seed: int) 
         assert max(f["gap"] / f["noise_floor"] for f in label["records"].values()) > 2.0
 
 
-@pytest.mark.parametrize("kind", ["cubic_spring", "point_mass", "sensor_misplacement"])
+@pytest.mark.parametrize(
+    "kind", ["cubic_spring", *(pytest.param(k, marks=pytest.mark.slow) for k in ("point_mass", "sensor_misplacement"))]
+)
 def test_two_numerical_routes_agree_on_a_frame(kind):
     _check_against_predictor("frames", (kind,), seed=5)
 

@@ -39,6 +39,7 @@ def test_many_at_once_are_each_by_itself(modes):
     assert coupled_batch(modes, 2, np.array([[5.0]]), impulse_at=6.3, weight=10.0)[0] == np.inf
 
 
+@pytest.mark.slow
 def test_no_grid_beats_the_optimum(modes):
     limits = Limits(spacing=0.5, effort=0.5, forbidden=((2.0, 2.4),))
     best = place_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=limits, starts=4)

@@ -42,6 +42,7 @@ def test_a_cell_of_no_width_is_bounded_by_its_own_work(task):
             assert np.isinf(bound_of(task, table, cell, np.zeros(4), 0.9 * at.effort[0]))
 
 
+@pytest.mark.slow
 def test_no_placement_that_keeps_the_limit_is_below_the_bound(task):
     table, rng = Intervals.of(task), np.random.default_rng(1)
     counts = {"informative": 0, "refused": 0, "kept": 0}

@@ -35,7 +35,7 @@ def report(pairs, gain=None):
     return FeedbackTask(modes, patch, np.array(GAINS[pairs] if gain is None else gain), state, 0.1)
 
 
-@pytest.mark.parametrize("pairs", [1, 2])
+@pytest.mark.parametrize("pairs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_published_optimum_is_met_and_proven(pairs):
     found = place_pairs(report(pairs), starts=4)
     assert round(found.index, 4) <= PUBLISHED[pairs] and found.index == pytest.approx(PUBLISHED[pairs], abs=5.1e-5)

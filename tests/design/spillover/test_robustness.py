@@ -64,6 +64,7 @@ def test_models_are_wrong_by_what_was_asked():
         perturbed_modes(modes, np.nan)
 
 
+@pytest.mark.slow
 def test_robustness_is_the_share_of_positive_damping():
     """Without gain a loop is stable where every damping ratio drawn is positive: normal, so known."""
     covariance = np.zeros((2, 2))

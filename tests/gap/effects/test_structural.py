@@ -62,7 +62,9 @@ def test_what_is_stiff_beside_bending_stays_as_it_is(other):
     np.testing.assert_allclose(rig.modes.omega, _plate(**other, bending_stiffness=4.5).modes(3).omega, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("edges", "within"), [("simply supported", 1e-6), ("clamped", 2e-5)])
+@pytest.mark.parametrize(
+    ("edges", "within"), [("simply supported", 1e-6), pytest.param("clamped", 2e-5, marks=pytest.mark.slow)]
+)
 def test_what_stands_on_a_plate_feels_the_modes_that_are_left_out(edges, within):
     plate = _plate(edges=edges)
     for part in (PointMass((0.52, 0.33), 0.03), PointSpring((0.3, 0.45), 200.0)):

@@ -70,6 +70,7 @@ def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig
     assert found.path == "structure" and found.linear_share < 0.1
 
 
+@pytest.mark.slow
 def test_a_force_is_placed_without_the_sensor_that_is_at_fault(rig, measured):
     faulty = rig.sensors[1]
     sensors = tuple(replace(s, gain=-1.0) if s is faulty else s for s in rig.sensors)
@@ -107,6 +108,7 @@ def test_a_gap_that_is_not_of_one_force_is_not_placed(rig, measured, elsewhere):
     assert not place.holds
 
 
+@pytest.mark.slow
 def test_a_long_record_is_placed_by_some_of_its_lines(rig, measured, monkeypatch):
     real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
     records = [measured(real, str(seed), 0.3, seed) for seed in (2, 3)]

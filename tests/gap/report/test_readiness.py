@@ -96,6 +96,7 @@ def test_modes_changed_behind_the_back_of_their_structure_are_refused(rig):
     check_modes(replace(rig, modes=modes.select(slice(3))))
 
 
+@pytest.mark.slow
 def test_modes_of_a_structure_with_masses_on_it_are_mass_normalised():
     beam = Beam(
         length=2.0, mass_per_length=([0, 0.7, 0.7, 2], [2, 2, 1, 1]), bending_stiffness=4.0, left="clamped",

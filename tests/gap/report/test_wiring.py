@@ -158,7 +158,12 @@ def test_faults_that_hide_one_another_are_found_one_after_the_other(case):
 
 
 @pytest.mark.parametrize(
-    "kinds", [("sensor_misplacement",), ("actuator_gain",), ("sensor_gain",), ("one_sided_stop",), ("modal_damping",)]
+    "kinds",
+    [
+        ("sensor_misplacement",),
+        ("sensor_gain",),
+        *(pytest.param((k,), marks=pytest.mark.slow) for k in ("actuator_gain", "one_sided_stop", "modal_damping")),
+    ],
 )
 def test_an_effect_is_not_taken_for_a_fault_of_wiring(kinds):
     case, _ = make_trial(3, kinds=kinds)

@@ -93,6 +93,7 @@ def test_a_gain_off_by_more_than_any_calibration_is_named(rig, measured):
     assert effect.values["gain"] == pytest.approx(0.993 * 0.8, rel=0.02)
 
 
+@pytest.mark.slow
 def test_of_effects_that_errors_of_modes_close_the_one_with_the_smallest_errors_is_likeliest(rig, measured):
     mass = Effect(POINT_MASS, None, {"at": AT, "mass": 0.1})
     loss = Effect(LOCAL_STIFFNESS_LOSS, None, {"at": AT, "width": 0.2, "loss": 0.3})

@@ -84,6 +84,7 @@ def test_what_a_right_law_leaves_beside_a_random_force_is_its_linear_answer(rig,
     assert error[0] < 0.02 < 0.1 < error[1]
 
 
+@pytest.mark.slow
 def test_it_is_found_beside_small_errors_of_the_model(rig, records):
     """A model 1 % off in stiffness and a sensor that is late leave far more than the noise."""
     late = (replace(rig.sensors[0], delay=0.003), *rig.sensors[1:])

@@ -39,6 +39,7 @@ def test_a_deviation_is_that_of_fits_that_leave_out_a_block_each(hinged_rig):
     assert found.deviations["gain"] == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.slow
 def test_noise_of_the_inputs_widens_the_interval_of_a_law_as_fits_to_other_draws_of_it_do(hinged_rig):
     """A strong cubic spring: the scatter of its stiffness over fits to records whose inputs were logged anew."""
     nominal = hinged_rig(n_modes=2)

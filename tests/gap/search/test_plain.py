@@ -94,6 +94,7 @@ def test_stiffness_and_damping_that_are_a_little_off_are_no_effect(search):
     assert in_place_of_errors(one, beside_errors(one)) is None
 
 
+@pytest.mark.slow
 def test_errors_that_are_surely_likelier_stay(search):
     """Smooth variations that alter what is left by little more than a hundredth of the noise, but surely."""
     waves = nominal_errors(search(()).rig, NominalPrior(stiffness=0.02, mass=0.02))

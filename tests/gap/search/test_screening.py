@@ -75,6 +75,7 @@ def test_both_halves_of_a_pair_are_found_at_once(rig, search):
     assert named["sensor_gain[d3]"]["gain"] == pytest.approx(0.8, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_what_the_numbers_of_a_given_effect_make_up_for_is_no_move(rig, search):
     given = (Effect(kind_named("cubic_spring"), None, {"at": 0.62, "stiffness": 2000.0}),)
     evidence = Evidence.of(given[0].apply(rig), search.data, 20)
@@ -128,6 +129,7 @@ def test_a_force_is_sought_beside_no_motion_that_runs_away(rig, search):
     assert _evidence(search, hardening).rig.elements
 
 
+@pytest.mark.slow
 def test_what_one_half_of_a_wrong_pair_leaves_tells_the_other(search):
     wrong = (
         Effect(SPRING, None, {"at": 0.6, "stiffness": 30.0}),

@@ -192,7 +192,7 @@ def test_trials_on_plates_and_frames_that_were_told_wrongly_once(structure, seed
     assert told["kinds"] and all(error < 0.02 for error in told["position_errors"])
 
 
-@pytest.mark.parametrize("interpolated", [False, True])
+@pytest.mark.parametrize("interpolated", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_sensors_are_late_as_the_records_show(rig, measured, interpolated):
     """A logger that puts channels on one clock by straight lines weakens what is quick; a late sensor does not."""
     quick = rig.modes.omega[-1] * DT

@@ -170,6 +170,7 @@ def test_what_is_elsewhere_and_not_found_yet_does_not_make_two_modes_one():
     assert are_two(records, poles, 1, 0, 30.0)
 
 
+@pytest.mark.slow
 def test_pairs_beside_each_other_are_found_while_either_hides_the_other():
     """Half of one is missing while the other is judged, and the other way round."""
     poles = np.array([-0.39 + 37.6j, -0.23 + 38.14j, -0.29 + 42.38j, -0.37 + 42.71j])
@@ -183,6 +184,7 @@ def test_pairs_beside_each_other_are_found_while_either_hides_the_other():
     assert (np.abs(found.modes.poles - poles) < 0.02).all()
 
 
+@pytest.mark.slow
 def test_the_amplitude_of_each_record_is_found_on_the_common_backbone():
     """Least squares of three records by one law: noise and no more is left of each."""
     records = in_records(lambda k: (1.0, 0.6, 0.3)[k] * bent(rise=0.5 * (1.0, 0.6, 0.3)[k] ** 2))

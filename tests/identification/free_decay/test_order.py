@@ -108,7 +108,10 @@ def shaken(n_samples, seed, share=0.9):
     return modes, replace(quiet, outputs=quiet.outputs + noise)
 
 
-@pytest.mark.parametrize(("n_samples", "seed"), [(4096, 2), (4096, 5), (40_000, 2), (40_000, 4)])
+@pytest.mark.parametrize(
+    ("n_samples", "seed"),
+    [(4096, 2), (40_000, 2), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((4096, 5), (40_000, 4)))],
+)
 def test_noise_that_sensors_share_is_no_mode(n_samples, seed):
     modes, record = shaken(n_samples, seed)
     found = identify(record)

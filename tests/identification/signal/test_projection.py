@@ -98,6 +98,7 @@ def within(normalised):
     return chi2.ppf(1e-3, size) < squares < chi2.isf(1e-3, size)
 
 
+@pytest.mark.slow
 def test_errors_are_true_and_at_the_bound_where_one_record_is_ten_times_noisier():
     truth, limit, figures, own, shapes = np.r_[MODES.omega, MODES.zeta], least(), [], [], []
     k, each = np.abs(SHAPES).argmax(axis=0), np.arange(3)
@@ -164,6 +165,7 @@ POLES = np.array([-0.2 + 12.0j, -0.3 + 31.0j])
 SEEN = np.array([[1.0, 0.8 + 0.1j], [0.5, -1.0]])
 
 
+@pytest.mark.slow
 def test_driven_records_count_by_their_noise():
     quiet, noisy = np.array([0.02, 0.01]), np.array([0.2, 0.1])
     own = []

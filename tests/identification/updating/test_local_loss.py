@@ -55,7 +55,7 @@ def measured(kind, *, lost, centre):
     return identify(free_decay(truth, noise_std=0.01 * level, seed=1, **options)).refined
 
 
-@pytest.mark.parametrize(("kind", "centre"), [("beam", 0.625), ("bar", 0.3)])
+@pytest.mark.parametrize(("kind", "centre"), [("beam", 0.625), pytest.param("bar", 0.3, marks=pytest.mark.slow)])
 def test_a_fifth_of_the_stiffness_lost_over_a_tenth_of_the_length_is_found(kind, centre):
     """Neither mass nor stiffness is known, but for the mass at one place."""
     found = locate_damage(
@@ -108,7 +108,7 @@ def test_an_edge_that_passes_the_end_comes_back(beside_the_end):
     assert from_beyond.chi2 == pytest.approx(from_truth.chi2, abs=0.1)
 
 
-@pytest.mark.parametrize("centre", [0.92, 0.96])
+@pytest.mark.parametrize("centre", [0.92, pytest.param(0.96, marks=pytest.mark.slow)])
 def test_what_of_a_loss_passes_the_end_is_not_told(centre, beside_the_end):
     modes = beside_the_end if centre == 0.92 else measured("beam", lost=0.2, centre=centre)
     found = locate_damage(modes, NOMINAL["beam"], known_mass=[(0.5, 1.0)], mass_terms=[2], stiffness_terms=[3])

@@ -74,6 +74,7 @@ def test_modes_that_the_start_has_twice_are_told_apart_by_their_shapes(angle):
     np.testing.assert_allclose(found.std / truth, 2e-3 / np.sqrt(3.0) * wider, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_intervals_hold_where_repeated_modes_are_turned_by_almost_half_a_right_angle():
     """Both frequencies of a pair then give the mean stiffness, and next to nothing the difference."""
     truth = np.array([0.9, 0.9])

@@ -85,6 +85,7 @@ def test_as_many_terms_as_there_are():
     assert not few.explains and few.criterion > found.criterion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["beam", pytest.param("bar", marks=pytest.mark.slow)])
 def test_intervals_hold_the_truth_as_often_as_they_say(kind):
     """Share of draws whose nominal 95 % band holds the truth at each place, within what chance allows."""

@@ -123,7 +123,7 @@ def fields_of(modes, errors):
 
 
 @pytest.mark.parametrize("draws", [8, pytest.param(100, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("noise", [1e-3, 3e-3])
+@pytest.mark.parametrize("noise", [1e-3, pytest.param(3e-3, marks=pytest.mark.slow)])
 def test_intervals_of_the_stiffness_hold(noise, draws):
     found = [fields_of(*drawn(seed, noise)) for seed in range(draws)]
     score = np.array([(f.stiffness(X, Y) - 170.0) / f.stiffness.std(X, Y) for f in found])
@@ -131,6 +131,7 @@ def test_intervals_of_the_stiffness_hold(noise, draws):
     assert np.sqrt((score**2).mean()) > 0.5  # nor are they much too wide
 
 
+@pytest.mark.slow
 def test_standard_errors_by_noise_alone_are_the_scatter_of_draws():
     modes, errors = drawn(0, 3e-3)
     alone = fields_of(modes, replace(errors, roughness=np.zeros(5)))

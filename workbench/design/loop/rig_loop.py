@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from os import cpu_count
 from typing import TypeVar
 
 import numpy as np
@@ -19,6 +18,7 @@ from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.simulate import law_arrays, participation_of, structure_arrays
 from workbench.rig.statespace import output_matrix
 from workbench.structure.domain import Where
+from workbench.threads import cores
 
 SUBSTEPS = 4
 
@@ -158,7 +158,7 @@ def of_loops(
 ) -> list[K]:
     """What is kept of the run of each of many rigs: a thousand runs fill the memory, a few figures of each do not."""
     tests = [test if test.seed is None else replace(test, seed=test.seed + i) for i in range(len(rigs))]
-    with ThreadPoolExecutor(cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         return list(pool.map(lambda rig, one: kept(rig, run_loop(rig, controller, one)), rigs, tests))
 
 

@@ -4,7 +4,6 @@ Cells of places, or of candidates, are halved, the least bounded first, until no
 placement that beats the optimum by more than the gap; `workbench.design.placement.cell_bounds` has their bounds.
 """
 
-import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +23,7 @@ from workbench.design.placement.scan import MOST_TRIED, allowed_places, scan
 from workbench.design.placement.task import Placement, PlacementTask
 from workbench.structure.domain import NamedPoints, Rectangle, listed
 from workbench.structure.printed import place_text
-from workbench.threads import one_blas_thread
+from workbench.threads import cores, one_blas_thread
 
 START_LEVEL = 3  # halvings of the length before the first bound
 BATCH = 50_000  # cells bounded at once
@@ -144,7 +143,7 @@ class _Search:
         n = self._task.n_controlled
         level = range(2**START_LEVEL - 1, 2 ** (START_LEVEL + 1) - 1)
         cells = np.array(list(combinations_with_replacement(level, n)), np.int64).reshape(-1, n)
-        workers = min(os.cpu_count() or 1, 8)
+        workers = min(cores(), 8)
         self._bounds(cells[:1])  # compiles them, the first time on a machine: half a minute that is no search
         began = time.monotonic()
         with ThreadPoolExecutor(workers) as pool:

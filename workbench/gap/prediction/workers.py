@@ -18,11 +18,11 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any, ClassVar, NoReturn, TypeVar
 
-import joblib
 import numpy as np
 
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Kind
+from workbench.threads import cores
 
 MOST = 8  # processes: to fork one takes a hundredth of a second, every time
 FORKS = sys.platform == "linux"  # elsewhere libraries of the system do not survive one, or there is none
@@ -58,7 +58,7 @@ class Workers:
     @classmethod
     def at_hand(cls) -> "Workers":
         """One a core, as long as they pay for being forked."""
-        return cls(min(joblib.cpu_count(), MOST))
+        return cls(min(cores(), MOST))
 
     def map(self, function: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
         """`function(item)` of each, in their order; each process takes the next item when it is done with one.

@@ -13,7 +13,6 @@ All poles are then fitted together, on the whole record, and those leave again t
 strong ones shows in the next round; the search ends when no peak is higher than noise makes it.
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -33,6 +32,7 @@ from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import Projection, forget_transforms, independent
 from workbench.identification.signal.searches import FALSE_ALARM, FIT, SELECTION, Budget, spurious_modes
 from workbench.records.record import Record
+from workbench.threads import cores
 
 
 @dataclass(frozen=True)
@@ -238,7 +238,7 @@ class _Search:
                 left[:, :n] *= scale[some, None]
                 left[:, :n] *= decay
                 del decay
-                spectrum = rfft(left, axis=1, workers=os.cpu_count())
+                spectrum = rfft(left, axis=1, workers=cores())
                 del left
                 forget_transforms(n)
                 found += np.einsum("jk,jk->k", spectrum.real, spectrum.real)

@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import joblib
-
 from workbench.study.runs.cache import decoded, read_record
 from workbench.study.runs.cases import StudyError, checked, key_of, seed_of
 from workbench.study.runs.engines import Job, cluster, here, keep, processes
 from workbench.study.runs.fingerprint import fingerprint
 from workbench.study.runs.results import Result, Results
+from workbench.threads import cores
 
 CACHE = Path("out/cache")
 
@@ -99,7 +98,7 @@ def _computed(
         return iter(())
     if scheduler:
         return cluster(function, jobs, scheduler)
-    workers = min(workers or joblib.cpu_count(), len(jobs))
+    workers = min(workers or cores(), len(jobs))
     if workers == 1:
         return here(function, jobs, awaiting)
     return processes(function, jobs, workers, awaiting)
