@@ -35,7 +35,12 @@ def name(page: Path) -> str:
     return page.relative_to(DOCS).as_posix()
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if any(lang == "python" for lang, _ in blocks(p))], ids=name)
+LONG = ("how-to/plates.md",)
+WITH_EXAMPLES = [p for p in PAGES if any(lang == "python" for lang, _ in blocks(p))]
+MARKED = [pytest.param(p, id=name(p), marks=[pytest.mark.slow] if name(p) in LONG else []) for p in WITH_EXAMPLES]
+
+
+@pytest.mark.parametrize("page", MARKED)
 def test_the_examples_of_a_page_run_and_print_what_it_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")

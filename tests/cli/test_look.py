@@ -3,6 +3,7 @@
 import shlex
 
 import numpy as np
+import pytest
 
 RATE, N = 1000.0, 4000
 OMEGA, ZETA = 2.0 * np.pi * 40.0, 0.01
@@ -43,6 +44,7 @@ def test_a_ring_down_that_is_far_from_over_is_one(run, tmp_path):
     assert "--ambient" not in run("look", path, "--page", tmp_path / "p.html").output
 
 
+@pytest.mark.slow
 def test_an_input_is_known_by_its_name_or_unit_and_steady_motion_is_ambient(run, tmp_path):
     rng = np.random.default_rng(1)
     force, moves = rng.standard_normal((2, N))

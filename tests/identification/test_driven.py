@@ -302,7 +302,7 @@ def real_system(feedthrough):
     ("delays", "straight", "feedthrough", "close"),
     [
         ((2.35, 0.0), False, 0.0, 0.02),
-        ((1.0, 3.6), False, 0.1, 0.02),
+        pytest.param((1.0, 3.6), False, 0.1, 0.02, marks=pytest.mark.slow),
         pytest.param((0.4, 0.4), False, 0.1, 0.02, marks=pytest.mark.slow),
         ((1.75, 0.25), True, 0.1, 0.02),
     ],

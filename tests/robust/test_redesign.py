@@ -487,6 +487,7 @@ def hidden_plant():
     return find_trial_with_plant(np.random.default_rng([20301, 20]), dirt="clean", size=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "vibrates", "near"), [("imsc", 0.3, 1.0), pytest.param("poles", 0.6, 1.02, marks=pytest.mark.slow)]
 )

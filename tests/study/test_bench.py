@@ -79,7 +79,7 @@ def bench(tmp_path):
         yield port
 
 
-@pytest.fixture(params=["forces", "patches"])
+@pytest.fixture(params=["forces", pytest.param("patches", marks=pytest.mark.slow)])
 def plate(request, tmp_path):
     """A plate with two actuators: its rig and its description."""
     path = tmp_path / "plate.toml"

@@ -152,6 +152,7 @@ def test_an_unknown_kind_is_refused():
         make_trial(1, kinds=("gremlin",))
 
 
+@pytest.mark.slow
 def test_a_bench_that_cannot_show_a_kind_says_so():
     damping = ModalDamping(0.01)
     rod = Bar(length=1.0, mass_per_length=1.0, axial_stiffness=1.0, left="fixed", right="free", damping=damping)

@@ -193,6 +193,7 @@ def test_laws_at_a_point_agree_with_an_adaptive_integrator(rig, commands, kind):
         np.testing.assert_allclose(got, want, atol=2e-5 * np.abs(want).max())
 
 
+@pytest.mark.slow
 def test_what_acts_all_along_agrees_with_an_adaptive_integrator(rig, commands):
     effects = [
         {"kind": "air_drag", "coefficient": 0.5},

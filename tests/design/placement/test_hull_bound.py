@@ -203,7 +203,7 @@ def least_work(task, limits, limited, low, high, rng):
     return np.sqrt(best)
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
 def test_no_bound_is_above_what_is_met_in_its_cell(seed):
     """Of random tasks and cells, wanted a little above the least that a search in the cell meets: all ask too much."""
     rng = np.random.default_rng(seed)

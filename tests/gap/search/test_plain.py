@@ -155,6 +155,7 @@ def test_a_sensor_is_late_where_it_is_surely_so(hinged_rig, deviation, is_late):
     [
         ((0.2, 0.21, 0.2, 0.2), 0.0, True),
         ((0.2, 0.3, 0.2, 0.25), 0.0, False),  # each by itself
+        ((0.05, 0.06, 0.05, 0.055), 0.0, False),  # likewise: the less they are late, the less they are apart
         ((0.2, 0.2, 0.2, 0.2), 0.02, False),  # which may be so of them
         ((-0.2, -0.2, -0.2, -0.2), 0.0, False),  # nothing is ahead of its command
     ],

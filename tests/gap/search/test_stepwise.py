@@ -213,6 +213,7 @@ def test_sensors_are_late_as_the_records_show(rig, measured, interpolated):
     assert beside.explains(found)
 
 
+@pytest.mark.slow
 def test_one_sensor_is_late_by_straight_lines_too(rig, measured):
     """More than a sample late, so that no error of the model says so."""
     late = Effect(kind_named("sensor_delay"), "d2", {"delay": 1.4 * DT})

@@ -108,6 +108,7 @@ def test_an_edge_that_passes_the_end_comes_back(beside_the_end):
     assert from_beyond.chi2 == pytest.approx(from_truth.chi2, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("centre", [0.92, pytest.param(0.96, marks=pytest.mark.slow)])
 def test_what_of_a_loss_passes_the_end_is_not_told(centre, beside_the_end):
     modes = beside_the_end if centre == 0.92 else measured("beam", lost=0.2, centre=centre)

@@ -122,6 +122,7 @@ def fields_of(modes, errors):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draws", [8, pytest.param(100, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("noise", [1e-3, pytest.param(3e-3, marks=pytest.mark.slow)])
 def test_intervals_of_the_stiffness_hold(noise, draws):

@@ -245,7 +245,7 @@ def late_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
         return ()
     common = float(np.mean([*delays.values()]))
     apart = max(max(abs(delay - common), doubt[name]) for name, delay in delays.items())
-    if (2.0 * apart / dict(JOINT.widest)["delay"]) ** (len(delays) - 1) > PLAIN.by_chance:
+    if (2.0 * apart / common) ** (len(delays) - 1) > PLAIN.by_chance:  # of sensors that are about as late as these
         return ()
     return _common(rig, common * sample_time)
 

@@ -714,7 +714,7 @@ class Stepwise:
         errors = nominal_errors(search.rig, replace(target, late=(), early=(), interpolated=False), punctual)
         each = search.workers.map(lambda e: fit_jointly(search, (*step.effects, e), errors, rounds=2), late)
         best, *others = sorted(each, key=lambda s: s.fit.cost)
-        if self._is_likelier(step, best):
+        if self._is_likelier(step, best) or not best.effects[-1].stands_out(search.rig):
             return step
         if others and not self._is_likelier(best, others[0]):
             share = cost_of(search.rig, (*step.effects, errors), search.data) - best.fit.cost
