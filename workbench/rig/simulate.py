@@ -432,9 +432,8 @@ def _step(
     if outputs.size:
         reading, orders = reading_of(rig)
         known = _left_to_motion(rig, outputs, reading, orders, participation, at_samples)
-    of_the_users_own = any(isinstance(e, elements.UserLaw) for e in rig.elements)
-    step: Callable[..., None] = stepping.stepper_with_laws() if of_the_users_own else stepping.step_record
     damping, coupling, spread = structure_arrays(rig)
+    step: Callable[..., None] = stepping.step_record
     step(
         modes.omega,
         damping,

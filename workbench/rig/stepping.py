@@ -9,7 +9,6 @@ which friction turns is taken in finer ones.
 import math
 from collections.abc import Callable
 from functools import cache
-from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -40,10 +39,23 @@ Kept = tuple[Floats, Floats, Floats, Floats]
 LANES = 8  # modes that are worked on at once; a number of them that is no multiple is rounded up, with modes at rest
 
 
+@intrinsic
+def _call(typing: Any, address: Any, w: Any, v: Any, p: Any) -> Any:
+    """Call the law(w, v, pointer to parameters) at an address."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        data = context.make_array(signature.args[3])(context, builder, values[3]).data
+        law = ir.FunctionType(ir.DoubleType(), [ir.DoubleType(), ir.DoubleType(), data.type])
+        return builder.call(builder.inttoptr(values[0], law.as_pointer()), [values[1], values[2], data])
+
+    return types.float64(types.int64, types.float64, types.float64, p), generate
+
+
 @njit(cache=True, nogil=True)
 def user_law(w: float, v: float, p: Floats) -> float:
-    """Stands for the law of the user's own, until `stepper_with_laws` puts one in its place."""
-    return 0.0
+    """A law of the user's own, whose address stands behind its parameters."""
+    force: float = _call(int(p[p.size - 1]), w, v, p)  # type: ignore[call-arg]
+    return force
 
 
 @njit(cache=True, nogil=True)
@@ -668,25 +680,6 @@ def step_record(
             advance(linear, finely, drives, elements, along, motion, points, work, kept)
 
 
-@intrinsic
-def _call(typing: Any, address: Any, w: Any, v: Any, p: Any) -> Any:
-    """Call the law(w, v, pointer to parameters) at an address."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        data = context.make_array(signature.args[3])(context, builder, values[3]).data
-        law = ir.FunctionType(ir.DoubleType(), [ir.DoubleType(), ir.DoubleType(), data.type])
-        return builder.call(builder.inttoptr(values[0], law.as_pointer()), [values[1], values[2], data])
-
-    return types.float64(types.int64, types.float64, types.float64, p), generate
-
-
-@njit(cache=True, nogil=True)
-def _law_at_address(w: float, v: float, p: Floats) -> float:
-    """The law whose address stands behind its parameters."""
-    force: float = _call(int(p[p.size - 1]), w, v, p)  # type: ignore[call-arg]
-    return force
-
-
 @cache
 def address_of(law: Callable[[float, float, Floats], float]) -> float:
     """Where force(w, v, parameters) = `law` stands in the memory of this process, compiled."""
@@ -702,18 +695,3 @@ def address_of(law: Callable[[float, float, Floats], float]) -> float:
 
 
 _KEPT: list[Any] = []  # laws of the user's own live as long as this process
-
-
-@cache
-def stepper_with_laws() -> Callable[..., None]:
-    """`step_record` for elements of kind USER, whose rows of parameters end with the address of their law."""
-    scope = dict(globals(), user_law=_law_at_address)
-    solvers = ("element_force", "solve_element", "solve_pair", "solve_in_turn")
-    for name in (*solvers, "_advance_once", "advance", "step_record"):
-        compiled = globals()[name]
-        options = {key: value for key, value in compiled.targetoptions.items() if key != "nopython"}
-        anew = FunctionType(compiled.py_func.__code__, scope, name)
-        anew.__qualname__ = f"{name}_with_laws"  # under which it is kept on disk
-        scope[name] = njit(cache=True, **options)(anew)
-    stepper: Callable[..., None] = scope["step_record"]
-    return stepper

@@ -12,7 +12,7 @@ from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.loop_steps import ControllerArrays, loop_record
 from workbench.rig.actuators import Actuator
-from workbench.rig.elements import PeriodicForce, PointElement, RandomForce, UserLaw
+from workbench.rig.elements import PeriodicForce, PointElement, RandomForce
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.simulate import law_arrays, participation_of, structure_arrays
@@ -163,7 +163,7 @@ def of_loops(
 
 
 def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
-    """Refuse a controller that does not fit a rig or a test, or a rig that no loop simulates."""
+    """Refuse a controller that does not fit a rig or a test, or a sensor that no loop simulates."""
     for kind, names, there in (
         ("sensor", controller.sensors, {s.name for s in rig.sensors}),
         ("actuator", controller.actuators, {a.name for a in rig.actuators}),
@@ -179,8 +179,6 @@ def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
             f"the controller runs every {controller.sample_time:g} s and the test every {test.sample_time:g} s; sample"
             " both alike"
         )
-    if any(isinstance(e, UserLaw) for e in rig.elements):
-        raise ValueError("a loop cannot simulate a UserLaw; describe it by one of the laws of workbench.rig.elements")
     for name in controller.sensors:
         if MEASURED[named(rig.sensors, name).quantity][1] > 1:
             raise ValueError(f"sensor {name} reads acceleration; a controller here reads displacement or velocity")
