@@ -106,8 +106,9 @@ def _in_place(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]], 
     effects = step.effects
     named = {effect.kind for effect in effects}
     common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON if kind not in named)
+    at_ports = [ports for ports in _for_one_cause(search.rig, kept) if named.isdisjoint(e.kind for e in ports)]
     if not effects:
-        both = _explaining(search, [(*common, *ports) for ports in _for_one_cause(search.rig, kept)], step)
+        both = _explaining(search, [(*common, *ports) for ports in at_ports], step)
         if both is not None and {SENSOR_DELAY, *OF_ALL} & {effect.kind for effect in both.effects}:
             return both  # one sensor late alone, or all alike, are an effect beside common errors
         # beside noise of the inputs that an effect made seem louder, common errors may explain what they do not cause
@@ -117,7 +118,7 @@ def _in_place(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]], 
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
         fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
-    found = _explaining(search, [(*s, *ports) for s in sets for ports in _for_one_cause(search.rig, kept)], step)
+    found = _explaining(search, [(*s, *ports) for s in sets for ports in at_ports], step)
     return found or _one_more(search, (*effects, *kept), common, step)
 
 
