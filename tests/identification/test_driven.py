@@ -589,6 +589,7 @@ def struck(hz, change, seed, n=1500, snr=50.0):
 SEEDS = [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_after_a_blow_one_sensor_tells_two_close_modes(seed):
     """How a record begins was taken for a shape, so that one of the two was left out."""

@@ -303,7 +303,9 @@ LAWS = {
 }
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    "law", ["stiffening", *(pytest.param(law, marks=pytest.mark.slow) for law in ("time", "slipping"))]
+)
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 8))])
 def test_one_sensor_tells_a_mode_that_changes_after_a_blow_from_two(law, seed):
     """It made two to four modes of the one."""

@@ -48,6 +48,7 @@ def test_the_static_answer_of_modes_left_out_makes_the_few_that_are_kept_exact(p
     np.testing.assert_allclose(np.diag(with_rest.damping), np.diag(exact.damping), rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_cost_of_leaving_out_modes_of_a_plate_is_as_stated():
     plate = Plate(
         length=(1.2, 0.8), mass_per_area=8.0, bending_stiffness=175.0, poisson_ratio=0.3, edges="simply supported"

@@ -241,7 +241,7 @@ def opened(look, until):
     return at
 
 
-@pytest.mark.parametrize("width", [390, 1200])
+@pytest.mark.parametrize("width", [390, pytest.param(1200, marks=pytest.mark.slow)])
 def test_it_can_be_played_on(bench, look, drawn, moves, until, width, tmp_path):
     from selenium.webdriver import ActionChains
 

@@ -51,6 +51,7 @@ def test_coloured_noise_has_its_size_and_its_memory(size, memory):
     assert lag == pytest.approx(memory, abs=0.02)
 
 
+@pytest.mark.slow
 def test_inputs_are_logged_with_noise_and_a_hammer_at_rest_is_not():
     (clean, _), (dirty, _) = (make_trial(3, dirt=dirt) for dirt in ("clean", "input"))
     for one, other in zip(clean.fit, dirty.fit, strict=True):
@@ -78,6 +79,7 @@ def test_gains_are_off_by_a_per_cent():
         assert np.std(measured - driven @ gains) == pytest.approx(std, rel=0.08)
 
 
+@pytest.mark.slow
 def test_actuators_and_sensors_stand_off_their_places():
     """The places of all of them, found from the readings alone, leave noise."""
     case, _ = make_trial(6, dirt="place")

@@ -62,9 +62,9 @@ def test_simply_supported_plate_has_products_of_sines():
 @pytest.mark.parametrize(
     ("edges", "first", "values"),
     [
-        ("clamped", 0, [35.985, 73.394, 73.394, 108.22, 131.58, 132.21]),
+        pytest.param("clamped", 0, [35.985, 73.394, 73.394, 108.22, 131.58, 132.21], marks=pytest.mark.slow),
         ({"left": "clamped", "right": "free", "bottom": "free", "top": "free"}, 0, [3.471, 8.507, 21.28, 27.20, 30.96]),
-        ("free", 3, [13.468, 19.596, 24.270, 34.801, 34.801]),
+        pytest.param("free", 3, [13.468, 19.596, 24.270, 34.801, 34.801], marks=pytest.mark.slow),
     ],
     ids=["clamped", "cantilever", "free"],
 )

@@ -38,6 +38,7 @@ def beating(omega=20.0, sigma=(0.15, 0.2), apart=0.2, time=TIME):
     return first + 0.5 * second
 
 
+@pytest.mark.slow
 def test_a_mode_on_a_backbone_leaves_noise_and_no_more():
     beside = np.exp(-0.1 * TIME) * np.cos(50.0 * TIME)
     noise = 0.01 * bent().std()
