@@ -456,6 +456,20 @@ def _turns(kinds: Integers, parameters: Floats, rates: Floats) -> bool:
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
+def _keep(kept: Floats, a: Floats, b: Floats, c: Floats, d: Floats) -> None:
+    """Four arrays (n,) as they are, into `kept` (4, n)."""
+    for i in range(a.size):
+        kept[0, i], kept[1, i], kept[2, i], kept[3, i] = a[i], b[i], c[i], d[i]
+
+
+@njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
+def _put_back(kept: Floats, a: Floats, b: Floats, c: Floats, d: Floats) -> None:
+    """Four arrays as `_keep` has kept them."""
+    for i in range(a.size):
+        a[i], b[i], c[i], d[i] = kept[0, i], kept[1, i], kept[2, i], kept[3, i]
+
+
+@njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
 def advance(
     linear: Linear,
     finely: Linear,
@@ -489,15 +503,9 @@ def advance(
     modes_kept, points_kept, rates, parts_of = kept
     rubs = _rubs(kinds)
     if rubs:
-        for r in range(q.size):
-            modes_kept[0, r], modes_kept[1, r], modes_kept[2, r], modes_kept[3, r] = q[r], v[r], old[r], spread[r]
+        _keep(modes_kept, q, v, old, spread)
+        _keep(points_kept, point, earlier, w, z)
         for i in range(kinds.size):
-            points_kept[0, i], points_kept[1, i], points_kept[2, i], points_kept[3, i] = (
-                point[i],
-                earlier[i],
-                w[i],
-                z[i],
-            )
             rates[0, i] = _rate(shapes, i, v)
     parts, part = 1, 0
     while part < parts:
@@ -517,20 +525,8 @@ def advance(
             for i in range(kinds.size):
                 rates[1, i] = _rate(shapes, i, v)
             if _turns(kinds, parameters, rates):
-                for r in range(q.size):
-                    q[r], v[r], old[r], spread[r] = (
-                        modes_kept[0, r],
-                        modes_kept[1, r],
-                        modes_kept[2, r],
-                        modes_kept[3, r],
-                    )
-                for i in range(kinds.size):
-                    point[i], earlier[i], w[i], z[i] = (
-                        points_kept[0, i],
-                        points_kept[1, i],
-                        points_kept[2, i],
-                        points_kept[3, i],
-                    )
+                _put_back(modes_kept, q, v, old, spread)
+                _put_back(points_kept, point, earlier, w, z)
                 parts, part = PARTS, 0
         if parts > 1:
             for r in range(q.size):
