@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, nominal_errors
 from workbench.gap.effects.ports import ACTUATOR_DELAY, ACTUATOR_LAG, SENSOR_DELAY, SENSOR_LAG
@@ -23,8 +23,7 @@ from workbench.structure.member import Structure
 
 COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
 OF_PORTS = ("delay", "gain", "place")  # groups of errors that are no mode's and no wave's
-# what makes all sensors late by as much, and the number that says by how much
-OF_ALL = {SENSOR_LAG: "time_constant", ACTUATOR_LAG: "time_constant", ACTUATOR_DELAY: "delay"}
+OF_ALL = (SENSOR_LAG, ACTUATOR_LAG, ACTUATOR_DELAY)  # what makes all sensors late by as much
 
 
 def are_common(effects: Sequence[Effect]) -> bool:
@@ -34,10 +33,20 @@ def are_common(effects: Sequence[Effect]) -> bool:
     )
 
 
+def is_like_errors(kind: Kind) -> bool:
+    """Whether effects of a kind are in the structure and linear, as errors of all its modes and waves are."""
+    return kind.path == "structure" and not kind.nonlinear and kind not in COMMON
+
+
 def may_be_error(effect: Effect, search: Search) -> bool:
     """Whether a careful model may be off by as much as an effect at a port says: in timing, a gain or a place."""
-    late = next((effect.values[name] for name in ("delay", "time_constant") if name in effect.values), np.inf)
-    return late < dict(JOINT.widest)["delay"] * search.data.records[0].sample_time or is_slight(effect, search.rig)
+    least = dict(JOINT.widest)["delay"] * search.data.records[0].sample_time
+    return lateness(effect) < least or is_slight(effect, search.rig)
+
+
+def lateness(effect: Effect) -> float:
+    """Time that an effect makes ports late by, s; inf where it makes none late."""
+    return float(next((effect.values[name] for name in ("delay", "time_constant") if name in effect.values), np.inf))
 
 
 def is_slight(effect: Effect, rig: Rig) -> bool:
@@ -218,7 +227,7 @@ def other_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], ...]:
     if late is None:
         return ()
     others, whole = [e for e in found.effects if e is not late], search.data.finely(SELECTION.fine)
-    causes = [e for e in _common(search.rig, late.values[OF_ALL[late.kind]]) if e.kind is not late.kind]
+    causes = [e for e in _common(search.rig, lateness(late)) if e.kind is not late.kind]
     each = search.workers.map(lambda e: fit(search.rig, (*others, e), whole), causes)
     best, rivals = ranked(search, [found, *(f for f in each if search.explains(f))])
     return rivals if best is found else ()
@@ -226,8 +235,8 @@ def other_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], ...]:
 
 def _common(rig: Rig, late: float) -> tuple[Effect, ...]:
     """Every effect that makes all sensors late by that time, s."""
-    kinds = ((kind, name, kind.targets(rig)) for kind, name in OF_ALL.items())
-    return tuple(Effect(kind, at[0], {name: late}) for kind, name, at in kinds if at)
+    kinds = ((kind, targets[0]) for kind in OF_ALL if (targets := kind.targets(rig)))
+    return tuple(Effect(kind, all_, {kind.parameters(rig, all_)[0].name: late}) for kind, all_ in kinds)
 
 
 def late_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
@@ -253,11 +262,12 @@ def late_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
 
 def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...], step: Step) -> Fit | None:
     """The effects and another in the structure, linear as errors are, that stands for those of every mode and wave."""
-    alike = tuple(kind for kind in search.catalogue if kind.path == "structure" and not kind.nonlinear)
+    alike = tuple(kind for kind in search.catalogue if is_like_errors(kind))
     if not alike:
         return None
     alone = fit(search.rig, effects, search.quick, iterations=PLAIN.plainly)
-    if alone.cost < 1.0 + STEPWISE.no_gap:  # too little for another effect
+    # too little for another effect; beside noise of the inputs, what is loud where that noise is counts for little
+    if not search.logged and alone.cost < 1.0 + STEPWISE.no_gap:
         return None
     given = alone.effects
     evidence = search.evidence_of(apply_all(search.rig, given))

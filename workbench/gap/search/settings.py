@@ -225,6 +225,8 @@ class JointSettings:
     # of a sample: an accelerometer that is later stays on its side of the jumps when an effect is added; what was seen
     # of the others may have been the gap
     surely_late: float = 0.05
+    # times the noise one sample ahead: errors alone that leave more may miss that sensors are late by straight lines
+    straight: float = 2.0
     # of a sample: what accelerometers are tried to be late or early by, to see which side of jumps they read
     delays: tuple[float, ...] = (0.1, 0.25, 0.5)
     # times the power of the change over the span before a sample that the change after it has at a jump

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all, can_be, key_of
+from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, key_of
 from workbench.gap.effects.limiting_cases import (
     contained,
     each_left_out,
@@ -16,20 +16,28 @@ from workbench.gap.effects.limiting_cases import (
     with_one_simpler,
 )
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
-from workbench.gap.effects.ports import ACTUATOR_GAIN, SENSOR_GAIN
+from workbench.gap.effects.ports import ACTUATOR_GAIN, SENSOR_DELAY, SENSOR_GAIN, SENSOR_LAG
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened, size_of
-from workbench.gap.search.plain import COMMON, in_place_of_errors, is_slight, late_effects, other_causes
+from workbench.gap.search.plain import (
+    COMMON,
+    in_place_of_errors,
+    is_like_errors,
+    is_slight,
+    late_effects,
+    lateness,
+    other_causes,
+)
 from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
 from workbench.gap.search.selection import fitted_ahead, one_more
 from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
 from workbench.rig.simulate import is_stepped
 
-TIMING = {"sensor_delay": "delay", "sensor_lag": "time_constant"}  # kinds, and the time that a sensor is late by
+TIMING = (SENSOR_DELAY, SENSOR_LAG)
 
 
 class Stepwise:
@@ -85,10 +93,14 @@ class Stepwise:
         fresh = self.search.workers.map(self.afresh, [effects for effects in sets if key_of(effects) not in keys])
         found = [s for s in (*self.known, *fresh) if not self._may_be_errors(s)]
         best = sorted(found, key=lambda s: s.fit.cost)
-        if not (self.search.by_mode and best and self.explains(best[0])):
+        if not (best and self.explains(best[0]) and (self.search.by_mode or not self.is_believed)):
             return best
-        # errors of each mode close what any linear effect leaves: the one that they are the least beside is it
-        return sorted(found, key=lambda s: s.description(best[0].noise_power))
+        # errors of each mode, or larger ones than a model has, close what any linear effect leaves: the one that they
+        # are the least beside is it
+        noise = best[0].noise_power
+        if self.search.by_mode:
+            return sorted(found, key=lambda s: s.description(noise))
+        return sorted(found, key=lambda s: s.description(noise) + self._a_number * self._size(s)[0])
 
     def _likeliest_alone(self) -> list[Fit]:
         """The likeliest single effects one sample ahead, beside errors that give way; none that a simpler equals."""
@@ -97,6 +109,9 @@ class Stepwise:
         beside = replace(search, held=(self.last.errors,))
         without = cost_of(search.rig, beside.held, beside.ahead)
         found = [f for f in fitted_ahead(beside, sets) if beside.surely_better(f, without, f.n_parameters)]
+        if not (found or self.is_believed):  # errors that no model has are what leaves it nothing to do
+            alike = [f for f in self.ahead if is_like_errors(f.effects[0].kind)]
+            return spread_over_kinds(alike, 1)[: STEPWISE.singles]
         chosen: list[Fit] = []
         for single in spread_over_kinds(found, 1):
             comes_to = contained(single.effects, search.rig)
@@ -125,8 +140,10 @@ class Stepwise:
         if not (best.is_plausible and self._is_worth(best, self.last)):
             return False
         fewer = self._without_needless(best)
-        if not fewer.effects:  # all that it did was to lead the errors out of a false valley
-            self.steps.append(fit_jointly(self.search, (), fewer.errors))
+        without = None if fewer.effects else fit_jointly(self.search, (), fewer.errors)
+        # all that it did was to lead the errors out of a false valley
+        if without is not None and are_plausible(without.errors, damping=False):
+            self.steps.append(without)
             return self.is_enough
         self.steps.append(best)
         self._with_input_noise(best)
@@ -325,12 +342,16 @@ class Stepwise:
             return ()
         key, rig = key_of(sets[0].effects), self.search.rig
         sets = [s for s in sets if key not in contained(s.effects, rig)]
-        a_number, alike = 0.5 * np.log(self.search.data.n_values), not self.explains(sets[0])
-        noise = sets[0].sensor_noise
-        length = [s.description(noise, of_errors_alone=alike) + a_number * s.fit.n_parameters for s in sets]
+        noise, alike = sets[0].sensor_noise, not self.explains(sets[0])
+        length = [s.description(noise, of_errors_alone=alike) + self._a_number * s.fit.n_parameters for s in sets]
         odds = np.exp(min(length) - np.array(length))
         likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
         return tuple((s.fit, float(p)) for s, p in likely if p > STEPWISE.excluded)
+
+    @property
+    def _a_number(self) -> float:
+        """Description length, nats, of a number."""
+        return 0.5 * float(np.log(self.search.data.n_values))
 
     def _with_one_more(self, step: Step) -> Step | None:
         """The best set with one more effect, where it takes most of what is left."""
@@ -383,7 +404,7 @@ class Stepwise:
         """The step with an accelerometer late that the likeliest set has late; no small delay leads past its jumps."""
         best = min(tried, key=lambda s: s.fit.cost)
         prior, late = step.errors.target, best.effects[-1]
-        if late.kind.name not in TIMING or prior.interpolated or not self._is_timing(best, TIMING):
+        if late.kind not in TIMING or prior.interpolated or not self._is_timing(best, TIMING):
             return None
         jumping = {sensor.name for sensor in self.search.rig.sensors if sensor.quantity == "acceleration"}
         if late.target not in jumping.difference(prior.late):
@@ -391,7 +412,7 @@ class Stepwise:
         errors = opened(self.search, step.errors)
         early = tuple(name for name in prior.early if name != late.target)
         target = replace(errors.target, late=(*prior.late, late.target), early=early)
-        delay = late.values[TIMING[late.kind.name]] / prior.sample_time
+        delay = lateness(late) / prior.sample_time
         values = {**errors.values, f"delay_{late.target}": delay}
         sided = fit_jointly(self.search, step.effects, nominal_errors(self.search.rig, target, values))
         return sided if sided.fit.cost < step.fit.cost else None
@@ -480,10 +501,10 @@ class Stepwise:
         """Whether an effect of a set is what the model may be off by at a port, which errors beside it are too."""
         return self._is_timing(step) or any(is_slight(effect, self.search.rig) for effect in step.effects)
 
-    def _is_timing(self, step: Step, kinds: Collection[str] = ("sensor_delay",)) -> bool:
+    def _is_timing(self, step: Step, kinds: Collection[Kind] = (SENSOR_DELAY,)) -> bool:
         """Whether an effect of a set is what the timing of a sensor may be off by: late by less than believed."""
         least = dict(JOINT.widest)["delay"] * self.search.data.records[0].sample_time
-        return any(effect.values[TIMING[e]] < least for effect in step.effects if (e := effect.kind.name) in kinds)
+        return any(lateness(effect) < least for effect in step.effects if effect.kind in kinds)
 
     def _slopes(self, step: Step) -> np.ndarray:
         """Sensitivities (n_values, n_errors) to errors beside the effects of a step, on the most telling records."""
@@ -522,8 +543,9 @@ class Stepwise:
         """The fit one sample ahead, or that of sensors which are late by straight lines, where it leaves less."""
         *effects, errors = ahead.effects
         delays = {name: value for name, value in errors.values.items() if group_of(name) == "delay"}
-        is_late = any(effect.kind.name in TIMING for effect in effects)
-        if not is_late and max(map(abs, delays.values()), default=0.0) < JOINT.surely_late:
+        is_late = any(effect.kind in TIMING for effect in effects)
+        seen = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.surely_late
+        if not seen and (effects or ahead.cost < JOINT.straight):
             return ahead
         prior = replace(self.search.prior, interpolated=True)
         straight = self._ahead(effects, nominal_errors(self.search.rig, prior, delays))
@@ -703,7 +725,7 @@ class Stepwise:
     def _with_late(self, step: Step) -> Step:
         """The set with sensors that are late for one cause as that effect, where this leaves no more.
 
-        A trifle of the gap whose cause is in doubt stays an error.
+        A trifle of the gap stays an error.
         """
         search, target, named = self.search, step.errors.target, {effect.kind for effect in step.effects}
         late = [effect for effect in late_effects(search.rig, step.errors) if effect.kind not in named]
@@ -714,10 +736,10 @@ class Stepwise:
         errors = nominal_errors(search.rig, replace(target, late=(), early=(), interpolated=False), punctual)
         each = search.workers.map(lambda e: fit_jointly(search, (*step.effects, e), errors, rounds=2), late)
         best, *others = sorted(each, key=lambda s: s.fit.cost)
-        if self._is_likelier(step, best) or not best.effects[-1].stands_out(search.rig):
+        effect = best.effects[-1]
+        if self._is_likelier(step, best) or not effect.stands_out(search.rig):
             return step
-        if others and not self._is_likelier(best, others[0]):
-            share = cost_of(search.rig, (*step.effects, errors), search.data) - best.fit.cost
-            if share < STEPWISE.explained * self._gap:
-                return step
+        share = cost_of(search.rig, (*step.effects, errors), search.data) - best.fit.cost
+        if share < STEPWISE.explained * self._gap or not self._matter([effect], best.effects):
+            return step
         return replace(best, others=(best, *others))
