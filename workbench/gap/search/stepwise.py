@@ -131,8 +131,10 @@ class Stepwise:
         if not self.alone:
             return False
         best = self.alone[0]
-        if not self.explains(best):
-            best = self._with_input_noise(best) or best
+        beside = None if self.explains(best) else self._with_input_noise(best)
+        if beside is not None:  # noise as loud may be all that errors leave
+            best = beside
+            self.steps[-1] = fit_jointly(self.search, self.last.effects, self.last.errors)
         left = best.excess(best.noise_power)
         if not self.explains(best) and left > STEPWISE.further * float(self.search.nominal.mean()):
             return False
