@@ -134,7 +134,7 @@ class Verdict:
             text = "No effect of the catalogue, alone or with another, explains the gap"
             if not any_beyond(self.effects):
                 near = words and (self.shrinkage is None or self.shrinkage.overall >= NEAR)
-                text += f"; the nearest, {words}, would close {closed or 'part of '}it." if near else "."
+                text += f"; the nearest, {words}, would close {closed or 'part of '}it." if near else f"{self._rest}."
             elif self.alternatives:
                 text += f" as likely as {words}, which explains {closed}it{self._not_excluded}"
             else:
