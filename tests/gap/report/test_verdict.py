@@ -70,21 +70,18 @@ def test_errors_that_no_careful_model_has_are_not_called_small(hinged_rig, recor
     ) != small
 
 
-@pytest.mark.parametrize("nominal", [0.93, 0.0])
-def test_what_errors_close_is_said_where_no_effect_is_near(hinged_rig, record_of, nominal):
+@pytest.mark.parametrize(
+    ("nominal", "rest"),
+    [(0.93, "93 % are small errors of the model (damping 9 %), 7.0 % remain"), (0.0, "100 % remain")],
+)
+def test_what_errors_close_is_said_where_no_effect_is_near(hinged_rig, record_of, nominal, rest):
     rig, rng = hinged_rig(3), np.random.default_rng(5)
     record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
     found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
-    budget = replace(
-        found.budget, nominal=nominal, unexplained=1.0 - nominal, noise=0.0, errors={"damping_percent": 9.0}
-    )
-    rest = (
-        "93 % are small errors of the model (damping 9 %), 7.0 % remain unexplained"
-        if nominal
-        else "100 % remain unexplained"
-    )
+    shares = {"nominal": nominal, "unexplained": 1.0 - nominal, "noise": 0.0}
+    budget = replace(found.budget, **shares, errors={"damping_percent": 9.0})
     sentence = replace(found, budget=budget, outcome="unknown", effects=()).sentence
-    assert sentence == f"No effect of the catalogue, alone or with another, explains the gap; {rest}."
+    assert sentence == f"No effect of the catalogue, alone or with another, explains the gap; {rest} unexplained."
 
 
 def test_effects_of_one_kind_have_shares_of_their_own(hinged_rig, record_of):
