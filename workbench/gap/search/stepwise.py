@@ -124,7 +124,22 @@ class Stepwise:
         """Whether few effects explain the records as well as errors of the nominal model that no model has."""
         if not (self.last.effects or self.last.is_plausible or self.search.logged):
             self.plain = self._without_errors(self.last)
+            if self.plain is None:
+                self._from_common_errors()
         return self.plain is not None
+
+    def _from_common_errors(self) -> None:
+        """Errors anew from those common to all along and to all modes, where these lead to smaller ones that do."""
+        search = self.search
+        errors = nominal_errors(search.rig, search.prior)
+        if "stiffness_0" not in errors.values:
+            return
+        common = fit(search.rig, [Effect(kind, None, {"factor": 1.0}) for kind in COMMON], search.data)
+        stiffness, damping = (float(np.log(effect.values["factor"])) for effect in common.effects)
+        sizes = {name: damping for name in errors.values if group_of(name) == "damping"} | {"stiffness_0": stiffness}
+        found = fit_jointly(search, (), nominal_errors(search.rig, search.prior, errors.values | sizes))
+        if self.explains(found) and are_plausible(found.errors, damping=False):
+            self.steps.append(found)
 
     def by_singles(self) -> bool:
         """Whether a likeliest single effect beside errors leaves next to nothing: then it is the first step."""
