@@ -26,6 +26,7 @@ from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measu
 from workbench.gap.search.plain import (
     COMMON,
     in_place_of_errors,
+    is_hardly_late,
     is_like_errors,
     is_slight,
     late_effects,
@@ -37,7 +38,7 @@ from workbench.gap.search.selection import fitted_ahead, one_more
 from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
 from workbench.rig.simulate import is_stepped
 
-TIMING = (SENSOR_DELAY, SENSOR_LAG)
+TIMING = (SENSOR_DELAY, SENSOR_LAG)  # what makes a sensor late
 
 
 class Stepwise:
@@ -97,10 +98,8 @@ class Stepwise:
             return best
         # errors of each mode, or larger ones than a model has, close what any linear effect leaves: the one that they
         # are the least beside is it
-        noise = best[0].noise_power
-        if self.search.by_mode:
-            return sorted(found, key=lambda s: s.description(noise))
-        return sorted(found, key=lambda s: s.description(noise) + self._a_number * self._size(s)[0])
+        noise, a_number = best[0].noise_power, 0.0 if self.search.by_mode else self._a_number
+        return sorted(found, key=lambda s: s.description(noise) + a_number * self._size(s)[0])
 
     def _likeliest_alone(self) -> list[Fit]:
         """The likeliest single effects one sample ahead, beside errors that give way; none that a simpler equals."""
@@ -520,8 +519,7 @@ class Stepwise:
 
     def _is_timing(self, step: Step, kinds: Collection[Kind] = (SENSOR_DELAY,)) -> bool:
         """Whether an effect of a set is what the timing of a sensor may be off by: late by less than believed."""
-        least = dict(JOINT.widest)["delay"] * self.search.data.records[0].sample_time
-        return any(lateness(effect) < least for effect in step.effects if effect.kind in kinds)
+        return any(is_hardly_late(effect, self.search) for effect in step.effects if effect.kind in kinds)
 
     def _slopes(self, step: Step) -> np.ndarray:
         """Sensitivities (n_values, n_errors) to errors beside the effects of a step, on the most telling records."""
