@@ -30,6 +30,32 @@ def test_a_gap_below_the_tolerance_is_said(hinged_rig, record_of, gain):
     assert float(told[1]) == pytest.approx(100 * 0.006 / 1.006, abs=0.06)
 
 
+def test_noise_a_little_louder_than_stated_is_no_gap(hinged_rig, record_of):
+    """A quarter louder, beside noise of a tenth of the signal at the low level: 6 % of that is not stated, and noise."""
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    inputs = np.repeat(rng.normal(size=200), 10)[None]
+    inputs *= 10.0 * rig.sensors[0].noise_std / record_of(rig, inputs, rng).outputs.std()
+    records = [record_of(rig, level * inputs, rng, name=name) for name, level in (("low", 1.0), ("high", 4.0))]
+    quieter = tuple(replace(sensor, noise_std=sensor.noise_std / 1.25) for sensor in rig.sensors)
+    channels = tuple(replace(channel, noise_std=channel.noise_std / 1.25) for channel in records[0].output_channels)
+    stated = [replace(record, output_channels=channels) for record in records]
+    verdict = diagnose(replace(rig, sensors=quieter), stated, catalogue=(kind_named("actuator_gain"),))
+    assert verdict.where.beyond_noise > 0.05
+    assert verdict.sentence == "There is no gap beyond the noise of the sensors."
+
+
+@pytest.mark.parametrize(("share", "words"), [(0.0, "less than 0.1 %"), (4e-4, "less than 0.1 %"), (0.006, "0.6 %")])
+def test_what_is_told_to_cause_next_to_nothing_is_not_said_to_cause_nothing(hinged_rig, record_of, share, words):
+    """A sensor seen to clip is told although noise makes nearly all of the gap."""
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
+    clipping = Effect(kind_named("sensor_clipping"), "d1", {"limit": 0.01}, {"limit": 0.0})
+    budget = replace(found.budget, effects={clipping.label: share}, noise=1.0 - share)
+    shown = replace(found, outcome="explained", effects=(clipping,), budget=budget)
+    assert f"causes {words} of the gap" in shown.sentence
+
+
 @pytest.mark.parametrize(
     ("delays", "words"),
     [

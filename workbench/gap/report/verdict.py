@@ -106,11 +106,12 @@ class Verdict:
         words = joined_in_words(named)
         if self.outcome == "none":
             louder = self.budget.noise_ratio > REMARKED and self.budget.unexplained < SHOWN
-            if self.nominal_errors is None and (self.where.beyond_noise == 0 or louder):
-                return "There is no gap beyond the noise of the sensors."
             if self.nominal_errors is None:
-                below = f", below the tolerance of {100.0 * self.tolerance:g} %" if self.tolerance else ""
-                return f"The gap beyond the noise is {_percent(self.where.beyond_noise)} of the signal{below}."
+                beyond, tolerance = self.where.beyond_noise, self.tolerance
+                if louder or not 0.0 < beyond < tolerance:  # what is beyond the stated noise and searched for is noise
+                    return "There is no gap beyond the noise of the sensors."
+                below = f"below the tolerance of {100.0 * tolerance:g} %"
+                return f"The gap beyond the noise is {_percent(beyond)} of the signal, {below}."
             if self.record_to_record is not None:
                 return self._differing(self.record_to_record)
             if self.budget.errors_are_small:
@@ -341,7 +342,9 @@ def place_in_words(where: Any, deviations: Mapping[str, float]) -> str:
 def _percent(share: float) -> str:
     """A share in per cent, with a digit more where it is small or nearly all."""
     percent = 100.0 * share
-    return f"{percent:.1f} %" if 0.05 <= percent < 9.95 or 99.05 <= percent < 99.95 else f"{percent:.0f} %"
+    if percent < 0.05:
+        return "less than 0.1 %"
+    return f"{percent:.1f} %" if percent < 9.95 or 99.05 <= percent < 99.95 else f"{percent:.0f} %"
 
 
 def _with_deviation(value: float, deviation: float) -> str:
