@@ -31,7 +31,7 @@ def test_a_gap_below_the_tolerance_is_said(hinged_rig, record_of, gain):
 
 
 def test_noise_a_little_louder_than_stated_is_no_gap(hinged_rig, record_of):
-    """A quarter louder, beside noise of a tenth of the signal at the low level: 6 % of that is not stated, and noise."""
+    """A quarter louder, beside noise of a tenth of the signal at the low level: 6 % of that is unstated noise."""
     rig, rng = hinged_rig(3), np.random.default_rng(5)
     inputs = np.repeat(rng.normal(size=200), 10)[None]
     inputs *= 10.0 * rig.sensors[0].noise_std / record_of(rig, inputs, rng).outputs.std()

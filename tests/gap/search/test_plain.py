@@ -13,7 +13,14 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import fit
 from workbench.gap.search.jointly import fit_jointly
-from workbench.gap.search.plain import common_as_errors, in_place_of_errors, late_effects, may_be_error, other_causes
+from workbench.gap.search.plain import (
+    common_as_errors,
+    few_one_by_one,
+    in_place_of_errors,
+    late_effects,
+    may_be_error,
+    other_causes,
+)
 from workbench.gap.search.search import Search
 from workbench.trials.make import make_trial
 from workbench.trials.scoring import score_dirty
@@ -92,6 +99,27 @@ def test_what_a_careful_model_may_be_off_by_at_a_port(search, effect, may):
 def test_stiffness_and_damping_that_are_a_little_off_are_no_effect(search):
     one = search((MODULUS, DAMPING))
     assert in_place_of_errors(one, beside_errors(one)) is None
+
+
+def test_strong_effects_are_found_one_by_one_beside_common_errors(search):
+    """Beside a sensor that reads half as much and a damper ten times as strong, stiffness and damping a little off."""
+    strong = replace(DAMPER, values={"at": 1.2, "coefficient": 0.6})
+    halved = Effect(kind_named("sensor_gain"), "d3", {"gain": 0.5})
+    one = search((strong, halved, MODULUS, DAMPING))
+    errors = beside_errors(one)
+    assert not errors.is_plausible
+    found = {effect.kind.name: effect for effect in few_one_by_one(one, errors, 4).effects}
+    assert found.keys() == {"point_damper", "sensor_gain", "modulus_error", "modal_damping"}
+    assert found["point_damper"].at == pytest.approx(1.2, abs=0.01)
+    assert found["point_damper"].values["coefficient"] == pytest.approx(0.6, rel=0.01)
+    assert found["sensor_gain"].target == "d3" and found["sensor_gain"].values["gain"] == pytest.approx(0.5, rel=0.01)
+    assert found["modulus_error"].values["factor"] == pytest.approx(1.008, abs=0.001)
+
+
+def test_what_a_careful_model_may_have_at_a_port_is_not_taken_for_one_of_few(search):
+    slight = Effect(kind_named("sensor_gain"), "d3", {"gain": 1.03})
+    one = search((slight,))
+    assert few_one_by_one(one, beside_errors(one), 4) is None
 
 
 @pytest.mark.slow

@@ -429,7 +429,7 @@ def _with_a_second(
         return alone
     near = min(f.cost for f in (start, *singles)) < 1.0 + STEPWISE.no_gap
     # damping is hardly known: where its errors alone are large, an effect that makes them smaller is asked for, no more
-    enough = beside.is_enough or beside.without_errors() or beside.by_singles()
+    enough = beside.is_enough or beside.without_errors() or beside.by_singles() or beside.by_few()
     enough = enough or (beside.is_quiet and beside.is_believed)
     if not (enough or near or search.is_over):
         random = random_beside(search, singles) or random_beside_errors(search, beside.steps[0])

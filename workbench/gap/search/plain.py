@@ -2,21 +2,24 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind, apply_all
-from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
+from workbench.gap.effects.limiting_cases import contained, each_left_out, simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, nominal_errors
 from workbench.gap.effects.ports import ACTUATOR_DELAY, ACTUATOR_LAG, SENSOR_DELAY, SENSOR_LAG
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.finish import finished, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import Step, on_their_sides, surely_late
 from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Search, promise
-from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, SELECTION, STEPWISE
+from workbench.gap.search.selection import on_whole_records, one_more
+from workbench.gap.search.settings import JOINT, PAIRS, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.structure.domain import middle
 from workbench.structure.member import Structure
@@ -262,6 +265,46 @@ def late_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
     if (2.0 * apart / common) ** (len(delays) - 1) > PLAIN.by_chance:  # of sensors that are about as late as these
         return ()
     return _common(rig, common * sample_time)
+
+
+def few_one_by_one(search: Search, step: Step, most: int) -> Fit | None:
+    """At most so many effects, each found beside those before and both common errors, that leave only noise.
+
+    None where one leaves more than half of what was there, on whole records and one sample ahead, or is what a careful
+    model may be off by at a port. Errors of their own for every mode and wave stand in for strong effects that are
+    still missing, and cost more to ask beside.
+
+    Args:
+        search: what they are sought in.
+        step: errors of the nominal model that leave more, or that no model has.
+        most: effects.
+    """
+    common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON)
+    best = fit(search.rig, common, search.data)
+    for _ in range(most):
+        if search.is_over:
+            return None
+        ahead = one_more(search, best.effects, search.evidence_of(apply_all(search.rig, best.effects)))
+        fits = on_whole_records(search, ahead, PAIRS.more)
+        nearer = bool(fits) and fits[0].cost - 1.0 < PAIRS.nearer * (best.cost - 1.0)
+        if not (nearer or (fits and ahead[0].cost < PAIRS.nearer * cost_of(search.rig, best.effects, search.ahead))):
+            return None
+        comes_to, enough = contained(fits[0].effects, search.rig), (1.0 + SEARCH.significant) * fits[0].cost
+        best = next((f for f in fits if f.key in comes_to and f.cost < enough), fits[0])
+        named = [effect for effect in best.effects if effect.kind not in COMMON]
+        if any(may_be_error(effect, search) for effect in named):
+            return None
+        if best.cost < PLAIN.near and search.explains(finished(search, best)):
+            sets = [(*s, *some) for s in (named, *each_left_out(named)) for some in _some_of(common)]
+            found = _explaining(search, [s for s in sets if s], step)
+            return None if found is None else with_intervals(search.rig, found, search.data, search.workers)
+    return None
+
+
+def _some_of(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
+    """Every subset, the empty one first."""
+    for n in range(len(effects) + 1):
+        yield from combinations(effects, n)
 
 
 def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...], step: Step) -> Fit | None:

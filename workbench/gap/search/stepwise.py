@@ -25,6 +25,7 @@ from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened, size_of
 from workbench.gap.search.plain import (
     COMMON,
+    few_one_by_one,
     in_place_of_errors,
     is_hardly_late,
     is_like_errors,
@@ -165,6 +166,17 @@ class Stepwise:
         self._with_input_noise(best)
         self.steps.append(self._finely(self.last))
         return True
+
+    def by_few(self) -> bool:
+        """Whether few effects beside both common errors explain the records, where errors alone are not believed."""
+        if self.is_believed or self.last.effects or self.search.logged:
+            return False
+        found = few_one_by_one(self.search, self.last, STEPWISE.most)
+        if found is None or not self._matter(found.effects, found.effects):
+            return False
+        if all(effect.stands_out(self.search.rig) for effect in found.effects):
+            self.plain = found
+        return self.plain is not None
 
     def run(self, most: int = STEPWISE.most) -> None:
         """Add effects as long as each takes most of what is left above the noise, at most so many; once."""
