@@ -133,7 +133,9 @@ def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
     found = tmp_path / "design.json"
     result = run("design", rig, "--control", 4, "--weight", 20, "--final-time", 3000, "--json", found)
     assert result.exit_code == 0, result.output
-    imsc, coupled = json.loads(found.read_text())["laws"]
+    written = json.loads(found.read_text())
+    imsc, coupled = written["laws"]
+    assert written["controlled"] == [1, 2, 3, 4]  # as a page and the command count modes
     expected = [1.213865e-3, 5.203347e-5, 1.294254e-4, 1.037589e-4]
     np.testing.assert_allclose(imsc["work"][5:], expected, rtol=1e-5)
     assert coupled["cost"] <= imsc["cost"] * (1 + 1e-9)

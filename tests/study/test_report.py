@@ -20,7 +20,7 @@ IDENTIFIED = {
     "damping_ratios": [0.01], "damping_std": [0.001], "shapes_real": [[1.0], [0.5]], "shapes_imag": [[0.0], [0.1]],
 }  # fmt: skip
 DESIGNED = {
-    "weight": 2.0, "controlled": [0],
+    "weight": 2.0, "controlled": [1],
     "laws": [{"law": "IMSC", "cost": 1.0, "effort": 2.0, "peak_force": 3.0, "work": [-1.0, 0.25, 0.5],
               "poles_real": [-1.0, -1.0], "poles_imag": [2.0, -2.0]}],
 }  # fmt: skip
@@ -29,7 +29,7 @@ STUDIED = {
     "checks": [{"name": "c", "value": 0.5, "limit": 1.0, "holds": True, "at_least": False}], "found": ["a line"],
 }  # fmt: skip
 PLACED = {
-    "length": 10.0, "controlled": [0, 1], "lower_bound": 0.2,
+    "length": 10.0, "controlled": [1, 2], "lower_bound": 0.2,
     "placements": [{"positions": [2.0, 6.0], "residual_work": 0.25, "by_mode": [0.1, 0.15], "effort": 1.0,
                     "peak_force": 0.5, "condition": 2.0, "status": "Solve_Succeeded"}],
 }  # fmt: skip
@@ -59,8 +59,10 @@ def test_identified_modes_swing(tmp_path):
     assert track["imaginary"] == [[0.0], [0.1]]
 
 
-def test_a_design_shows_what_it_spills(tmp_path):
-    shown = page_content_in(written(tmp_path, DESIGNED))
+@pytest.mark.parametrize("counted_from", [1, 0])
+def test_a_design_shows_what_it_spills(tmp_path, counted_from):
+    """Modes are counted from one; a file written before they were is read too."""
+    shown = page_content_in(written(tmp_path, {**DESIGNED, "controlled": [counted_from]}))
     heads = ("law", "cost", "effort [N² s]", "peak force [N]", "W_R [J]", "loop")
     assert shown.tables == [("Laws", heads, [["IMSC", 1.0, 2.0, 3.0, 0.75, "stable"]])]
     [bars] = [m for m in shown.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "bars"]

@@ -99,7 +99,7 @@ def design(
             "impulse_at": at,
             "weight": weight,
             "final_time": end,
-            "controlled": list(range(n)),
+            "controlled": list(range(1, n + 1)),
             "laws": [
                 {
                     "law": row.law.name,

@@ -127,7 +127,7 @@ def place(
             "length": None if isinstance(domain, NamedPoints) else domain.length,
             "impulse_at": struck,
             "weight": weight,
-            "controlled": list(range(control)),
+            "controlled": list(range(1, control + 1)),
             "placements": [{key: getattr(row, key) for key in WRITTEN} for row in rows],
             "lower_bound": None if certificate is None else certificate.lower_bound,
         },

@@ -185,8 +185,12 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
 def _designed(content: dict[str, Any]) -> dict[str, Any]:
     """A comparison of control laws."""
     laws = content["laws"]
-    controlled = set(content.get("controlled", ()))
-    works = {law["law"]: np.array([w for r, w in enumerate(law["work"]) if r not in controlled], float) for law in laws}
+    controlled = content.get("controlled", ())
+    first = 0 if 0 in controlled else 1  # files of earlier versions count modes from zero
+    works = {
+        law["law"]: np.array([w for r, w in enumerate(law["work"], first) if r not in controlled], float)
+        for law in laws
+    }
     poles = {law["law"]: _poles_of(law) for law in laws}
     rows = [
         [
