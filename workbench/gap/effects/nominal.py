@@ -18,7 +18,7 @@ from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints, centred_at, middle, reach
 from workbench.structure.member import Structure
-from workbench.structure.modes import PointShapes, Shapes
+from workbench.structure.modes import Modes, PointShapes, Shapes
 from workbench.structure.profile import Profile
 
 FEW = 9  # cosines that may be as large as one another; of more, those beyond SMOOTH half waves fall off by the square,
@@ -81,6 +81,7 @@ GROUPS = ("stiffness", "mass", "frequency", "damping", "delay", "gain", "place",
 OUTSIDE = ("delay", "gain", "place", "shape", "record")  # groups that leave the modes as they are
 
 
+@lru_cache(maxsize=4096)
 def group_of(parameter: str) -> str:
     """The group that a parameter of the nominal errors belongs to."""
     return parameter.split("_", 1)[0]
@@ -252,7 +253,7 @@ def _off(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, floa
     rig = _solved(rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE})
     rig = differing(rig, prior.figure, deviations_of(values))
     ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
-    units = _shape_units(rig) if prior.shape else np.zeros((len(ports), 0))
+    units = _shape_units(rig.modes, ports) if prior.shape else np.zeros((len(ports), 0))
     off = [_off_port(rig, port, unit, prior, values) for port, unit in zip(ports, units, strict=True)]
     if all(one is other for one, other in zip(ports, off, strict=True)):
         return rig
@@ -264,22 +265,27 @@ def _off_port(rig: Rig, port: Any, units: Floats, prior: NominalPrior, values: d
     """An actuator or a sensor with the errors of its place, its calibration, its mode shapes (n_modes,), its timing."""
     changes: dict[str, Any] = {}
     if prior.place:
-        domain = rig.modes.domain
-        errors = [values.get(name, 0.0) for name in _places(rig, port)]  # shares of the extent
-        if any(errors) and not isinstance(domain, NamedPoints):
-            at = np.atleast_1d(np.asarray(middle(port.at), float)) + np.array(errors) * domain.size
-            at = np.clip(at, *reach(domain, port.at))  # where outputs are exchanged, it stands elsewhere
-            changes["at"] = centred_at(port.at, tuple(at.tolist()) if at.size > 1 else float(at[0]))
+        errors = tuple([values.get(name, 0.0) for name in _places(rig, port)])  # shares of the extent
+        if any(errors):
+            changes["at"] = _moved(rig.modes.domain, port.at, errors)
     if gain := values.get(_gain(port), 0.0):
         changes["gain"] = port.gain * float(np.exp(gain))
     if units.size:
-        errors = [values.get(name, 0.0) for name in _shapes(port, units.size)]
-        changes["shape_error"] = tuple((units * errors).tolist())
+        own = [values.get(name, 0.0) for name in _shapes(port, units.size)]
+        changes["shape_error"] = tuple((units * own).tolist())
     if delay := values.get(f"delay_{port.name}", 0.0) if isinstance(port, Sensor) else 0.0:
         changes["delay"] = port.delay + delay * prior.sample_time
     if prior.interpolated and isinstance(port, Sensor):
         changes["interpolated"] = True
     return _changed(port, tuple(changes.items())) if changes else port
+
+
+@lru_cache(maxsize=4096)
+def _moved(domain: Any, where: Any, errors: tuple[float, ...]) -> Any:
+    """A place that is off by shares of the extent, on the structure still: exchanged outputs stand elsewhere."""
+    at = np.atleast_1d(np.asarray(middle(where), float)) + np.array(errors) * domain.size
+    at = np.clip(at, *reach(domain, where))
+    return centred_at(where, tuple(at.tolist()) if at.size > 1 else float(at[0]))
 
 
 @lru_cache(maxsize=4096)
@@ -296,10 +302,13 @@ def _room(rig: Rig, port: Actuator | Sensor) -> Floats:
     return room
 
 
-def _shape_units(rig: Rig) -> Floats:
-    """Rms of each mode, its displacement or its slope, at all ports of that kind: (n_ports, n_modes)."""
-    ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
-    shapes, kinds = np.array([shape_of(rig.modes, port) for port in ports]), [derivative_of(port) for port in ports]
+@lru_cache(maxsize=64)
+def _shape_units(modes: Modes, ports: tuple[Actuator | Sensor, ...]) -> Floats:
+    """Rms of each mode, its displacement or its slope, at all ports of that kind: (n_ports, n_modes).
+
+    Remembered: not to be written to.
+    """
+    shapes, kinds = np.array([shape_of(modes, port) for port in ports]), [derivative_of(port) for port in ports]
     rms = {kind: np.sqrt((shapes[np.array(kinds) == kind] ** 2).mean(axis=0)) for kind in set(kinds)}
     return np.array([rms[kind] for kind in kinds])
 
@@ -316,9 +325,10 @@ def _places(rig: Rig, port: Actuator | Sensor) -> list[str]:
     return [f"place_{_side(port)}_{port.name}_{name}" for name in coordinates]
 
 
-def _shapes(port: Actuator | Sensor, n_modes: int) -> list[str]:
+@lru_cache(maxsize=1024)
+def _shapes(port: Actuator | Sensor, n_modes: int) -> tuple[str, ...]:
     """Names of the errors of the mode shapes there."""
-    return [f"shape_{_side(port)}_{port.name}_{r}" for r in range(1, n_modes + 1)]
+    return tuple(f"shape_{_side(port)}_{port.name}_{r}" for r in range(1, n_modes + 1))
 
 
 def _side(port: Actuator | Sensor) -> str:

@@ -143,6 +143,9 @@ class _Problem:
             for (_, p), z in zip(self.parameters, self.start, strict=True)
         ]
         self.steps = np.array(floor)
+        self.scale, self.least, self.most = (
+            np.array([getattr(p, name) for _, p in self.parameters]) for name in ("scale", "low", "high")
+        )
         self.low = np.array([p.to_free(p.low) for _, p in self.parameters])
         self.high = np.array([p.to_free(p.high) for _, p in self.parameters])
         # a believed value is one more measurement: of itself, by its own standard deviation
@@ -160,8 +163,9 @@ class _Problem:
 
     def at(self, free: np.ndarray) -> tuple[Effect, ...]:
         values = [dict(effect.values) for effect in self.effects]
-        for (i, parameter), z in zip(self.parameters, free, strict=True):
-            values[i][parameter.name] = parameter.from_free(z)
+        numbers = np.minimum(np.maximum(free * self.scale, self.least), self.most).tolist()
+        for (i, parameter), z, number in zip(self.parameters, free, numbers, strict=True):
+            values[i][parameter.name] = parameter.from_free(z) if parameter.logarithmic else number
         return tuple(replace(e, values=v) for e, v in zip(self.effects, values, strict=True))
 
     def residual(self, free: np.ndarray, *, coarsely: bool = False) -> np.ndarray | None:
