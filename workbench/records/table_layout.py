@@ -172,7 +172,7 @@ def _with_names(
             units = tuple(field.strip(" []()") for field in titles[-1][2][n_stamps:])
         titles = titles[:-1]
     names = (
-        _told_apart([row[2] for row in titles]) if titles else _fields(comment, delimiter, trailing)
+        _distinct_names([row[2] for row in titles]) if titles else _fields(comment, delimiter, trailing)
     )  # as numpy's savetxt: behind a comment
     if not titles and len(names) != len(fields):
         if lines:
@@ -188,7 +188,7 @@ def _with_names(
     return layout
 
 
-def _told_apart(titles: Sequence[list[str]]) -> list[str]:
+def _distinct_names(titles: Sequence[list[str]]) -> list[str]:
     """The names of the last line of titles; where some are alike, behind what stands above them."""
     names = [name.strip() for name in titles[-1]]
     for above in reversed(titles[:-1]):

@@ -63,7 +63,7 @@ class Verdict:
     notes: tuple[str, ...] = ()
 
     @property
-    def _told(self) -> tuple[Effect, ...]:
+    def _named(self) -> tuple[Effect, ...]:
         """The effects, rounding or clipping of every sensor stated once."""
         shown = [e for e in self.effects if e.kind is not NOMINAL_ERRORS]
         for kind in dict.fromkeys(e.kind for e in shown if e.kind.found_in == "readings"):
@@ -102,7 +102,7 @@ class Verdict:
     @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
-        named = [_described(effect, self.nominal) for effect in self._told]
+        named = [_described(effect, self.nominal) for effect in self._named]
         words = joined_in_words(named)
         if self.outcome == "none":
             louder = self.budget.noise_ratio > REMARKED and self.budget.unexplained < SHOWN
@@ -122,7 +122,7 @@ class Verdict:
             )
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if self.outcome == "explained":
-            shares = [self._share_of(effect) for effect in self._told]
+            shares = [self._share_of(effect) for effect in self._named]
             if len(named) == 1:
                 text = f"{words} causes {_percent(shares[0])} of the gap"
             else:
@@ -207,7 +207,7 @@ class Verdict:
     def to_json(self) -> dict[str, Any]:
         """The verdict as the case format asks for it, and what stands behind it."""
         known = self.outcome in ("none", "explained")
-        effects = [effect_json(effect, self.nominal) for effect in self._told]
+        effects = [effect_json(effect, self.nominal) for effect in self._named]
         shrink = self.shrinkage
         rivals = zip(self.alternatives, self.rivals, strict=True)
         return {
