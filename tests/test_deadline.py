@@ -2,7 +2,9 @@
 
 from time import process_time
 
+import numpy as np
 import pytest
+from numba import njit
 
 from workbench.deadline import NEVER, Deadline
 from workbench.gap.prediction.workers import Workers
@@ -34,6 +36,23 @@ def test_a_forked_process_counts_on_from_the_fork():
         return deadline.is_past
 
     assert Workers(2).map(later, range(2)) == [True, True]
+
+
+def test_what_compiling_takes_is_not_counted():
+    """In a forked process, too, whose clock begins anew."""
+
+    def compiled_anew(_=None):
+        begun = process_time()
+        njit(lambda x: np.sort(x)[::-1].cumsum())(np.ones(3))
+        busy(0.05)
+        return process_time() - begun > 0.2
+
+    compiled_anew()  # the compiler itself is loaded
+    deadline = Deadline(0.2)
+    assert compiled_anew() and not deadline.is_past
+    assert Workers(2).map(lambda _: (compiled_anew(), deadline.is_past), range(2)) == [(True, False)] * 2
+    busy(0.2)
+    assert deadline.is_past
 
 
 def test_no_time_at_all_is_refused():

@@ -43,7 +43,7 @@ def diagnose(
         bool, typer.Option("--as-wired", help="Go on in spite of faults of wiring and units, without correcting them.")
     ] = False,
     workers: Annotated[int | None, typer.Option(help="Processes sharing the work; one per core unless given.")] = None,
-    seconds: Annotated[float, typer.Option(help="Processor time to search for, s.")] = 120.0,
+    seconds: Annotated[float, typer.Option(help="Processor time to search for, s; twice as long on one core.")] = 120.0,
 ) -> None:
     """Locate the gap between a simulation and a test, name the missing effect, and measure how far the gap closes.
 

@@ -42,7 +42,7 @@ PAID = 0.02  # of what is left of records held out: what an effect that acts the
 TRIFLE = 0.0005  # of the gap there: likewise
 CLEAR = 10.0  # times that: what is left there without an effect that counts beyond doubt
 HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
-SECONDS = 120.0  # of processor time of this process: twice what cases of a laboratory take at most
+SECONDS = 120.0  # of processor time of this process and one beside it: twice what cases of a laboratory take at most
 SEARCH_SHARE = 0.8  # of that time; the rest is for intervals, budget and the next experiment
 BESIDE_ERRORS = 0.8  # likewise where the model itself is a little off: 4 % of the gap's power may be left
 
@@ -75,8 +75,8 @@ def diagnose(
         name: of the case.
         report: called with (what, share done) as the search proceeds.
         workers: processes that share the work, this one included; None for one per core.
-        seconds: of processor time of this process, after which the search ends with the best that it has, and the
-            verdict says so; None for no limit.
+        seconds: of processor time of this process, twice as many where it works alone, after which the search ends with
+            the best that it has, and the verdict says so; None for no limit. What compiling takes is not counted.
         settle: seconds at the start of each record that are simulated but not counted, where a record does not start
             at rest.
         free_nominal: fit errors of the nominal model beside every effect from the first.
@@ -89,6 +89,9 @@ def diagnose(
         ValueError: records that do not fit the rig or cannot be of it, a validation record that repeats one to be
             fitted, or modes that are not those of the structure.
     """
+    sharing = Workers.at_hand() if workers is None else Workers(workers)
+    if seconds is not None and sharing.number == 1:
+        seconds *= 2.0
     deadline = Deadline(None if seconds is None else SEARCH_SHARE * seconds)
     for record in (*records, *validation):
         _check(rig, record)
@@ -102,7 +105,6 @@ def diagnose(
         each = zip(rig.sensors, noise_guessed(rig, records), strict=True)
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
     faults = () if settle else wiring(rig, records)
-    sharing = Workers.at_hand() if workers is None else Workers(workers)
     report("looking for the unmodelled force", 0.02)
     found = baseline(rig, records, settle=settle, workers=sharing, deadline=deadline)
     nominal = found.nominal

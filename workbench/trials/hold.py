@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from workbench.cases.case import read_case
-from workbench.gap.diagnose import SECONDS, diagnose
+from workbench.gap.diagnose import diagnose
 from workbench.trials.make import write_trials
 from workbench.trials.scoring import Tally, score, score_dirty, tally
 
@@ -87,7 +87,7 @@ def processor_times(trials: Iterable[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def verdict_on(folder: Path) -> dict[str, Any]:
-    """The verdict on a case folder, as JSON, by one process, which has the time of two."""
+    """The verdict on a case folder, as JSON, by one process."""
     case = read_case(folder)
-    verdict = diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1, seconds=2.0 * SECONDS)
+    verdict = diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1)
     return verdict.to_json()
