@@ -118,7 +118,7 @@ def test_strong_effects_are_found_one_by_one_beside_common_errors(search):
 
 def test_what_a_careful_model_may_have_at_a_port_is_not_taken_for_one_of_few(search):
     slight = Effect(kind_named("sensor_gain"), "d3", {"gain": 1.03})
-    one = search((slight,))
+    one = replace(search((slight,)), catalogue=(slight.kind,))
     assert few_one_by_one(one, beside_errors(one), 4) is None
 
 
