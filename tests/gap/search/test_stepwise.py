@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from workbench.deadline import Deadline
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, apply_all
@@ -217,6 +218,24 @@ def test_sensors_are_late_as_the_records_show(rig, measured, interpolated):
     assert found.errors.target.interpolated is interpolated
     np.testing.assert_allclose(delays, late, atol=0.01)
     assert beside.explains(found)
+
+
+def test_a_comparison_that_time_cut_short_names_nothing(rig, measured):
+    """A stiff spring beside errors, the only one that is tried: where time ran out, others may have been as likely."""
+    spring = Effect(kind_named("ground_spring"), None, {"at": 0.7, "stiffness": 40.0})
+    real = apply_all(rig, (spring,))
+    deadline = Deadline()
+    data = FitData(
+        (measured(real, "low", 0.3, 0), measured(real, "high", 3.0, 1)), np.full(4, NOISE), deadline=deadline
+    )
+    nominal = data.by_channel(data.residual(rig))
+    beside = Stepwise(Search(rig, data, data, data, CATALOGUE, lambda *_: None, ALONE, nominal))
+    beside.singles = [(spring,)]
+    assert len(beside.alone) == 1
+    deadline._end = 0.0
+    assert not beside.by_singles() and not beside.last.effects
+    deadline._end = np.inf
+    assert beside.by_singles() and beside.last.effects[0].kind is spring.kind
 
 
 @pytest.mark.slow

@@ -143,7 +143,7 @@ class Stepwise:
 
     def by_singles(self) -> bool:
         """Whether a likeliest single effect beside errors leaves next to nothing: then it is the first step."""
-        if not self.alone:
+        if not self.alone or self.search.is_over:  # fits that were cut off tell no likeliest
             return False
         best = self.alone[0]
         beside = None if self.explains(best) else self._with_input_noise(best)
