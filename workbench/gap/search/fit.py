@@ -163,6 +163,7 @@ class _Problem:
 
     def at(self, free: np.ndarray) -> tuple[Effect, ...]:
         values = [dict(effect.values) for effect in self.effects]
+        # what is no logarithm at once, as `from_free` has it: errors are dozens
         numbers = np.minimum(np.maximum(free * self.scale, self.least), self.most).tolist()
         for (i, parameter), z, number in zip(self.parameters, free, numbers, strict=True):
             values[i][parameter.name] = parameter.from_free(z) if parameter.logarithmic else number

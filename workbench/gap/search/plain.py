@@ -25,6 +25,7 @@ from workbench.structure.domain import middle
 from workbench.structure.member import Structure
 
 COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
+NO_COMMON = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON)  # of no size, to be fitted from there
 OF_PORTS = ("delay", "gain", "place")  # groups of errors that are no mode's and no wave's
 OF_ALL = (SENSOR_LAG, ACTUATOR_LAG, ACTUATOR_DELAY)  # what makes all sensors late by as much
 
@@ -121,7 +122,7 @@ def _in_place(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]], 
     """The same beside those errors at the ports."""
     effects = step.effects
     named = {effect.kind for effect in effects}
-    common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON if kind not in named)
+    common = tuple(effect for effect in NO_COMMON if effect.kind not in named)
     at_ports = [ports for ports in _for_one_cause(search.rig, kept) if named.isdisjoint(e.kind for e in ports)]
     if not effects:
         both = _explaining(search, [(*common, *ports) for ports in at_ports], step)
@@ -130,7 +131,7 @@ def _in_place(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]], 
         # beside noise of the inputs that an effect made seem louder, common errors may explain what they do not cause
         more = _one_more(search, (*common, *kept), (), step) if both is None or search.logged else None
         return _one_common(search, common, kept, both, step) if more is None and both is not None else more
-    sets = [s for given in (effects, *rivals) for s in (given, *((*given, e) for e in common), (*given, *common))]
+    sets = [(*given, *some) for given in (effects, *rivals) for some in _some_of(common)]
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
         fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
@@ -279,8 +280,7 @@ def few_one_by_one(search: Search, step: Step, most: int) -> Fit | None:
         step: errors of the nominal model that leave more, or that no model has.
         most: effects.
     """
-    common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON)
-    best = fit(search.rig, common, search.data)
+    best = fit(search.rig, NO_COMMON, search.data)
     for _ in range(most):
         if search.is_over:
             return None
@@ -295,7 +295,7 @@ def few_one_by_one(search: Search, step: Step, most: int) -> Fit | None:
         if any(may_be_error(effect, search) for effect in named):
             return None
         if best.cost < PLAIN.near and search.explains(finished(search, best)):
-            sets = [(*s, *some) for s in (named, *each_left_out(named)) for some in _some_of(common)]
+            sets = [(*s, *some) for s in (named, *each_left_out(named)) for some in _some_of(NO_COMMON)]
             found = _explaining(search, [s for s in sets if s], step)
             return None if found is None else with_intervals(search.rig, found, search.data, search.workers)
     return None

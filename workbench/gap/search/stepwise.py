@@ -25,6 +25,7 @@ from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened, size_of
 from workbench.gap.search.plain import (
     COMMON,
+    NO_COMMON,
     few_one_by_one,
     in_place_of_errors,
     is_hardly_late,
@@ -134,7 +135,7 @@ class Stepwise:
         errors = nominal_errors(search.rig, search.prior)
         if "stiffness_0" not in errors.values:
             return
-        common = fit(search.rig, [Effect(kind, None, {"factor": 1.0}) for kind in COMMON], search.data)
+        common = fit(search.rig, NO_COMMON, search.data)
         stiffness, damping = (float(np.log(effect.values["factor"])) for effect in common.effects)
         sizes = {name: damping for name in errors.values if group_of(name) == "damping"} | {"stiffness_0": stiffness}
         found = fit_jointly(search, (), nominal_errors(search.rig, search.prior, errors.values | sizes))
