@@ -117,7 +117,7 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
     # where the structure moves less, the same effect takes more strength
     factors = FINISH.factors if strength is not None else (1.0,)
     tried = []
-    for where in _other_places(effect, domain):
+    for where in other_places(effect, domain):
         there = [moved(where, factor) for factor in factors]
         likeliest = min(there, key=lambda s: cost_of(search.rig, s, search.first))
         tried.append(fit(search.rig, likeliest, search.first, iterations=FINISH.tried))
@@ -127,7 +127,7 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
     return [*(f.effects for f in elsewhere[:2]), *map(moved, _mirrored(effect.at, domain))]
 
 
-def _other_places(effect: Effect, domain: Domain) -> Sequence[Where]:
+def other_places(effect: Effect, domain: Domain) -> Sequence[Where]:
     """Along an interval or over a rectangle some all over it; named points; pairs of them with either point kept."""
     if isinstance(domain, Interval):
         return [float(x) for x in domain.length * np.linspace(0.04, 0.96, 13)]

@@ -21,6 +21,7 @@ from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
+from workbench.gap.search.finish import other_places
 from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened, size_of
 from workbench.gap.search.plain import (
@@ -35,7 +36,7 @@ from workbench.gap.search.plain import (
     lateness,
     other_causes,
 )
-from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
+from workbench.gap.search.search import Decision, Search, apart, most_informative, spread_over_kinds
 from workbench.gap.search.selection import fitted_ahead, one_more
 from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
 from workbench.rig.simulate import is_stepped
@@ -209,7 +210,7 @@ class Stepwise:
             if self.search.is_over:
                 break
             before = self.last
-            step = self._with_one_more(before)
+            step = self._elsewhere(before) or self._with_one_more(before)
             if step is None:
                 break
             self.steps.append(step)
@@ -381,6 +382,25 @@ class Stepwise:
     def _a_number(self) -> float:
         """Description length, nats, of a number."""
         return 0.5 * float(np.log(self.search.data.n_values))
+
+    def _elsewhere(self, step: Step) -> Step | None:
+        """The one linear effect of the structure at another place, where beside errors it leaves less than here.
+
+        Errors of all waves bend to it wherever it is, and to first order they are what it is: it has a valley at every
+        wave, and only fits tell which of them is the deepest.
+        """
+        if len(step.effects) != 1 or not is_like_errors(step.effects[0].kind) or step.effects[0].at is None:
+            return None
+        (effect,), domain = step.effects, self.search.rig.modes.domain
+        self.search.report("the same effect elsewhere", 0.6)
+        places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
+        here, *others = self._fitted([(effect,), *places], step, self._slopes(step))
+        near = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
+        best = min(near, key=lambda s: s.fit.cost, default=here)
+        if best.fit.cost > STEPWISE.near * here.fit.cost:
+            return None
+        found = self._whole(best)
+        return found if self._loss(found) < self._loss(step) else None
 
     def _with_one_more(self, step: Step) -> Step | None:
         """The best set with one more effect, where it takes most of what is left."""
