@@ -236,7 +236,7 @@ def test_inputs_that_run_straight_between_samples():
     assert np.abs(found.state_space(w) - plant(w)).max() < 1e-6 * np.abs(plant(w)).max()
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_noise_that_outputs_share_is_no_mode(seed):
     """As of what shakes the whole bench: its peaks counted once an output."""
     quiet = measured(system(4, 1, seed=seed), excitation("noise", 1))

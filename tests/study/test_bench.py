@@ -8,6 +8,7 @@ import time
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from itertools import combinations, pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -428,24 +429,23 @@ def apart(look, until, tmp_path):
     return checked
 
 
-SCREENS = [
-    (390, "dark"),
-    (1400, "light"),
-    *(pytest.param(*screen, marks=pytest.mark.slow) for screen in ((390, "light"), (1400, "dark"))),
-]
+def screens(*first: tuple[int, str]) -> list[Any]:
+    """Every screen, those apart from the first ones in the slow run alone."""
+    every = [(width, scheme) for width in (390, 1400) for scheme in ("light", "dark")]
+    return [screen if screen in first else pytest.param(*screen, marks=pytest.mark.slow) for screen in every]
 
 
-@pytest.mark.parametrize(("width", "scheme"), SCREENS)
+@pytest.mark.parametrize(("width", "scheme"), screens((1400, "light")))
 def test_nothing_covers_anything_else_beside_a_beam(width, scheme, apart):
     apart(RIG, TEXT, width, scheme)
 
 
-@pytest.mark.parametrize(("width", "scheme"), SCREENS)
+@pytest.mark.parametrize(("width", "scheme"), screens((390, "dark")))
 def test_nothing_covers_anything_else_on_a_plate(width, scheme, apart, plate):
     apart(*plate, width, scheme)
 
 
-@pytest.mark.parametrize(("width", "scheme"), SCREENS)
+@pytest.mark.parametrize(("width", "scheme"), screens((1400, "light")))
 def test_nothing_covers_anything_else_on_a_frame(width, scheme, apart, frame):
     apart(*frame, width, scheme)
 

@@ -12,8 +12,9 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import fit
-from workbench.gap.search.jointly import fit_jointly
+from workbench.gap.search.jointly import fit_jointly, surely_late
 from workbench.gap.search.plain import (
+    _at_ports,
     common_as_errors,
     few_one_by_one,
     in_place_of_errors,
@@ -169,6 +170,13 @@ def test_one_sensor_late_alone_is_an_effect(hinged_rig, late, alone):
     found = late_effects(hinged_rig(n_modes=4), errors)
     assert [effect.target for effect in found] == ([alone] if alone else [])
     assert all(effect.values["delay"] == pytest.approx(0.005) for effect in found)
+
+
+def test_a_sensor_on_the_late_side_of_jumps_stays_there_by_a_trifle(hinged_rig):
+    late = NominalPrior(delay=1e-6, gain=0.01, late=("d1",), sample_time=0.01)
+    errors = nominal_errors(hinged_rig(n_modes=4), late, {"delay_d1": 1e-4})
+    sides = [surely_late(kept).target for (kept,) in _at_ports(errors)]
+    assert sides and all(side.delay == late.delay and not side.late for side in sides)
 
 
 @pytest.mark.parametrize(("deviation", "is_late"), [(0.02, True), (0.2, False)])

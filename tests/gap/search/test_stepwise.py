@@ -175,6 +175,13 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (20281121, "input", 1.0, ("point_mass",)),  # small errors stood for it beside noise of the inputs
         (20270165, "input", 2.0, ("point_mass",)),  # errors common to all did
         (20270117, "offset", 0.5, ("sensor_delay",)),  # told as sensors that are late beside common errors
+        (
+            75100003,
+            "shape",
+            1.0,
+            ("local_stiffness_loss",),
+        ),  # errors had bent to it, and left a mass to do what is left
+        (75200007, "offset", 1.0, ("local_stiffness_loss",)),  # a traceback: sensors on the late side of jumps
         (881003, "triple", 0.5, ("actuator_dead_zone", "clearance", "ground_spring")),  # told as a cubic spring
     ],
 )

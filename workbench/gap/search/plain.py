@@ -156,7 +156,7 @@ def _at_ports(errors: Effect) -> Iterator[tuple[Effect, ...]]:
     prior = errors.target
     sides = {"late": prior.late, "early": prior.early, "interpolated": prior.interpolated}
     timing = NominalPrior(sample_time=prior.sample_time, waves=prior.waves, **sides)
-    if prior.delay > PLAIN.punctual:
+    if prior.delay > PLAIN.punctual or prior.late:
         timing = replace(timing, delay=prior.delay)
     for kept in dict.fromkeys((timing, replace(timing, gain=prior.gain, place=prior.place))):
         values = {name: value for name, value in errors.values.items() if group_of(name) in kept.groups}

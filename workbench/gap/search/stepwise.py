@@ -111,16 +111,18 @@ class Stepwise:
         beside = replace(search, held=(self.last.errors,))
         without = cost_of(search.rig, beside.held, beside.ahead)
         found = [f for f in fitted_ahead(beside, sets) if beside.surely_better(f, without, f.n_parameters)]
+        alike = spread_over_kinds([f for f in self.ahead if is_like_errors(f.effects[0].kind)], 1)
         if not (found or self.is_believed):  # errors that no model has are what leaves it nothing to do
-            alike = [f for f in self.ahead if is_like_errors(f.effects[0].kind)]
-            return spread_over_kinds(alike, 1)[: STEPWISE.singles]
+            return alike[: STEPWISE.singles]
         chosen: list[Fit] = []
         for single in spread_over_kinds(found, 1):
             comes_to = contained(single.effects, search.rig)
             as_likely = {f.key for f in found if f.cost < (1.0 + SEARCH.significant) * single.cost}
             if not comes_to & as_likely:
                 chosen.append(single)
-        return [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.near * chosen[0].cost]
+        chosen = [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.near * chosen[0].cost]
+        # errors that have bent to an effect leave others to do what is left: the likeliest without them is tried too
+        return chosen + [f for f in alike[:1] if f.key not in {other.key for other in chosen}]
 
     def without_errors(self) -> bool:
         """Whether few effects explain the records as well as errors of the nominal model that no model has."""
