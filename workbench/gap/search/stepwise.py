@@ -111,7 +111,7 @@ class Stepwise:
         beside = replace(search, held=(self.last.errors,))
         without = cost_of(search.rig, beside.held, beside.ahead)
         found = [f for f in fitted_ahead(beside, sets) if beside.surely_better(f, without, f.n_parameters)]
-        alike = spread_over_kinds([f for f in self.ahead if is_like_errors(f.effects[0].kind)], 1)
+        alike = self._like_errors
         if not (found or self.is_believed):  # errors that no model has are what leaves it nothing to do
             return alike[: STEPWISE.singles]
         chosen: list[Fit] = []
@@ -123,6 +123,11 @@ class Stepwise:
         chosen = [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.near * chosen[0].cost]
         # errors that have bent to an effect leave others to do what is left: the likeliest without them is tried too
         return chosen + [f for f in alike[:1] if f.key not in {other.key for other in chosen}]
+
+    @property
+    def _like_errors(self) -> list[Fit]:
+        """The likeliest linear effects of the structure one sample ahead without errors, best first."""
+        return spread_over_kinds([f for f in self.ahead if is_like_errors(f.effects[0].kind)], 1)
 
     def without_errors(self) -> bool:
         """Whether few effects explain the records as well as errors of the nominal model that no model has."""
@@ -171,6 +176,25 @@ class Stepwise:
         self.steps.append(self._finely(self.last))
         return True
 
+    def _in_fewer_words(self) -> None:
+        """A linear effect beside small errors, where errors that leave only noise without it are much longer to say.
+
+        Only where the records surely prefer it as well: their noise is seldom what it is taken for.
+        """
+        alone, noise = self.last, self.last.noise_power
+        longest = alone.description(noise) - STEPWISE.fewer_words
+        if longest < 0.0:
+            return
+        sets = [f.effects for f in self._like_errors[: STEPWISE.finalists]]
+        tried = [s for s in self.search.workers.map(self.afresh, sets) if s.is_plausible and not self._may_be_errors(s)]
+        more = [s.fit.n_parameters - alone.fit.n_parameters for s in tried]
+        likelier = [s for s, n in zip(tried, more, strict=True) if self.search.pays(self._gain(s, alone), max(n, 1))]
+        found = [s for s in likelier if s.description(noise) < longest]
+        if found:
+            best = min(found, key=lambda s: s.description(noise))
+            if self._matter(best.effects, best.fit.effects):
+                self.steps.append(replace(best, others=tuple(found)))
+
     def by_few(self) -> bool:
         """Whether few effects beside both common errors explain the records, where errors alone are not believed."""
         if self.is_believed or self.last.effects or self.search.logged:
@@ -187,6 +211,8 @@ class Stepwise:
         if self.is_run:
             return
         self.is_run = True
+        if self.is_enough and not (self.last.effects or self.search.by_mode):
+            self._in_fewer_words()
         first = self.last
         if first.effects:  # where two hide, the errors may stand for one
             self.plain = self._without_errors(first)
