@@ -181,6 +181,9 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
             1.0,
             ("local_stiffness_loss",),
         ),  # errors had bent to it, and left a mass to do what is left
+        (75200003, "mixed", 1.0, ("local_stiffness_loss",)),  # errors that were longer to say stood for it
+        (75400014, "mixed", 1.0, ("point_mass",)),  # likewise
+        (75400010, "mixed", 1.0, ("local_stiffness_loss",)),  # likewise, beside noise of the inputs
         (75200007, "offset", 1.0, ("local_stiffness_loss",)),  # a traceback: sensors on the late side of jumps
         (881003, "triple", 0.5, ("actuator_dead_zone", "clearance", "ground_spring")),  # told as a cubic spring
     ],

@@ -211,7 +211,7 @@ class Stepwise:
         if self.is_run:
             return
         self.is_run = True
-        if self.is_enough and not (self.last.effects or self.search.by_mode):
+        if self.is_quiet and self.last.is_plausible and not (self.last.effects or self.search.by_mode):
             self._in_fewer_words()
         first = self.last
         if first.effects:  # where two hide, the errors may stand for one
