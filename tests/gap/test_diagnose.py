@@ -21,6 +21,7 @@ def verdict_on(case, **options):
     return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, **options)
 
 
+@pytest.mark.slow
 def test_the_verdict_does_not_depend_on_how_many_share_the_work(hinged_rig, record_of):
     rig, rng = hinged_rig(3), np.random.default_rng(5)
     real = kind_named("cubic_spring").apply(rig, None, {"at": 0.62, "stiffness": 2000.0})

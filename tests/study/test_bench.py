@@ -185,6 +185,7 @@ def test_what_makes_no_design_on_a_plate_is_refused(change, words, tmp_path):
         shown(rig, asked({**plain(start(rig)), **change}))
 
 
+@pytest.mark.slow
 def test_a_design_saved_on_a_plate_is_a_study_that_runs_and_agrees(plate, tmp_path):
     rig, text = plate
     path = save(rig, text, replace(start(rig), sensors=((0.4, 0.3), (0.8, 0.3), (0.6, 0.6))), "found", tmp_path)
