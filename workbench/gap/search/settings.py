@@ -238,8 +238,8 @@ class StepwiseSettings:
     """Constants of the stepwise selection."""
 
     shorter: float = 30.0  # description length, nats, that an effect which makes errors plausible must save
-    # likewise where errors alone are plausible and leave only noise: of 27 trials that hide nothing no effect saved
-    # over 3, of eight that hide one which errors stood in for five saved 15 to 140
+    # likewise where errors alone are plausible and leave only noise: of 19 trials that hide nothing no effect saved
+    # over 3, of 13 that hide one which errors stood in for five saved 15 to 140
     fewer_words: float = 10.0
     singles: int = 3  # effects alone, the likeliest beside errors, that are tried as the first
     candidates: int = 4  # sets fitted on whole records at each step
