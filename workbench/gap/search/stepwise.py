@@ -187,9 +187,8 @@ class Stepwise:
             return
         sets = [f.effects for f in self._like_errors[: STEPWISE.finalists]]
         tried = [s for s in self.search.workers.map(self.afresh, sets) if s.is_plausible and not self._may_be_errors(s)]
-        more = [s.fit.n_parameters - alone.fit.n_parameters for s in tried]
-        likelier = [s for s, n in zip(tried, more, strict=True) if self.search.pays(self._gain(s, alone), max(n, 1))]
-        found = [s for s in likelier if s.description(noise) < longest]
+        shorter = [s for s in tried if s.description(noise) < longest]
+        found = [s for s in shorter if self._is_likelier(s, alone, least=SEARCH.trifle)]
         if found:
             best = min(found, key=lambda s: s.description(noise))
             if self._matter(best.effects, best.fit.effects):
@@ -424,8 +423,8 @@ class Stepwise:
         places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
         here, *others = self._fitted([(effect,), *places], step, self._slopes(step))
         near = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
-        best = min(near, key=lambda s: s.fit.cost, default=here)
-        if best.fit.cost > STEPWISE.near * here.fit.cost:
+        best = min(near, key=lambda s: s.fit.cost, default=None)
+        if best is None or best.fit.cost > STEPWISE.near * here.fit.cost:
             return None
         found = self._whole(best)
         return found if self._loss(found) < self._loss(step) else None
@@ -537,10 +536,10 @@ class Stepwise:
         saved = step.description(noise, of_errors_alone=trifle) - best.description(noise, of_errors_alone=trifle)
         return not step.is_plausible and saved > STEPWISE.shorter
 
-    def _is_likelier(self, best: Step, step: Step) -> bool:
+    def _is_likelier(self, best: Step, step: Step, least: float = SEARCH.significant) -> bool:
         """Whether records surely prefer a set to a smaller one, by more than a model is imperfect."""
         more, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), self._gain(best, step)
-        return gain > SEARCH.significant and self.search.pays(gain, more)
+        return gain > least and self.search.pays(gain, more)
 
     def _gain(self, best: Step, step: Step) -> float:
         """Twice the log-likelihood that one step has more than another, a value."""
