@@ -5,13 +5,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 
 import numpy as np
-from scipy.signal import lfilter
 
-from workbench.arrays import Complexes, Flags, Floats, Integers
+from workbench.arrays import Complexes, Floats, Integers
 from workbench.records.record import Record
 from workbench.rig import elements, stepping
-from workbench.rig.actuators import Actuator
 from workbench.rig.between_samples import BetweenSamples, Step
+from workbench.rig.driving import actuator_force, beyond_straight, drives, lagged, shifted, sinusoid_on_substeps
 from workbench.rig.linear import (
     ModalPoles,
     held_response,
@@ -40,7 +39,6 @@ LAWS: dict[type[elements.PointElement], int] = {
 }
 QUANTITIES = ("displacement", "velocity", "acceleration")  # by derivative in time
 KEPT = 8  # rigs of which what all records share is remembered
-DRIVES_KEPT, MOST_KEPT = 16, 2**18  # forces on substeps that are remembered likewise, and the most values of one
 NOTHING, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
 
 
@@ -198,7 +196,7 @@ def sensor_reading(sensor: Sensor, truth: np.ndarray, sample_time: float) -> np.
     """A sensor's mean reading (n_samples,) of the truth: lag, gain, bias and drift, clipping, rounding."""
     y = truth
     if sensor.time_constant > 0:
-        y = _lagged(y, sensor.time_constant, sample_time)
+        y = lagged(y, sensor.time_constant, sample_time)
     if sensor.gain != 1:
         y = sensor.gain * y
     if sensor.bias or sensor.drift:
@@ -208,21 +206,6 @@ def sensor_reading(sensor: Sensor, truth: np.ndarray, sample_time: float) -> np.
     if sensor.step > 0:
         y = _mean_rounded(y, sensor.step, sensor.noise_std)
     return y
-
-
-def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
-    """The force that an actuator heads for: hysteresis, gain, dead zone, saturation, before what takes its time."""
-    if actuator.hysteresis_share:
-        share = actuator.hysteresis_share
-        command = (1.0 - share) * command + share * stepping.hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[
-            1:
-        ]
-    force = command if actuator.gain == 1 else actuator.gain * command
-    if actuator.dead_zone > 0:
-        force = np.sign(force) * np.maximum(np.abs(force) - actuator.dead_zone, 0.0)
-    if np.isfinite(actuator.limit):
-        force = np.clip(force, -actuator.limit, actuator.limit)
-    return force
 
 
 @lru_cache(maxsize=KEPT)
@@ -307,7 +290,7 @@ def _steps_within(
         lag = actuator.time_constant
         if not (late or lag) or np.isfinite(actuator.rate_limit):
             continue
-        older, newer = _shifted(actuator_force(actuator, inputs[j]), int(shift))
+        older, newer = shifted(actuator_force(actuator, inputs[j]), int(shift))
         for begins, change in ((0.0, older - acting[j]), (late, newer - older)) if lag else ((late, newer - older),):
             steps[begins, lag] = steps.get((begins, lag), 0.0) + np.outer(participation[:, j], change)
     return tuple(Step(late, lag, forces) for (late, lag), forces in steps.items())
@@ -419,20 +402,21 @@ def _step(
     """
     modes = rig.modes
     n_samples = inputs.shape[1]
-    drives = _drives(rig.actuators, inputs, sample_time, substeps, input_hold)
-    driven, starts, ends, at_samples = drives.driven, drives.starts, drives.ends, drives.at_samples
-    participation = participation_of(rig)
+    driving = drives(rig.actuators, inputs, sample_time, substeps, input_hold)
+    driven, starts, ends, at_samples = driving.driven, driving.starts, driving.ends, driving.at_samples
+    participation, (damping, coupling, spread) = participation_of(rig), structure_arrays(rig)
+    h = sample_time / substeps
+    added = [beyond_straight(c, modes.omega, damping, h) * participation[:, j] for j, c in driving.courses]
     for element in rig.elements:
         if isinstance(element, elements.PeriodicForce):
-            mean, now = _sinusoid_on_substeps(element, n_samples, sample_time, substeps)
-            driven, starts, ends = np.append(driven, True), np.vstack([starts, mean]), np.vstack([ends, mean])
+            start, end, now = sinusoid_on_substeps(element, n_samples, sample_time, substeps)
+            driven, starts, ends = np.append(driven, True), np.vstack([starts, start]), np.vstack([ends, end])
             at_samples = np.vstack([at_samples, now])
             participation = np.column_stack([participation, modes.phi_at(element.at)])
     known, reading, orders = outputs, NOTHING, NO_ORDERS
     if outputs.size:
         reading, orders = reading_of(rig)
         known = _left_to_motion(rig, outputs, reading, orders, participation, at_samples)
-    damping, coupling, spread = structure_arrays(rig)
     step: Callable[..., None] = stepping.step_record
     step(
         modes.omega,
@@ -444,6 +428,8 @@ def _step(
         starts,
         ends,
         np.ascontiguousarray(participation[:, driven]),
+        driving.sizes,
+        np.array(added).reshape(len(added), 2, modes.n_modes),
         *spread,
         *_laws(rig),
         known,
@@ -518,147 +504,6 @@ def stretching_of(rig: Rig) -> Floats:
     """∫ φ_r' φ_s' dx, (n_modes, n_modes)."""
     slopes, weights = along(rig, 1)
     return slopes.T @ (weights[:, None] * slopes)
-
-
-@dataclass(frozen=True, eq=False)
-class _Drives:
-    """Forces of the actuators on substeps.
-
-    Attributes:
-        driven: (n_actuators,) which of them are ever at work.
-        starts, ends: (n_driven, n_samples * substeps) of what runs straight over each substep as their forces do.
-        at_samples: (n_actuators, n_samples) all forces.
-    """
-
-    driven: Flags
-    starts: Floats
-    ends: Floats
-    at_samples: Floats
-
-
-class _Signals:
-    """Signals that never change, as a key: the array itself, not its values."""
-
-    def __init__(self, values: Floats) -> None:
-        self.values = values
-
-    def __hash__(self) -> int:
-        return id(self.values)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Signals) and self.values is other.values
-
-
-def _drives(
-    actuators: tuple[Actuator, ...], inputs: Floats, sample_time: float, substeps: int, input_hold: str
-) -> _Drives:
-    """Remembered for the inputs of a record, which nobody can write to: structure and sensors change more often."""
-    is_lasting = inputs.base is None and not inputs.flags.writeable
-    known = _known_drives if is_lasting and inputs.size * substeps <= MOST_KEPT else _known_drives.__wrapped__
-    return known(actuators, _Signals(inputs), sample_time, substeps, input_hold)
-
-
-@lru_cache(maxsize=DRIVES_KEPT)
-def _known_drives(
-    actuators: tuple[Actuator, ...], inputs: _Signals, sample_time: float, substeps: int, input_hold: str
-) -> _Drives:
-    on_substeps = _forces_on_substeps if input_hold == "zero" else _straight_forces_on_substeps
-    starts, ends, at_samples = on_substeps(actuators, inputs.values, sample_time, substeps)
-    driven = np.logical_or(starts.any(axis=1), ends.any(axis=1))
-    return _Drives(driven, starts[driven], ends[driven], at_samples)
-
-
-def _forces_on_substeps(
-    actuators: tuple[Actuator, ...], inputs: np.ndarray, sample_time: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What runs straight over each substep as each actuator's force does, start and end, and the force at each sample.
-
-    It has the mean of the force over the substep. A ramp under a rate limit that ends within one has its first moment
-    too, so that the motion is right to the third power of the substep.
-    """
-    fine = np.empty((inputs.shape[0], inputs.shape[1] * substeps))
-    rise = np.zeros_like(fine)  # half of it, over a substep
-    now = np.empty_like(inputs)
-    h = sample_time / substeps
-    for j, actuator in enumerate(actuators):
-        held = np.repeat(actuator_force(actuator, inputs[j]), substeps)
-        start = held
-        if np.isfinite(actuator.rate_limit):
-            held, start = stepping.ramped(held, actuator.rate_limit * h)
-            if actuator.delay == 0 and actuator.time_constant == 0:
-                change = np.diff(np.r_[start, 2.0 * held[-1] - start[-1]])
-                share = np.minimum(
-                    np.abs(change) / (actuator.rate_limit * h), 1.0
-                )  # of the substep, until the ramp ends
-                rise[j] = change * share * (1.5 - share)
-        fine[j], at_start = _delayed_and_lagged(held, start, actuator, h)
-        fine[j] += actuator.bias
-        now[j] = at_start[::substeps] + actuator.bias
-    return fine - rise, fine + rise, now
-
-
-def _straight_forces_on_substeps(
-    actuators: tuple[Actuator, ...], inputs: np.ndarray, sample_time: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of inputs that run straight from sample to sample; after the last it stays."""
-    h, n = sample_time / substeps, inputs.shape[1]
-    time = h * np.arange(n * substeps + 1)
-    edges = np.empty((inputs.shape[0], time.size))
-    for j, actuator in enumerate(actuators):
-        force = np.interp(time, sample_time * np.arange(n), actuator_force(actuator, inputs[j]))
-        if np.isfinite(actuator.rate_limit):
-            _, start = stepping.ramped(np.r_[force[1:], force[-1]], actuator.rate_limit * h)
-            force = start
-        if actuator.delay:
-            force = np.interp(time - actuator.delay, time, force, left=0.0)
-        if actuator.time_constant:
-            force = _lagged(force, actuator.time_constant, h, settled=False)
-        edges[j] = force + actuator.bias
-    return edges[:, :-1], edges[:, 1:], edges[:, :-1:substeps]
-
-
-def _delayed_and_lagged(
-    held: np.ndarray, at_start: np.ndarray, actuator: Actuator, h: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean force over each substep and force at its start, of forces that are these before delay and lag."""
-    if actuator.delay == 0 and actuator.time_constant == 0:
-        return held, at_start
-    shift, rest = divmod(actuator.delay, h)
-    share = rest / h
-    older, newer = _shifted(held, int(shift))
-    command = share * older + (1.0 - share) * newer
-    start = _shifted(at_start, int(shift))[1 if rest == 0 else 0]
-    if actuator.time_constant == 0:
-        return command, start
-    fade = np.exp(-h / actuator.time_constant)
-    acting = np.r_[0.0, lfilter([1.0 - fade], [1.0, -fade], command)[:-1]]
-    mean = command + (acting - command) * (1.0 - fade) * actuator.time_constant / h
-    return mean, acting
-
-
-def _shifted(values: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Values one step more than so many steps later, and so many steps later; zero before the first."""
-    padded = np.r_[np.zeros(steps + 1), values][: values.size + 1]
-    return padded[:-1], padded[1:]
-
-
-def _sinusoid_on_substeps(
-    element: elements.PeriodicForce, n_samples: int, sample_time: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray]:
-    omega, h = 2 * np.pi * element.frequency_hz, sample_time / substeps
-    edges = omega * h * np.arange(n_samples * substeps + 1) + element.phase
-    mean = element.amplitude * np.sinc(omega * h / (2 * np.pi)) * np.sin(0.5 * (edges[:-1] + edges[1:]))
-    return mean, element.amplitude * np.sin(edges[:-1:substeps])
-
-
-def _lagged(truth: np.ndarray, time_constant: float, sample_time: float, *, settled: bool = True) -> np.ndarray:
-    """A first-order lag of a signal that is linear between samples, settled at its first value, or at zero."""
-    ratio = sample_time / time_constant
-    fade = np.exp(-ratio)
-    new = 1.0 - (1.0 - fade) / ratio
-    old = (1.0 - fade) / ratio - fade
-    first = truth[0] if settled else 0.0
-    return np.asarray(lfilter([new, old], [1.0, -fade], truth, zi=[first - new * truth[0]])[0])
 
 
 def _mean_rounded(y: np.ndarray, step: float, noise_std: float) -> np.ndarray:

@@ -29,7 +29,7 @@ FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
 PARTS = 8
 # What `advance` takes, as it describes them.
 Linear = tuple[Floats, Floats, Floats]
-Drives = tuple[Floats, Floats]
+Drives = tuple[Floats, Floats, Floats, Floats]
 Elements = tuple[Integers, Floats, Floats]
 Along = tuple[float, Floats, Floats, Floats, Floats, Floats]
 Moving = tuple[Floats, Floats, Floats]
@@ -373,7 +373,7 @@ def _advance_once(
 ) -> None:
     """As `advance`, whether friction turns or not."""
     e, aw, av = linear
-    drive, drive_end = drives
+    drive, drive_end, more_q, more_v = drives
     kinds, shapes, parameters = elements
     stretch, stretching, drag_shapes, drag_weights, push, coupling = along
     q, v, old = motion
@@ -383,8 +383,8 @@ def _advance_once(
     distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
     for r in range(n):
         start, end = old[r] + drive[r], drive_end[r]
-        base_q[r] = e[0, 0, r] * q[r] + e[0, 1, r] * v[r] + e[0, 2, r] * start + e[0, 3, r] * end
-        base_v[r] = e[1, 0, r] * q[r] + e[1, 1, r] * v[r] + e[1, 2, r] * start + e[1, 3, r] * end
+        base_q[r] = more_q[r] + e[0, 0, r] * q[r] + e[0, 1, r] * v[r] + e[0, 2, r] * start + e[0, 3, r] * end
+        base_v[r] = more_v[r] + e[1, 0, r] * q[r] + e[1, 1, r] * v[r] + e[1, 2, r] * start + e[1, 3, r] * end
     if n_elements == 0 and not distributed:
         for r in range(n):
             q[r] = base_q[r]
@@ -486,7 +486,8 @@ def advance(
     Args:
         linear, finely: propagators and reactions, as `drifted_propagators` fills them; those of a substep PARTS times
             finer are taken where friction turns.
-        drives: modal forces (n_modes,) at the start and the end, straight between.
+        drives: modal forces (n_modes,) at the start and the end, straight between; and what they do beyond that to q
+            and q' by the end.
         elements: kinds (n_elements,), shapes (n_elements, n_modes) and parameters (n_elements, 3) of those at points.
         along: of what acts all along, as `spread_forces` takes it.
         motion: q, q' and the modal forces of all elements, (n_modes,): updated.
@@ -496,7 +497,7 @@ def advance(
         kept: the motion, the points and the rates before the substep, and drives of its parts.
     """
     kinds, shapes, parameters = elements
-    start, end = drives
+    start, end, more_q, more_v = drives
     q, v, old = motion
     point, earlier, w, z = points
     spread = work[5]
@@ -513,7 +514,7 @@ def advance(
         whole = parts == 1
         _advance_once(
             linear if whole else finely,
-            drives if whole else (parts_of[0], parts_of[1]),
+            drives if whole else (parts_of[0], parts_of[1], parts_of[2], parts_of[3]),
             elements,
             along,
             motion,
@@ -533,6 +534,8 @@ def advance(
                 rise = (end[r] - start[r]) / PARTS
                 parts_of[0, r] = start[r] + part * rise
                 parts_of[1, r] = parts_of[0, r] + rise
+                parts_of[2, r] = more_q[r] if part == PARTS - 1 else 0.0
+                parts_of[3, r] = more_v[r] if part == PARTS - 1 else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -543,8 +546,9 @@ def at_rest(n: int, n_elements: int) -> tuple[Linear, Linear, Drives, Moving, Po
     motion = np.zeros(n), np.zeros(n), np.zeros(n)
     points = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
     work = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    kept = np.zeros((4, n)), np.zeros((4, n_elements)), np.zeros((2, n_elements)), np.zeros((2, n))
-    return linear, finely, (np.zeros(n), np.zeros(n)), motion, points, work, kept
+    kept = np.zeros((4, n)), np.zeros((4, n_elements)), np.zeros((2, n_elements)), np.zeros((4, n))
+    drives = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    return linear, finely, drives, motion, points, work, kept
 
 
 @njit(cache=True, nogil=True)
@@ -588,6 +592,8 @@ def step_record(
     starts: Floats,
     ends: Floats,
     participation: Floats,
+    sizes: Floats,
+    added: Floats,
     stretch: float,
     stretching: Floats,
     drag_shapes: Floats,
@@ -607,7 +613,9 @@ def step_record(
     """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest; or error_out.
 
     starts, ends (n_inputs, n_samples * n_sub) of forces that run straight over each substep; participation
-    (n_modes, n_inputs); stretching (n_modes, n_modes); drag_shapes (n_modes, n_points); shapes (n_elements, n_modes).
+    (n_modes, n_inputs). What true forces do beyond these has sizes (n_added, n_samples * n_sub), each of which adds
+    `added` (n_added, 2, n_modes) to q and q' by the end of a substep. stretching (n_modes, n_modes); drag_shapes
+    (n_modes, n_points); shapes (n_elements, n_modes).
 
     Where something is measured, (n_sensors, n_samples), its error against reading (n_sensors, n_modes) of displacement,
     velocity or acceleration, by orders (n_sensors,) 0, 1 or 2, fills error_out in place of the motion, which it sets
@@ -620,10 +628,13 @@ def step_record(
     )
     n = LANES * (omega.size // LANES)  # so the compiler sees it
     into, n_sensors = np.zeros((n_inputs, n)), measured.shape[0]
+    more = np.zeros((added.shape[0], 2, n))
     seen, held = np.zeros((n_sensors, n)), np.zeros((2, n_sensors, n))
     for r in range(n_modes):
         for j in range(n_inputs):
             into[j, r] = participation[r, j]
+        for j in range(added.shape[0]):
+            more[j, 0, r], more[j, 1, r] = added[j, 0, r], added[j, 1, r]
         for j in range(n_sensors):
             seen[j, r], held[0, j, r], held[1, j, r] = reading[j, r], gain[0, r, j], gain[1, r, j]
     accelerations = False
@@ -631,7 +642,8 @@ def step_record(
         accelerations |= orders[j] == 2
     h = dt / n_sub
     linear, finely, drives, motion, points, work, kept = at_rest(n, n_elements)
-    (drive, drive_end), (q, v, old), w_old, accelerated = drives, motion, points[2], np.zeros(n)
+    (drive, drive_end, more_q, more_v), (q, v, old), w_old = drives, motion, points[2]
+    accelerated = np.zeros(n)
     elements = kinds, shapes, parameters
     along = stretch, stretching, drag_shapes, drag_weights, np.empty(drag_weights.size), coupling
     for k in range(n_samples):
@@ -673,6 +685,14 @@ def step_record(
                 for r in range(n):
                     drive[r] += into[j, r] * first
                     drive_end[r] += into[j, r] * last
+            for r in range(n if more.shape[0] > 0 else 0):
+                more_q[r] = 0.0
+                more_v[r] = 0.0
+            for j in range(more.shape[0]):
+                size = sizes[j, k * n_sub + sub]
+                for r in range(n):
+                    more_q[r] += more[j, 0, r] * size
+                    more_v[r] += more[j, 1, r] * size
             advance(linear, finely, drives, elements, along, motion, points, work, kept)
 
 

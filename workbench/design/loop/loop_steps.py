@@ -127,7 +127,7 @@ def loop_record(
         omega, damping, coupling, stretching, drag_shapes, shapes
     )
     linear, finely, drives, motion, points, work, kept = at_rest(LANES * (omega.size // LANES), n_el)
-    modal, (q, v, _), (point, _, w_old, _) = drives[0], motion, points
+    (modal, _, none, _), (q, v, _), (point, _, w_old, _) = drives, motion, points
     for r in range(n_modes):
         q[r], v[r] = start[0, r], start[1, r]
     elements = kinds, shapes, parameters
@@ -206,7 +206,7 @@ def loop_record(
                 f_out[j, k] += force / n_sub
                 for r in range(n_modes):
                     modal[r] += into[r, j] * force
-            advance(linear, finely, (modal, modal), elements, along, motion, points, work, kept)
+            advance(linear, finely, (modal, modal, none, none), elements, along, motion, points, work, kept)
             for j in range(ny):
                 y = 0.0
                 for r in range(n_modes):
