@@ -187,6 +187,7 @@ def test_stiffness_drift_against_an_adaptive_integrator():
     assert np.abs(mine - peer).max() < 1e-4 * np.abs(peer).max()
 
 
+@pytest.mark.parametrize("input_hold", ["zero", "first"])
 @pytest.mark.parametrize("ends", ["hinged", "free"])
 @pytest.mark.parametrize(
     "port",
@@ -201,15 +202,15 @@ def test_stiffness_drift_against_an_adaptive_integrator():
     ],
     ids=str,
 )
-def test_delays_and_lags_are_exact_beside_a_law_too(port, ends):
+def test_delays_and_lags_are_exact_beside_a_law_too(port, ends, input_hold):
     """One substep a sample, in which the highest mode goes through five cycles, on the stepped route and the linear."""
     both = {**vars(beam()), "left": ends, "right": ends, "damping": ModalDamping((1.5, *29 * (0.01,)))}
     modes = Beam(**both).modes(30 if ends == "hinged" else 20)
     actuators = (Actuator("F1", 2.0, **port), Actuator("F2", 6.3))
     exact, stepped = (rig(laws, modes, actuators) for laws in ((), (CubicSpring(4.0, 0.0),)))
-    for options in ({"substeps": 1}, {"substeps": 3}):
-        linear = simulate(exact, drive(100), sample_time=DT).outputs
-        mine = simulate(stepped, drive(100), sample_time=DT, **options).outputs
+    linear = simulate(exact, drive(100), sample_time=DT, input_hold=input_hold).outputs
+    for substeps in (1, 3):
+        mine = simulate(stepped, drive(100), sample_time=DT, substeps=substeps, input_hold=input_hold).outputs
         np.testing.assert_allclose(mine, linear, rtol=0, atol=1e-9 * np.abs(linear).max())
 
 

@@ -6,12 +6,13 @@ first moment stands for it where laws are solved; what it does to each mode beyo
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import factorial
 from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
 
-from workbench.arrays import Flags, Floats
+from workbench.arrays import Complexes, Flags, Floats
 from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
 
@@ -34,31 +35,35 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
     return force
 
 
-class Fading(NamedTuple):
-    """A force that begins within a substep and fades.
+class Piece(NamedTuple):
+    """A force size t^power e^(-rate t) from a time t = 0 within a substep on.
 
     Attributes:
         begins: s, after the start of the substep.
-        rate: of its fading, 1/s; 0 for one that stays.
-        size: N.
+        rate: 1/s; 0 for one that does not fade.
+        size: N, or N/s.
+        power: 0, or 1 for one that rises, which does not fade.
     """
 
     begins: float
     rate: float
     size: float
+    power: int = 0
 
 
-Course = tuple[Fading, ...]  # of a force over a substep, the sum of these
+Course = tuple[Piece, ...]  # of a force over a substep, the sum of these
 
 
 def _straightened(course: Course, h: float) -> tuple[float, float]:
     """Mean over a substep, and half the rise of the straight line of the same first moment."""
     mean = moment = 0.0
-    for begins, rate, size in course:
+    for begins, rate, size, power in course:
         lasts = h - begins
-        faded = np.exp(-rate * lasts)
-        area = (1.0 - faded) / rate if rate else lasts
-        first = (area - lasts * faded) / rate if rate else 0.5 * lasts**2
+        area, first = lasts ** (power + 1) / (power + 1), lasts ** (power + 2) / (power + 2)
+        if rate:
+            faded = np.exp(-rate * lasts)
+            area = (1.0 - faded) / rate
+            first = (area - lasts * faded) / rate
         mean += size * area / h
         moment += size * (first + (begins - 0.5 * h) * area) / h**2
     return mean, 6.0 * moment
@@ -73,15 +78,20 @@ def beyond_straight(course: Course, omega: Floats, damping: Floats, h: float) ->
     poles = -0.5 * damping + np.array([1.0, -1.0])[:, None] * root
     mean, rise = _straightened(course, h)
     response = np.zeros_like(poles)
-    for begins, rate, size in course:
-        lasts, x = h - begins, (poles + rate) * (h - begins)
-        near = np.abs(x) < 0.5
-        slight = np.where(near & (x != 0), x, 1.0)  # where the difference of two that are all but one says nothing
-        grown = np.exp(-rate * lasts) * np.where(x == 0, 1.0, np.expm1(slight) / slight)
-        apart = (np.exp(poles * lasts) - np.exp(-rate * lasts)) / np.where(near, 1.0, x)
-        response += size * lasts * np.where(near, grown, apart)
+    for begins, rate, size, power in course:
+        lasts = h - begins
+        response += size * lasts ** (power + 1) * _grown(poles * lasts, rate * lasts, power)
     both = np.array([response[0] - response[1], poles[0] * response[0] - poles[1] * response[1]]) / (2.0 * root)
     return np.asarray(both.real - straight[:, 2] * (mean - rise) - straight[:, 3] * (mean + rise))
+
+
+def _grown(pole: Complexes, rate: float, power: int) -> Complexes:
+    """∫ t^power e^(-rate t) e^(pole (1 - t)) dt from 0 to 1; of a power the rate is 0."""
+    x = pole + rate
+    near = np.abs(x) < 0.5  # where the difference of what is all but alike says nothing, by its series
+    series = np.exp(-rate) * sum(np.where(near, x, 0.0) ** k / factorial(k + power + 1) for k in range(16))
+    x = np.where(near, 1.0, x)
+    return np.where(near, series, (np.exp(pole) - 1.0 - pole) / x**2 if power else (np.exp(pole) - np.exp(-rate)) / x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,94 +140,97 @@ def drives(
 def _known_drives(
     actuators: tuple[Actuator, ...], inputs: _Signals, sample_time: float, substeps: int, input_hold: str
 ) -> Drives:
-    courses: list[tuple[int, Course]] = []
-    sizes = [np.zeros((0, inputs.values.shape[1] * substeps))]
-    if input_hold == "zero":
-        starts, ends, at_samples, crooked = _forces_on_substeps(actuators, inputs.values, sample_time, substeps)
-        for j, course, size in crooked:
-            if size.any():
-                courses.append((j, course))
-                sizes.append(size[None])
-    else:
-        starts, ends, at_samples = _straight_forces_on_substeps(actuators, inputs.values, sample_time, substeps)
+    lines, at_samples, crooked = _forces_on_substeps(actuators, inputs.values, sample_time, substeps, input_hold)
+    (starts, ends), h = lines, sample_time / substeps
     driven = np.logical_or(starts.any(axis=1), ends.any(axis=1))
-    return Drives(driven, starts[driven], ends[driven], at_samples, tuple(courses), np.concatenate(sizes))
+    least = ROUND_OFF * max(np.abs(starts).max(initial=0.0), np.abs(ends).max(initial=0.0))
+    crooked = [
+        (j, course, size) for j, course, size in crooked if np.abs(size).max(initial=0.0) * h ** course[0].power > least
+    ]
+    sizes = np.array([size for *_, size in crooked]).reshape(len(crooked), starts.shape[1])
+    courses = tuple((j, course) for j, course, _ in crooked)
+    return Drives(driven, starts[driven], ends[driven], at_samples, courses, sizes)
 
 
 def _forces_on_substeps(
-    actuators: tuple[Actuator, ...], inputs: np.ndarray, sample_time: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, Course, np.ndarray]]]:
+    actuators: tuple[Actuator, ...], inputs: Floats, sample_time: float, substeps: int, input_hold: str
+) -> tuple[tuple[Floats, Floats], Floats, list[tuple[int, Course, Floats]]]:
     """What runs straight over each substep as each actuator's force does, start and end, and the force at each sample.
 
     It has the mean and the first moment of the force over the substep. What a delayed or lagged force does beyond that
     is the last: the actuator, what the force does per unit, and its size in each substep.
     """
-    fine = np.empty((inputs.shape[0], inputs.shape[1] * substeps))
-    rise = np.zeros_like(fine)  # half of it, over a substep
+    mean = np.empty((inputs.shape[0], inputs.shape[1] * substeps))
+    rise = np.zeros_like(mean)  # half of it, over a substep
     now = np.empty_like(inputs)
     crooked = []
     h = sample_time / substeps
     for j, actuator in enumerate(actuators):
-        held = np.repeat(actuator_force(actuator, inputs[j]), substeps)
-        start = held
-        if np.isfinite(actuator.rate_limit):
-            held, start = stepping.ramped(held, actuator.rate_limit * h)
-            if actuator.delay == 0 and actuator.time_constant == 0:
-                change = np.diff(np.r_[start, 2.0 * held[-1] - start[-1]])
-                share = np.minimum(np.abs(change) / (actuator.rate_limit * h), 1.0)  # until the ramp ends
+        force = actuator_force(actuator, inputs[j])
+        if input_hold == "zero":
+            mean[j] = start = np.repeat(force, substeps)
+            if np.isfinite(actuator.rate_limit):
+                most = actuator.rate_limit * h
+                mean[j], start = stepping.ramped(start, most)
+                change = np.diff(np.r_[start, 2.0 * mean[j, -1] - start[-1]])
+                share = np.minimum(np.abs(change) / most, 1.0)  # of the substep, until the ramp ends
                 rise[j] = change * share * (1.5 - share)
+        else:  # straight from sample to sample; after the last it stays
+            edges = np.interp(np.arange(mean.shape[1] + 1), substeps * np.arange(inputs.shape[1]), force)
+            if np.isfinite(actuator.rate_limit):
+                _, edges = stepping.ramped(np.r_[edges[1:], edges[-1]], actuator.rate_limit * h)
+            start = edges[:-1]
+            mean[j], rise[j] = 0.5 * (start + edges[1:]), 0.5 * np.diff(edges)
         if actuator.delay or actuator.time_constant:
-            held, start, courses = _delayed_and_lagged(held, start, actuator, h)
+            mean[j], rise[j], start, courses = _delayed_and_lagged(mean[j], rise[j], start, actuator, h)
             for course, size in courses:
-                mean, half = _straightened(course, h)
-                held = held + mean * size
+                straight, half = _straightened(course, h)
+                mean[j] += straight * size
                 rise[j] += half * size
                 crooked.append((j, course, size))
-        fine[j] = held + actuator.bias
+        mean[j] += actuator.bias
         now[j] = start[::substeps] + actuator.bias
-    return fine - rise, fine + rise, now, crooked
-
-
-def _straight_forces_on_substeps(
-    actuators: tuple[Actuator, ...], inputs: np.ndarray, sample_time: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of inputs that run straight from sample to sample; after the last it stays."""
-    h, n = sample_time / substeps, inputs.shape[1]
-    time = h * np.arange(n * substeps + 1)
-    edges = np.empty((inputs.shape[0], time.size))
-    for j, actuator in enumerate(actuators):
-        force = np.interp(time, sample_time * np.arange(n), actuator_force(actuator, inputs[j]))
-        if np.isfinite(actuator.rate_limit):
-            _, start = stepping.ramped(np.r_[force[1:], force[-1]], actuator.rate_limit * h)
-            force = start
-        if actuator.delay:
-            force = np.interp(time - actuator.delay, time, force, left=0.0)
-        if actuator.time_constant:
-            force = lagged(force, actuator.time_constant, h, settled=False)
-        edges[j] = force + actuator.bias
-    return edges[:, :-1], edges[:, 1:], edges[:, :-1:substeps]
+    return (mean - rise, mean + rise), now, crooked
 
 
 def _delayed_and_lagged(
-    held: np.ndarray, at_start: np.ndarray, actuator: Actuator, h: float
-) -> tuple[np.ndarray, np.ndarray, list[tuple[Course, np.ndarray]]]:
-    """Forces held over substeps, and at their starts, as delay and lag leave them.
+    mean: Floats, rise: Floats, start: Floats, actuator: Actuator, h: float
+) -> tuple[Floats, Floats, Floats, list[tuple[Course, Floats]]]:
+    """Forces that are straight over substeps, as delay and lag leave them.
+
+    Args:
+        mean, rise: of each substep, half the rise.
+        start: force at the start of each, where a ramp that ends within it is not straight.
 
     Returns:
-        What is held over each substep; the force at its start; and courses per unit beside what is held, with sizes.
+        Mean and half the rise of what is straight; the force at each start; and courses per unit beside it, with sizes.
     """
     shift = int(actuator.delay / h + ROUND_OFF)
     late = actuator.delay - shift * h if actuator.delay > (shift + ROUND_OFF) * h else 0.0
-    older, newer = shifted(held, shift)
-    change, lag = newer - older, actuator.time_constant
+    (old_mean, mean), (old_rise, rise), (_, start) = (shifted(each, shift) for each in (mean, rise, start))
+    courses: list[tuple[Course, Floats]] = []
+    if late:  # the substep before goes on until then
+        before, until = old_mean + old_rise * (1.0 - 2.0 * late / h), old_mean + old_rise
+        jump, bend = mean - rise - until, 2.0 * (rise - old_rise) / h
+        courses = [((Piece(late, 0.0, 1.0),), jump), ((Piece(late, 0.0, 1.0, 1),), bend)]
+        mean, rise, start = before + old_rise, old_rise, before
+    lag = actuator.time_constant
     if lag == 0:
-        start = shifted(at_start, shift)
-        return (older, start[0], [((Fading(late, 0.0, 1.0),), change)]) if late else (newer, start[1], [])
-    came, fade = np.exp(-(h - late) / lag), np.exp(-h / lag)
-    new = (1.0 - came) * newer + (came - fade) * older
+        return mean, rise, start, courses
+    # y + T y' = u: each part of u settles, and what it lags by fades
+    slope = 2.0 * rise / h
+    settled, fade = mean - rise - lag * slope, np.exp(-h / lag)
+    new = settled * (1.0 - fade) + 2.0 * rise
+    if late:
+        left, came = h - late, np.exp(-(h - late) / lag)
+        new = new + jump * (1.0 - came) + bend * (left - lag * (1.0 - came))
+        courses = [
+            ((Piece(late, 0.0, 1.0), Piece(late, 1.0 / lag, -1.0)), jump),
+            ((Piece(late, 0.0, 1.0, 1), Piece(late, 0.0, -lag), Piece(late, 1.0 / lag, lag)), bend),
+        ]
     acting = np.r_[0.0, lfilter([1.0], [1.0, -fade], new)[:-1]]
-    comes, goes = (Fading(late, 0.0, 1.0), Fading(late, 1.0 / lag, -1.0)), (Fading(0.0, 1.0 / lag, 1.0),)
-    return older, acting, [(comes, change), (goes, acting - older)]
+    courses.append(((Piece(0.0, 1.0 / lag, 1.0),), acting - settled))
+    return mean - lag * slope, rise, acting, courses
 
 
 def shifted(values: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:

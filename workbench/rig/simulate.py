@@ -406,7 +406,8 @@ def _step(
     driven, starts, ends, at_samples = driving.driven, driving.starts, driving.ends, driving.at_samples
     participation, (damping, coupling, spread) = participation_of(rig), structure_arrays(rig)
     h = sample_time / substeps
-    added = [beyond_straight(c, modes.omega, damping, h) * participation[:, j] for j, c in driving.courses]
+    beyond = {c: beyond_straight(c, modes.omega, damping, h) for c in {course for _, course in driving.courses}}
+    added = [beyond[course] * participation[:, j] for j, course in driving.courses]
     for element in rig.elements:
         if isinstance(element, elements.PeriodicForce):
             start, end, now = sinusoid_on_substeps(element, n_samples, sample_time, substeps)
