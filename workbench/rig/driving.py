@@ -15,9 +15,10 @@ from scipy.signal import lfilter
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
+from workbench.rig.linear import whole_samples
 
 DRIVES_KEPT, MOST_KEPT = 16, 2**18  # forces on substeps that are remembered, and the most values of one
-ROUND_OFF = 1e-9  # of a substep
+ROUND_OFF = 1e-9  # of the largest force
 ALIKE = 1e-5  # over a substep: nearer, the two poles of a mode are taken for as far apart
 
 
@@ -205,8 +206,7 @@ def _delayed_and_lagged(
     Returns:
         Mean and half the rise of what is straight; the force at each start; and courses per unit beside it, with sizes.
     """
-    shift = int(actuator.delay / h + ROUND_OFF)
-    late = actuator.delay - shift * h if actuator.delay > (shift + ROUND_OFF) * h else 0.0
+    shift, late = whole_samples(actuator.delay, h)
     (old_mean, mean), (old_rise, rise), (_, start) = (shifted(each, shift) for each in (mean, rise, start))
     courses: list[tuple[Course, Floats]] = []
     if late:  # the substep before goes on until then

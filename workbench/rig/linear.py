@@ -9,6 +9,7 @@ from workbench.arrays import Complexes, Floats
 from workbench.structure.modes import modal_state_matrix
 
 CLOSE = 1e-9  # of a lag's rate: nearer, a pole is as good as on it
+EVEN = 1e-9  # of a sample: a delay so near a whole number of samples is one
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,13 @@ def _real_motion(poles: Complexes, response: Complexes, displacement: Floats, ve
             velocity[i, k] = 2.0 * (sigma * s.real - omega * s.imag)
 
 
+def whole_samples(delay: float, period: float) -> tuple[int, float]:
+    """Whole samples of a delay, and what is left of it, s."""
+    whole = int(delay / period + EVEN)
+    rest = delay - whole * period
+    return whole, rest if rest > EVEN * period else 0.0
+
+
 def held_response(
     system: ModalPoles,
     forces: np.ndarray,
@@ -110,8 +118,7 @@ def held_response(
     """
     poles, weights = system.poles, system.weights @ participation
     n_samples = forces.shape[1]
-    shift, rest = divmod(delay, sample_time)
-    shift = int(shift)
+    shift, rest = whole_samples(delay, sample_time)
     older = _shifted(forces, shift + 1)
     newer = _shifted(forces, shift)
     response = np.zeros((poles.size, n_samples), complex)
@@ -186,8 +193,8 @@ class _StraightPieces:
 
     @classmethod
     def of(cls, forces: np.ndarray, sample_time: float, delay: float) -> "_StraightPieces":
-        shift, rest = divmod(delay, sample_time)
-        late, share = int(shift), 1.0 - rest / sample_time
+        late, rest = whole_samples(delay, sample_time)
+        share = 1.0 - rest / sample_time
         ahead = np.c_[forces[:, 1:], forces[:, -1:]]
         old, middle, new = _shifted(forces, late + 1), _shifted(forces, late), _shifted(ahead, late)
         if late < forces.shape[1]:

@@ -18,6 +18,7 @@ from workbench.rig.linear import (
     modal_poles,
     sinusoid_response,
     straight_response,
+    whole_samples,
 )
 from workbench.rig.rig import Rig, shape_error_of, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
@@ -286,11 +287,11 @@ def _steps_within(
     """
     steps: dict[tuple[float, float], Floats] = {}
     for j, actuator in enumerate(rig.actuators):
-        shift, late = divmod(actuator.delay, sample_time)
+        shift, late = whole_samples(actuator.delay, sample_time)
         lag = actuator.time_constant
         if not (late or lag) or np.isfinite(actuator.rate_limit):
             continue
-        older, newer = shifted(actuator_force(actuator, inputs[j]), int(shift))
+        older, newer = shifted(actuator_force(actuator, inputs[j]), shift)
         for begins, change in ((0.0, older - acting[j]), (late, newer - older)) if lag else ((late, newer - older),):
             steps[begins, lag] = steps.get((begins, lag), 0.0) + np.outer(participation[:, j], change)
     return tuple(Step(late, lag, forces) for (late, lag), forces in steps.items())

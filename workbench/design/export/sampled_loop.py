@@ -16,12 +16,12 @@ from scipy.linalg import expm
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.laws.law import DesignError
 from workbench.rig.actuators import Actuator
+from workbench.rig.linear import whole_samples
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
 from workbench.structure.modes import Modes
 
 MOST_PAST = 400  # commands under way at a time
-EVEN = 1e-9  # of a sample: a delay so near a whole number of samples is one
 
 
 def sampled_loop(
@@ -66,7 +66,7 @@ def held(a: np.ndarray, b: np.ndarray, period: float, delays: np.ndarray) -> tup
     Raises:
         DesignError: too many commands under way.
     """
-    parts = [_whole_and_rest(float(delay), period) for delay in delays]
+    parts = [whole_samples(float(delay), period) for delay in delays]
     past = [whole + (rest > 0) for whole, rest in parts]
     if max(past, default=0) > MOST_PAST:
         raise DesignError(
@@ -115,14 +115,6 @@ def linear_plant(
     known = [replace(s, bias=0.0, drift=0.0, limit=np.inf, step=0.0) for s in sensors]
     plant = state_space(modes, drives, known)
     return np.asarray(plant.A), np.asarray(plant.B), np.asarray(plant.C)
-
-
-def _whole_and_rest(delay: float, period: float) -> tuple[int, float]:
-    """Whole samples of a delay, and what is left of it, s."""
-    whole, rest = divmod(delay, period)
-    if rest > (1 - EVEN) * period:
-        whole, rest = whole + 1, 0.0
-    return int(whole), 0.0 if rest < EVEN * period else rest
 
 
 def _integral(a: np.ndarray, span: float) -> np.ndarray:
