@@ -250,13 +250,3 @@ def sinusoid_on_substeps(
     share = 3.0 * (np.sinc(half / np.pi) - np.cos(half)) / half if half > ALIKE else half
     rise = element.amplitude * share * np.cos(middle)
     return mean - rise, mean + rise, element.amplitude * np.sin(edges[:-1:substeps])
-
-
-def lagged(truth: np.ndarray, time_constant: float, sample_time: float, *, settled: bool = True) -> np.ndarray:
-    """A first-order lag of a signal that is linear between samples, settled at its first value, or at zero."""
-    ratio = sample_time / time_constant
-    fade = np.exp(-ratio)
-    new = 1.0 - (1.0 - fade) / ratio
-    old = (1.0 - fade) / ratio - fade
-    first = truth[0] if settled else 0.0
-    return np.asarray(lfilter([new, old], [1.0, -fade], truth, zi=[first - new * truth[0]])[0])

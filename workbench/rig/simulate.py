@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 
 import numpy as np
+from scipy.signal import lfilter
 
 from workbench.arrays import Complexes, Floats, Integers
 from workbench.records.record import Record
 from workbench.rig import elements, stepping
 from workbench.rig.between_samples import BetweenSamples, Step
-from workbench.rig.driving import actuator_force, beyond_straight, drives, lagged, shifted, sinusoid_on_substeps
+from workbench.rig.driving import actuator_force, beyond_straight, drives, shifted, sinusoid_on_substeps
 from workbench.rig.linear import (
     ModalPoles,
     held_response,
@@ -197,7 +198,7 @@ def sensor_reading(sensor: Sensor, truth: np.ndarray, sample_time: float) -> np.
     """A sensor's mean reading (n_samples,) of the truth: lag, gain, bias and drift, clipping, rounding."""
     y = truth
     if sensor.time_constant > 0:
-        y = lagged(y, sensor.time_constant, sample_time)
+        y = _lagged(y, sensor.time_constant, sample_time)
     if sensor.gain != 1:
         y = sensor.gain * y
     if sensor.bias or sensor.drift:
@@ -506,6 +507,15 @@ def stretching_of(rig: Rig) -> Floats:
     """∫ φ_r' φ_s' dx, (n_modes, n_modes)."""
     slopes, weights = along(rig, 1)
     return slopes.T @ (weights[:, None] * slopes)
+
+
+def _lagged(truth: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
+    """A first-order lag of a signal that is linear between samples, settled at its first value."""
+    ratio = sample_time / time_constant
+    fade = np.exp(-ratio)
+    new = 1.0 - (1.0 - fade) / ratio
+    old = (1.0 - fade) / ratio - fade
+    return np.asarray(lfilter([new, old], [1.0, -fade], truth, zi=[(1.0 - new) * truth[0]])[0])
 
 
 def _mean_rounded(y: np.ndarray, step: float, noise_std: float) -> np.ndarray:
