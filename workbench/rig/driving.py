@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
-from workbench.rig.linear import whole_samples
+from workbench.rig.linear import shifted, whole_samples
 
 DRIVES_KEPT, MOST_KEPT = 16, 2**18  # forces on substeps that are remembered, and the most values of one
 ROUND_OFF = 1e-9  # of the largest force
@@ -207,7 +207,8 @@ def _delayed_and_lagged(
         Mean and half the rise of what is straight; the force at each start; and courses per unit beside it, with sizes.
     """
     shift, late = whole_samples(actuator.delay, h)
-    (old_mean, mean), (old_rise, rise), (_, start) = (shifted(each, shift) for each in (mean, rise, start))
+    old_mean, old_rise = (shifted(each, shift + 1) for each in (mean, rise))
+    mean, rise, start = (shifted(each, shift) for each in (mean, rise, start))
     courses: list[tuple[Course, Floats]] = []
     if late:  # the substep before goes on until then
         before, until = old_mean + old_rise * (1.0 - 2.0 * late / h), old_mean + old_rise
@@ -231,12 +232,6 @@ def _delayed_and_lagged(
     acting = np.r_[0.0, lfilter([1.0], [1.0, -fade], new)[:-1]]
     courses.append(((Piece(0.0, 1.0 / lag, 1.0),), acting - settled))
     return mean - lag * slope, rise, acting, courses
-
-
-def shifted(values: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Values one step more than so many steps later, and so many steps later; zero before the first."""
-    padded = np.r_[np.zeros(steps + 1), values][: values.size + 1]
-    return padded[:-1], padded[1:]
 
 
 def sinusoid_on_substeps(

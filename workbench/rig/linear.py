@@ -119,8 +119,8 @@ def held_response(
     poles, weights = system.poles, system.weights @ participation
     n_samples = forces.shape[1]
     shift, rest = whole_samples(delay, sample_time)
-    older = _shifted(forces, shift + 1)
-    newer = _shifted(forces, shift)
+    older = shifted(forces, shift + 1)
+    newer = shifted(forces, shift)
     response = np.zeros((poles.size, n_samples), complex)
     decay = np.exp(poles * sample_time)
     if time_constant == 0:
@@ -196,7 +196,7 @@ class _StraightPieces:
         late, rest = whole_samples(delay, sample_time)
         share = 1.0 - rest / sample_time
         ahead = np.c_[forces[:, 1:], forces[:, -1:]]
-        old, middle, new = _shifted(forces, late + 1), _shifted(forces, late), _shifted(ahead, late)
+        old, middle, new = shifted(forces, late + 1), shifted(forces, late), shifted(ahead, late)
         if late < forces.shape[1]:
             middle_before = middle.copy()
             middle_before[:, late] = 0.0  # nothing runs up to the first sample
@@ -281,10 +281,11 @@ def _faded_growth(poles: Complexes, rate: float, span: float) -> Complexes:
     return grown / (poles + rate)
 
 
-def _shifted(values: np.ndarray, samples: int) -> np.ndarray:
+def shifted(values: np.ndarray, samples: int) -> np.ndarray:
+    """Values (..., n_samples) so many samples later, zero before the first."""
     if samples == 0:
         return values
-    shifted = np.zeros_like(values)
-    if samples < values.shape[1]:
-        shifted[:, samples:] = values[:, : values.shape[1] - samples]
-    return shifted
+    later = np.zeros_like(values)
+    if samples < values.shape[-1]:
+        later[..., samples:] = values[..., : values.shape[-1] - samples]
+    return later

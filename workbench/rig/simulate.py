@@ -11,12 +11,13 @@ from workbench.arrays import Complexes, Floats, Integers
 from workbench.records.record import Record
 from workbench.rig import elements, stepping
 from workbench.rig.between_samples import BetweenSamples, Step
-from workbench.rig.driving import actuator_force, beyond_straight, drives, shifted, sinusoid_on_substeps
+from workbench.rig.driving import actuator_force, beyond_straight, drives, sinusoid_on_substeps
 from workbench.rig.linear import (
     ModalPoles,
     held_response,
     modal_motion,
     modal_poles,
+    shifted,
     sinusoid_response,
     straight_response,
     whole_samples,
@@ -292,7 +293,8 @@ def _steps_within(
         lag = actuator.time_constant
         if not (late or lag) or np.isfinite(actuator.rate_limit):
             continue
-        older, newer = shifted(actuator_force(actuator, inputs[j]), shift)
+        force = actuator_force(actuator, inputs[j])
+        older, newer = shifted(force, shift + 1), shifted(force, shift)
         for begins, change in ((0.0, older - acting[j]), (late, newer - older)) if lag else ((late, newer - older),):
             steps[begins, lag] = steps.get((begins, lag), 0.0) + np.outer(participation[:, j], change)
     return tuple(Step(late, lag, forces) for (late, lag), forces in steps.items())
