@@ -15,6 +15,7 @@ from workbench.gap.search.finish import finished, simplest, widened
 from workbench.gap.search.fit import fit
 from workbench.gap.search.search import Search
 from workbench.gap.search.selection import on_whole_records
+from workbench.rig.actuators import Actuator
 from workbench.rig.elements import BoucWen, CoulombFriction, CubicSpring
 
 BOUC_WEN, SPRING, NOISE = kind_named("bouc_wen"), kind_named("ground_spring"), 1e-5
@@ -30,12 +31,12 @@ def rig(hinged_rig):
 def search(rig, record_of):
     """A search in a record of what the rig really is."""
 
-    def make(real, workers: int = 1, level: float = 1.0, steps: int = 100) -> Search:
+    def make(real, workers: int = 1, level: float = 1.0, steps: int = 100, of=rig) -> Search:
         rng = np.random.default_rng(0)
         command = level * np.repeat(rng.normal(size=steps), 10)[None]
         data = FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
-        quick, nominal = data.stepped(2), data.by_channel(data.residual(rig))
-        return Search(rig, data, quick, quick, CATALOGUE, lambda text, share: None, Workers(workers), nominal)
+        quick, nominal = data.stepped(2), data.by_channel(data.residual(of))
+        return Search(of, data, quick, quick, CATALOGUE, lambda text, share: None, Workers(workers), nominal)
 
     return make
 
@@ -136,3 +137,21 @@ def test_friction_is_of_two_directions_where_the_records_surely_say_so(rig, sear
     if offset:
         both = effect.values["force_forward"], effect.values["force_backward"]
         assert both == pytest.approx((0.005, 0.003), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("offset", "kinds"), [(0.0, {"coulomb_friction", "actuator_bias"}), (0.001, {"two_way_friction"})]
+)
+def test_a_drive_beside_friction_stands_in_for_a_second_direction_for_no_trifle_alone(
+    hinged_rig, search, offset, kinds
+):
+    rig = hinged_rig(actuators=(Actuator("F", 0.72),))
+    friction, bias = CoulombFriction(0.62, 0.004, 1e-3, offset), kind_named("actuator_bias")
+    real = replace(rig, elements=(friction,))
+    one = search(real if offset else bias.apply(real, "F", {"force": -0.001}), steps=500, of=rig)
+    start = (
+        Effect(kind_named("coulomb_friction"), None, {"at": 0.6, "force": 0.005, "smoothing_speed": 1e-3}),
+        Effect(bias, "F", {"force": -0.0005}),
+    )
+    found = widened(one, finished(one, fit(one.rig, start, one.data)))
+    assert {effect.kind.name for effect in found.effects} == kinds

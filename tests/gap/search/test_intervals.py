@@ -4,16 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from workbench.gap.effects.catalogue import kind_named
-from workbench.gap.effects.effect import Effect
+from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.settings import INTERVALS
+from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
+from workbench.structure.member import Bar
 
 
 def test_a_deviation_is_that_of_fits_that_leave_out_a_block_each(hinged_rig):
@@ -65,3 +70,27 @@ def test_noise_of_the_inputs_widens_the_interval_of_a_law_as_fits_to_other_draws
     assert deviation > 1.5 * without.effects[0].deviations["stiffness"]
     free = np.diag(told.covariance) / np.diag(without.covariance)
     assert (free > 1.0 - 1e-9).all() and free.max() > 1.5**2
+
+
+def test_a_place_where_the_structure_moves_most_is_known_by_the_square_of_the_distance():
+    """A mass at the free end of a bar, whose shapes are level there: one deviation inwards the records object by one.
+
+    The tangent, which is none, would leave the place open over the whole bar.
+    """
+    bar = Bar(length=1.0, mass_per_length=1.0, axial_stiffness=100.0, left="fixed", right="free")
+    sensors = (Sensor("d1", 0.4, noise_std=3e-3), Sensor("d2", 0.9, noise_std=3e-3))
+    nominal = Rig(bar.modes(4), (Actuator("F", 0.6),), sensors, structure=bar)
+    mass = Effect(kind_named("point_mass"), None, {"at": 1.0, "mass": 0.02})
+    inputs = np.repeat(np.random.default_rng(0).normal(size=100), 5)[None]
+    record = simulate(apply_all(nominal, (mass,)), inputs, sample_time=0.01)
+    data = FitData((record,), np.full(2, 3e-3))
+    (found,) = with_intervals(nominal, fit(nominal, (mass,), data), data).effects
+
+    def objection(values):
+        return np.sum(data.residual(apply_all(nominal, (replace(mass, values=values),))) ** 2)
+
+    inwards = found.values["at"] - found.deviations["at"]
+    best = minimize_scalar(lambda m: objection({"at": inwards, "mass": m}), bracket=(0.019, 0.021))
+    assert found.values["at"] == pytest.approx(1.0, abs=1e-4)
+    assert 0.01 < found.deviations["at"] < 0.2
+    assert best.fun == pytest.approx(1.0, rel=0.5)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from workbench.gap.effects.effect import COORDINATES, Effect, apply_all, key_of, place_values
-from workbench.gap.effects.limiting_cases import simpler_sets, wider_sets, with_one_simpler
+from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets, wider_sets, with_one_simpler
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit
 from workbench.gap.search.search import Search, promise
 from workbench.gap.search.settings import FINISH, SELECTION
@@ -51,7 +51,11 @@ def _with_stepping(search: Search, finely: Fit) -> Fit:
 
 
 def widened(search: Search, found: Fit) -> Fit:
-    """The fit, or one with an effect as what it is a limiting case of, where the records surely prefer that."""
+    """The fit, or one with an effect as what it is a limiting case of, where the records surely prefer that.
+
+    The wider law may make another effect needless: a constant force beside friction stood in for friction that differs
+    between the two directions. That is no richer a set, so any sure gain is one.
+    """
     sets = list(wider_sets(found.effects))
     if not sets:
         return found
@@ -69,6 +73,10 @@ def widened(search: Search, found: Fit) -> Fit:
             trial.cost, anew(found.effects).cost, extra
         ):
             return trial
+        instead = [anew(fewer) for fewer in each_left_out(trial.effects) if fewer]
+        best = min(instead, key=lambda f: f.cost, default=found)
+        if best.n_parameters <= found.n_parameters and search.surely_better(best, cost, 0):
+            return best
     return found
 
 

@@ -1,5 +1,6 @@
 """Standard deviations of fitted parameters that hold where the model is a little wrong too."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_a
 from workbench.gap.prediction.logged_inputs import noise_of_inputs
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
-from workbench.gap.search.fit import Fit, parameters_of, slopes
+from workbench.gap.search.fit import Fit, finite_residual, parameters_of, slopes
 from workbench.gap.search.settings import INTERVALS
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -43,6 +44,7 @@ def with_intervals(
     if jacobian.shape[1] == 0:
         return found
     parameters = parameters_of(rig, found.effects)
+    jacobian = _along_places(rig, found.effects, data, residual, jacobian)
     least = np.array([_least(found.effects[i], p) for i, p in parameters])
     level = max(float(residual @ residual) / residual.size, 1.0)
     priors = np.array([_precision(p) for _, p in parameters])
@@ -63,6 +65,38 @@ def with_intervals(
     joint = _joint(information, information @ spread @ information, level, len(without))
     joint = _no_smaller(joint, of_inputs)
     return replace(found, effects=tuple(effects), covariance=joint / np.outer(scale, scale) + np.diag(least**2))
+
+
+def _along_places(
+    rig: Rig, effects: Sequence[Effect], data: FitData, residual: np.ndarray, jacobian: np.ndarray
+) -> np.ndarray:
+    """The slopes, along a place that its tangent leaves open by the secant over its deviation.
+
+    Where the structure moves most, at the free end of a bar or in the middle of a beam, the tangent is none: readings
+    change with the square of the distance, and a deviation of half the extent would be said of a place known well.
+    """
+    level = max(float(residual @ residual) / residual.size, 1.0)
+    jacobian = jacobian.copy()
+    for j, (i, parameter) in enumerate(parameters_of(rig, effects)):
+        if parameter.name not in COORDINATES:
+            continue
+        value = effects[i].values[parameter.name]
+        room = max(value - parameter.low, parameter.high - value) / parameter.scale
+        inwards = 1.0 if parameter.high - value > value - parameter.low else -1.0
+        far = INTERVALS.straight * (parameter.high - parameter.low) / parameter.scale
+        for k in range(INTERVALS.secants):
+            deviation = 1.0 / np.sqrt(jacobian[:, j] @ jacobian[:, j] / level + _precision(parameter))
+            # a square's secant is half as steep over half the distance: the mean of logarithms meets it at once
+            step = min(deviation if k == 0 else np.sqrt(step * deviation), room)
+            if step < far:
+                break
+            there = {**effects[i].values, parameter.name: value + inwards * step * parameter.scale}
+            moved = (*effects[:i], replace(effects[i], values=there), *effects[i + 1 :])
+            changed = finite_residual(rig, moved, data)
+            if changed is None:
+                break
+            jacobian[:, j] = inwards * (changed[: residual.size] - residual) / step
+    return jacobian
 
 
 def _precision(parameter: Parameter) -> float:

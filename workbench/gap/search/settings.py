@@ -333,6 +333,8 @@ class IntervalSettings:
     most_leverage: float = 0.5  # of a block on a direction that it alone tells: what there is no telling without it
     blocks: int = 12  # a record: long beside the correlation of what is left, many enough to scatter
     draws: int = 48  # of noise of the logged inputs: a standard deviation of 48 is known to a tenth
+    straight: float = 0.01  # of the extent: how far from a place readings are taken to change in proportion
+    secants: int = 4  # after the tangent: each halves, on a logarithmic scale at least, what the last was off by
 
 
 SEARCH = SearchSettings()
