@@ -84,10 +84,10 @@ def _along_places(
         room = max(value - parameter.low, parameter.high - value) / parameter.scale
         inwards = 1.0 if parameter.high - value > value - parameter.low else -1.0
         far = INTERVALS.straight * (parameter.high - parameter.low) / parameter.scale
-        for k in range(INTERVALS.secants):
-            deviation = 1.0 / np.sqrt(jacobian[:, j] @ jacobian[:, j] / level + _precision(parameter))
+        step = deviation = _alone(jacobian[:, j], level, parameter)
+        for _ in range(INTERVALS.secants):
             # a square's secant is half as steep over half the distance: the mean of logarithms meets it at once
-            step = min(deviation if k == 0 else np.sqrt(step * deviation), room)
+            step = min(np.sqrt(step * deviation), room)
             if step < far:
                 break
             there = {**effects[i].values, parameter.name: value + inwards * step * parameter.scale}
@@ -96,7 +96,13 @@ def _along_places(
             if changed is None:
                 break
             jacobian[:, j] = inwards * (changed[: residual.size] - residual) / step
+            deviation = _alone(jacobian[:, j], level, parameter)
     return jacobian
+
+
+def _alone(slope: np.ndarray, level: float, parameter: Parameter) -> float:
+    """Standard deviation of a free coordinate, were all others known."""
+    return float(1.0 / np.sqrt(slope @ slope / level + _precision(parameter)))
 
 
 def _precision(parameter: Parameter) -> float:
