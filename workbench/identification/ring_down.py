@@ -18,6 +18,7 @@ from workbench.identification.free_decay.preparation import decay_start, without
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, data_faults, of_same_sensors
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
+from workbench.identification.signal.overtones import multiple_of
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import SECONDS, Budget, Progress
 from workbench.records.record import Record
@@ -41,9 +42,6 @@ class RingDownSettings:
     stands_out: float = 5.0  # times the residual beside them that it may stand out by
     band: int = 6  # bins about a mode
     beside: int = 60  # bins beside it
-    highest_overtone: int = 9
-    overtone_at_most: float = 0.03  # amplitude of an overtone, relative to its base
-    within: float = 2e-3  # of a whole multiple of the base's frequency
 
 
 RING_DOWN = RingDownSettings()
@@ -344,7 +342,7 @@ def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, 
     span = max(record.n_samples * record.sample_time for record in records)
     for r in range(modes.n_modes):
         f, zeta, doubt = modes.frequencies_hz[r], modes.zeta[r], SURE * refined.zeta_std[r]
-        base, times = _base(modes.frequencies_hz, size, r)
+        base, times = multiple_of(modes.frequencies_hz, size, r)
         if f * span < 1.0:
             found.append("period longer than the record: a drift?")
         elif zeta < -doubt:
@@ -357,13 +355,3 @@ def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, 
         else:
             found.append("")
     return tuple(found)
-
-
-def _base(frequencies: np.ndarray, size: np.ndarray, r: int) -> tuple[int | None, int]:
-    """The mode of which r may be an overtone, and which."""
-    for base in np.argsort(-size):
-        times = round(frequencies[r] / frequencies[base])
-        near = abs(frequencies[r] / frequencies[base] - times) < RING_DOWN.within * times
-        if 2 <= times <= RING_DOWN.highest_overtone and near and size[r] < RING_DOWN.overtone_at_most * size[base]:
-            return int(base), times
-    return None, 0

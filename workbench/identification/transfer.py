@@ -21,6 +21,7 @@ from workbench.identification.input_output.model_order import Selected, evidence
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, time_derivatives
+from workbench.identification.signal.overtones import overtone_remarks
 from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel
@@ -166,7 +167,9 @@ def identify_transfer(
         found.append(_modes_of(*selected, channels, edges, f[first:last], own))
     whole = _together(found, channels) if n_bands > 1 else found[0]
     overlap = overlap_remarks(whole.modes.poles, h.shape[0] * h.shape[1])
-    whole = replace(whole, remarks=(*whole.remarks, *overlap, *_uneven(whole), *budget.remarks))
+    deviation = whole.modes.omega * whole.zeta_std + 1j * whole.omega_std
+    overtones = overtone_remarks(whole.modes.poles, np.sqrt(whole.evidence), 2.0 * np.pi * whole.scatter_hz, deviation)
+    whole = replace(whole, remarks=(*whole.remarks, *overlap, *_uneven(whole), *overtones, *budget.remarks))
     if whole.modes.n_modes == 0:
         raise ValueError(
             f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
