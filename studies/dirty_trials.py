@@ -25,7 +25,7 @@ def study(outcome, data: Path | None = None) -> None:
             outcome.say(f"seed {result['seed']}: {result.error}")
         elif not result["score"]["named"]:
             score = result["score"]
-            outcome.say(f"seed {result['seed']}, {score['class']}: hidden {score['hidden']}, told {score['told']}")
+            outcome.say(f"seed {result['seed']}, {score['class']}: true {score['hidden']}, diagnosed {score['told']}")
     outcome.table("scores", {result["seed"]: result["score"] for result in held})
     by_class = {name: tally_dirty(s for s in scores if s["class"] == name) for name in DIRT_CLASSES}
     by_size = {size: tally_dirty(s for s in scores if s["size"] == size) for size in SIZES}

@@ -20,7 +20,7 @@ def study(outcome, data: Path | None = None) -> None:
             outcome.say(f"seed {result['seed']}: {result.error}")
         elif not result["score"]["kinds"]:
             told, hid = result["score"]["told"], result["score"]["hidden"]
-            outcome.say(f"seed {result['seed']}: hidden {hid}, told {told}")
+            outcome.say(f"seed {result['seed']}: true {hid}, diagnosed {told}")
     outcome.table("scores", {result["seed"]: result["score"] for result in found if result.error is None})
     outcome.table("shares", held.shares)
     for family in held.shares:

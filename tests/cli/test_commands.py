@@ -113,13 +113,11 @@ def test_identify_reads_transfer_functions(tmp_path):
     modes = json.loads(found.read_text())
     scores = (np.array(modes["frequencies_hz"]) - [8.0, 19.0]) / modes["frequencies_std_hz"]
     assert np.abs(scores).max() < 4.0 and modes["sensors"] == ["H 1", "H 2", "H 3"]
-    assert (
-        modes["order_limited_hz"] == [] and not any(modes["doubtful"]) and "stopped at its limit" not in result.output
-    )
+    assert modes["order_limited_hz"] == [] and not any(modes["doubtful"]) and "reached its limit" not in result.output
     one = run("identify", path, "--outputs", "H 2", "--band-hz", 5, 12, "--json", found)
     assert one.exit_code == 0 and len(json.loads(found.read_text())["frequencies_hz"]) == 1
     few = run("identify", path, "--modes", 1)
-    assert few.exit_code == 0 and "the search stopped at its limit of modes" in " ".join(few.output.split())
+    assert few.exit_code == 0 and "the search reached its limit of modes" in " ".join(few.output.split())
     for options, said in (
         (("--start", 1.0), "leave --start and --ambient out"),
         (("--inputs", "a"), "name no inputs"),

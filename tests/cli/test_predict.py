@@ -102,4 +102,4 @@ def test_what_is_wired_wrongly_is_said_before_it_is_diagnosed(run, case):
     write_case(replace(read, fit=turned), case / "turned")
     refused = run("predict", case / "turned", "friday.csv")
     assert refused.exit_code == 2
-    assert "d1 has the sign turned: multiply by -1; correct the case" in refused.stderr and not (case / "out").exists()
+    assert "d1 has the wrong sign: multiply by -1; correct the case" in refused.stderr and not (case / "out").exists()

@@ -314,7 +314,7 @@ def test_thousands_of_channels_are_seen_in_seconds(tmp_path, ending):
     ("body", "words"),
     [
         ("import os, signal\ndef load(*_): os.kill(os.getpid(), signal.SIGSEGV)\n", r"crashed on it \(SIGSEGV\)"),
-        ("def load(path, limits):\n    while True: pass\n", "no end within [15] s"),
+        ("def load(path, limits):\n    while True: pass\n", "did not end within [15] s"),
         ("import numpy\ndef load(path, limits): return {'a': numpy.ones(2**33)}\n", "more than 1 GiB"),
         ("import os\ndef load(path, limits): os._exit(9)\n", "process that reads it failed"),
         ("def load(path, limits): print('noise'); raise KeyError\n", "cannot be read as MAT: KeyError"),

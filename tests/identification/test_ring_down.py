@@ -135,7 +135,7 @@ def test_short_random_response_is_refused_or_remarked():
         except ValueError as error:
             assert "no free decay" in str(error) or "is it a free decay" in str(error) or "grows" in str(error)
         else:
-            driven = ("it is driven, or depends strongly on amplitude", "tones that drive it?")
+            driven = ("it is driven, or depends strongly on amplitude", "harmonic excitation?")
             assert any(words in note for note in told.notes for words in driven), told.notes
 
 

@@ -176,7 +176,7 @@ def test_shapes_that_are_stated_as_mass_normalised_and_are_not_are_refused_with_
         (arrays(modal_masses=np.ones(2)), "an array 'modal_masses' is not known; name it modal_mass if it is that"),
         (arrays(mass_matrix=np.eye(3)), r"mass matrix of 2 points must be finite, \(2, 2\); it is \(3, 3\)"),
         (arrays(mass_matrix=np.full((2, 2), np.nan)), "it is not finite"),
-        (arrays(mass_matrix=-np.eye(2)), "mass matrix is not positive: mode 1 would have a modal mass of -"),
+        (arrays(mass_matrix=-np.eye(2)), "mass matrix is not positive definite: mode 1 has a modal mass of -"),
     ],
 )
 def test_a_file_that_is_no_set_of_modes_is_refused(tmp_path, values, message):

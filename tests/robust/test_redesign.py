@@ -295,7 +295,7 @@ def test_the_ends_of_an_interval_are_told_apart(rig, controller):
     assert "at 10.43 % (95 %: 10.41 to 10.45) damping" in found.sentence
     assert "25 % (20 to 30), as much effort" in found.sentence
     alike = replace(sure.proof, damping=np.full((3, 6), 0.05))
-    assert "redesigned: 5.00 % (samples alike)," in replace(found, proof=alike).sentence
+    assert "redesigned: 5.00 % (the same in all samples)," in replace(found, proof=alike).sentence
 
 
 def test_every_draw_is_judged_by_its_own_simulation(rig, controller):
@@ -319,7 +319,7 @@ def test_on_off_control_is_told_by_its_settling(rig):
     found = redesign(stuck, relays, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
     assert "settles in" in found.sentence and found.steps[-1].loss < 0.1 * found.steps[0].loss
     alike = replace(found.proof, controlled_settling=np.full(3, 2.29), settling=np.full(3, 2.29))
-    assert "redesigned: 2.29 s (samples alike)" in replace(found, proof=alike).sentence
+    assert "redesigned: 2.29 s (the same in all samples)" in replace(found, proof=alike).sentence
 
 
 def test_relays_that_a_dead_zone_silences_are_made_to_act_again(rig):
@@ -330,7 +330,7 @@ def test_relays_that_a_dead_zone_silences_are_made_to_act_again(rig):
     assert found.after.effort > 1.5 * found.before.effort and found.weight == 0.0
     assert found.improves
     assert found.advice.startswith("Use the redesigned controller: it settles the controlled modes in")
-    assert "for some instead of no effort" in found.advice and "some instead of no work" in found.sentence
+    assert "for nonzero instead of zero effort" in found.advice and "nonzero instead of zero work" in found.sentence
 
 
 def test_moving_the_actuators_is_offered_where_it_pays(rig):
@@ -346,7 +346,7 @@ def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, 
     sure = possible(rig, unexplained=0.01, outcome="unknown")
     found = redesign(sure, controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False)
     assert found.proof.small_gain_margin > 0.01 and found.safe
-    assert found.sentence.endswith("so stability is guaranteed while no frequency is off by more.")
+    assert found.sentence.endswith("so stability is guaranteed if the share exceeds that at no frequency.")
     proofs = {name: replace(getattr(found, name), small_gain_margin=1.004) for name in ("present_proof", "proof")}
     certain = replace(found, **proofs)  # whichever controller is the one to use
     assert (
@@ -428,7 +428,7 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
     with pytest.raises(TypeError, match="a law, a controller or a placement task; got str"):
         redesign(plain, "imsc", sample_time=DT)
     for given, match in (
-        ({"test": "impulse"}, "a loop is put through a test; got str"),
+        ({"test": "impulse"}, "the test must be a LoopTest; got str"),
         ({"sample_time": "0.01"}, "sample_time is a number in s; got '0.01'"),
         ({"more_cost": None}, "more_cost is a number; got None"),
         ({"draws": "2"}, "is a whole number, 1 or more; got '2'"),

@@ -132,8 +132,8 @@ def test_thirty_thousand_degrees_of_freedom_take_no_longer_than_twice_arpack():
     [
         (np.eye(3), np.triu(np.ones((3, 3))) + 3 * np.eye(3), "not symmetric.*one triangle"),
         (np.diag([1.0, -1.0, 1.0]), np.eye(3), "'b' has -1 kg"),
-        (np.array([[1, 2, 0], [2, 1, 0], [0, 0, 1.0]]), np.eye(3), "mass matrix is not positive"),
-        (np.eye(3), np.diag([1.0, -1.0, 1.0]), "stiffness matrix is not positive"),
+        (np.array([[1, 2, 0], [2, 1, 0], [0, 0, 1.0]]), np.eye(3), "mass matrix is not positive semidefinite"),
+        (np.eye(3), np.diag([1.0, -1.0, 1.0]), "stiffness matrix is not positive semidefinite"),
         (np.eye(2), np.eye(3), r"shape \(2, 2\)"),
         (np.eye(3), np.diag([1.0, np.nan, 1.0]), "not finite"),
         (np.eye(3), (1.0 + 0.02j) * np.eye(3), r"stiffness matrix is complex.*loss factor.*ModalDamping"),

@@ -24,7 +24,7 @@ def export(
     ] = options.ESTIMATORS[0],
     disturbance: options.Disturbance = 1.0,
     computing_delay_ms: Annotated[
-        float, typer.Option(help="From a reading to the first effect of its command, beside the actuators' delays.")
+        float, typer.Option(help="Computation delay from a reading to its command, ms, beside the actuators' delays.")
     ] = 0.0,
 ) -> None:
     """Write a controller as a step function in C or Python, or as a MAT file, at the rate of its computer.

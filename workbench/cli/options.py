@@ -42,7 +42,9 @@ Damping = Annotated[
 ]
 Disturbance = Annotated[
     float,
-    typer.Option(help="For the Kalman filter: intensity of white modal forces; noise is as the outputs state it."),
+    typer.Option(
+        help="For the Kalman filter: intensity of white modal forces; the sensors' noise is noise_std of the outputs."
+    ),
 ]
 RecordName = Annotated[
     str, typer.Argument(metavar="RECORD", help="File with a column for each input, or a record of the case by name.")

@@ -29,9 +29,11 @@ def place(
     weight: options.Weight = 1.0,
     impulse_at: options.ImpulseAt = None,
     effort: Annotated[
-        float, typer.Option(help="Effort limit: times that of even spacing on a beam, else of the rig's actuators.")
+        float, typer.Option(help="Effort limit, times that of evenly spaced actuators (beam), or of the rig's own.")
     ] = 1.5,
-    spacing: Annotated[float | None, typer.Option(help="Least distance between actuators, m; size/20.")] = None,
+    spacing: Annotated[
+        float | None, typer.Option(help="Least distance between actuators, m; 1/20 of the size unless given.")
+    ] = None,
     peak_force: Annotated[float, typer.Option(help="Force limit of each actuator, N.")] = math.inf,
     condition: Annotated[float, typer.Option(help="Limit of the condition number of B (Frobenius).")] = math.inf,
     forbid: Annotated[
@@ -41,7 +43,7 @@ def place(
         str | None, typer.Option(metavar="PLACES", help="Candidates, m (X,Y;X,Y on a plate) or names.")
     ] = None,
     grid: Annotated[
-        float | None, typer.Option(metavar="M", help="Candidates on a grid over a plate, so far apart, m.")
+        float | None, typer.Option(metavar="M", help="Spacing of a grid of candidates over a plate, m.")
     ] = None,
     proof: Annotated[
         float | None, typer.Option(help="Prove global optimality to within this share, such as 0.05.")

@@ -61,7 +61,7 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
 def plot_budget(budget: Budget) -> Figure:
     """What causes the gap of each record: one bar per record, split by cause."""
     causes = [label_in_words(label) for label in budget.effects]
-    causes += ["small errors of the model", "unexplained", "noise"]
+    causes += ["errors of the nominal model", "unexplained", "noise"]
     colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], GREY]
     records = list(budget.by_record)
     figure, ax = new_figure(width=9, height=1.6 + 0.5 * len(records))
@@ -179,12 +179,12 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str = "m", force: str = "
     there = verdict.nominal.modes.domain.text(place.at)
     there = there if isinstance(place.at, Between) else f"at {there}"
     step = max(1, place.force.size // 4000)
-    for ax, series, name in (
-        (axes[0], place.displacement, f"displacement [{length}]"),
-        (axes[1], place.velocity, f"velocity [{length}/s]"),
+    for ax, series, (name, unit) in (
+        (axes[0], place.displacement, ("displacement", length)),
+        (axes[1], place.velocity, ("velocity", f"{length}/s")),
     ):
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=3, alpha=0.6)
-        ax.set_xlabel(f"{name} {there}")
+        ax.set_xlabel(f"{name} {there} [{unit}]")
         law = _law(chosen, series, name)
         if law is not None:  # beneath the points, which it would hide where they follow it
             ax.plot(*law, color=COLOURS[1], linewidth=5.0, alpha=0.6, zorder=1, label="fitted law")
@@ -197,7 +197,7 @@ def _law(chosen: Sequence[Effect], series: Floats, name: str) -> tuple[Floats, F
     """The fitted law as a line over one variable, where it depends on that variable alone."""
     if not chosen:
         return None
-    law = chosen[0].kind.force_laws.get(name.split()[0])
+    law = chosen[0].kind.force_laws.get(name)
     grid = np.linspace(series.min(), series.max(), 400)
     return None if law is None else (grid, law(chosen[0].values, grid))
 
@@ -217,8 +217,8 @@ def plot_rivals(verdict: Verdict) -> Figure:
     ax.axvline(verdict.attribution.nominal_cost, color=COLOURS[1], linestyle="--", label="nominal")
     ax.set(
         xscale="log",
-        xlabel="mean square residual over that of the noise",
-        title="each effect alone, fitted as well as it can be",
+        xlabel="mean square residual / noise power [-]",
+        title="best fit of each effect alone",
     )
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure

@@ -18,19 +18,19 @@ _FAMILY = {
     "unknown": "outside the catalogue:",
 }
 _ERRORS = {
-    "clean": "none",
+    "clean": "no test errors",
     "shape": "mass, stiffness, damping vary",
-    "offset": "all stiffness, all damping off",
-    "noise": "noise louder than stated",
+    "offset": "stiffness and damping off uniformly",
+    "noise": "noise above the stated",
     "coloured": "coloured noise",
     "input": "noise of logged inputs",
-    "late": "sensors late",
-    "gain": "calibration of gains",
-    "place": "places off",
+    "late": "delays of sensors",
+    "gain": "errors of calibration",
+    "place": "positions of sensors and actuators off",
     "mixed": "several of these",
-    "triple": "none; three effects",
+    "triple": "no test errors, three effects",
 }
-BOTH, OTHER = "both of the two", "another two"
+BOTH, OTHER = "both effects", "another two"
 
 
 def plot_confusion(tally: Tally) -> Figure:
@@ -46,10 +46,12 @@ def plot_confusion(tally: Tally) -> Figure:
     ax.plot([-0.5, len(rows) - 0.5], [-0.5, len(rows) - 0.5], color=GREY, linewidth=0.6, zorder=0)
     ax.set_xticks(range(len(columns)), [_plain(c) for c in columns], rotation=90, fontsize=8)
     ax.set_yticks(range(len(rows)), ["two effects" if r == BOTH else _plain(r) for r in rows], fontsize=8)
-    ax.set(xlim=(-0.6, len(columns) - 0.4), ylim=(len(rows) - 0.4, -0.6), xlabel="named", ylabel="hidden")
+    ax.set(
+        xlim=(-0.6, len(columns) - 0.4), ylim=(len(rows) - 0.4, -0.6), xlabel="diagnosed effect", ylabel="true effect"
+    )
     total = sum(of for _, of in tally.shares.values())
     words = "; ".join(f"{_FAMILY[family]} {right} of {of}" for family, (right, of) in tally.shares.items())
-    ax.set_title(f"{total} blind cases, numbers of cases, blue right and orange wrong.\n{words}")
+    ax.set_title(f"{total} blind cases; number of each, blue correct, orange wrong\n{words}")
     return figure
 
 
@@ -82,8 +84,8 @@ def plot_dirt(scores: Sequence[Mapping[str, Any]]) -> Figure:
     for column, size in enumerate(sizes):
         ax.barh(0, 0, color=COLOURS[column], label=f"{size:g} × the errors of a careful test")
     ax.set_yticks(range(len(classes)), [_ERRORS[name] for name in classes])
-    ax.set(xlim=(0, 112), ylim=(len(classes) - 0.4, -0.6), xlabel="verdicts that are right [%]")
-    ax.set_ylabel("small errors of the test")
+    ax.set(xlim=(0, 112), ylim=(len(classes) - 0.4, -0.6), xlabel="correct verdicts [%]")
+    ax.set_ylabel("class of test error")
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(sizes), fontsize=8)
     return figure
 
@@ -123,4 +125,4 @@ def _order(name: str) -> tuple[int, str]:
 
 
 def _plain(name: str) -> str:
-    return {"none": "nothing", "unknown": "something else"}.get(name, label_in_words(name))
+    return {"none": "nothing", "unknown": "outside the catalogue"}.get(name, label_in_words(name))

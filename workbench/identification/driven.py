@@ -356,7 +356,7 @@ def _few(how: dict[str, Any]) -> dict[str, Any]:
 def _late_remarks(data: KnownInputs) -> tuple[str, ...]:
     names = data.records[0].input_names
     late = [f"{names[i]} {d:.2f} samples ({d * data.dt:.3g} s)" for i, d in enumerate(data.delays) if d > 0]
-    return (f"inputs act late, by {', '.join(late)}: the model holds for inputs so delayed",) if late else ()
+    return (f"inputs act late, by {', '.join(late)}: the model is of the delayed inputs",) if late else ()
 
 
 def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.ndarray | None:

@@ -118,7 +118,7 @@ def ring_down(
         found, cut, more = _without_drift(cut, n_modes, budget)
     except np.linalg.LinAlgError:
         found = _by_stabilisation(cut, budget)
-        more = ["model order by stabilisation diagram: by likelihood there is none"]
+        more = ["model order by the stabilisation diagram, for selection by likelihood failed"]
     found = found.without_artefacts(np.pi / cut[0].sample_time, growing=True)
     _check_decays(cut, found.refined)
     found = found.without_artefacts(np.pi / cut[0].sample_time)
@@ -310,8 +310,8 @@ def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
     if share < 0.5:
         return ()
     return (
-        f"{100 * share:.0f} % of the motion does not decay within the record: tones that drive it? Then leave these"
-        " modes out, or cut it to where they end",
+        f"{100 * share:.0f} % of the motion does not decay within the record: harmonic excitation? Then leave these"
+        " modes out, or cut the record to where it ends",
     )
 
 

@@ -295,7 +295,7 @@ def _uneven(whole: TransferModes) -> tuple[str, ...]:
         return ()
     return (
         f"frequencies scatter in the peaks of {', '.join(which)}: such a mode changes with time or amplitude, or a"
-        " window blurs it, and is the mean of what it was; measure at one level, and longer segments",
+        " window blurs it, and its figures are means; measure at one level, and longer segments",
     )
 
 

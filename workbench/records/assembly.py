@@ -146,8 +146,8 @@ def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> 
         raise RecordFileError(f"{path}: its description of the channels is damaged: {error}") from error
     if not whole:
         raise RecordFileError(
-            f"{path} is not as it was written: its checksum shows a change. If that was meant, take the description"
-            " out, and name the inputs anew"
+            f"{path} was changed after it was written: its checksum does not match. If that was meant, delete the"
+            " description in it, and name the inputs again"
         )
     return described
 

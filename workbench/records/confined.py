@@ -52,7 +52,7 @@ def load_confined(module: str, path: Path, limits: Limits = DEFAULT) -> dict[str
             )
         except subprocess.TimeoutExpired:
             raise RecordFileError(
-                f"{path} is damaged or too large: its reader came to no end within {PATIENCE * seconds:.0f} s"
+                f"{path} is damaged or too large: reading it did not end within {PATIENCE * seconds:.0f} s"
             ) from None
         found.seek(0)
         if ended.returncode == 0:
@@ -69,7 +69,7 @@ def load_confined(module: str, path: Path, limits: Limits = DEFAULT) -> dict[str
         name = signal.Signals(-ended.returncode).name
         if name == "SIGXCPU":
             raise RecordFileError(
-                f"{path} is damaged or too large: its reader came to no end within {seconds:.0f} s; cut the record, or"
+                f"{path} is damaged or too large: reading it did not end within {seconds:.0f} s; cut the record, or"
                 " write it as HDF5 or NPZ"
             )
         raise RecordFileError(f"{path} is damaged: its reader crashed on it ({name})")

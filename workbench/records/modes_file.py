@@ -138,7 +138,7 @@ def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) ->
         if not (masses > 0).all():
             r = int(np.argmin(masses))
             raise RecordFileError(
-                f"{path}: its mass matrix is not positive: mode {r + 1} would have a modal mass of {masses[r]:.3g} kg"
+                f"{path}: its mass matrix is not positive definite: mode {r + 1} has a modal mass of {masses[r]:.3g} kg"
             )
         between = np.abs(products - np.diag(masses)) / np.sqrt(np.outer(masses, masses))
         if between.max(initial=0.0) > ORTHOGONAL:

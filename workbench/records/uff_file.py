@@ -41,7 +41,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         where = f"{path}, data set {number}"
         data = np.asarray(entry["data"])
         if np.iscomplexobj(data):
-            raise RecordFileError(f"{where} is complex, and says not that it is a transfer function (function type 4)")
+            raise RecordFileError(f"{where} is complex, but not marked as a transfer function (function type 4)")
         if data.size != entry["num_pts"]:
             raise RecordFileError(f"{where} holds {data.size} samples and says {entry['num_pts']}: it is damaged")
         facts = _facts(where, entry)

@@ -235,7 +235,7 @@ def check_loop_kinds(controller: object, test: object) -> None:
     """
     if not isinstance(controller, DigitalController):
         raise TypeError(
-            f"what runs in the loop is a sampled controller; got {type(controller).__name__}: make one of a law and an"
+            f"the controller must be a sampled one; got {type(controller).__name__}: make one of a law and an"
             " estimator by sampled(kalman(...), sample_time)"
         )
     check_test(test)
@@ -249,7 +249,7 @@ def check_test(test: object) -> None:
     """
     if not isinstance(test, LoopTest):
         raise TypeError(
-            f"a loop is put through a test; got {type(test).__name__}: make one by LoopTest(n_samples, sample_time,"
+            f"the test must be a LoopTest; got {type(test).__name__}: make one by LoopTest(n_samples, sample_time,"
             " impulse_at=...), from workbench.design.loop.rig_loop"
         )
 

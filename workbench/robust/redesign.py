@@ -277,7 +277,7 @@ class Redesign:
             middle, low, high = interval(self._settling(proof))
             if not np.isfinite(high):
                 return self._settles(proof)
-            ends = "samples alike" if f"{low:.3g}" == f"{high:.3g}" else f"{lead}{low:.3g} to {high:.3g}"
+            ends = "the same in all samples" if f"{low:.3g}" == f"{high:.3g}" else f"{lead}{low:.3g} to {high:.3g}"
             return f"{'settles in ' * named}{middle:.3g} s ({ends})"
         ratios = _ratios(proof.damping[:, self.mode], lead)
         return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
@@ -345,13 +345,13 @@ class Redesign:
         if self.possible.explained:
             return ""
         share, margin = self.possible.unexplained, self._used.small_gain_margin
-        error = f"{_percent(share)} of the output is unexplained"
+        error = f"{_percent(share)} of the output is unexplained in the mean over frequencies"
         if np.isnan(margin):
             return f"No stability guarantee: {error}, and on-off control has no small-gain margin."
         bears = f"the small-gain margin is {_percent(min(margin, 9.99))}"
         # the share is a mean over frequencies, and the bound is of each of them
-        sure = "guaranteed while no frequency is off by more" if margin > share else "not guaranteed"
-        return f"No effect explains the gap: {error} in the mean; {bears}, so stability is {sure}."
+        sure = "guaranteed if the share exceeds that at no frequency" if margin > share else "not guaranteed"
+        return f"No effect explains the gap: {error}; {bears}, so stability is {sure}."
 
     def __repr__(self) -> str:
         return f"<Redesign: {self.sentence}>"
@@ -747,7 +747,7 @@ def _notes(possible: UncertainRig, rig: Rig, aimed: bool) -> tuple[str, ...]:
             " controllers are judged by vibration and effort; give a longer test to judge them by settling."
         )
     if any(a.hysteresis_share for a in rig.actuators):
-        notes.append("The hysteresis of an actuator is in the verification, but no step makes up for it.")
+        notes.append("The hysteresis of an actuator is in the verification, but is not compensated.")
     if possible.rivals:
         share = sum(p for _, p in possible.rivals)
         notes.append(f"{100 * share:.0f} % of the draws are rival sets of effects that the records do not exclude.")
@@ -758,7 +758,7 @@ def _times(after: np.ndarray, before: np.ndarray) -> str:
     """Median of draws (n_draws,) over another, in words that go before what is meant."""
     new, old = interval(after)[0], interval(before)[0]
     if old == 0.0:
-        return AS_MUCH if new == 0.0 else "some instead of no"
+        return AS_MUCH if new == 0.0 else "nonzero instead of zero"
     times = f"{new / old:.2g}"
     return AS_MUCH if times == "1" else f"{times} times the"
 
@@ -776,7 +776,7 @@ def _ratios(values: np.ndarray, lead: str = "") -> str:
     middle, low, high = (100.0 * v for v in interval(values))
     digits = next((n for n in (2, 3, 4) if _rounded(low, n) != _rounded(high, n)), 0)
     if not digits:
-        return f"{_rounded(middle, 3)} % (samples alike)"
+        return f"{_rounded(middle, 3)} % (the same in all samples)"
     return f"{_rounded(middle, digits)} % ({lead}{_rounded(low, digits)} to {_rounded(high, digits)})"
 
 

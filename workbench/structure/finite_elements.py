@@ -71,7 +71,9 @@ class FiniteElements(Printed):
             object.__setattr__(self, "damping", _symmetric("damping", damping, n))
         if (self.mass.diagonal() < 0).any():
             i = int(np.argmin(self.mass.diagonal()))
-            raise ValueError(f"the mass matrix is not positive: point {points.names[i]!r} has {self.mass[i, i]:.3g} kg")
+            raise ValueError(
+                f"the mass matrix is not positive semidefinite: point {points.names[i]!r} has {self.mass[i, i]:.3g} kg"
+            )
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         n, nodes = len(self.nodes.names), len(set(self.nodes.nodes))
@@ -87,13 +89,14 @@ class FiniteElements(Printed):
         """The lowest `n_modes` modes, mass-normalised, by shift-invert Lanczos (ARPACK); all of them by LAPACK.
 
         Raises:
-            ValueError: more modes than degrees of freedom that have mass, or matrices that are not positive.
+            ValueError: more modes than degrees of freedom that have mass, or matrices that are not positive
+                semidefinite.
         """
         n, n_modes = len(self.nodes.names), index(n_modes)
         if not 1 <= n_modes <= n:
             raise ValueError(f"from 1 to {n} modes can be asked of {n} degrees of freedom; got {n_modes}")
         if _negative_pivots(self.mass):
-            raise ValueError("the mass matrix is not positive: some motion would have negative kinetic energy")
+            raise ValueError("the mass matrix is not positive semidefinite: a motion has negative kinetic energy")
         shift, factor = self._shifted_factor()
         if n_modes < n:
             inverse = LinearOperator((n, n), matvec=factor.solve, dtype=float)
@@ -109,14 +112,14 @@ class FiniteElements(Printed):
                 raise ValueError("some motion has no mass, so there are fewer modes; ask for fewer") from error
         sizes = np.sum(shapes * (self.mass @ shapes), axis=0)
         if (sizes <= 0).any():
-            raise ValueError("the mass matrix is not positive: a mode has no kinetic energy")
+            raise ValueError("the mass matrix is not positive semidefinite: a mode has no kinetic energy")
         shapes = shapes / np.sqrt(sizes)
         values = np.sum(shapes * (self.stiffness @ shapes), axis=0)
         floor = ROUNDING * np.sum(np.abs(shapes) * (abs(self.stiffness) @ np.abs(shapes)), axis=0)
         if (values < -floor).any():
             raise ValueError(
-                f"the stiffness matrix is not positive: an eigenvalue ω² is {values.min():.3g}; is its sign right, and"
-                " are all elements stable?"
+                f"the stiffness matrix is not positive semidefinite: an eigenvalue ω² is {values.min():.3g};"
+                " is its sign right, and are all elements stable?"
             )
         values = np.where(values < floor, 0.0, values)
         order = np.argsort(values, kind="stable")
@@ -199,8 +202,8 @@ class FiniteElements(Printed):
                 negative = _negative(factor)
                 if negative:
                     raise ValueError(
-                        f"the stiffness matrix is not positive: {negative} of its eigenvalues are negative; is its"
-                        " sign right, and are all elements stable?"
+                        f"the stiffness matrix is not positive semidefinite: {negative} of its eigenvalues are"
+                        " negative; is its sign right, and are all elements stable?"
                     )
                 return 0.0, factor
         except RuntimeError:  # a pivot of exactly zero

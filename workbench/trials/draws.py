@@ -394,7 +394,7 @@ def draw_effect(kind: str, scene: Scene, rng: np.random.Generator) -> dict[str, 
         strength *= float(np.clip((target / max(gap, 1e-12)) ** (1.0 / power), 0.02, 50.0))
     if SMALLEST < gap < LARGEST:
         return effect
-    raise Unsuitable(f"{kind}: no strength gives a gap that can be seen; the last was {gap:.2g}")
+    raise Unsuitable(f"{kind}: no strength gives a detectable gap; the last was {gap:.2g}")
 
 
 def _gap(effect: dict[str, Any], scene: Scene, rng: np.random.Generator) -> float:

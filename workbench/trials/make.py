@@ -105,7 +105,7 @@ def make_trial_with_plant(
             return case, {**label, "class": dirt, "size": size}, real
         except Unsuitable as error:
             reason = str(error)
-    raise ValueError(f"no case with {' and '.join(kinds)} came about on this bench; the last draw: {reason}")
+    raise ValueError(f"no case with {' and '.join(kinds)} could be generated on this bench; the last draw: {reason}")
 
 
 def _draw_effects(
@@ -167,7 +167,7 @@ def _case(
         moved, sent = tested(real, bench, test, commands, rng)
         measured = real.readings(moved, bench.sample_time, rng)
         if not np.isfinite(measured).all() or (np.ptp(measured, axis=1) == 0).any():
-            raise Unsuitable("the altered structure runs away, or a sensor is dead")
+            raise Unsuitable("the response diverges, or a sensor is dead")
         logged = _logged(sent, real.plant.logging_noise, rng)
         record = bench.rig.record(logged, measured, sample_time=bench.sample_time, name=test)
         (validation if test == "validate" else fit).append(record)
@@ -218,7 +218,7 @@ def _check_strong(
             moved, _ = tested(plant, bench, test, commands, np.random.default_rng(rng.integers(2**31)))
             y.append(plant.readings(moved, bench.sample_time))
         if not np.isfinite(y).all():
-            raise Unsuitable("the altered structure runs away")
+            raise Unsuitable("the response diverges")
         gaps.append(_gap(y[2], y[1]))
         ratios.append(gaps[-1] / max(_gap(y[1], y[0]), 1e-12))
     if not rounded and max(gaps) < VISIBLE:
@@ -410,4 +410,6 @@ def find_trial_with_plant(
             reason = error  # a variable of `except` ends with it
         if others:
             kinds = tuple(str(k) for k in rng.choice(others, len(kinds), replace=False))
-    raise ValueError(f"none of {tries} seeds makes a trial: {reason}; are the sensors and levels of the bench right?")
+    raise ValueError(
+        f"none of {tries} seeds gives a usable trial: {reason}; are the sensors and levels of the bench right?"
+    )

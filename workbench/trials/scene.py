@@ -100,7 +100,7 @@ class Scene:
             cosine[i] = 0.0
             if np.sqrt(np.maximum(1.0 - cosine.max() ** 2, 0.0)) > DISTINCT:
                 return places[i]
-        raise Unsuitable("every lively place moves the modes as another one does")
+        raise Unsuitable("no two places are distinguishable by their mode shapes")
 
     def gap(self, plant: Plant, rng: np.random.Generator, reference: Plant | None = None) -> float:
         """Noise-free gap between a plant and the nominal one, or another, at the middle level."""
@@ -115,5 +115,5 @@ class Scene:
         scale = measured.std(axis=1, keepdims=True)
         gap = float(np.sqrt(np.mean(((measured - predicted) / np.where(scale > 0, scale, 1.0)) ** 2)))
         if not np.isfinite(gap):
-            raise Unsuitable("the altered structure runs away")
+            raise Unsuitable("the response diverges")
         return gap

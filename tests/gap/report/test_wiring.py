@@ -75,7 +75,7 @@ def test_exchanged_outputs_are_named(case):
 @pytest.mark.parametrize(
     ("factor", "sentence"),
     [
-        (-1.0, "The output a3 has the sign turned: multiply by -1."),
+        (-1.0, "The output a3 has the wrong sign: multiply by -1."),
         (1 / 9.80665, "The output a3 looks like g where m/s² is meant: multiply by 9.80665."),
         (1e3, "The output a3 is 1000 times too large, such as mm for m: multiply by 0.001."),
         (2 * np.pi, "The output a3 is 2π times too large: multiply by 0.159155."),
@@ -88,7 +88,7 @@ def test_an_output_in_another_unit_is_named(case, factor, sentence):
 
 def test_two_outputs_with_turned_signs_are_named_together(case):
     matrix = diagonal(7, 0, -1.0) @ diagonal(7, 3, -1.0)
-    expect(case, change(case.fit, outputs=matrix), "The outputs a1 and a4 have the sign turned: multiply by -1.")
+    expect(case, change(case.fit, outputs=matrix), "The outputs a1 and a4 have the wrong sign: multiply by -1.")
 
 
 def test_all_outputs_in_another_unit_may_as_well_be_the_inputs(case):
@@ -99,7 +99,7 @@ def test_all_outputs_in_another_unit_may_as_well_be_the_inputs(case):
 def test_a_hammer_in_millinewton_and_an_input_with_its_sign_turned_are_named(case):
     hammer = "The input hammer is 1000 times too large, such as mN for N: multiply by 0.001."
     expect(case, change(case.fit, inputs=diagonal(4, 3, 1e3)), hammer)
-    expect(case, change(case.fit, inputs=diagonal(4, 1, -1.0)), "The input F2 has the sign turned: multiply by -1.")
+    expect(case, change(case.fit, inputs=diagonal(4, 1, -1.0)), "The input F2 has the wrong sign: multiply by -1.")
 
 
 def test_a_mislabelled_quantity_is_named(case):
@@ -180,8 +180,8 @@ def test_a_gain_that_is_near_a_unit_and_differs_beyond_its_error_is_said_and_not
     [fault] = wiring(case.rig, records)
     assert not fault.certain
     assert fault.sentence == (
-        "The output a3 may look like g where m/s² is meant; but the gain is +1 % from that factor, beyond its error: it"
-        " is taken as an error of gain."
+        "The output a3 may look like g where m/s² is meant; but the gain differs from that by +1 %, more than its"
+        " error: taken for an error of calibration."
     )
     rig, kept = mended([fault], case.rig, records)
     assert rig is case.rig and all(np.array_equal(a.outputs, b.outputs) for a, b in zip(kept, records, strict=True))
@@ -191,7 +191,7 @@ def test_an_input_with_a_gain_near_a_unit_is_not_mended_beside_a_turned_sign_tha
     matrix = diagonal(4, 0, 9.80665 * 1.02) @ diagonal(4, 1, -1.0)
     faults = wiring(case.rig, change(case.fit, inputs=np.linalg.inv(matrix)))
     assert [(fault.kind, fault.certain) for fault in faults] == [("sign", True), ("unit", False)]
-    assert "the gain is +2 % from that factor" in faults[1].sentence
+    assert "the gain differs from that by +2 %" in faults[1].sentence
 
 
 @pytest.mark.parametrize("factor", [1 / 9.81, 1.0005 / 9.80665])

@@ -177,7 +177,7 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
     """
     if not isinstance(controller, Controller):
         raise TypeError(
-            f"what runs once a sample is a law on an estimator; got {type(controller).__name__}: make one by kalman,"
+            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by kalman,"
             " luenberger or filtered"
         )
     if not 0 < number(sample_time, "sample_time", "s") < np.inf:

@@ -66,7 +66,9 @@ def kalman(
     try:
         gain, _, _ = control.lqe(a, np.vstack([np.zeros((n, n)), np.eye(n)]), c, push, spread)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(f"no Kalman filter settles with these sensors: {error}; move or add one") from error
+        raise DesignError(
+            f"the Kalman filter's Riccati equation has no stabilising solution: {error}; move or add a sensor"
+        ) from error
     again = partial(kalman, disturbance=disturbance, noise=noise)
     return _controller(law, sensors, a, b, c, np.asarray(gain), "Kalman filter", again)
 

@@ -125,11 +125,13 @@ def sample_design(
             modes, or a delay under which no rate is stable.
     """
     if not isinstance(modes, Modes):
-        raise TypeError(f"a design is of modes; got {type(modes).__name__}: hand the modes of a structure or of a rig")
+        raise TypeError(
+            f"modes must be Modes; got {type(modes).__name__}: give structure.modes(n), or the modes of a rig"
+        )
     if not isinstance(controller, Controller | Law | OnOffLaw):
         raise TypeError(
-            f"what is sampled is a law on an estimator; got {type(controller).__name__}: make one by kalman, luenberger"
-            " or filtered; a DigitalController is sampled already, write_controller writes it"
+            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by kalman,"
+            " luenberger or filtered; a DigitalController is sampled already, write_controller writes it"
         )
     if not isinstance(controller, Controller):
         raise DesignError(
@@ -142,7 +144,7 @@ def sample_design(
     before = close_with(modes, controller)
     if not before.stable:
         raise DesignError(
-            f"{controller.name}: the loop of all {modes.n_modes} modes is unstable before any sampling, a pole at"
+            f"{controller.name}: the loop of all {modes.n_modes} modes is unstable in continuous time, a pole at"
             f" {-before.margin:+.3g} 1/s; explain_spillover(modes, controller) names the path, and"
             " spillover_remedies a cure"
         )
@@ -193,7 +195,7 @@ def _too_slow(stable: Callable[[float], bool], rate: float, delay: float) -> str
         slow, fast = (slow, middle) if stable(middle) else (middle, fast)
     least = next(r for r in (_round_up(fast), 1.1 * fast, 2.0 * fast) if stable(r) or r > 1.5 * fast)
     return (
-        f"at {rate:g} Hz the loop is unstable, as a held command comes half a sample late; sample at"
+        f"at {rate:g} Hz the loop is unstable, for the hold delays by half a sample; sample at"
         f" {_round_up(least):g} Hz or more, or lower the gains"
     )
 

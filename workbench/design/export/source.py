@@ -108,7 +108,7 @@ def _equations(given: _Numbers) -> list[str]:
     if "FRICTION" in there:
         lines.append("w <- w + PUSH (FRICTION tanh(speed / SMOOTHING)), speed = SPEED_Z z + SPEED_Y y")
     if "LIMIT" in there or "RATE" in there:
-        bounds = [text for name, text in (("LIMIT", "+-LIMIT"), ("RATE", "+-RATE of the v before")) if name in there]
+        bounds = [text for name, text in (("LIMIT", "+-LIMIT"), ("RATE", "+-RATE of the previous v")) if name in there]
         lines.append(f"v = w within {' and '.join(bounds)}")
     else:
         lines.append("v = w")

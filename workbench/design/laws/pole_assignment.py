@@ -57,8 +57,8 @@ def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarra
     x, g = np.hstack([vectors.real, vectors.imag]), np.hstack([inputs.real, inputs.imag])
     if not np.linalg.cond(x) < ILL_CONDITIONED:
         raise DesignError(
-            f"{b.shape[1]} input(s) cannot hold these {n} pairs of poles apart; space the poles out, move an actuator"
-            " (for an observer, a sensor) or add one"
+            f"{b.shape[1]} input(s) cannot assign {n} pairs of poles so close together; space them out, move an"
+            " actuator (for an observer, a sensor) or add one"
         )
     return -np.linalg.solve(x.T, g.T).T
 

@@ -71,7 +71,7 @@ class Certificate:
         if self.cell is None:
             return text
         where = "; ".join(f"{low:.4g} to {high:.4g}" for low, high in self.cell)
-        return f"{text}; what keeps the gap open: actuators at {where} m"
+        return f"{text}; the bound is that of actuators at {where} m"
 
 
 def _listed(places: np.ndarray) -> str:

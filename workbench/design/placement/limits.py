@@ -56,7 +56,7 @@ class Limits:
             raise DesignError(f"spacing and margin must be 0 or more; got {self.spacing:g} and {self.margin:g}")
         for low, high in self.forbidden:
             if not np.less(low, high).all():
-                raise DesignError(f"forbidden zone ({low}, {high}) must run from less to more")
+                raise DesignError(f"forbidden zone ({low}, {high}) must be (lower, upper)")
         zones = tuple((same_place(low), same_place(high)) for low, high in self.forbidden)
         object.__setattr__(self, "forbidden", zones)
         if self.candidates is not None:

@@ -324,9 +324,21 @@ def names_in(target: Any) -> tuple[str, ...]:
     return tuple(name for name in (target if isinstance(target, tuple) else (target,)) if isinstance(name, str))
 
 
+# of kinds whose names in words are no identifiers with spaces
+AS_WRITTEN = (
+    ("bouc wen", "Bouc-Wen"),
+    ("coulomb", "Coulomb"),
+    ("two way friction", "direction-dependent friction"),
+    ("one sided", "one-sided"),
+)
+
+
 def label_in_words(label: str) -> str:
     """A label as a figure or a note shows it: actuator gain (F2), Bouc-Wen."""
-    return label.replace("[", " (").replace("]", ")").replace("_", " ").replace("bouc wen", "Bouc-Wen")
+    words = label.replace("[", " (").replace("]", ")").replace("_", " ")
+    for plain, written in AS_WRITTEN:
+        words = words.replace(plain, written)
+    return words
 
 
 def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:

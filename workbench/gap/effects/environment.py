@@ -114,7 +114,7 @@ RANDOM_DISTURBANCE = Kind(
     apply=lambda rig, _, v: with_element(rig, RandomForce(place_of(v), v["rms"])),
     starts=_random_starts,
     found_in="residual",
-    remainder="A random disturbance leaves a remainder that no model can predict; its statistics were fitted.",
+    remainder="A random disturbance leaves an unpredictable residual; only its statistics were estimated.",
     phrase="a random disturbance",
 )
 

@@ -364,7 +364,7 @@ ACTUATOR_MISPLACEMENT = Kind(
     apply=lambda rig, target, v: _change_actuators(rig, target, at=centred_at(_standing(rig, target), place_of(v))),
     starts=_actuator_starts,
     targets=_movable(each_actuator),
-    phrase="an actuator that stands elsewhere",
+    phrase="a misplaced actuator",
 )
 
 SENSOR_MISPLACEMENT = Kind(
@@ -374,7 +374,7 @@ SENSOR_MISPLACEMENT = Kind(
     apply=lambda rig, target, v: _change_sensors(rig, target, at=place_of(v)),
     starts=_position_starts,
     targets=_movable(each_sensor),
-    phrase="a sensor that stands elsewhere",
+    phrase="a misplaced sensor",
 )
 
 
@@ -627,7 +627,7 @@ SENSOR_QUANTISATION = _sensor(
     low=1e-300,
     nonlinear=True,
     found_in="readings",
-    remainder="Rounding leaves a remainder of a step over the root of twelve that no model can predict.",
+    remainder="Quantisation leaves an unpredictable error of step/√12 rms.",
 )
 
 KINDS = (

@@ -36,8 +36,8 @@ def _in_motion(rig: Rig, record: Record) -> list[str]:
         off = min(abs(float(y[0])), abs(float(y[0] - y.mean())))  # neither a bias nor a load that comes to stay
         if MEASURED[sensor.quantity][1] < 2 and off > max(AT_REST * sensor.noise_std, IN_MOTION * float(y.std())):
             return [
-                f"Record {record.name!r} does not begin at rest ({sensor.name} reads {y[0]:.3g}): give settle, a few"
-                " decay times of the slowest mode, or cut it where nothing moves."
+                f"Record {record.name!r} does not start from rest ({sensor.name} reads {y[0]:.3g}): cut it where"
+                " nothing moves, or give `settle`, a few decay times of the slowest mode, which are not counted then."
             ]
     return []
 

@@ -129,8 +129,8 @@ def _check_units(rig: Rig, record: Record, sizes: np.ndarray) -> None:
         return
     if len(off) == sum(ratios.size > 0 for ratios in ratios_of) > 1:
         raise RecordsError(
-            f"the outputs read about {_about(np.concatenate(ratios_of))} times what the model makes of the inputs: are"
-            f" outputs, inputs and model in units that fit, {_units(record)}?"
+            f"the outputs read about {_about(np.concatenate(ratios_of))} times the prediction of the model: are"
+            f" outputs, inputs and model in consistent units, {_units(record)}?"
         )
     name, unit = rig.sensors[off[0]].name, record.output_channels[off[0]].unit or "its unit"
     raise RecordsError(

@@ -117,8 +117,8 @@ class Verdict:
             if self.budget.errors_are_small:
                 return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
             return (
-                "Errors of the nominal model explain the gap, but larger ones than a careful model has"
-                f"{self._errors_in_words}: something may be missing that no effect of the catalogue is."
+                "Errors of the nominal model explain the gap, but they are implausibly large"
+                f"{self._errors_in_words}: an effect outside the catalogue may be missing."
             )
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if self.outcome == "explained":
@@ -129,7 +129,7 @@ class Verdict:
                 each = joined_in_words([_percent(share) for share in shares])
                 text = f"{words} cause {_percent(sum(shares))} of the gap ({each})"
             if any(effect.kind.remainder for effect in self.effects):
-                text += ", part of which nothing can predict"
+                text += ", part of which is unpredictable"
             text += self._rest + self._not_excluded
         else:
             text = "No effect of the catalogue, alone or with another, explains the gap"
@@ -159,7 +159,9 @@ class Verdict:
             share = _percent(self.budget.effects.get(differs.label, 0.0))
             parts.append(f"{share} are differences of {differs.figure} from record to record ({differs.words})")
         if self.budget.nominal >= SHOWN:
-            small = "small errors of the model" if self.budget.errors_are_small else "errors of the model, not small"
+            small = (
+                "small errors of the model" if self.budget.errors_are_small else "implausibly large errors of the model"
+            )
             parts.append(f"{_percent(self.budget.nominal)} are {small}{self._errors_in_words}")
         if self.budget.unexplained >= SHOWN:
             parts.append(f"{_percent(self.budget.unexplained)} remain unexplained")
@@ -182,9 +184,9 @@ class Verdict:
         ]
         common = sizes.get("common_delay_ms", 0.0)
         if common:
-            words.append(f"all sensors {'late' if common > 0 else 'early'} by {abs(common):.2g} ms, or the actuators")
+            words.append(f"all sensors, or the actuators, {'late' if common > 0 else 'early'} by {abs(common):.2g} ms")
         elif sizes.get("delays_ms", 0.0) > 0:
-            words.append(f"sensors off by {sizes['delays_ms']:.2g} ms")
+            words.append(f"timing of sensors {sizes['delays_ms']:.2g} ms")
         return f" ({', '.join(words)})" if words else ""
 
     @property

@@ -36,7 +36,7 @@ MAY_BE_GAIN = (G, 1.0 / G, TURN, 1.0 / TURN)  # the other factors are further fr
 
 # measured / predicted: what an output does that reads so, and what an input does that is logged so as to give it
 FACTORS = {
-    -1.0: ("have the sign turned", "have the sign turned"),
+    -1.0: ("have the wrong sign", "have the wrong sign"),
     1.0 / G: ("are 9.81 times too small", "are 9.81 times too large"),
     G: ("are 9.81 times too large", "are 9.81 times too small, such as kgf for N"),
     1e3: ("are 1000 times too large, such as mm for m", "are 1000 times too small, such as kN for N"),
@@ -111,8 +111,8 @@ def check_kept_apart(records: Sequence[Record], validation: Sequence[Record]) ->
         for record in records:
             if _same(kept, record):
                 raise ValueError(
-                    f"validation record {kept.name!r} repeats the fit record {record.name!r}: nothing would be measured"
-                    " by it; keep another record for validation, or none"
+                    f"validation record {kept.name!r} repeats the fit record {record.name!r}, so it validates"
+                    " nothing; keep another record for validation, or none"
                 )
 
 
@@ -306,7 +306,7 @@ def _doubtful(what: str, off: Floats) -> str:
     """What may be a fault of units, and by how much it is none; off: relative differences of the gains."""
     may = what.replace(" look ", " may look ", 1).replace(" are ", " may be ", 1)
     far = ", ".join(dict.fromkeys(f"{100 * share:+.2g} %" for share in off))
-    return f"{may}; but the gain is {far} from that factor, beyond its error: it is taken as an error of gain."
+    return f"{may}; but the gain differs from that by {far}, more than its error: taken for an error of calibration."
 
 
 def _factor(gain: float) -> float | None:

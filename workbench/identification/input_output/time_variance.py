@@ -52,7 +52,7 @@ class ChangingSettings:
 
 
 CHANGING = ChangingSettings()
-IS_MEAN = "such a mode is the mean of what it was: identify parts of the record, or levels one by one"
+IS_MEAN = "its figures are means over the record: identify shorter parts, or each level by itself"
 
 
 class Change(NamedTuple):

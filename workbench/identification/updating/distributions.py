@@ -151,7 +151,7 @@ def mass_and_stiffness(
 
 def _mass(modes: Modes, basis: Basis, prior: Profile, known: Sequence[tuple[float, float]]) -> Distribution:
     if len(known) == 0:
-        raise ValueError("orthogonality leaves the size of the mass open; give the mass at one point or more")
+        raise ValueError("orthogonality determines the mass only up to a factor; give the mass at one point or more")
     shapes, weights, x = _sampled(modes, 0, (*basis.breaks, *prior.breaks))
     places, values = np.array(known, float).T
     coefficients, misfit = mass_series(

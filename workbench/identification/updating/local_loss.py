@@ -210,7 +210,7 @@ def _without_loss(problem: Problem) -> list[FittedStructure]:
 
 def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLoss | None]]) -> FittedStructure:
     """The most likely of what searches from several starts find; one that ends at no structure is passed over."""
-    found, reason = [], "no structure of so many terms was found to look for a loss in; use fewer terms"
+    found, reason = [], "no structure of so many terms could be fitted, so no loss can be located; use fewer terms"
     for near, loss in starts:
         try:
             found.append(problem.fit(near, loss))

@@ -65,7 +65,7 @@ class Problem:
         if mass.n_terms and stiffness.n_terms and not (len(task.known_mass) or len(task.known_stiffness)):
             if task.mass_prior is None and task.stiffness_prior is None:
                 raise ValueError(
-                    "modes leave the overall size of mass and stiffness open; give known_mass at a point,"
+                    "modes determine mass and stiffness only up to a common factor; give known_mass at a point,"
                     " known_stiffness, or a prior"
                 )
         series = SeriesStructure(task.nominal, mass, stiffness, task.measured.modes.positions)

@@ -169,7 +169,7 @@ def plate_mass_and_stiffness(
     size = np.sqrt((shapes**2).mean(axis=0))
     shapes = shapes / size
     if not known_mass:
-        raise ValueError("orthogonality leaves the size of the mass open; give the mass at one point or more")
+        raise ValueError("orthogonality determines the mass only up to a factor; give the mass at one point or more")
     places = np.vstack([modes.domain.locate(place) for place, _ in known_mass])
     values = np.array([value for _, value in known_mass], float)
     if not (np.isfinite(values) & (values > 0)).all():

@@ -175,10 +175,10 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
         here = (at >= low) & (at <= high)
         doubtful |= here & apart
         lines.append(
-            f"between {low:.6g} and {high:.6g} Hz the search stopped at its limit of modes, the residual is not noise:"
-            f" of {here.sum()} modes there {(here & apart).sum()} are not reported, their shapes are complex (low phase"
-            " collinearity); roving sensors or hammers, or a structure that changes, make data inconsistent like that:"
-            " leave that band out by --band-hz, or take more --modes"
+            f"between {low:.6g} and {high:.6g} Hz the search reached its limit of modes, the residual above the"
+            f" noise: of {here.sum()} modes there {(here & apart).sum()} are not reported, their shapes are complex"
+            " (low phase collinearity). Roving sensors or hammers, or a structure that changes, make data inconsistent"
+            " like that: leave that band out by --band-hz, or allow more --modes"
         )
     for r, parts in enumerate(found.cluster_hz):
         if parts:
@@ -197,8 +197,8 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
     if uneasy.size:
         lines.append(
             f"modes {', '.join(str(r + 1) for r in uneasy)}: complex shapes (low phase collinearity); either damping"
-            " couples close modes, or data of roving sensors or hammers are inconsistent, and these are parts of fewer"
-            " modes"
+            " couples close modes, or data of roving sensors or hammers are inconsistent, and several of these are one"
+            " mode"
         )
     band = found.frequencies_hz
     outputs, inputs = found.modes.n_outputs, len(measured.references)

@@ -77,7 +77,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     if distortions:
         seen = (
             "Spectra before any model: excited lines, odd and even ones that are not excited, and noise."
-            + " Only odd lines are excited, so even ones reveal an even law."
+            + " Only odd lines are excited, so even ones reveal an even nonlinearity."
             * all(d.parity_resolved for d in distortions)
         )
         figures.append((plot_distortion(distortions), seen))
