@@ -151,7 +151,7 @@ def compare_placements(outcome, bending) -> None:
     nodes = nodes_of_mode(modes, 3)
     at_nodes = [task.placed(nodes[list(keep)], "nodes of mode 4") for keep in ((0, 1, 2), (0, 1, 3), (0, 2, 3))]
     rule = min(at_nodes, key=lambda placement: placement.residual_work)
-    best = place_actuators(task, Limits(effort=1.5 * rule.effort, spacing=0.05, margin=0.02))
+    best = place_actuators(task, Limits(effort=1.5 * rule.effort, spacing=0.05, edge_distance=0.02))
     named = {"evenly spaced": even, "nodes of mode 4": rule, "least W_R": best}
     outcome.table(
         "placements",

@@ -86,7 +86,7 @@ def test_artefacts_join_the_noise():
     none = SampledModes(np.zeros(0), np.zeros(0), np.zeros((2, 0)), MODES.positions)
     found = Identified(refined, np.array([90.0, 40.0]), 30.0, none, np.zeros(0)).without_artefacts(300.0)
     assert found.modes.omega.tolist() == [20.0] and found.noise_modes.omega.tolist() == [50.0]
-    assert found.evidence.tolist() == [90.0] and found.noise_evidence.tolist() == [40.0]
+    assert found.statistic.tolist() == [90.0] and found.noise_statistic.tolist() == [40.0]
     assert found.covariance.shape == (2, 2) and found.refined.amplitudes[0].shape == (2, 1)
 
 

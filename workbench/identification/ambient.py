@@ -23,6 +23,7 @@ from workbench.identification.signal.modal_estimates import (
 from workbench.identification.signal.projection import project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel, Record
+from workbench.renamed import Renamed
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
@@ -51,19 +52,21 @@ class AmbientModes(ModalEstimates):
     Attributes:
         modes: shapes of displacement, largest entry 1.
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), by leaving out parts of the record; zero between modes.
-        evidence: (n_modes,) twice the log likelihood ratio of the record, predicted by one step, with and without each
+        statistic: (n_modes,) twice the log likelihood ratio of the record, predicted by one step, with and without each
             mode.
-        limit: what a mode fitted to noise alone exceeds with the chance of a false alarm.
-        decays: the correlation functions that the shapes are read off, one record a reference.
+        threshold: what a mode fitted to noise alone exceeds with the chance of a false alarm.
+        correlations: functions that the shapes are read off, one record a reference.
         remarks: what was left undone, where the time was up.
     """
 
     modes: SampledModes
     covariance: np.ndarray
-    evidence: np.ndarray
-    limit: float
-    decays: tuple[Record, ...]
+    statistic: np.ndarray
+    threshold: float
+    correlations: tuple[Record, ...]
     remarks: tuple[str, ...] = ()
+
+    evidence, limit, decays = Renamed("statistic"), Renamed("threshold"), Renamed("correlations")
 
 
 def correlation_functions(
@@ -105,7 +108,7 @@ def identify_ambient(
 
     Args:
         record: long: each twelfth of it is to be longer than a mode takes to decay.
-        n_modes: that many, those of the highest evidence; unless given, those that rise above the noise and whose
+        n_modes: that many, those of the highest test statistic; unless given, those that rise above the noise and whose
             frequency is as sure as that of a mode.
         longest: lag, s, as in `correlation_functions`.
         references: names of outputs, as in `correlation_functions`.
@@ -125,11 +128,11 @@ def identify_ambient(
     # A mode is its pole, its shape and its excitation, of which one has no scale, at one of so many frequencies.
     limit = float(chi2.isf(false_alarm / record.n_samples, 4 * subspace.n_outputs))
     if n_modes is None:
-        modes = subspace.with_errors([mode for mode in stable if mode.evidence > limit], budget)
+        modes = subspace.with_errors([mode for mode in stable if mode.statistic > limit], budget)
         least = 1.0 / (record.n_samples * record.sample_time)
         modes = [mode for mode in modes if mode.variance[1, 1] < AMBIENT.least_sure**2 * least * abs(mode.pole.real)]
     else:
-        modes = subspace.with_errors(sorted(stable, key=lambda mode: -mode.evidence)[:n_modes], budget)
+        modes = subspace.with_errors(sorted(stable, key=lambda mode: -mode.statistic)[:n_modes], budget)
     if not modes or len(modes) < (n_modes or 0):
         many = "no mode that rises" if n_modes is None else f"{len(modes)} stable modes, not {n_modes}, that rise"
         raise ValueError(f"record {record.name!r} holds {many} above its noise; measure longer")
@@ -156,8 +159,8 @@ def _report(
     for r, mode in enumerate(found):
         jacobian = by_poles(poles[[r]])
         covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
-    evidence = np.array([mode.evidence for mode in found])
-    return AmbientModes(modes, frozen(covariance), frozen(evidence), limit, decays, budget.remarks)
+    statistic = np.array([mode.statistic for mode in found])
+    return AmbientModes(modes, frozen(covariance), frozen(statistic), limit, decays, budget.remarks)
 
 
 def _shapes(decays: Sequence[Record], poles: np.ndarray) -> np.ndarray:

@@ -31,6 +31,7 @@ from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import HOLDS, Channel, Record
+from workbench.renamed import Renamed
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
@@ -68,8 +69,8 @@ class Driven(ParticipatingModes):
         sample_time: s, of the records.
         initial: one (n_modes,) complex a record: z_r at its first sample, where y = Re Σ 2 c_r z_r; zero if at rest.
         noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
-        evidence: (n_modes,) χ² of each mode in the noise.
-        limit: what a mode fitted to noise alone exceeds with the chance of a false alarm.
+        statistic: (n_modes,) χ² of each mode in the noise.
+        threshold: what a mode fitted to noise alone exceeds with the chance of a false alarm.
         converged: whether the search ended because the step was small.
         remarks: what is doubtful, and what was left undone where the time was up.
         output_channels, input_channels: of the records.
@@ -82,12 +83,14 @@ class Driven(ParticipatingModes):
     sample_time: float
     initial: tuple[np.ndarray, ...]
     noise: np.ndarray
-    evidence: np.ndarray
-    limit: float
+    statistic: np.ndarray
+    threshold: float
     converged: bool
     remarks: tuple[str, ...]
     output_channels: tuple[Channel, ...]
     input_channels: tuple[Channel, ...]
+
+    evidence, limit = Renamed("statistic"), Renamed("threshold")
 
     @property
     def participation_std(self) -> np.ndarray:
@@ -344,7 +347,7 @@ def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selec
 
 def _predictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
     """Without modes that make the prediction of what is held out worse; about these no further mode is looked for."""
-    fit, distorted = without_unpredictive(data, selected.fit, selected.evidence, budget)
+    fit, distorted = without_unpredictive(data, selected.fit, selected.statistic, budget)
     selected = selected if fit is selected.fit else selected.refitted(fit)
     return replace(selected, distorted=(*data.distorted, *distorted))
 
@@ -406,7 +409,7 @@ def _in_noise(data: KnownInputs, strongest: Selected, how: dict[str, Any]) -> tu
     budget, few = how["budget"], _few(how)
     few["most_modes"] = max(few["most_modes"], strongest.fit.poles.size)
     data, selected = _with_noise(data, strongest, few, how, budget)
-    doubtful = (selected.evidence < SELECTION.weak * selected.limit) | ~_oscillate(data, selected)
+    doubtful = (selected.statistic < SELECTION.weak * selected.limit) | ~_oscillate(data, selected)
     if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
         return data, selected
     sure = settled(data, only(data, selected.fit, ~doubtful), budget=budget)
@@ -545,8 +548,8 @@ def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, re
             for k in range(len(records))
         ),
         noise=frozen(data.noise(fit)),
-        evidence=frozen(selected.evidence),
-        limit=selected.limit,
+        statistic=frozen(selected.statistic),
+        threshold=selected.limit,
         converged=fit.converged,
         remarks=remarks,
         output_channels=channels,

@@ -22,6 +22,7 @@ from workbench.identification.signal.overtones import multiple_of
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import SECONDS, Budget, Progress
 from workbench.records.record import Record
+from workbench.renamed import Renamed
 from workbench.structure.modes import SampledModes
 from workbench.threads import one_blas_thread
 
@@ -57,8 +58,8 @@ class RingDown(OfRefined):
         refined: their modes.
         remarks: one per mode, empty where there is none.
         noise_modes: candidates rejected as noise.
-        noise_evidence: (n_noise,) theirs, below `limit`.
-        limit: evidence from which on a mode counts.
+        noise_statistic: (n_noise,) theirs, below `threshold`.
+        threshold: statistic from which on a mode counts.
         by_amplitude: the modes of each segment of the decay.
         proportional: g1 and g2 of the modes without remark; None where they are fewer than two.
         notes: what was done to the records, and what remains unexplained.
@@ -68,11 +69,13 @@ class RingDown(OfRefined):
     refined: Refined
     remarks: tuple[str, ...]
     noise_modes: SampledModes
-    noise_evidence: np.ndarray
-    limit: float
+    noise_statistic: np.ndarray
+    threshold: float
     by_amplitude: AmplitudeDependence
     proportional: ProportionalFit | None
     notes: tuple[str, ...]
+
+    noise_evidence, limit = Renamed("noise_statistic"), Renamed("threshold")
 
     def _remarks(self) -> tuple[str, ...]:
         of_modes = (f"mode {r + 1}: {remark}" for r, remark in enumerate(self.remarks) if remark)
@@ -132,8 +135,8 @@ def ring_down(
         found.refined,
         doubts,
         found.noise_modes,
-        found.noise_evidence,
-        found.limit,
+        found.noise_statistic,
+        found.threshold,
         amplitude_dependence(cut, found.refined),
         proportional_fit(found.refined, sure) if len(sure) > 1 else None,
         (*notes, *more, *budget.remarks, *_goes_on(found.refined, cut), *doubtful, *coloured),
@@ -203,7 +206,7 @@ def _by_stabilisation(records: list[Record], budget: Budget) -> Identified:
 
 
 def _as_identified(start: SampledModes, records: list[Record], budget: Budget) -> Identified:
-    """Modes of given number: no evidence, none rejected."""
+    """Modes of given number: no test, none rejected."""
     refined, none = in_coloured_noise(refine(records, start, offset=True, budget=budget), records), np.zeros(0)
     return Identified(refined, none, 0.0, unshaped(none.astype(complex), records[0]), none)
 

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from workbench.identification.input_output.changing_decay import beside_changing
 from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
-from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
+from workbench.identification.input_output.model_order import Selected, select_modes, statistic_of
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, time_derivatives
@@ -61,7 +61,7 @@ class TransferModes(ParticipatingModes):
         participation: (n_modes, n_references) complex l_r, for c_r the shape as the outputs measure it.
         misfit: (n_outputs,) rms of the residual: in units of the stated noise (1 where it is noise alone), or, where
             none was stated, of real and imaginary part each, in the unit of the output.
-        evidence: (n_modes,) χ² of each mode in the noise.
+        statistic: (n_modes,) χ² of each mode in the noise.
         converged: whether the search ended because the step was small.
         cluster_hz: of each mode the other members of its cluster (`peak_shape`), Hz: points measured one after
             another are inconsistent there, or the mode drifts or depends on amplitude.
@@ -75,7 +75,7 @@ class TransferModes(ParticipatingModes):
     """
 
     misfit: np.ndarray
-    evidence: np.ndarray
+    statistic: np.ndarray
     converged: bool
     cluster_hz: tuple[tuple[float, ...], ...]
     scatter_hz: np.ndarray
@@ -85,6 +85,7 @@ class TransferModes(ParticipatingModes):
     remarks: tuple[str, ...] = ()
 
     parts_hz, full_hz = Renamed("cluster_hz"), Renamed("order_limited_hz")
+    evidence = Renamed("statistic")
 
 
 def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:
@@ -168,7 +169,7 @@ def identify_transfer(
     whole = _together(found, channels) if n_bands > 1 else found[0]
     overlap = overlap_remarks(whole.modes.poles, h.shape[0] * h.shape[1])
     deviation = whole.modes.omega * whole.zeta_std + 1j * whole.omega_std
-    overtones = overtone_remarks(whole.modes.poles, np.sqrt(whole.evidence), 2.0 * np.pi * whole.scatter_hz, deviation)
+    overtones = overtone_remarks(whole.modes.poles, np.sqrt(whole.statistic), 2.0 * np.pi * whole.scatter_hz, deviation)
     whole = replace(whole, remarks=(*whole.remarks, *overlap, *_uneven(whole), *overtones, *budget.remarks))
     if whole.modes.n_modes == 0:
         raise ValueError(
@@ -273,7 +274,7 @@ def _modes_of(
         vector_covariance=frozen(vectors),
         participation=frozen(participation, complex),
         misfit=frozen(lines.misfit(fit)),
-        evidence=frozen([evidence_of(fit, int(r)) for r in inside]),
+        statistic=frozen([statistic_of(fit, int(r)) for r in inside]),
         converged=fit.converged,
         cluster_hz=tuple(cluster_hz[r] for r in inside),
         scatter_hz=frozen(scatter[inside] / (2.0 * np.pi)),
@@ -304,7 +305,7 @@ def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) ->
     fit = selected.fit
     shapes = fit.amplitudes / fit.poles ** time_derivatives(channels)[:, None]
     seen = SampledModes.of_poles(fit.poles, shapes, _places(channels))
-    parts = parts_of(fit.poles, seen.phase_collinearity, selected.evidence)
+    parts = parts_of(fit.poles, seen.phase_collinearity, selected.statistic)
     kept = np.setdiff1d(np.arange(fit.poles.size), [r for each in parts.values() for r in each])
     cluster_hz = [tuple(sorted(fit.poles.imag[parts.get(int(r), [])] / (2.0 * np.pi))) for r in kept]
     if not parts:
@@ -312,7 +313,7 @@ def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) ->
     middle = fit.poles.copy()
     for r, others in parts.items():
         cluster = [r, *(k for k in others if np.abs(fit.poles.real[k]) < PEAKS.narrow * np.abs(fit.poles.real[r]))]
-        middle[r] = np.average(fit.poles[cluster], weights=selected.evidence[cluster])
+        middle[r] = np.average(fit.poles[cluster], weights=selected.statistic[cluster])
     return settled(lines, projected(lines, middle[kept], fit.participation[kept])), cluster_hz
 
 
@@ -332,7 +333,7 @@ def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> Tr
         vector_covariance=frozen(np.concatenate([band.vector_covariance for band in found])),
         participation=frozen(np.vstack([band.participation for band in found]), complex),
         misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in found]) ** 2)),
-        evidence=frozen(np.concatenate([band.evidence for band in found])),
+        statistic=frozen(np.concatenate([band.statistic for band in found])),
         converged=all(band.converged for band in found),
         cluster_hz=tuple(parts for band in found for parts in band.cluster_hz),
         scatter_hz=frozen(np.concatenate([band.scatter_hz for band in found])),

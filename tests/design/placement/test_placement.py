@@ -299,7 +299,7 @@ def test_four_actuators_and_ten_modes_are_proven_within_five_per_cent(ends, fact
     "limits",
     [
         Limits(peak_force=0.35, spacing=0.5),
-        Limits(condition=2.5, spacing=0.5, margin=0.05),
+        Limits(condition=2.5, spacing=0.5, edge_distance=0.05),
         Limits(effort=0.2, forbidden=((4.9, 5.6), (7.0, 8.0))),
         Limits(peak_force=0.5, candidates=tuple(np.linspace(0.5, 9.5, 31))),
     ],
@@ -318,7 +318,7 @@ def test_every_limit_is_part_of_the_proof(limits, hinged_modes):
     kept = np.all([excess <= 0 for excess in limits.violations(fine, costs).values()], axis=0)
     for low, high in limits.forbidden:
         kept &= ~((fine > low) & (fine < high)).any(axis=1)
-    kept &= ((fine >= limits.margin) & (fine <= 10.0 - limits.margin)).all(axis=1)
+    kept &= ((fine >= limits.edge_distance) & (fine <= 10.0 - limits.edge_distance)).all(axis=1)
     # the best of the candidates is evaluated here among others: the last digit may differ
     assert kept.any() and costs.work[kept].min() >= proof.lower_bound * (1.0 - 1e-12)
     # and a worse one that keeps the limits is found out
@@ -397,3 +397,11 @@ def test_a_damped_structure_is_placed_with_the_law_that_it_gets(hinged_modes):
 def test_as_many_places_as_controlled_modes_are_placed(task):
     with pytest.raises(DesignError, match="4 controlled modes take as many actuators; got 2 places"):
         task.placed((3.0, 6.0), "")
+
+
+def test_the_former_name_of_the_distance_from_the_edges_still_works():
+    with pytest.warns(DeprecationWarning, match="edge_distance"):
+        limits = Limits(margin=0.3, spacing=0.5)
+    assert limits == Limits(edge_distance=0.3, spacing=0.5)
+    with pytest.warns(DeprecationWarning, match="edge_distance"):
+        assert limits.margin == 0.3

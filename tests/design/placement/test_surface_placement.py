@@ -52,7 +52,7 @@ def test_casadi_takes_the_shapes_of_a_plate_and_their_derivatives(task):
 
 
 def test_a_plate_is_placed_as_well_as_by_a_fine_grid_and_outside_the_zone(task):
-    limits = Limits(effort=0.021, spacing=0.1, margin=0.05, forbidden=(ZONE,))
+    limits = Limits(effort=0.021, spacing=0.1, edge_distance=0.05, forbidden=(ZONE,))
     best = place_actuators(task, limits, starts=3)
     on_grid, _ = scan(task, limits, n_places=12)
     assert best.residual_work <= on_grid.residual_work and best.effort <= 0.021 * (1 + 1e-5)
@@ -137,7 +137,7 @@ def test_what_has_no_room_or_no_place_is_refused(task):
     nowhere = Modes(sampled.omega, sampled.damping, sampled.shapes, points)
     with pytest.raises(DesignError, match="no spacing can be kept"):
         place_actuators(placement_task(nowhere, 2, impulse_at="1y", weight=1.0), Limits(spacing=0.1))
-    with pytest.raises(DesignError, match="no zones or margins"):
-        place_actuators(placement_task(sampled, 2, impulse_at="1y", weight=1.0), Limits(margin=0.1))
+    with pytest.raises(DesignError, match="no zones or edges"):
+        place_actuators(placement_task(sampled, 2, impulse_at="1y", weight=1.0), Limits(edge_distance=0.1))
     with pytest.raises(DesignError, match="acts between two places"):
         placement_task(sampled, 2, impulse_at="1y", weight=1.0, actuator=Actuator("P", Between("1y", "2y")))

@@ -40,7 +40,7 @@ def test_the_modes_that_are_there_and_no_others_at_the_bound(truth, record):
     assert (np.abs(found.modes.zeta - truth.zeta) < 4 * limit.zeta_std).all()
     assert np.allclose(found.refined.omega_std, limit.omega_std, rtol=0.05)
     assert np.allclose(found.refined.noise_std, 1e-4, rtol=0.05)
-    assert found.refined.converged and (found.evidence > found.limit).all()
+    assert found.refined.converged and (found.statistic > found.threshold).all()
 
 
 def test_the_same_as_one_mode_at_a_time(record):
@@ -48,7 +48,7 @@ def test_the_same_as_one_mode_at_a_time(record):
     one, many = identify(short), identify_long([short], most_modes=99)
     assert many.modes.n_modes == one.modes.n_modes
     assert (np.abs(many.modes.omega - one.modes.omega) < 0.05 * one.refined.omega_std).all()
-    assert np.allclose(many.evidence, one.evidence, rtol=0.02)
+    assert np.allclose(many.statistic, one.statistic, rtol=0.02)
 
 
 def test_a_record_without_noise(truth):

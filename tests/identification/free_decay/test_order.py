@@ -32,7 +32,7 @@ def test_the_modes_that_are_there_and_no_others(truth, noise):
     assert found.modes.n_modes == 5
     std = cramer_rao_bound(truth, record, noise_std=noise or 1e-9).omega_std
     assert (np.abs(found.modes.omega - truth.omega) < 4 * std).all()
-    assert (found.evidence > found.limit).all()
+    assert (found.statistic > found.threshold).all()
 
 
 def test_without_noise_every_mode_comes_in_and_nothing_else_is_tried():

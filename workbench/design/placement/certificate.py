@@ -94,7 +94,7 @@ def certify(
     """A certificate that no placement under the limits has less residual work by more than a gap, by branch and bound.
 
     A limit of the condition alone leaves actuators beside the supports, where B vanishes and no bound holds: give a
-    margin with it.
+    distance from the edges with it.
 
     Args:
         placement: that of `place` unless given.

@@ -13,6 +13,7 @@ import numpy as np
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
+from workbench.renamed import Renamed
 from workbench.structure.domain import SLACK, Interval, NamedPoints, Place, Rectangle, position, reach, same_place
 
 TOLERANCE = 2e-6
@@ -21,6 +22,23 @@ DRAWS = 20_000
 SAMPLES = 40  # of every box
 
 Zone = tuple[Place, Place]
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _also_takes_margin(limits: Callable[P, R]) -> Callable[P, R]:
+    """The constructor with the former name of `edge_distance` too."""
+
+    @wraps(limits)
+    def with_former(*args: P.args, **kwargs: P.kwargs) -> R:
+        if "margin" in kwargs:
+            warn("Limits(margin=...) is now Limits(edge_distance=...)", DeprecationWarning, 2)
+            kwargs["edge_distance"] = kwargs.pop("margin")
+        return limits(*args, **kwargs)
+
+    return with_former
 
 
 @dataclass(frozen=True)
@@ -32,7 +50,7 @@ class Limits:
         peak_force: largest force of any actuator.
         condition: of B, largest ‖B‖‖B⁻¹‖ in the Frobenius norm (n where B is orthogonal).
         spacing: least distance between neighbours, m; of the middles of patches, which overlap where it is small.
-        margin: least distance from the ends or edges, m.
+        edge_distance: least distance from the ends or edges, m.
         forbidden: zones where no actuator can stand, m: intervals (from, to), or on a rectangle boxes between two
             corners ((x, y), (x, y)). All of a patch keeps out of them.
         candidates: the only places there are; None where an actuator may stand anywhere else. Of named points all that
@@ -43,17 +61,21 @@ class Limits:
     peak_force: float = np.inf
     condition: float = np.inf
     spacing: float = 0.0
-    margin: float = 0.0
+    edge_distance: float = 0.0
     forbidden: tuple[Zone, ...] = ()
     candidates: tuple[Place, ...] | None = None
+
+    margin = Renamed("edge_distance")
 
     def __post_init__(self) -> None:
         for name in ("effort", "peak_force", "condition"):
             value = getattr(self, name)
             if not value > 0:
                 raise DesignError(f"the limit of {name.replace('_', ' ')} must be positive; got {value:g}")
-        if not (0 <= self.spacing < np.inf and 0 <= self.margin < np.inf):
-            raise DesignError(f"spacing and margin must be 0 or more; got {self.spacing:g} and {self.margin:g}")
+        if not (0 <= self.spacing < np.inf and 0 <= self.edge_distance < np.inf):
+            raise DesignError(
+                f"spacing and edge_distance must be 0 or more; got {self.spacing:g} and {self.edge_distance:g}"
+            )
         for low, high in self.forbidden:
             if not np.less(low, high).all():
                 raise DesignError(f"forbidden zone ({low}, {high}) must be (lower, upper)")
@@ -78,7 +100,7 @@ class Limits:
         Raises:
             DesignError: none is left, or a zone that lies outside.
         """
-        margin = max(self.margin, clear)
+        margin = max(self.edge_distance, clear)
         at, intervals = margin, []
         zones = sorted((position(low), position(high)) for low, high in self.forbidden)
         _check_overlap([(np.array([low]), np.array([high])) for low, high in zones], Interval(length))
@@ -90,7 +112,7 @@ class Limits:
             intervals.append((at, length - margin))
         intervals = [(low, high) for low, high in intervals if low <= high]
         if not intervals:
-            raise DesignError(f"margin {margin:g} and the forbidden intervals leave no place of {length:g} m")
+            raise DesignError(f"{margin:g} m from the ends and the forbidden intervals leave no place of {length:g} m")
         return intervals
 
     def boxes(self, task: PlacementTask) -> list[Box]:
@@ -104,8 +126,8 @@ class Limits:
             stretches = self.intervals(task.n_controlled, domain.length, task.reach[0])
             return [(np.array([low]), np.array([high])) for low, high in stretches]
         if isinstance(domain, NamedPoints):
-            if self.forbidden or self.margin:
-                raise DesignError("named points have no zones or margins; give the candidates that are allowed")
+            if self.forbidden or self.edge_distance:
+                raise DesignError("named points have no zones or edges; give the candidates that are allowed")
             if self.spacing and domain.positions is None:
                 raise DesignError("the positions of the points are not known, so no spacing can be kept; give them")
             return []
@@ -115,20 +137,20 @@ class Limits:
             raise DesignError(f"a forbidden zone of a rectangle is ((x, y), (x, y)), m; got {self.forbidden}")
         _check_overlap(zones, domain)
         zones = tuple((low - half, high + half) for low, high in zones)
-        return free_boxes(domain, np.maximum(self.margin, half), zones)
+        return free_boxes(domain, np.maximum(self.edge_distance, half), zones)
 
     def intervals(self, n: int, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
         """The same, where n actuators find room at all.
 
         Raises:
-            DesignError: spacing and margin that n actuators cannot keep on this length.
+            DesignError: distances that n actuators cannot keep on this length.
         """
-        margin = max(self.margin, clear)
+        margin = max(self.edge_distance, clear)
         needed = 2 * margin + (n - 1) * self.spacing
         if needed > length:
             raise DesignError(
                 f"{n} actuators {self.spacing:g} apart and {margin:g} from the ends need {needed:g} m; the"
-                f" structure has {length:g}: lower spacing or margin"
+                f" structure has {length:g}: lower spacing or edge_distance"
             )
         intervals = self.allowed(length, clear)
         apart, at, fit = max(self.spacing, APART * length), -np.inf, 0
@@ -167,10 +189,10 @@ class Limits:
         return all(excess[0] <= TOLERANCE for excess in violations.values())
 
 
-P = ParamSpec("P")
-R = TypeVar("R")
+Limits.__init__ = _also_takes_margin(Limits.__init__)  # type: ignore[method-assign]
+
 FORMER = {"effort_limit": "effort", "peak_limit": "peak_force", "condition_limit": "condition"}
-FORMER |= {name: name for name in ("spacing", "margin", "forbidden", "candidates")}
+FORMER |= {"margin": "edge_distance", **{name: name for name in ("spacing", "forbidden", "candidates")}}
 
 
 def takes_former_limits(function: Callable[P, R]) -> Callable[P, R]:

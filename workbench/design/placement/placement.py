@@ -125,7 +125,7 @@ def _guesses(
         order = np.lexsort((costs.work, excess))
         return [_in_order(drawn[i]) for i in order[: starts + 2]]
     length, (first, last) = domain.length, task.reach
-    margin = max(limits.margin, first)
+    margin = max(limits.edge_distance, first)
     guesses = [first + (last - first) * (np.arange(n) + 1) / (n + 1)]
     nodes = nodes_of_mode(task.modes, n)
     if nodes.size == n:

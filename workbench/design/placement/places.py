@@ -78,7 +78,7 @@ def free_boxes(domain: Rectangle, margin: np.ndarray, zones: tuple[Box, ...]) ->
         free = [part for i, part in enumerate(free) if not any(_inside(part, other) for other in free[i + 1 :])]
     if not free or not all((low <= high).all() for low, high in free):
         raise DesignError(
-            f"margin {margin.max():g} and the forbidden zones leave no place of {domain}; lower the margin or forbid"
+            f"{margin.max():g} m from the edges and the forbidden zones leave no place of {domain}; lower it or forbid"
             " less"
         )
     return free

@@ -115,7 +115,7 @@ def allowed_places(task: PlacementTask, limits: Limits, n_places: int) -> np.nda
     if limits.candidates is not None:
         grid = as_places(domain, list(limits.candidates))
     elif isinstance(domain, Interval):
-        edge = max(limits.margin, task.reach[0], domain.length / n_places / 2)
+        edge = max(limits.edge_distance, task.reach[0], domain.length / n_places / 2)
         grid = np.linspace(edge, domain.length - edge, n_places)
     elif isinstance(domain, NamedPoints):
         grid = as_places(domain, domain.rotations() if task.actuator.kind == "moment" else domain.grid())

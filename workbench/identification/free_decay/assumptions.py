@@ -24,7 +24,7 @@ class AssumptionsSettings:
     """Constants of the test for dependence on amplitude."""
 
     segments: int = 4  # of a record, each twice as long as the one before
-    least_evidence: float = 100.0  # χ² of a mode in a segment, for its frequency there to mean something
+    least_statistic: float = 100.0  # χ² of a mode in a segment, for its frequency there to mean something
     least_cycles: float = 3.0  # likewise
     least_sure: float = 0.01  # relative standard error of a frequency up to which a segment counts
     chance: float = 1e-3  # that a linear structure is said to depend on amplitude
@@ -104,8 +104,8 @@ def _segments(
         begun = size * np.exp(-decay * first * record.sample_time)
         # Mean over the stretch of the squared envelope.
         mean = begun**2 * _mean_of_decay(2.0 * decay * span)
-        evidence = (0.5 * (last - first) * mean / noise[:, None] ** 2).sum(axis=0)
-        there = np.flatnonzero(evidence > ASSUMPTIONS.least_evidence)
+        statistic = (0.5 * (last - first) * mean / noise[:, None] ** 2).sum(axis=0)
+        there = np.flatnonzero(statistic > ASSUMPTIONS.least_statistic)
         if there.size == 0 or last - first < 4 * (there.size + 1):
             continue
         try:

@@ -76,7 +76,7 @@ def identify_long(
     measured.run(most_modes)
     apart = independent(records, [fit.residual.T for fit in measured.fits]) if measured.poles.size else None
     if apart is None:
-        return measured.report(measured.evidence()) if measured.poles.size else None
+        return measured.report(measured.statistic()) if measured.poles.size else None
     # noise that outputs share makes peaks in all of them
     mixed = _Search(apart[0], false_alarm, measured.budget)
     mixed.origins = measured.origins
@@ -84,7 +84,7 @@ def identify_long(
     mixed.run(most_modes)
     measured.rejected += mixed.rejected
     measured.settle(mixed.poles, FIT.most_steps)
-    return measured.report(mixed.evidence()) if mixed.poles.size else None
+    return measured.report(mixed.statistic()) if mixed.poles.size else None
 
 
 class _Search:
@@ -163,21 +163,21 @@ class _Search:
         """Leave out what is no mode and, thoroughly, what its neighbours explain as well; whether any left."""
         if self.poles.size == 0:
             return False
-        evidence = self.evidence()
+        statistic = self.statistic()
         limit = self.limit * np.array([self._noise_ratio(pole) for pole in self.poles])
-        out = spurious_modes(self.poles, self._shapes, evidence, self.bin_width) | (evidence < limit)
+        out = spurious_modes(self.poles, self._shapes, statistic, self.bin_width) | (statistic < limit)
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
                 near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
-                if near.size > 1 and self._evidence_beside(r, near) < limit[r]:
-                    evidence[r] = self._gain(r, near)
-                    out[r] = evidence[r] < limit[r]
+                if near.size > 1 and self._statistic_beside(r, near) < limit[r]:
+                    statistic[r] = self._gain(r, near)
+                    out[r] = statistic[r] < limit[r]
         for r in map(int, np.flatnonzero(out)):
             # Of two that overlap the weaker goes first: the other may then stand.
-            weaker = out & (evidence < evidence[r]) & (self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
+            weaker = out & (statistic < statistic[r]) & (self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
             out[r] = not weaker.any()
         if out.any():
-            self.rejected += [(complex(pole), e) for pole, e in zip(self.origins[out], evidence[out], strict=True)]
+            self.rejected += [(complex(pole), e) for pole, e in zip(self.origins[out], statistic[out], strict=True)]
             self.origins = self.origins[~out]
             self.settle(self.poles[~out], 2)
         return bool(out.any())
@@ -187,7 +187,7 @@ class _Search:
         """Amplitudes over the noise, (n_signals, n_modes), of one record below the other."""
         return np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(self.fits, self.weights, strict=True)])
 
-    def evidence(self) -> np.ndarray:
+    def statistic(self) -> np.ndarray:
         """χ² of each mode's amplitudes, poles held, (n_modes,)."""
         return np.array([self._strength(r, np.zeros((self.weights.shape[1], 0))) for r in range(self.poles.size)])
 
@@ -200,18 +200,18 @@ class _Search:
             strength += float((a * np.linalg.solve(fit.spread[np.ix_(both, both)], a)).sum())
         return strength
 
-    def _evidence_beside(self, r: int, near: np.ndarray) -> float:
+    def _statistic_beside(self, r: int, near: np.ndarray) -> float:
         """χ² of mode r in combinations of the outputs that see none of its neighbours."""
         shapes = np.hstack(np.split(self._shapes[:, near[near != r]], len(self.fits)))
         return self._strength(r, np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0])
 
-    def report(self, evidence: np.ndarray) -> Identified:
-        """The modes with their covariance, and the evidence (n_modes,) of each."""
+    def report(self, statistic: np.ndarray) -> Identified:
+        """The modes with their covariance, and the statistic (n_modes,) of each."""
         found = self.records, self.poles, self.fits, self.noise
         refined = as_refined(*found, converged=self.converged, steps=self.steps)
         refined = in_coloured_noise(refined, self.records, self.fits)
-        evidence = evidence[np.argsort(np.abs(self.poles))]
-        found_modes = identified(refined, evidence, self.limit, self.rejected, self.records[0])
+        statistic = statistic[np.argsort(np.abs(self.poles))]
+        found_modes = identified(refined, statistic, self.limit, self.rejected, self.records[0])
         return replace(found_modes, remarks=self.budget.remarks)
 
     def _size(self, rate: float) -> tuple[int, int]:

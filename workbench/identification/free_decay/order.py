@@ -282,12 +282,12 @@ class _FreeDecay:
 
     def suspects(self, model: _Model) -> Iterator[tuple[complex, _Model, bool]]:
         """The weakest that is spurious, or else the modes whose amplitudes are weak or that stand close to another."""
-        evidence, spurious = self.evidence(model), self._spurious(model.poles, model)
+        statistic, spurious = self.statistic(model), self._spurious(model.poles, model)
         if spurious.any():
-            r = int(np.argmin(np.where(spurious, evidence, np.inf)))
+            r = int(np.argmin(np.where(spurious, statistic, np.inf)))
             yield complex(model.poles[r]), self._without(model, r), True
             return
-        for r, (pole, strength) in enumerate(zip(model.poles, evidence, strict=True)):
+        for r, (pole, strength) in enumerate(zip(model.poles, statistic, strict=True)):
             near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf)
             if strength < SELECTION.weak * self.threshold(model, pole) or near < SELECTION.close * abs(pole.real):
                 yield complex(pole), self._without(model, r), False
@@ -303,7 +303,7 @@ class _FreeDecay:
         span = max(record.n_samples * record.sample_time for record in self.records)
         return poles[(poles.real * span < SELECTION.most_growth) & (np.abs(poles) * span > 2.0 * np.pi)]
 
-    def evidence(self, model: _Model) -> np.ndarray:
+    def statistic(self, model: _Model) -> np.ndarray:
         """χ² of each mode's amplitudes, poles held, (n_modes,)."""
         fits = [project(record, model.poles, True) for record in self.records]
         n, strength = model.poles.size, np.zeros(model.poles.size)
@@ -325,8 +325,8 @@ class _FreeDecay:
         while (lost := self._lost(poles, refined.modes.poles)).any() and not lost.all():
             poles = poles[~lost]
             refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
-        evidence = self.evidence(replace(model, poles=poles))[np.argsort(np.abs(poles))]
-        found = identified(in_coloured_noise(refined, records), evidence, self.limit, self.rejected, records[0])
+        statistic = self.statistic(replace(model, poles=poles))[np.argsort(np.abs(poles))]
+        found = identified(in_coloured_noise(refined, records), statistic, self.limit, self.rejected, records[0])
         return replace(found, remarks=self.budget.remarks)
 
     def _lost(self, poles: np.ndarray, refined: np.ndarray) -> np.ndarray:
@@ -366,7 +366,7 @@ class _FreeDecay:
     def _distinct(self, model: _Model, poles: np.ndarray, r: int, s: int) -> bool:
         """Whether one sensor that sees a beat of modes r and s is likelier to see both than a single nonlinear mode.
 
-        In the records as measured: a filter that whitens the residual of one mode removes most of its evidence.
+        In the records as measured: a filter that whitens the residual of one mode removes most of its statistic.
         """
         width = self.grids[0].bin_width
         pair, others = poles[[r, s]], np.delete(poles, [r, s])

@@ -46,12 +46,12 @@ def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
 
 
 def identified(
-    refined: Refined, evidence: np.ndarray, limit: float, rejected: Sequence[tuple[complex, float]], record: Record
+    refined: Refined, statistic: np.ndarray, limit: float, rejected: Sequence[tuple[complex, float]], record: Record
 ) -> Identified:
-    """Refined modes with their evidence (n_modes,), beside the poles rejected as noise, each with its own."""
+    """Refined modes with their statistic (n_modes,), beside the poles rejected as noise, each with its own."""
     noise = sorted(rejected, key=lambda pair: abs(pair[0]))
     modes = unshaped(np.array([pole for pole, _ in noise], complex), record)
-    return Identified(refined, frozen(evidence), limit, modes, frozen([strength for _, strength in noise]))
+    return Identified(refined, frozen(statistic), limit, modes, frozen([strength for _, strength in noise]))
 
 
 def in_coloured_noise(

@@ -50,7 +50,7 @@ def without_unpredictive(
     the record, or grow, one by one: a single line is all that they fit.
 
     Args:
-        strength: (n_modes,) evidence of each mode.
+        strength: (n_modes,) statistic of each mode.
     """
     n, omega = fit.poles.size, fit.poles.imag
     reach = HELD_OUT.reach * omega

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from workbench.identification.input_output.fit_errors import fixed_std
 from workbench.identification.input_output.known_inputs import KnownInputs, sources
 from workbench.identification.input_output.modal_fit import Fit
-from workbench.identification.input_output.model_order import evidence_of_each
+from workbench.identification.input_output.model_order import statistic_of_each
 from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
 
@@ -72,8 +72,8 @@ def first_lags(records: Sequence[Record]) -> np.ndarray:
     left = squares - found.T @ moment + DELAYS.floor**2 * np.diag(np.diag(squares))
     spread = np.diag(cho_solve(factor, np.eye(len(gram)))) * scale**2
     b, free = found[lags * m :], max(rows - lags * len(records) - len(gram), 1)
-    evidence = np.einsum("kj,kj->k", b, np.linalg.solve(left / free, b.T).T) / spread[lags * m :]
-    acts = evidence.reshape(lags + 1, q) > chi2.isf(FALSE_ALARM / (lags * q), m)
+    statistic = np.einsum("kj,kj->k", b, np.linalg.solve(left / free, b.T).T) / spread[lags * m :]
+    acts = statistic.reshape(lags + 1, q) > chi2.isf(FALSE_ALARM / (lags * q), m)
     return np.where(acts.any(axis=0), np.argmax(acts, axis=0), 0)
 
 
@@ -117,9 +117,9 @@ def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray
     seen = fit.amplitudes / fit.poles**derivative
     turn = np.exp(-0.5j * np.angle((seen**2).sum(axis=0)))
     phase = np.angle(1j * fit.participation[:, :q] / turn[:, None])
-    evidence = evidence_of_each(fit)
+    statistic = statistic_of_each(fit)
     size = np.abs(fit.participation[:, :q]) ** 2
-    known = (evidence / (evidence + DELAYS.known))[:, None] * size / size.sum(axis=1, keepdims=True)
+    known = (statistic / (statistic + DELAYS.known))[:, None] * size / size.sum(axis=1, keepdims=True)
     cost = np.zeros((TRIED.size, q))
     for k, f in enumerate(TRIED):
         now, before = np.array([_columns_left(pole, data.dt, f, data.straight) for pole in fit.poles]).T

@@ -48,21 +48,21 @@ class Selected:
 
     Attributes:
         fit: of them all.
-        evidence: (n_modes,) χ² of each.
+        statistic: (n_modes,) χ² of each.
         limit: what noise alone exceeds by false alarm.
         full: whether more might be there, the most modes being taken.
         distorted: poles about which further modes were left out, as they predict nothing.
     """
 
     fit: Fit
-    evidence: np.ndarray
+    statistic: np.ndarray
     limit: float
     full: bool
     distorted: tuple[complex, ...] = ()
 
     def refitted(self, fit: Fit) -> "Selected":
-        """The modes of another fit, with their evidence in it."""
-        return replace(self, fit=fit, evidence=evidence_of_each(fit))
+        """The modes of another fit, with their statistic in it."""
+        return replace(self, fit=fit, statistic=statistic_of_each(fit))
 
 
 def select_modes(
@@ -94,7 +94,7 @@ def select_modes(
     fit = selection.select(fit)
     order = np.argsort(np.abs(fit.poles))
     ordered = replace(only(data, fit, order), converged=fit.converged, steps=fit.steps)
-    return Selected(ordered, evidence_of_each(fit)[order], problem.limit, selection.full)
+    return Selected(ordered, statistic_of_each(fit)[order], problem.limit, selection.full)
 
 
 def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALSE_ALARM) -> Fit:
@@ -122,13 +122,13 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
     limit = chi2.isf(false_alarm / data.cells, size * data.values.shape[1])
     while poles.size:
         blocks = np.arange(poles.size * size).reshape(poles.size, size)
-        evidence = np.zeros(poles.size)
+        statistic = np.zeros(poles.size)
         for spread, c, variance in zip(spreads, coefficients, variances, strict=True):
             own = c[blocks]
             inner = spread[blocks[:, :, None], blocks[:, None, :]]
-            evidence += (own * np.linalg.solve(inner, own) / variance).sum(axis=(1, 2))
-        weakest = int(np.argmin(evidence))
-        if evidence[weakest] >= limit:
+            statistic += (own * np.linalg.solve(inner, own) / variance).sum(axis=(1, 2))
+        weakest = int(np.argmin(statistic))
+        if statistic[weakest] >= limit:
             break
         out, rest = blocks[weakest], np.delete(np.arange(len(scale)), blocks[weakest])
         for k, spread in enumerate(spreads):
@@ -208,27 +208,27 @@ class _Modes:
         """
         model = settled(self.data, start, SELECTION.few_steps, self.budget, ORDER.decided)
         while model.poles.size and not self.budget.spent("check of each mode"):
-            evidence = np.where(_spurious(self.data, model), 0.0, whole_evidence_of(model))
-            is_weak = evidence < [self.threshold(model, pole) for pole in model.poles]
+            statistic = np.where(_spurious(self.data, model), 0.0, whole_statistic_of(model))
+            is_weak = statistic < [self.threshold(model, pole) for pole in model.poles]
             weak = np.flatnonzero(is_weak & ~_changes(self.data, model.poles))
             if not weak.size:
                 break
-            out = weak[np.argsort(evidence[weak])[: (weak.size + 1) // 2]]
+            out = weak[np.argsort(statistic[weak])[: (weak.size + 1) // 2]]
             rest = np.delete(np.arange(model.poles.size), out)
             model = settled(self.data, only(self.data, model, rest), SELECTION.few_steps, self.budget, ORDER.decided)
         return self.settled(model)
 
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
         """Those that are spurious, weak, or close to another."""
-        spurious, whole_evidence = _spurious(self.data, model), whole_evidence_of(model)
+        spurious, whole_statistic = _spurious(self.data, model), whole_statistic_of(model)
         changes = _changes(self.data, model.poles)
         for r, pole in enumerate(model.poles):
             if changes[r]:
                 continue
             near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf) < SELECTION.close * abs(pole.real)
             threshold = self.threshold(model, pole)
-            doubtful = near and whole_evidence[r] < ORDER.distinct * threshold
-            if spurious[r] or doubtful or evidence_of(model, r) < SELECTION.weak * threshold:
+            doubtful = near and whole_statistic[r] < ORDER.distinct * threshold
+            if spurious[r] or doubtful or statistic_of(model, r) < SELECTION.weak * threshold:
                 without = only(self.data, model, np.delete(np.arange(model.poles.size), r))
                 without = settled(self.data, without, SELECTION.few_steps, self.budget, ORDER.decided)
                 yield complex(pole), without, bool(spurious[r])
@@ -258,7 +258,7 @@ def _is_about_distorted(data: Measurement, poles: np.ndarray) -> np.ndarray:
 
 
 def _changes(data: Measurement, poles: np.ndarray) -> np.ndarray:
-    """Which poles are those of modes that are more than linear: in what else these do, no evidence is left of them."""
+    """Which poles are those of modes that are more than linear: in what else these do, nothing is left of them."""
     out = np.zeros(poles.size, bool)
     for pole in data.distorted:
         out[np.argmin(np.abs(poles - pole))] = True
@@ -318,7 +318,7 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     """Which are damped too much to ring, or split another mode that has their shape, participation and band."""
     poles = fit.poles
     shapes = fit.amplitudes / fit.noise[:, None]
-    strength = evidence_of_each(fit)
+    strength = statistic_of_each(fit)
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + data.resolution
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
@@ -327,7 +327,7 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     return np.asarray(split.any(axis=1) | (-poles.real > SELECTION.most_damped * np.abs(poles)))
 
 
-def evidence_of(fit: Fit, r: int) -> float:
+def statistic_of(fit: Fit, r: int) -> float:
     """χ² of a mode's shape in the noise, poles and participation held."""
     both, noise, found = [r, fit.poles.size + r], fit.noise, 0.0
     for part, outputs in fit.outputs():
@@ -336,12 +336,12 @@ def evidence_of(fit: Fit, r: int) -> float:
     return found
 
 
-def evidence_of_each(fit: Fit) -> np.ndarray:
-    """`evidence_of` each mode, (n_modes,)."""
-    return np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
+def statistic_of_each(fit: Fit) -> np.ndarray:
+    """`statistic_of` each mode, (n_modes,)."""
+    return np.array([statistic_of(fit, r) for r in range(fit.poles.size)])
 
 
-def whole_evidence_of(fit: Fit) -> np.ndarray:
+def whole_statistic_of(fit: Fit) -> np.ndarray:
     """χ² of each mode's shape in the noise, (n_modes,), poles and participation of all modes unknown."""
     n, bound, free = fit.poles.size, covariance(fit), free_parameters(fit)
     found = np.zeros(n)

@@ -46,12 +46,12 @@ class Peaks(NamedTuple):
     Attributes:
         uneven: (n_modes,) where it is so by more than chance, and enough to matter.
         scatter: (n_modes,) rms of δ, rad/s.
-        evidence: (n_modes,) χ² of the further term, in the noise of the fit.
+        statistic: (n_modes,) χ² of the further term, in the noise of the fit.
     """
 
     uneven: np.ndarray
     scatter: Floats
-    evidence: Floats
+    statistic: Floats
 
 
 def peaks(lines: Lines, fit: Fit) -> Peaks:
@@ -82,17 +82,17 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
     covariance = (vt[kept].T / s[kept] ** 2) @ vt[kept]
     rest = lines.unstacked((y - m @ found).reshape(fit.noise.size, -1).T)
     power = 0.5 * (np.abs(rest) ** 2).mean(axis=(0, 1))
-    uneven, scatter, evidence = np.zeros(n, bool), np.zeros(n), np.zeros(n)
+    uneven, scatter, statistic = np.zeros(n, bool), np.zeros(n), np.zeros(n)
     for r, pole in enumerate(fit.poles):
         both = np.array([r, 2 * n + r])
         beside = np.abs(lines.omega - pole.imag) < max(PEAKS.beside * abs(pole.real), PEAKS.beside * lines.resolution)
         noise_ratio = max(1.0, float(power[beside].mean())) if beside.any() else 1.0
         value = found[both]
-        evidence[r] = value @ np.linalg.pinv(covariance[np.ix_(both, both)], hermitian=True) @ value
+        statistic[r] = value @ np.linalg.pinv(covariance[np.ix_(both, both)], hermitian=True) @ value
         scatter[r] = np.sqrt(np.hypot(*value) / size[r])
-        sure = evidence[r] > noise_ratio * chi2.isf(PEAKS.false_alarm, 2)
+        sure = statistic[r] > noise_ratio * chi2.isf(PEAKS.false_alarm, 2)
         uneven[r] = sure and scatter[r] > PEAKS.matters * abs(pole.real)
-    return Peaks(uneven, scatter, evidence)
+    return Peaks(uneven, scatter, statistic)
 
 
 def _third(lines: Lines, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

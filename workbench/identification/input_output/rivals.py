@@ -12,7 +12,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.modal_fit import Fit, Measurement, Pair, modal_coordinate, projected
-from workbench.identification.input_output.model_order import evidence_of_each
+from workbench.identification.input_output.model_order import statistic_of_each
 from workbench.identification.signal.searches import Budget
 
 
@@ -75,7 +75,7 @@ def in_place_of_clusters(
     Returns:
         None where linear modes are likelier everywhere.
     """
-    strength = evidence_of_each(fit)
+    strength = statistic_of_each(fit)
     rates = np.maximum(-fit.poles.real, 0.5 * data.resolution)
     apart = np.abs(np.subtract.outer(fit.poles.imag, fit.poles.imag))
     near = alike & (apart < RIVALS.near * np.add.outer(rates, rates))

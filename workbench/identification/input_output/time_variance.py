@@ -30,7 +30,7 @@ from workbench.identification.input_output.modal_fit import (
     only,
     settled,
 )
-from workbench.identification.input_output.model_order import evidence_of, evidence_of_each
+from workbench.identification.input_output.model_order import statistic_of, statistic_of_each
 from workbench.identification.input_output.rivals import in_place_of_clusters, independent, of_unit_length
 from workbench.identification.signal.searches import SELECTION, Budget
 from workbench.structure.modes import mac
@@ -46,7 +46,7 @@ class ChangingSettings:
     instead: float = 0.5  # of what a second mode explains that a change of the first must explain in its place
     matters: float = 0.1  # of the half-power bandwidth: a smaller change harms no model
     reach: float = 0.15  # of the frequency of a mode, within which another may stand for its change
-    faint: float = 0.2  # of its evidence, likewise
+    faint: float = 0.2  # of its statistic, likewise
     collinear: float = 1e-4  # singular value over which columns of unit length count
     faded: float = 4.0  # time constants of a mode that a record must hold: of fewer, the change is no small one
 
@@ -103,11 +103,11 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
     if fit.noise.size * data.n_inputs == 1:
         return fit
 
-    def evidence(one: Fit, at: int) -> float:
+    def statistic(one: Fit, at: int) -> float:
         change = changes_in_time(data, one)
         return float((change.frequency[at] / change.deviation[at]) ** 2) if change.sure[at] else -np.inf
 
-    return one_for_two(data, fit, budget, evidence, "check of modes that change within the record")[0]
+    return one_for_two(data, fit, budget, statistic, "check of modes that change within the record")[0]
 
 
 def one_for_two(
@@ -126,7 +126,7 @@ def one_for_two(
     for pair in _pairs_alike(fit):
         if budget.spent(check):
             break
-        weak, strong = sorted(pair, key=lambda r: evidence_of(fit, r))
+        weak, strong = sorted(pair, key=lambda r: statistic_of(fit, r))
         left = np.delete(kept, weak)
         one = settled(data, only(data, fit, left), budget=budget)
         if change(one, int(np.searchsorted(left, strong))) > CHANGING.instead * added_misfit(one, fit, one.noise):
@@ -143,7 +143,7 @@ def beside_changing(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -
     """
     if fit.noise.size * data.n_inputs == 1:
         return _beside_rivals(data, fit, limit, budget)
-    strength = evidence_of_each(fit)
+    strength = statistic_of_each(fit)
     participation = fit.participation[:, : data.n_inputs].T
     alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > CHANGING.alike
     beside: list[Floats] = []

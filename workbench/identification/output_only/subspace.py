@@ -62,7 +62,7 @@ class StablePole:
         pole: λ, rad/s.
         shape: (n_outputs,) complex, as the outputs measure it.
         presence: share of the orders at which it was found.
-        evidence: twice the log likelihood ratio of the record with and without it, predicted by one step.
+        statistic: twice the log likelihood ratio of the record with and without it, predicted by one step.
         orders, poles: of the models that it is found in.
         slower: its sampling interval over that of the record.
         variance: (2, 2) of Re λ and Im λ; nan until estimated.
@@ -71,7 +71,7 @@ class StablePole:
     pole: complex
     shape: np.ndarray
     presence: float
-    evidence: float
+    statistic: float
     orders: tuple[int, ...]
     poles: tuple[complex, ...]
     slower: int
@@ -154,7 +154,7 @@ class Subspace:
         groups: list[list[StablePole]] = []
         orders = range(2, model.highest_order(self._outputs[slower].shape[1]) + 1, 2)
         for order in reversed(orders):
-            log_mu, shapes, gains = model.poles(order, evidence=True)
+            log_mu, shapes, gains = model.poles(order, statistic=True)
             for pole, shape, gain in zip(log_mu / dt, shapes.T, gains, strict=True):
                 if not (0 < -pole.real < SUBSPACE.most_damped * abs(pole) and low < abs(pole) < top):
                     continue
@@ -214,13 +214,13 @@ class Model:
         noise = 2.0 * np.sqrt(self._c.shape[0] * SUBSPACE.past / n_samples)
         return int(np.clip(2 * np.sum(self._correlations > noise), SUBSPACE.least_order, SUBSPACE.most_order))
 
-    def poles(self, order: int, evidence: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """ln μ and shapes (n_outputs, n_poles) of the poles above the real axis, and the evidence of each a sample."""
+    def poles(self, order: int, statistic: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """ln μ and shapes (n_outputs, n_poles) of the poles above the real axis, and the statistic of each a sample."""
         c = self._c[:, :order]
         mu, vectors = np.linalg.eig(self._a[:order, :order])
         up = np.flatnonzero(mu.imag > 0)
         gains = np.zeros(up.size)
-        if evidence:
+        if statistic:
             least = np.linalg.slogdet(self._now - c @ c.T)[1]
             for k, r in enumerate(up):
                 # The states that are left are those orthogonal to both left eigenvectors of the mode.

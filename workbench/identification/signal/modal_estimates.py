@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from workbench.records.record import Channel
+from workbench.renamed import Renamed
 from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes, frozen
 from workbench.structure.printed import Printed, counted
@@ -166,19 +167,21 @@ class Identified(OfRefined):
 
     Attributes:
         refined: the modes, with covariance.
-        evidence: (n_modes,) χ² of each mode's amplitudes in the noise, 2 degrees of freedom a signal.
-        limit: what the strongest mode fitted to white noise alone exceeds with the chance `false_alarm`.
-        noise_modes: candidates rejected, each with an evidence below the limit, overdamped, or part of another.
-        noise_evidence: (n_noise,) theirs.
+        statistic: (n_modes,) χ² of each mode's amplitudes in the noise, 2 degrees of freedom a signal.
+        threshold: what the strongest mode fitted to white noise alone exceeds with the chance `false_alarm`.
+        noise_modes: candidates rejected, each with a statistic below the threshold, overdamped, or part of another.
+        noise_statistic: (n_noise,) theirs.
         remarks: what was left undone, where the time was up.
     """
 
     refined: Refined
-    evidence: np.ndarray
-    limit: float
+    statistic: np.ndarray
+    threshold: float
     noise_modes: SampledModes
-    noise_evidence: np.ndarray
+    noise_statistic: np.ndarray
     remarks: tuple[str, ...] = field(default=())
+
+    evidence, limit, noise_evidence = Renamed("statistic"), Renamed("threshold"), Renamed("noise_statistic")
 
     def without_artefacts(self, nyquist: float, *, growing: bool = False) -> "Identified":
         """Only poles that can be modes (`credible`); the others join `noise_modes`.
@@ -192,7 +195,7 @@ class Identified(OfRefined):
         if good.all() or not good.any():
             return self
         kept, out = np.flatnonzero(good), np.flatnonzero(~good)
-        evidence = self.evidence if self.evidence.size else np.zeros(good.size)
+        statistic = self.statistic if self.statistic.size else np.zeros(good.size)
         joined = np.r_[self.noise_modes.omega, self.modes.omega[out]]
         order = np.argsort(joined)
         noise_modes = SampledModes(
@@ -204,9 +207,9 @@ class Identified(OfRefined):
         return replace(
             self,
             refined=self.refined.select(kept),
-            evidence=frozen(self.evidence[kept]) if self.evidence.size else self.evidence,
+            statistic=frozen(self.statistic[kept]) if self.statistic.size else self.statistic,
             noise_modes=noise_modes,
-            noise_evidence=frozen(np.r_[self.noise_evidence, evidence[out]][order]),
+            noise_statistic=frozen(np.r_[self.noise_statistic, statistic[out]][order]),
         )
 
 

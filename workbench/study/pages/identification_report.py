@@ -158,7 +158,7 @@ def _on_convergence(converged: bool, remarks: Sequence[str], remedy: str) -> lis
 def of_ambient(found: AmbientModes, record: Record) -> IdentificationReport:
     """A record under unknown broadband forces."""
     lines = ["poles by canonical variate analysis, standard errors by leaving out parts of the record", *found.remarks]
-    return _report([record], found, lines, _content(record.output_channels, found), found.decays)
+    return _report([record], found, lines, _content(record.output_channels, found), found.correlations)
 
 
 def of_transfer(found: TransferModes, measured: TransferFunctions) -> IdentificationReport:
