@@ -62,7 +62,7 @@ def measured():
 
 def identified(record):
     """Mass-normalised modes at the sensors: where force and motion meet, residues are φ_i φ_j / (2 i ω_d)."""
-    found = identify_driven(record, at_rest=True, feedthrough=False, most_modes=12)
+    found = identify_driven(record, at_rest=True, feedthrough=False, max_modes=12)
     modes, shapes = found.modes, []
     for r in range(modes.n_modes):
         products = 2j * modes.poles[r].imag * np.outer(modes.shapes[:, r], found.participation[r])

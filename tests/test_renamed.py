@@ -1,4 +1,4 @@
-"""Former names of attributes: each gives the new one, and says so."""
+"""Former names of attributes and arguments: each gives the new one, and says so."""
 
 import importlib
 import pkgutil
@@ -7,7 +7,7 @@ from dataclasses import fields, is_dataclass
 import pytest
 
 import workbench
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 
 
 def former_names():
@@ -38,3 +38,13 @@ def test_every_former_name_leads_to_an_attribute_that_is_there():
         own = {f.name for f in fields(owner)} if is_dataclass(owner) else set()
         assert new in own or hasattr(owner, new), f"{owner.__name__}.{old} leads to {new}, which is not there"
         assert old not in own
+
+
+def test_a_former_argument_is_taken_for_the_new_one_with_a_warning():
+    @former_arguments(span="length")
+    def area(length, *, width):
+        return length * width
+
+    assert area(2.0, width=3.0) == 6.0
+    with pytest.warns(DeprecationWarning, match=r"area\(span=...\) is now .*area\(length=...\)"):
+        assert area(span=2.0, width=3.0) == 6.0

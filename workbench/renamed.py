@@ -1,7 +1,12 @@
-"""Former names of attributes, which work for one version more."""
+"""Former names of attributes and arguments, which work for one version more."""
 
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 from warnings import warn
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class Renamed:
@@ -18,3 +23,27 @@ class Renamed:
             return self
         warn(f"{self._name} is now {self._new}; the old name goes with the next version", DeprecationWarning, 2)
         return getattr(instance, self._new)
+
+
+def former_arguments(**new_names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A function, or a constructor, that takes former names of its arguments too, with a DeprecationWarning.
+
+    Args:
+        new_names: by former name.
+    """
+
+    def taking(function: Callable[P, R]) -> Callable[P, R]:
+        name = function.__qualname__.removesuffix(".__init__")
+
+        @wraps(function)
+        def with_former(*args: P.args, **kwargs: P.kwargs) -> R:
+            for old in new_names.keys() & kwargs.keys():
+                new = new_names[old]
+                now = f"{name}({old}=...) is now {name}({new}=...); the old name goes with the next version"
+                warn(now, DeprecationWarning, 2)
+                kwargs[new] = kwargs.pop(old)
+            return function(*args, **kwargs)
+
+        return with_former
+
+    return taking

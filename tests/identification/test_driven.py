@@ -519,7 +519,7 @@ def test_a_mode_that_changes_with_amplitude_is_one_mode_with_a_remark(n_outputs)
 
 
 @pytest.mark.slow
-def test_most_modes_that_change_with_amplitude_are_one():
+def test_max_modes_that_change_with_amplitude_are_one():
     """Of the others some are told as several modes, some have no remark or one on a neighbour too."""
     assert np.mean([is_seen_to_stiffen(identify_driven(stiffening(seed))) for seed in range(10, 20)]) >= 0.5
 

@@ -97,7 +97,7 @@ def test_a_first_response_that_noise_hides_is_no_delay(bench):
     quiet = simulate(bench, rng.normal(size=(1, 400)), sample_time=0.05)
     noise = 0.002 * rng.normal(size=(2, *quiet.outputs.shape))[1]
     record = replace(quiet, outputs=quiet.outputs + noise)
-    found = identify_driven(record, at_rest=True, feedthrough=False, most_modes=3)
+    found = identify_driven(record, at_rest=True, feedthrough=False, max_modes=3)
     assert not found.delays.any() and not found.remarks
 
 
@@ -107,7 +107,7 @@ def test_the_spread_of_shapes_over_many_records_is_what_their_covariance_says(be
     inputs = rng.normal(size=(1, 400))
     quiet = simulate(bench, inputs, sample_time=0.05)
     loud = [replace(quiet, outputs=quiet.outputs + 0.002 * rng.normal(size=quiet.outputs.shape)) for _ in range(80)]
-    rigs = [rig_from(identify_driven(record, at_rest=True, feedthrough=False, most_modes=3)) for record in loud]
+    rigs = [rig_from(identify_driven(record, at_rest=True, feedthrough=False, max_modes=3)) for record in loud]
     points = rigs[0].modes.domain.names
     exact = np.array([bench.modes.phi(0.9)[0], *bench.modes.phi(PLACES)])
     assert points == ("F", "d1", "d2", "d3", "d4")

@@ -92,7 +92,7 @@ def test_errors_grow_where_what_is_left_is_louder():
         rng = np.random.default_rng(seed)
         std = 0.002 * np.abs(h).mean() * np.where(np.abs(lines - 9.8) < 2.0, 10.0, 1.0)
         measured = h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
-        found = identify_transfer(measured, lines, channels=channels, most_modes=4)
+        found = identify_transfer(measured, lines, channels=channels, max_modes=4)
         r = int(np.argmin(np.abs(found.modes.omega - modes.omega[2])))
         scores.append((found.modes.omega[r] - modes.omega[2]) / found.omega_std[r])
         scores.append((found.modes.zeta[r] - 0.01) / found.zeta_std[r])

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
-from warnings import warn
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,6 +18,7 @@ from workbench.design.placement.task import Placement, PlacementTask
 from workbench.draw.motion import SWAY, Net, frame_net, scattered_net
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.shapes.bands import Bands
+from workbench.renamed import former_arguments
 from workbench.structure.domain import Patch, Rectangle
 from workbench.structure.modes import Modes, SampledModes
 
@@ -102,13 +102,13 @@ def plot_surface_bands(bands: Bands) -> Figure:
     return figure
 
 
+@former_arguments(struck="impulse_at")
 def plot_surface_motion(
     responses: Mapping[str, Response],
     times: Sequence[float],
     *,
     actuators: np.ndarray | None = None,
     impulse_at: tuple[float, float] | None = None,
-    struck: tuple[float, float] | None = None,
 ) -> Figure:
     """Displacement of a plate at some instants, a row a response, all in one scale of colour.
 
@@ -116,9 +116,7 @@ def plot_surface_motion(
         times: s; the nearest instants of each response are drawn.
         actuators: (n_actuators, 2) places, m, marked by crosses.
         impulse_at: where the impulse acted, marked by a star.
-        struck: its former name.
     """
-    impulse_at = _impulse_at(impulse_at, struck)
     first = next(iter(responses.values()))
     figure, grid = new_figure(
         len(responses), len(times), width=2.6 * len(times), height=2.1 * len(responses) + 0.3, squeeze=False
@@ -150,13 +148,13 @@ def plot_surface_motion(
     return figure
 
 
+@former_arguments(struck="impulse_at")
 def plot_surface_placement(
     task: PlacementTask,
     placements: Mapping[str, Placement],
     *,
     limits: Limits | None = None,
     impulse_at: tuple[float, float] | None = None,
-    struck: tuple[float, float] | None = None,
 ) -> Figure:
     """Actuators on a plate over mode n + 1, whose nodal lines are black, and the work in each residual mode beside.
 
@@ -166,9 +164,7 @@ def plot_surface_placement(
         placements: by name, drawn in its colour.
         limits: of which the forbidden zones are hatched.
         impulse_at: where the impulse acts, marked by a star.
-        struck: its former name.
     """
-    impulse_at = _impulse_at(impulse_at, struck)
     n, modes = task.n_controlled, task.modes
     assert isinstance(modes.domain, Rectangle)
     figure, (left, right) = new_figure(1, 2, width=11, height=4.2)
@@ -304,13 +300,6 @@ def _panels(modes: Modes, count: int, columns: int) -> tuple[Figure, list[Axes]]
     for ax in grid.flat[count:]:
         ax.set_visible(False)
     return figure, list(grid.flat[:count])
-
-
-def _impulse_at(given: tuple[float, float] | None, former: tuple[float, float] | None) -> tuple[float, float] | None:
-    if former is None:
-        return given
-    warn("struck=... is now impulse_at=...; the old name goes with the next version", DeprecationWarning, 3)
-    return former
 
 
 def _bare(ax: Axes, modes: Modes) -> None:

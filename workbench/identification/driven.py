@@ -31,7 +31,7 @@ from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import HOLDS, Channel, Record
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
@@ -168,6 +168,7 @@ class Driven(ParticipatingModes):
         return np.stack([z.real, z.imag], axis=1).ravel()
 
 
+@former_arguments(most_modes="max_modes")
 @one_blas_thread
 def identify_driven(
     records: Record | Sequence[Record],
@@ -176,7 +177,7 @@ def identify_driven(
     input_hold: str | None = None,
     feedthrough: bool = True,
     delays: ArrayLike | None = None,
-    most_modes: int = 40,
+    max_modes: int = 40,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
@@ -198,7 +199,7 @@ def identify_driven(
         delays: (n_inputs,) s, by which each input acts late; estimated unless given, up to 60 samples. Of inputs held
             between samples, with a direct term, the fraction of a sample is the one that makes the modes most nearly
             real, for their response is the same whatever it is.
-        most_modes: where to stop at the latest.
+        max_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
             limit.
@@ -233,8 +234,8 @@ def identify_driven(
         raise ValueError(
             f"record {records[0].name!r}: {rows} samples are too few for {records[0].n_inputs} inputs; measure longer"
         )
-    most = min(most_modes, (rows - columns) // 6)
-    how = {"most_modes": most, "false_alarm": false_alarm}
+    most = min(max_modes, (rows - columns) // 6)
+    how = {"max_modes": most, "false_alarm": false_alarm}
     data, selected = _selected(data, budget, **how) if delays is not None else _with_delays(data, budget, **how)
     if selected.fit.poles.size == 0:
         raise ValueError(
@@ -338,10 +339,10 @@ def _late(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
 def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selected:
     """Those of a start, or else of a subspace model, and as many more as the first estimate of the noise needs."""
     if start is None:
-        poles = subspace_poles(data.records, data.whole, 2 * how["most_modes"] + DRIVEN.spare)
+        poles = subspace_poles(data.records, data.whole, 2 * how["max_modes"] + DRIVEN.spare)
         start = fit_of_poles(data, poles, how["false_alarm"])
     few = _few(how)
-    few["most_modes"] = max(few["most_modes"], start.poles.size)
+    few["max_modes"] = max(few["max_modes"], start.poles.size)
     return _predictive(data, select_modes(data, start=start, **few), how["budget"])
 
 
@@ -353,7 +354,7 @@ def _predictive(data: KnownInputs, selected: Selected, budget: Budget) -> Select
 
 
 def _few(how: dict[str, Any]) -> dict[str, Any]:
-    return {**how, "most_modes": min(DRIVEN.strongest, how["most_modes"])}
+    return {**how, "max_modes": min(DRIVEN.strongest, how["max_modes"])}
 
 
 def _late_remarks(data: KnownInputs) -> tuple[str, ...]:
@@ -407,7 +408,7 @@ def _in_noise(data: KnownInputs, strongest: Selected, how: dict[str, Any]) -> tu
     estimated anew without all doubtful modes; they stay if that makes modes and noise together less likely.
     """
     budget, few = how["budget"], _few(how)
-    few["most_modes"] = max(few["most_modes"], strongest.fit.poles.size)
+    few["max_modes"] = max(few["max_modes"], strongest.fit.poles.size)
     data, selected = _with_noise(data, strongest, few, how, budget)
     doubtful = (selected.statistic < SELECTION.weak * selected.limit) | ~_oscillate(data, selected)
     if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
@@ -484,7 +485,7 @@ def _with_noise(
                 break
             data, selected = changing[0], fewer
         line_std = data.noise_spectrum(selected.fit)
-        if alike(line_std, data.line_std) and not (selected.full and once["most_modes"] < how["most_modes"]):
+        if alike(line_std, data.line_std) and not (selected.full and once["max_modes"] < how["max_modes"]):
             break
         if budget.spent("estimation of the noise spectrum"):
             break

@@ -31,7 +31,7 @@ from workbench.threads import one_blas_thread
 class RingDownSettings:
     """Constants of what is said of a ring-down."""
 
-    most_modes: int = 20  # of a stabilisation diagram
+    max_modes: int = 20  # of a stabilisation diagram
     drift_rounds: int = 3  # of modes and drift
     parabola: int = 2  # degree of a drift before any mode is known
     dominant: float = 0.5  # share of the variance that it must leave at most, to be removed
@@ -197,7 +197,7 @@ def _identified(records: list[Record], n_modes: int | None, budget: Budget) -> I
 
 
 def _by_stabilisation(records: list[Record], budget: Budget) -> Identified:
-    highest = max(2, min(RING_DOWN.most_modes, min(record.n_samples for record in records) // 8))
+    highest = max(2, min(RING_DOWN.max_modes, min(record.n_samples for record in records) // 8))
     start = stable_modes(stabilise(records, orders=range(2, highest + 1))).modes
     if start.n_modes == 0:
         name = records[0].name

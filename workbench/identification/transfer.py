@@ -25,7 +25,7 @@ from workbench.identification.signal.overtones import overtone_remarks
 from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.sensors import MEASURED
 from workbench.structure.domain import place_array
 from workbench.structure.modes import SampledModes, frozen
@@ -110,6 +110,7 @@ def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int)
     return np.asarray(np.abs(h) * np.sqrt((1.0 - squared) / (2.0 * squared * averages)))
 
 
+@former_arguments(most_modes="max_modes")
 @one_blas_thread
 def identify_transfer(
     transfer: ArrayLike,
@@ -118,7 +119,7 @@ def identify_transfer(
     channels: tuple[Channel, ...],
     band_hz: tuple[float, float] | None = None,
     noise_std: ArrayLike | None = None,
-    most_modes: int = 40,
+    max_modes: int = 40,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
@@ -137,7 +138,7 @@ def identify_transfer(
             or by `coherence_noise`. Without it, noise is taken to be the same at all lines of an output, or to go with
             its size in part where neighbouring lines differ so (`noise_with_size`), and standard errors grow with the
             residual about each mode where that is larger than elsewhere.
-        most_modes: of a band, where to stop at the latest.
+        max_modes: of a band, where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
             limit.
@@ -162,7 +163,7 @@ def identify_transfer(
             2.0 * np.pi * f[inside],
             _residual_powers(channels),
             None if noise is None else noise[..., inside],
-            most_modes=min(most_modes, f[inside].size // each_own),
+            max_modes=min(max_modes, f[inside].size // each_own),
             false_alarm=false_alarm / n_bands,
         )
         found.append(_modes_of(*selected, channels, edges, f[first:last], own))
@@ -186,7 +187,7 @@ def _selected(
     lines, how = Lines(h, omega, powers, noise), {**how, "budget": budget}
     if noise is not None:
         return _beside_changing(lines, how)
-    few = how | {"most_modes": min(TRANSFER.strongest, how["most_modes"])}
+    few = how | {"max_modes": min(TRANSFER.strongest, how["max_modes"])}
     lines, selected = _beside_changing(lines, few)
     left = lines.left(selected.fit)
     guessed = noise_with_size(left, lines.fitted(selected.fit))

@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-from warnings import warn
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, named, run_loop
 from workbench.gap.report.verdict import Verdict
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
@@ -391,6 +390,7 @@ class Redesign:
         }
 
 
+@former_arguments(aim="criterion")
 @one_blas_thread
 def redesign(
     verdict: Verdict | UncertainRig,
@@ -406,7 +406,6 @@ def redesign(
     more_cost: float = MORE_COST,
     more_work: float = np.inf,
     report: Report = lambda text, share: None,
-    aim: str | None = None,
 ) -> Redesign:
     """A controller of the same kind, redesigned for the corrected rig, and both verified on the same samples of it.
 
@@ -429,7 +428,6 @@ def redesign(
         more_cost: share by which the redesigned controller may cost more than the present one where it settles sooner.
         more_work: share by which it may do more work, W = Σ_r |W_r|: as much as it takes, unless given.
         report: called with (what, share done).
-        aim: former name of `criterion`.
 
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
@@ -437,9 +435,6 @@ def redesign(
         TypeError: no verdict, no design, no test, or no number where one is asked for.
         ValueError: an impulse outside the structure, no draws, an unknown criterion, or a share below zero.
     """
-    if aim is not None:
-        warn("redesign(aim=...) is now redesign(criterion=...)", DeprecationWarning, 3)
-        criterion = aim
     if criterion not in (None, *CRITERIA):
         raise ValueError(f"a controller is judged by {' or '.join(CRITERIA)}; got {criterion!r}")
     for name, share in (("more_cost", more_cost), ("more_work", more_work)):

@@ -1,15 +1,15 @@
 """Modes: frequencies, damping and shapes, computed or identified, in one type."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, wraps
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.arrays import Complexes, Flags, Floats, Integers
+from workbench.renamed import former_arguments
 from workbench.structure.domain import (
     Between,
     Derivative,
@@ -261,20 +261,7 @@ class Modes(Printed):
         )
 
 
-def _taking_a_length(init: Callable[..., None]) -> Callable[..., None]:
-    """The constructor of `Modes` with the former name `length` of its `domain`."""
-
-    @wraps(init)
-    def with_length(self: Modes, *args: Any, **kwargs: Any) -> None:
-        if "length" in kwargs:
-            warnings.warn("Modes(length=...) is now Modes(domain=...)", DeprecationWarning, stacklevel=2)
-            kwargs["domain"] = kwargs.pop("length")
-        init(self, *args, **kwargs)
-
-    return with_length
-
-
-Modes.__init__ = _taking_a_length(Modes.__init__)  # type: ignore[method-assign]
+Modes.__init__ = former_arguments(length="domain")(Modes.__init__)  # type: ignore[method-assign]
 
 
 class PointShapes:

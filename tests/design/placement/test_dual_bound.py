@@ -77,7 +77,7 @@ def test_a_cell_where_b_is_singular_to_round_off_is_refused(task):
 def test_a_proof_closes_where_actuators_may_stand_beside_a_support(hinged_modes):
     four = placement_task(hinged_modes(10), 4, impulse_at=4.1, weight=0.2)
     even = four.placed(10.0 * np.arange(1, 5) / 5, "")
-    proof = certify(four, Limits(effort=even.effort, spacing=0.2), gap=0.05, most_cells=1_000_000, seconds=7200.0)
+    proof = certify(four, Limits(effort=even.effort, spacing=0.2), gap=0.05, max_cells=1_000_000, seconds=7200.0)
     assert proof.complete and proof.better is None
 
 
@@ -88,5 +88,5 @@ def test_six_actuators_have_a_bound_above_zero(hinged_modes):
     six = placement_task(modes, 6, impulse_at=6.3, weight=20.0)
     even = six.placed(10.0 * np.arange(1, 7) / 7, "")
     limits = Limits(effort=1.5 * even.effort, spacing=0.5)
-    bound = certify(six, limits, placement=place_actuators(six, limits), gap=0.10, most_cells=2_000_000, seconds=7200.0)
+    bound = certify(six, limits, placement=place_actuators(six, limits), gap=0.10, max_cells=2_000_000, seconds=7200.0)
     assert bound.better is None and bound.lower_bound > 0.0

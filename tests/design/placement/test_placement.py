@@ -275,7 +275,7 @@ def test_a_search_cut_short_says_its_gap_and_the_cell_that_holds_it(task):
     limits = Limits(effort=1.5 * even(task).effort, spacing=0.5)
     met = []
     best = place_actuators(task, limits, starts=4)
-    bound = certify(task, limits, placement=best, gap=0.05, most_cells=1_000, progress=lambda *at: met.append(at))
+    bound = certify(task, limits, placement=best, gap=0.05, max_cells=1_000, progress=lambda *at: met.append(at))
     assert not bound.complete and bound.lower_bound < 0.95 * best.residual_work
     assert bound.cell.shape == (4, 2) and (bound.cell[:, 0] < bound.cell[:, 1]).all()
     counts = [cells for _, _, cells in met]

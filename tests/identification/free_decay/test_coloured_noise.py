@@ -100,7 +100,7 @@ def test_long_records_say_their_errors_in_coloured_noise():
     for seed in range(20):
         noise = lfilter([1.0], [1.0, -0.9], np.random.default_rng(seed).standard_normal((2, 1400)), axis=1)[:, 200:]
         record = replace(CLEAN, outputs=CLEAN.outputs + 0.02 * noise / noise.std())
-        own.append(own_errors(identify_long([record], most_modes=3).refined, np.r_[MODES.omega, MODES.zeta]))
+        own.append(own_errors(identify_long([record], max_modes=3).refined, np.r_[MODES.omega, MODES.zeta]))
     own = np.array(own)
     # By mode, so that what is too wide for one does not make good what is too narrow for another.
     assert all(within(own[:, [r, r + 3]]) for r in range(3))
@@ -119,7 +119,7 @@ def test_driven_records_say_their_errors_in_coloured_noise():
         y = (seen @ np.array(z)).real + np.outer(direct, u) + 0.01 * noise / noise.std()
         channels = (Channel("a", "velocity"), Channel("b", "velocity"))
         record = Record(0.02, y, channels, u[None], (Channel("f", "force"),))
-        found = identify_driven(record, most_modes=2)
+        found = identify_driven(record, max_modes=2)
         own.append(own_errors(found, np.r_[np.abs(poles), -poles.real / np.abs(poles)]))
         feedthrough.append((found.feedthrough[:, 0] - direct) / found.feedthrough_std[:, 0])
     own = np.array(own)

@@ -34,7 +34,7 @@ def record(truth):
 
 
 def test_the_modes_that_are_there_and_no_others_at_the_bound(truth, record):
-    found, limit = identify_long([record], most_modes=99), cramer_rao_bound(truth, record, noise_std=1e-4)
+    found, limit = identify_long([record], max_modes=99), cramer_rao_bound(truth, record, noise_std=1e-4)
     assert found.modes.n_modes == truth.n_modes
     assert (np.abs(found.modes.omega - truth.omega) < 4 * limit.omega_std).all()
     assert (np.abs(found.modes.zeta - truth.zeta) < 4 * limit.zeta_std).all()
@@ -45,7 +45,7 @@ def test_the_modes_that_are_there_and_no_others_at_the_bound(truth, record):
 
 def test_the_same_as_one_mode_at_a_time(record):
     short = replace(record, outputs=record.outputs[:, :3000])
-    one, many = identify(short), identify_long([short], most_modes=99)
+    one, many = identify(short), identify_long([short], max_modes=99)
     assert many.modes.n_modes == one.modes.n_modes
     assert (np.abs(many.modes.omega - one.modes.omega) < 0.05 * one.refined.omega_std).all()
     assert np.allclose(many.statistic, one.statistic, rtol=0.02)
@@ -53,7 +53,7 @@ def test_the_same_as_one_mode_at_a_time(record):
 
 def test_a_record_without_noise(truth):
     clean = free_decay(truth, sample_time=1.0, n_samples=12_000)
-    found = identify_long([clean], most_modes=99)
+    found = identify_long([clean], max_modes=99)
     assert np.allclose(found.modes.omega, truth.omega, rtol=1e-8)
 
 
@@ -61,7 +61,7 @@ def test_a_record_without_noise(truth):
 def test_records_together_tell_more(truth):
     noise = 3e-3
     pair = [free_decay(truth, sample_time=1.0, n_samples=n, noise_std=noise, seed=n) for n in (8000, 6000)]
-    both, one = (identify_long(some, most_modes=99) for some in (pair, pair[:1]))
+    both, one = (identify_long(some, max_modes=99) for some in (pair, pair[:1]))
     assert both.modes.n_modes >= one.modes.n_modes >= 6
     near = np.abs(both.modes.omega[:, None] - one.modes.omega).argmin(axis=0)
     assert (both.refined.omega_std[near] < one.refined.omega_std).all()
@@ -70,9 +70,9 @@ def test_records_together_tell_more(truth):
 def test_a_long_record_takes_this_road_by_itself(record, monkeypatch):
     part = replace(record, outputs=record.outputs[:, :4000])
     monkeypatch.setattr(order, "ORDER", replace(order.ORDER, long=part.outputs.size - 1))
-    directly = one_blas_thread(identify_long)([part], most_modes=99)
+    directly = one_blas_thread(identify_long)([part], max_modes=99)
     assert np.array_equal(identify(part).modes.omega, directly.modes.omega)
-    assert identify(part, most_modes=2).modes.n_modes == 2
+    assert identify(part, max_modes=2).modes.n_modes == 2
 
 
 def test_noise_alone_is_refused():
@@ -85,7 +85,7 @@ def test_a_sensor_of_its_own_noise_and_unit(truth, record):
     rng = np.random.default_rng(3)
     outputs = record.outputs.copy()
     outputs[2] = 1e6 * (outputs[2] + 0.1 * rng.standard_normal(record.n_samples)) + 5e6
-    found = identify_long([replace(record, outputs=outputs)], most_modes=99)
+    found = identify_long([replace(record, outputs=outputs)], max_modes=99)
     assert found.modes.n_modes == truth.n_modes
     assert found.refined.noise_std[2] == pytest.approx(1e5, rel=0.05)
 
@@ -94,7 +94,7 @@ def test_noise_that_is_not_white_holds_no_modes(truth, record):
     white = np.random.default_rng(5).standard_normal(record.outputs.shape)
     coloured = lfilter([3e-4], [1.0, -0.9], white, axis=1)
     outputs = record.outputs + coloured
-    found = identify_long([replace(record, outputs=outputs)], most_modes=99)
+    found = identify_long([replace(record, outputs=outputs)], max_modes=99)
     away = np.abs(found.modes.omega[:, None] - truth.omega)
     assert (away.min(axis=1) < 1e-4 * found.modes.omega).all()
     assert found.modes.n_modes >= 6
@@ -104,14 +104,14 @@ def test_noise_that_is_not_white_holds_no_modes(truth, record):
 def test_a_mode_at_half_the_sample_rate_keeps_no_other_from_being_fitted():
     truth = modes([0.1, 0.1003, 0.2, 0.3, 0.49995], [0.002, 0.002, 0.004, 0.001, 0.01], 6)
     record = free_decay(truth, sample_time=1.0, n_samples=5000, noise_std=0.01, seed=1)
-    found, limit = identify_long([record], most_modes=99).modes, cramer_rao_bound(truth, record, noise_std=0.01)
+    found, limit = identify_long([record], max_modes=99).modes, cramer_rao_bound(truth, record, noise_std=0.01)
     assert found.n_modes == 5
     assert (np.abs(found.omega - truth.omega)[:4] < 4 * limit.omega_std[:4]).all()
 
 
 def test_the_first_modes_are_worth_the_wait(truth, record):
     """They were said not to be there where the time had gone before the search began."""
-    found = identify_long([record], most_modes=99, budget=Budget(1e-9))
+    found = identify_long([record], max_modes=99, budget=Budget(1e-9))
     assert found is not None and found.remarks
     strongest = [0, 1, 3, 5, 6]
     assert all(np.abs(found.modes.omega / omega - 1.0).min() < 0.01 for omega in truth.omega[strongest][:2])

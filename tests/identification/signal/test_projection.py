@@ -118,7 +118,7 @@ def test_errors_are_true_and_at_the_bound_where_one_record_is_ten_times_noisier(
 
 def test_modes_are_counted_by_the_quieter_record():
     """Both roads find the third mode, which the noisy record hides, and say the errors that the bound allows."""
-    for found in (identify(records(0)).refined, identify_long(records(0), most_modes=20).refined):
+    for found in (identify(records(0)).refined, identify_long(records(0), max_modes=20).refined):
         assert found.modes.n_modes == 3
         assert np.allclose(np.sqrt(np.diag(found.covariance)), least(), rtol=0.12)
 

@@ -21,6 +21,7 @@ from workbench.design.placement.limits import Limits, takes_former_limits
 from workbench.design.placement.placement import place_actuators
 from workbench.design.placement.scan import MOST_TRIED, allowed_places, scan
 from workbench.design.placement.task import Placement, PlacementTask
+from workbench.renamed import former_arguments
 from workbench.structure.domain import NamedPoints, Rectangle, listed
 from workbench.structure.printed import place_text
 from workbench.threads import cores, one_blas_thread
@@ -79,6 +80,7 @@ def _listed(places: np.ndarray) -> str:
     return "; ".join(each) if places.ndim > 1 else ", ".join(each)
 
 
+@former_arguments(most_cells="max_cells")
 @takes_former_limits
 @one_blas_thread
 def certify(
@@ -88,7 +90,7 @@ def certify(
     placement: Placement | None = None,
     gap: float = 0.01,
     seconds: float = 600.0,
-    most_cells: int = 200_000_000,
+    max_cells: int = 200_000_000,
     progress: Progress | None = None,
 ) -> Certificate:
     """A certificate that no placement under the limits has less residual work by more than a gap, by branch and bound.
@@ -99,7 +101,7 @@ def certify(
     Args:
         placement: that of `place` unless given.
         gap: share of W_R to be proven.
-        seconds, most_cells: after which the search stops with the bound that it has reached.
+        seconds, max_cells: after which the search stops with the bound that it has reached.
         progress: called with the bound, W_R of the placement and the cells bounded so far.
 
     Raises:
@@ -123,7 +125,7 @@ def certify(
         found = least.positions if least.residual_work < best.residual_work * (1.0 - gap) else None
         bound = min(least.residual_work, best.residual_work)
         return Certificate(best, bound, tried, True, found, seconds=time.monotonic() - began)
-    return _Search(task, limits, best, gap).run(seconds, most_cells, progress)
+    return _Search(task, limits, best, gap).run(seconds, max_cells, progress)
 
 
 class _Search:
@@ -139,7 +141,7 @@ class _Search:
         self._stuck_cell: np.ndarray | None = None
         self.cells = 0
 
-    def run(self, seconds: float, most_cells: int, progress: Progress | None) -> Certificate:
+    def run(self, seconds: float, max_cells: int, progress: Progress | None) -> Certificate:
         n = self._task.n_controlled
         level = range(2**START_LEVEL - 1, 2 ** (START_LEVEL + 1) - 1)
         cells = np.array(list(combinations_with_replacement(level, n)), np.int64).reshape(-1, n)
@@ -154,7 +156,7 @@ class _Search:
                     return Certificate(self._best, 0.0, self.cells, False, better, seconds=spent)
                 if progress is not None:
                     progress(self._lowest()[0] ** 2, self._best.residual_work, self.cells)
-                if spent > seconds or self.cells > most_cells:
+                if spent > seconds or self.cells > max_cells:
                     break
                 shelf = next((s for s in self._shelves if s), None)
                 cells = self._halved(_taken(shelf)) if shelf else cells[:0]

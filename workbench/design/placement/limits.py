@@ -13,7 +13,7 @@ import numpy as np
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.structure.domain import SLACK, Interval, NamedPoints, Place, Rectangle, position, reach, same_place
 
 TOLERANCE = 2e-6
@@ -26,19 +26,6 @@ Zone = tuple[Place, Place]
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-
-def _also_takes_margin(limits: Callable[P, R]) -> Callable[P, R]:
-    """The constructor with the former name of `edge_distance` too."""
-
-    @wraps(limits)
-    def with_former(*args: P.args, **kwargs: P.kwargs) -> R:
-        if "margin" in kwargs:
-            warn("Limits(margin=...) is now Limits(edge_distance=...)", DeprecationWarning, 2)
-            kwargs["edge_distance"] = kwargs.pop("margin")
-        return limits(*args, **kwargs)
-
-    return with_former
 
 
 @dataclass(frozen=True)
@@ -189,7 +176,7 @@ class Limits:
         return all(excess[0] <= TOLERANCE for excess in violations.values())
 
 
-Limits.__init__ = _also_takes_margin(Limits.__init__)  # type: ignore[method-assign]
+Limits.__init__ = former_arguments(margin="edge_distance")(Limits.__init__)  # type: ignore[method-assign]
 
 FORMER = {"effort_limit": "effort", "peak_limit": "peak_force", "condition_limit": "condition"}
 FORMER |= {"margin": "edge_distance", **{name: name for name in ("spacing", "forbidden", "candidates")}}

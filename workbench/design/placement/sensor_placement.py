@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from warnings import warn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +16,7 @@ from scipy.optimize import minimize
 from workbench.design.estimation.modal_filter import filter_of_mass
 from workbench.design.laws.law import DesignError, controlled_indices
 from workbench.design.placement.places import as_places
+from workbench.renamed import former_arguments
 from workbench.structure.domain import Interval, Place, Rectangle, listed, same_place
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, counted, place_text
@@ -84,6 +84,7 @@ def _error_by_mode(
     return np.asarray((seen**2).sum(axis=0) * e / e[index].sum())
 
 
+@former_arguments(mass_per_length="mass", most_tried="max_tried")
 @one_blas_thread
 def place_sensors(
     modes: Modes,
@@ -94,13 +95,12 @@ def place_sensors(
     mean_squares: ArrayLike,
     candidates: ArrayLike | None = None,
     starts: int = 3,
-    most_tried: int = 2000,
+    max_tried: int = 2000,
     seed: int = 0,
-    mass_per_length: ProfileLike | None = None,
 ) -> SensorPlacement:
     """Places of `count` displacement sensors among candidates for the least error of the filter.
 
-    Every choice is tried where there are at most `most_tried`; else sensors are exchanged one by one from even places
+    Every choice is tried where there are at most `max_tried`; else sensors are exchanged one by one from even places
     and random ones until no exchange helps, and along a structure, where no candidates were given, moved freely from
     there.
 
@@ -111,7 +111,6 @@ def place_sensors(
         mean_squares: (n_modes,) of the modal coordinates.
         candidates: places of the domain: (n_candidates,) m, (n_candidates, 2) m or names; unless given, 39 even places,
             a grid over the surface, or every point that is a displacement.
-        mass_per_length: the former name of mass.
 
     Raises:
         DesignError: fewer candidates than sensors, candidates of which no choice makes a filter, or mean squares that
@@ -121,9 +120,6 @@ def place_sensors(
     e = np.asarray(mean_squares, float)
     if e.shape != (modes.n_modes,) or (e < 0).any() or not e[list(index)].sum() > 0:
         raise DesignError(f"mean squares are needed of all {modes.n_modes} modes, none negative; got {e}")
-    if mass_per_length is not None:
-        warn("place_sensors(mass_per_length=...) is now place_sensors(mass=...)", DeprecationWarning, stacklevel=3)
-        mass = mass_per_length
     grid = _candidates(modes, candidates)
     if not 1 <= count <= len(grid):
         raise DesignError(f"{count} sensors cannot stand at {len(grid)} candidate places; allow more")
@@ -145,7 +141,7 @@ def place_sensors(
     first = np.unique(np.round(np.linspace(0, len(grid) - 1, count + 2)[1:-1]).astype(int))
     spread = [tuple(map(int, first))] if first.size == count else []
     even = filter_error(modes, index, evenly, mass, e) if along else min(map(error, spread), default=np.inf)
-    exhaustive = comb(len(grid), count) <= most_tried
+    exhaustive = comb(len(grid), count) <= max_tried
     if exhaustive:
         best = min(combinations(range(len(grid)), count), key=error)
     else:

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
-from warnings import warn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +18,7 @@ from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError, Law, weighed_states
 from workbench.design.placement.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
+from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, Interval, NamedPoints, Patch, Rectangle, centred_at, listed, reach
@@ -214,6 +214,7 @@ class PlacementTask(Printed):
         return float(0.5 * (largest * (inverse @ self.envelope).sum()) ** 2 * series)
 
 
+@former_arguments(chances="probabilities")
 def placement_task(
     modes: Modes,
     n_controlled: int,
@@ -224,7 +225,6 @@ def placement_task(
     probabilities: ArrayLike | None = None,
     final_time: float = np.inf,
     actuator: Actuator | None = None,
-    chances: ArrayLike | None = None,
 ) -> PlacementTask:
     """The task for an impulse (N s) at a place, or at any of several, IMSC with control weight R (5.43).
 
@@ -241,7 +241,6 @@ def placement_task(
         probabilities: (n_places,) of each place; even unless given.
         final_time: t_f; work is counted up to it.
         actuator: what is to be placed, a point force unless given; a `piezo_patch` or a moment, with its gain.
-        chances: the former name of probabilities.
 
     Raises:
         DesignError: no residual mode, an impulse that moves nothing, probabilities that are none, or a time that is not
@@ -253,9 +252,6 @@ def placement_task(
         raise DesignError(f"the final time must be positive; got {final_time}")
     if not np.isfinite(impulse) or impulse == 0:
         raise DesignError(f"the impulse must be finite and not 0, N s; got {impulse}")
-    if chances is not None:
-        warn("placement_task(chances=...) is now placement_task(probabilities=...)", DeprecationWarning, stacklevel=2)
-        probabilities = chances
     places = listed(as_places(modes.domain, impulse_at))
     if modes.are_still(places).all():
         raise DesignError(f"an impulse at {impulse_at} moves no mode: a support holds that place; give another")

@@ -13,6 +13,7 @@ import numpy as np
 from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_with
+from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes
 from workbench.threads import one_blas_thread
@@ -50,6 +51,7 @@ class _Setting:
     share: float = 1.0
 
 
+@former_arguments(most_added="max_added")
 @one_blas_thread
 def spillover_remedies(
     modes: Modes,
@@ -58,7 +60,7 @@ def spillover_remedies(
     sensors: Sequence[float],
     *,
     margin: float = 0.0,
-    most_added: int = 6,
+    max_added: int = 6,
 ) -> tuple[Remedy, ...]:
     """One remedy of each kind that has one, each verified on the full plant.
 
@@ -67,7 +69,7 @@ def spillover_remedies(
         redesign: the way the controller was designed.
         actuators, sensors: as they stand; sensors by place, m.
         margin: wanted of the rightmost pole, 1/s; 0 for stability alone.
-        most_added: sensors to try.
+        max_added: sensors to try.
     """
     start = _Setting(tuple(actuators), tuple(sorted(float(x) for x in sensors)))
 
@@ -101,7 +103,7 @@ def spillover_remedies(
                     best = size, name, at + way * size, move(way * size)
         if best is not None:
             found.append(remedy(kind, f"{best[1]} moved to x = {best[2]:.4g}", best[0], best[3]))
-    added = _added(start, met, modes.length, most_added)
+    added = _added(start, met, modes.length, max_added)
     if added is not None:
         new = sorted(set(added.sensors) - set(start.sensors))
         where = ", ".join(f"{x:.4g}" for x in new)

@@ -62,18 +62,18 @@ LONG = LongSettings()
 
 
 def identify_long(
-    records: Sequence[Record], *, most_modes: int, false_alarm: float = FALSE_ALARM, budget: Budget | None = None
+    records: Sequence[Record], *, max_modes: int, false_alarm: float = FALSE_ALARM, budget: Budget | None = None
 ) -> Identified | None:
     """The modes of long records, as many as there are; None where none rises above the noise.
 
     Args:
         records: free decay in white noise, of the same sensors at one rate; each output may hold a constant.
-        most_modes: where to stop at the latest.
+        max_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
         budget: of time; none unless given.
     """
     measured = _Search(records, false_alarm, budget or Budget())
-    measured.run(most_modes)
+    measured.run(max_modes)
     apart = independent(records, [fit.residual.T for fit in measured.fits]) if measured.poles.size else None
     if apart is None:
         return measured.report(measured.statistic()) if measured.poles.size else None
@@ -81,7 +81,7 @@ def identify_long(
     mixed = _Search(apart[0], false_alarm, measured.budget)
     mixed.origins = measured.origins
     mixed.settle(measured.poles, LONG.steps)
-    mixed.run(most_modes)
+    mixed.run(max_modes)
     measured.rejected += mixed.rejected
     measured.settle(mixed.poles, FIT.most_steps)
     return measured.report(mixed.statistic()) if mixed.poles.size else None
@@ -112,14 +112,14 @@ class _Search:
         self.fine = np.zeros(1)
         self.settle(np.zeros(0, complex), 0)
 
-    def run(self, most_modes: int) -> None:
+    def run(self, max_modes: int) -> None:
         """Take in peaks, and leave out what is no mode, until none is higher than noise makes it."""
         fruitless = 0
         for _ in range(LONG.most_rounds):
             before = self.poles.size
             # The first modes are worth the wait.
             ended = fruitless >= LONG.most_fruitless or (before > 0 and self.budget.spent("search for further modes"))
-            peaks = np.zeros(0) if ended else self.peaks()[: max(most_modes - before, 0)]
+            peaks = np.zeros(0) if ended else self.peaks()[: max(max_modes - before, 0)]
             if peaks.size:
                 self.take_in(peaks)
                 self.prune()

@@ -35,6 +35,7 @@ from workbench.identification.signal.searches import (
     spurious_modes,
 )
 from workbench.records.record import Record
+from workbench.renamed import former_arguments
 from workbench.threads import one_blas_thread
 
 
@@ -43,7 +44,7 @@ class OrderSettings:
     """Constants of the selection of modes of a free decay, beside those of every selection (`searches.SELECTION`)."""
 
     long: int = 100_000  # values in all from which modes are taken in many at a time
-    most_modes: int = 40  # unless the call says more: fits of more at once take minutes
+    max_modes: int = 40  # unless the call says more: fits of more at once take minutes
     whitened: int = 2  # times that coloured noise is learnt from the residual, and the modes from it in turn
     # candidates below the limit one after the other, and candidates that split a mode, after which the search ends
     most_weak: int = 2
@@ -67,11 +68,12 @@ DECIDES: Mapping[str, Any] = {"most_steps": SELECTION.few_steps, "enough": ORDER
 FULLY: Mapping[str, Any] = {}
 
 
+@former_arguments(most_modes="max_modes")
 @one_blas_thread
 def identify(
     records: Record | Sequence[Record],
     *,
-    most_modes: int | None = None,
+    max_modes: int | None = None,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
@@ -82,7 +84,7 @@ def identify(
 
     Args:
         records: free decay in noise, of the same sensors at one rate; each output may hold a constant.
-        most_modes: where to stop at the latest; 40 unless given, and 400 in long records.
+        max_modes: where to stop at the latest; 40 unless given, and 400 in long records.
         false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
             limit.
@@ -93,12 +95,12 @@ def identify(
             sensors or rate; too few samples.
     """
     records = of_same_sensors(records)
-    found = identify_within(records, Budget(seconds, progress), most_modes=most_modes, false_alarm=false_alarm)
+    found = identify_within(records, Budget(seconds, progress), max_modes=max_modes, false_alarm=false_alarm)
     return found.without_artefacts(np.pi / records[0].sample_time)
 
 
 def identify_within(
-    records: Sequence[Record], budget: Budget, *, most_modes: int | None = None, false_alarm: float = FALSE_ALARM
+    records: Sequence[Record], budget: Budget, *, max_modes: int | None = None, false_alarm: float = FALSE_ALARM
 ) -> Identified:
     """`identify`, on a budget that others share, artefacts included."""
     for record in records:
@@ -108,10 +110,10 @@ def identify_within(
     if fit_in < 1:
         raise ValueError(f"record {shortest.name!r} has {shortest.n_samples} samples; a mode needs 7: measure longer")
     if sum(r.outputs.size for r in records) > ORDER.long:
-        most = min(most_modes or 10 * ORDER.most_modes, fit_in)
-        found = identify_long(records, most_modes=most, false_alarm=false_alarm, budget=budget)
+        most = min(max_modes or 10 * ORDER.max_modes, fit_in)
+        found = identify_long(records, max_modes=most, false_alarm=false_alarm, budget=budget)
         return found if found is not None else _refuse(records)
-    most = min(most_modes or ORDER.most_modes, fit_in)
+    most = min(max_modes or ORDER.max_modes, fit_in)
     search_time = budget.share(SELECTION.search_share)
     verdicts: Verdicts = []
     problem, model = _selected(records, most, false_alarm, search_time, records, verdicts)
@@ -134,14 +136,14 @@ def identify_within(
 
 def _selected(
     records: Sequence[Record],
-    most_modes: int,
+    max_modes: int,
     false_alarm: float,
     budget: Budget,
     measured: Sequence[Record],
     verdicts: "Verdicts",
 ) -> tuple["_FreeDecay", "_Model"]:
     problem = _FreeDecay(records, false_alarm, measured, budget, verdicts)
-    selection = Stepwise(problem, most_modes, ORDER.most_weak, ORDER.most_splits, forgets=False, budget=budget)
+    selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, forgets=False, budget=budget)
     model = selection.select(problem.nothing)
     problem.rejected = selection.rejected
     return problem, model

@@ -68,7 +68,7 @@ class Selected:
 def select_modes(
     data: Measurement,
     *,
-    most_modes: int,
+    max_modes: int,
     false_alarm: float = FALSE_ALARM,
     budget: Budget | None = None,
     start: Fit | None = None,
@@ -77,14 +77,14 @@ def select_modes(
 
     Args:
         data: the measurement.
-        most_modes: where to stop at the latest.
+        max_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
         budget: of time; none unless given.
         start: modes to start from, of whatever fit; none unless given.
     """
     budget = Budget() if budget is None else budget
     problem = _Modes(data, false_alarm, budget)
-    selection = Stepwise(problem, most_modes, ORDER.most_weak, None, forgets=True, budget=budget)
+    selection = Stepwise(problem, max_modes, ORDER.most_weak, None, forgets=True, budget=budget)
     fit = projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex))
     if start is not None and start.poles.size:
         try:

@@ -281,7 +281,7 @@ class Stepwise(Generic[Model, Candidate]):
 
     Attributes:
         problem: see `Selection`.
-        most_modes: where to stop at the latest.
+        max_modes: where to stop at the latest.
         most_weak: candidates below the threshold, one after the other, from which on only noise is left.
         most_splits: candidates that split a mode before the search ends; None where they count as weak ones.
         forgets: whether a rejected candidate may be tried again once another mode has entered.
@@ -291,7 +291,7 @@ class Stepwise(Generic[Model, Candidate]):
     """
 
     problem: Selection[Model, Candidate]
-    most_modes: float
+    max_modes: float
     most_weak: float
     most_splits: int | None
     forgets: bool
@@ -305,7 +305,7 @@ class Stepwise(Generic[Model, Candidate]):
             before = self.problem.n_modes(model)
             grown = self.forward(model)
             most = self.problem.n_modes(grown)
-            self.full = most >= self.most_modes
+            self.full = most >= self.max_modes
             if grown is model:
                 break
             model = self.backward(self.problem.settled(grown))
@@ -322,7 +322,7 @@ class Stepwise(Generic[Model, Candidate]):
         if self.forgets:
             self.rejected.clear()
         while (
-            self.problem.n_modes(model) < self.most_modes
+            self.problem.n_modes(model) < self.max_modes
             and weak < self.most_weak
             and (self.most_splits is None or splits < self.most_splits)
             # The first mode is worth the wait.

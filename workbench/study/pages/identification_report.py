@@ -79,7 +79,7 @@ def identification_report(
             raise ValueError("transfer functions have no time: leave --start and --ambient out; --band-hz sets a band")
         one, most = transfer[0], MOST_MODES if n_modes is None else n_modes
         found = identify_transfer(
-            one.values, one.frequencies_hz, channels=one.output_channels, band_hz=band_hz, most_modes=most, **on
+            one.values, one.frequencies_hz, channels=one.output_channels, band_hz=band_hz, max_modes=most, **on
         )
         return of_transfer(found, one)
     if band_hz is not None:
@@ -93,7 +93,7 @@ def identification_report(
         check_data_quality(record)
     if not ambient:
         most = MOST_MODES if n_modes is None else n_modes
-        return of_driven(identify_driven(records, most_modes=most, **on), records)
+        return of_driven(identify_driven(records, max_modes=most, **on), records)
     if len(records) > 1 or records[0].n_inputs:
         raise ValueError(
             f"ambient forces are unknown and act all along one record; got {len(records)} records with"
