@@ -519,7 +519,7 @@ def test_a_mode_that_changes_with_amplitude_is_one_mode_with_a_remark(n_outputs)
 
 
 @pytest.mark.slow
-def test_max_modes_that_change_with_amplitude_are_one():
+def test_most_modes_that_change_with_amplitude_are_one():
     """Of the others some are told as several modes, some have no remark or one on a neighbour too."""
     assert np.mean([is_seen_to_stiffen(identify_driven(stiffening(seed))) for seed in range(10, 20)]) >= 0.5
 
@@ -548,7 +548,7 @@ def test_what_a_hardening_spring_adds_to_each_resonance_is_no_mode(n_outputs):
     found = identify_driven(hardening(3, n_outputs), seconds=200.0)  # the answer, not how fast this host is
     assert found.modes.frequencies_hz == pytest.approx([4.75, 9.47, 12.97], rel=0.004)
     assert found.modes.zeta == pytest.approx([0.0085, 0.0123, 0.0166], rel=0.15)
-    assert any("something is nonlinear" in remark and "mode 1 (" in remark for remark in found.remarks)
+    assert any("nonlinearity" in remark and "mode 1 (" in remark for remark in found.remarks)
 
 
 def test_half_a_record_that_ends_before_the_inputs_act_tells_nothing():
