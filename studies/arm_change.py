@@ -218,7 +218,7 @@ def _plot_responses(before, after, rig, corrected):
             ax.loglog(*_response(record, outputs), color=colour, linestyle=style, label=label)
         ax.set(title=f"{record.name} the change", xlabel="frequency [Hz]")
         ax.legend()
-    axes[0].set_ylabel("hub angle over drive [counts]")
+    axes[0].set_ylabel("|hub angle / drive| [counts/count]")
     return figure
 
 
@@ -226,6 +226,6 @@ def _plot_place(places, shares, lowest):
     figure, ax = new_figure(1, 1, width=8, height=3.4)
     ax.plot(1e3 * places, shares, "o-", color=COLOURS[0])
     ax.axvspan(1e3 * lowest, 1e3 * places[-1], color=COLOURS[2], alpha=0.2, label="not excluded (95 %)")
-    ax.set(xlabel="distance of the mass from the clamp [mm]", ylabel="power left, over that at the tip")
+    ax.set(xlabel="distance of the mass from the clamp [mm]", ylabel="residual power / that of a mass at the tip [-]")
     ax.legend()
     return figure

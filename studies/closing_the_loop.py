@@ -258,8 +258,8 @@ def _figure(rows):
     ax.axhline(1.0, color=GREY, linewidth=0.8)
     ax.set(
         yscale="log",
-        xlabel="hidden plant, in the order of what the nominal design costs",
-        ylabel="cost over that of the\ndesign on the true effects",
+        xlabel="simulated plants, sorted by the cost of the nominal controller",
+        ylabel="cost / that of the design\non the true effects [-]",
     )
     ax.legend(fontsize=8)
     return figure

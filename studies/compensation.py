@@ -234,9 +234,9 @@ def _figure(lost):
             for end, (who, colour, shift) in zip(ends, designs, strict=True):
                 ax.plot(i + shift, end, markers[_state(row[name][who])], color=colour, markersize=4)
         ax.axhline(1.0, color=GREY, linewidth=0.8)
-        ax.set(yscale="log", xlabel="hidden plant that loses time", title=name)
+        ax.set(yscale="log", xlabel="simulated plants slowed by their effects", title=name)
         ax.set_xticks([])
-    axes[0].set_ylabel("settling time over that\nwithout the effect")
+    axes[0].set_ylabel("settling time / that\nwithout the effect [-]")
     handles = [Line2D([], [], marker="o", linewidth=0, color=colour, label=who) for who, colour, _ in designs]
     handles += [Line2D([], [], marker=m, linewidth=0, color="black", label=state) for state, m in markers.items()]
     axes[0].legend(handles=handles, fontsize=8)

@@ -152,9 +152,9 @@ def plot_joint(at, lines, effect, loop):
         left.plot([0.0, WIDTH], [y, y], color=COLOURS[2], linewidth=7, alpha=0.6, zorder=2.5)
     arrow = {"arrowstyle": "<->", "color": COLOURS[2], "linewidth": 2.5}
     left.annotate("", (1.12 * WIDTH, low), (1.12 * WIDTH, high), arrowprops=arrow)
-    label = f"found: {effect.kind.words}\nbetween these floors, sideways"
+    label = f"identified: {effect.kind.words}\nbetween these floors, in x"
     left.plot([], [], color=COLOURS[2], linewidth=7, alpha=0.6, label=label)
-    left.set(aspect="equal", title="where", xlim=(-0.08, 1.2 * WIDTH))
+    left.set(aspect="equal", title="location of the joint", xlim=(-0.08, 1.2 * WIDTH))
     left.axis("off")
     left.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), fontsize=9)
     values = effect.values
@@ -164,7 +164,7 @@ def plot_joint(at, lines, effect, loop):
             force += part - (abs(part) * force + part * abs(force)) / (2.0 * values["yield_displacement"])
         found.append(values["stiffness"] * force)
     right.plot(1e3 * loop[:, 0], loop[:, 1], color=COLOURS[6], linewidth=4, alpha=0.35, label="real joint")
-    right.plot(1e3 * loop[:, 0], np.array(found), color=COLOURS[2], linewidth=0.8, label="law found")
-    right.set(xlabel="stretch of the joint [mm]", ylabel="force [N]", title="its law")
+    right.plot(1e3 * loop[:, 0], np.array(found), color=COLOURS[2], linewidth=0.8, label="identified law")
+    right.set(xlabel="stretch of the joint [mm]", ylabel="force [N]", title="force versus stretch of the joint")
     right.legend()
     return figure

@@ -41,11 +41,11 @@ DAMPED, FINAL_TIME = 0.2, 200.0
 # of frequencies, damping and shapes, to which every design is put
 ERRORS, DRAWS = 0.05, 60
 FIGURES = {
-    "cost": "cost",
-    "effort": "effort",
-    "spilled": "spillover W_R",
-    "stable_share": f"stable on, of models\n{ERRORS:.0%} wrong",
-    "design_time": "time to design,\nrelative to the first",
+    "cost": "cost J",
+    "effort": "effort [N² s]",
+    "spilled": "spillover W_R [J]",
+    "stable_share": f"share of models stable,\nperturbed by {ERRORS:.0%}",
+    "design_time": "time to design\n/ that of the first",
 }
 
 
@@ -213,10 +213,10 @@ def study(outcome, data=None):
     outcome.table("poles", gains_by_poles)
 
     spread, near = every_design((1.5, 3.5, 6.5, 8.5)), every_design((1.3, 2.6, 3.9, 5.2))
-    for name, found, where in (("designs", near, "close together"), ("designs_spread", spread, "spread")):
+    for name, found, where in (("designs", near, "closely spaced"), ("designs_spread", spread, "spread")):
         outcome.table(name, found)
-        title = f"four modes of a beam after the same impulse, actuators {where}; less is better but in the fourth"
-        caption = f"Every law on every way to know the state, actuators {where}, nine sensors."
+        title = f"control of four beam modes after an impulse, {where} actuators (less is better; more in the fourth)"
+        caption = f"Every law on every way to know the state, {where} actuators, nine sensors."
         outcome.figure(name, plot_designs(found, FIGURES, title), caption)
 
     def of(rows, law, state="exact coordinates"):
@@ -224,7 +224,7 @@ def study(outcome, data=None):
         return row
 
     outcome.check(
-        "close together: margin of IMSC through the modal filter, that spread ones have",
+        "closely spaced: stability margin of IMSC through the modal filter, 1/s",
         of(near, "IMSC, Riccati", "modal filter")["margin"],
         0.0,
     )

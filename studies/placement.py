@@ -64,7 +64,7 @@ def study(outcome, data=None):
     )
     outcome.figure(
         "front",
-        plot_effort_front(front, {"nodes of mode 5": nodes, "effort limit 1.5 times theirs": best}),
+        plot_effort_front(front, {"nodes of mode 5": nodes, "optimum at 1.5 × their effort": best}),
         "Least spillover at each effort, and where the actuators then stand.",
     )
     assert np.all(np.diff(best.positions) >= SPACING - 1e-6)

@@ -28,7 +28,7 @@ def study(outcome, data=None):
     beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
     modes = beam.modes(9)
     places = np.linspace(0.5, 9.5, 19)
-    disturbances = {"an impulse at 6.3": 6.3, "an impulse anywhere": places}
+    disturbances = {"an impulse at x = 6.3 m": 6.3, "an impulse anywhere": places}
 
     fronts, nodes = {}, {}
     for name, at in disturbances.items():

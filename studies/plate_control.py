@@ -123,7 +123,7 @@ def study(outcome, data=None):
     struck = impulse_state(truth, STRUCK_AT, 1e-3)
     time = np.linspace(0.0, 60.0 / truth.omega[0], 1500)
     nothing = Law(np.zeros_like(law.gain), law.controlled, law.actuators, "none")
-    loops = {"free": nothing, "controlled": law, "designed on the plate itself": exact}
+    loops = {"uncontrolled": nothing, "controlled": law, "designed on the plate itself": exact}
     responses = {name: initial_response(close_loop(truth, each), struck, time) for name, each in loops.items()}
     outcome.check(
         "stability margin of the plate under the identified law, 1/s", close_loop(truth, law).margin, 0.0, True
@@ -134,7 +134,7 @@ def study(outcome, data=None):
     }
     outcome.table("energy left in the controlled modes", kept)
     outcome.check(
-        "energy left in the controlled modes against none controlled", kept["controlled"] / kept["free"], 0.02
+        "energy left in the controlled modes against none controlled", kept["controlled"] / kept["uncontrolled"], 0.02
     )
 
     undamped = Modes(truth.omega, np.zeros(N_MODES), truth.shapes, truth.domain)
@@ -147,7 +147,7 @@ def study(outcome, data=None):
     outcome.check("W_r in closed form against quadrature, relative to W_R", difference, 1e-8)
     outcome.say(f"{found.n_modes} modes identified, their frequencies to {error:.1e}")
     outcome.say(
-        f"after {time[-1]:.2f} s the controlled modes keep {kept['controlled']:.1e} of their energy, {kept['free']:.2g}"
+        f"after {time[-1]:.2f} s the controlled modes keep {kept['controlled']:.1e} of their energy, {kept['uncontrolled']:.2g}"
         " without control"
     )
 
@@ -160,7 +160,7 @@ def study(outcome, data=None):
     outcome.figure(
         "motion",
         plot_surface_motion(
-            {name: responses[name] for name in ("free", "controlled")},
+            {name: responses[name] for name in ("uncontrolled", "controlled")},
             [time[i] for i in (40, 220, 480, 900, 1499)],
             actuators=SHAKERS,
             impulse_at=STRUCK_AT,

@@ -34,19 +34,19 @@ def peers_errors(
                 ax.plot([middle, middle], [row - 0.22, row + 0.3], color="black", lw=2.2)
             missed, false = (sum(s[what] for s in scores) for what in ("missed", "false"))
             ratio = sum(s["seconds"] for s in scores) / ours
-            time = "" if row == 0 else f", {ratio:.2g} × our time"
+            time = "" if row == 0 else f", {ratio:.2g} × time of this package"
             look = {"fontsize": 8.5, "color": GREY if missed + false == 0 else "black"}
             place = {"ha": "right", "va": "center", "transform": ax.get_yaxis_transform()}
             ax.text(0.99, row - 0.38, f"{missed} missed, {false} false{time}", **look, **place)
         ax.axvline(efficient[level], color=GREY, lw=3, alpha=0.5, zorder=0)
-        ax.set(xscale="log", xlabel="error of the worst mode\n[standard errors of the bound]")
-        ax.set_title(f"noise {level} dB below the record")
+        ax.set(xscale="log", xlabel="error of the worst mode\n/ Cramér-Rao standard deviation [-]")
+        ax.set_title(f"signal-to-noise ratio {level} dB")
         ax.set_yticks(range(len(by_name)), list(by_name))
         ax.set_ylim(len(by_name) - 0.5, -0.6)
     handles = [
         Line2D([], [], marker="o", lw=0, color=GREY, label="a structure, all its modes found"),
         Line2D([], [], marker="o", lw=0, color=GREY, mfc="none", label="one with modes missed"),
-        Line2D([], [], color="black", lw=2.2, label="median (missed: infinite)"),
+        Line2D([], [], color="black", lw=2.2, label="median (a missed mode counts as infinite error)"),
         Line2D([], [], color=GREY, lw=3, alpha=0.5, label="median of a method that attains the bound"),
     ]
     figure.legend(handles=handles, loc="outside upper left", ncols=4)
@@ -79,8 +79,8 @@ def plot_bands(bands: Bands, exact: Modes | None = None, positions: Sequence[flo
         if len(positions):
             bottom.plot(positions, np.zeros(len(positions)), "|", color=GREY, ms=9, label="sensors")
         bottom.set_xlabel("x [m]")
-    axes[0, 0].set_ylabel("identified φ(x)")
-    axes[1, 0].set_ylabel("about the identified curve")
+    axes[0, 0].set_ylabel("identified φ [1/√kg]")
+    axes[1, 0].set_ylabel("deviation from it [1/√kg]")
     figure.legend(*axes[1, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
 
@@ -112,7 +112,7 @@ def size_and_errors(rows: Sequence[Mapping[str, Any]], errors: np.ndarray) -> Fi
     right.hist(errors.T, edges, density=True, label=("frequency", "damping"), color=COLOURS[:2], alpha=0.8)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     right.plot(x, normal, color=GREY, lw=3, alpha=0.7, label="a method that attains the bound")
-    right.set(xlabel="error of a mode [standard errors of the bound]", ylabel="density")
+    right.set(xlabel="error of a mode / Cramér-Rao standard deviation [-]", ylabel="density")
     right.set_ylim(top=1.35 * right.get_ylim()[1])  # room for the legend
     right.legend(loc="upper left")
     return figure
@@ -133,13 +133,17 @@ def records_errors(errors: Mapping[str, np.ndarray], summary: Mapping[str, Mappi
         ax.fill_between(x, row - bell, row + bell, color=GREY, alpha=0.25, lw=0)
         at = row + rng.uniform(-0.3, 0.3, spread.size) * np.exp(-0.5 * spread**2)
         ax.plot(spread, at, "o", ms=3, color=COLOURS[0], alpha=0.6, mew=0)
-        least = "the bound" if totals["bound"] == "Cramér-Rao" else "its own error"
-        text = f"{totals['over_bound']:.2f} times {least}\n{100 * totals['inside']:.0f} % in their intervals"
+        least = "bound" if totals["bound"] == "Cramér-Rao" else "estimated error"
+        text = (
+            f"rms error / {least} = {totals['over_bound']:.2f}\n{100 * totals['inside']:.0f} % in their 95 % intervals"
+        )
         ax.text(4.15, row, text, va="center", fontsize=8.5)
     ax.set_yticks(range(len(errors)), list(errors))
     ax.set(ylim=(len(errors) - 0.5, -0.5), xlim=(-4.0, 6.2))
     ax.set_xticks(range(-4, 5, 2))
-    ax.set_xlabel("error of a frequency or damping ratio [standard errors by the Cramér-Rao bound]")
+    ax.set_xlabel(
+        "error of a frequency or damping ratio / standard error (Cramér-Rao bound; of unknown forces, estimated)"
+    )
     handles = [
         Line2D([], [], marker="o", lw=0, color=COLOURS[0], ms=4, label="one estimate"),
         Line2D([], [], color=GREY, alpha=0.4, lw=8, label="what a method that attains the bound would show"),

@@ -124,7 +124,10 @@ def plot_filter_errors(counts: Sequence[int], errors: np.ndarray) -> Figure:
     figure, ax = new_figure(1, 1, width=9, height=4)
     for r in range(errors.shape[1]):
         ax.semilogy(counts, np.maximum(errors[:, r], 1e-7), "o-", label=f"mode {r + 1}", color=COLOURS[r % 7])
-    ax.set(xlabel="number of sensors (displacement and slope each)", ylabel="error of the modal coordinate, |û - u|")
+    ax.set(
+        xlabel="number of sensors (displacement and slope each)",
+        ylabel="error of the modal coordinate, |q̂ - q| [m √kg]",
+    )
     ax.set_title("error of modal filters against the number of sensors")
     ax.legend(ncols=2)
     return figure
@@ -197,10 +200,10 @@ def plot_spillover_paths(explained: Explanation) -> Figure:
     axes[0].plot(numbers, before, "_", color=COLOURS[6], markersize=16, mew=2, label="uncontrolled")
     axes[0].axhline(0.0, color=GREY, linewidth=0.8)
     axes[0].set(xlabel="residual mode", ylabel="growth rate Re λ [1/s]", xticks=numbers)
-    axes[0].set_title("above zero the full plant is unstable")
+    axes[0].set_title("real part of residual poles (above 0: unstable)")
     axes[0].legend()
     worst = explained.shifts[0]
-    labels = [f"sensor {place_text(p.sensor_at)} → {p.actuator}" for p in worst.paths] + ["all paths"]
+    labels = [f"sensor at {place_text(p.sensor_at)} → {p.actuator}" for p in worst.paths] + ["all paths"]
     shifts = np.array([p.shift.real for p in worst.paths] + [worst.shift.real])
     rows = np.arange(len(labels))[::-1]
     axes[1].barh(rows, shifts, color=[COLOURS[1] if s > 0 else COLOURS[0] for s in shifts])
@@ -252,7 +255,14 @@ def plot_placement_fronts(fronts: dict[str, Sequence[Placement]], rule: dict[str
     for (name, front), (above, below) in zip(fronts.items(), axes.T, strict=True):
         effort = [p.effort for p in front]
         above.plot(effort, [p.residual_work for p in front], "o-", color=COLOURS[0], label="optimum at each effort")
-        above.plot(rule[name].effort, rule[name].residual_work, "s", color=COLOURS[1], markersize=9, label="nodes rule")
+        above.plot(
+            rule[name].effort,
+            rule[name].residual_work,
+            "s",
+            color=COLOURS[1],
+            markersize=9,
+            label="nodes of the next mode",
+        )
         below.plot(effort, np.array([p.positions for p in front]), "o-", color=COLOURS[0], markersize=4)
         below.plot(np.full(rule[name].positions.size, rule[name].effort), rule[name].positions, "s", color=COLOURS[1])
         alone = np.ptp(effort) < 1e-3 * effort[0]
@@ -260,7 +270,7 @@ def plot_placement_fronts(fronts: dict[str, Sequence[Placement]], rule: dict[str
         above.set_ylim(bottom=0.0)
         above.legend()
         below.set(xlabel="effort ∫ FᵀF dt [N² s]")
-    axes[0, 0].set_ylabel("spillover work W_R")
+    axes[0, 0].set_ylabel("spillover work W_R [J]")
     axes[1, 0].set_ylabel("places of the actuators [m]")
     return figure
 
@@ -287,7 +297,9 @@ def plot_robustness(scales: Sequence[float], shares: dict[str, Any], spreads: di
     axes[0].set(ylabel="share of perturbed models that stay stable", ylim=(-0.03, 1.05))
     axes[0].set_title("robustness to the errors of identification, and to larger ones")
     axes[0].legend(loc="lower left")
-    axes[1].set(xlabel="errors, as multiples of the identified standard errors", ylabel="W_R, median and 90 %")
+    axes[1].set(
+        xlabel="errors, as multiples of the identified standard errors", ylabel="W_R [J], median and 90 % interval"
+    )
     return figure
 
 
@@ -300,7 +312,7 @@ def plot_drift(rows: Sequence[dict[str, Any]]) -> Figure:
         axes[0].plot(drift, [row["omega"][r] / first[r] for row in rows], color=GREY, label="true" if r == 0 else None)
         found = [row["found"][r] / first[r] for row in rows]
         axes[0].plot(drift, found, "osD"[r % 3], color=COLOURS[r], label=f"mode {r + 1}, identified in the loop")
-    axes[0].set(xlabel="drift of the stiffness [%]", ylabel="frequency over the nominal one")
+    axes[0].set(xlabel="drift of the stiffness [%]", ylabel="frequency / nominal frequency [-]")
     axes[0].legend()
     for key, label, mark in (
         ("cost_of_the_old_law", "nominal law", "o-"),
@@ -331,14 +343,14 @@ def plot_switching(law: OnOffLaw, switched: Switched) -> Figure:
     handles, labels = axes[0].get_legend_handles_labels()
     once = dict(zip(labels, handles, strict=True))
     axes[0].legend(once.values(), once.keys(), loc="lower left")
-    axes[0].set(xlabel=f"q{r + 1}", ylabel=f"dq{r + 1}/dt", title=f"mode {r + 1} in the phase plane")
+    axes[0].set(xlabel=f"q{r + 1} [m √kg]", ylabel=f"dq{r + 1}/dt [m √kg/s]", title=f"mode {r + 1} in the phase plane")
     pushes = np.zeros(response.time.size)
     for s in stretches:
         tau = response.time - s.start
         inside = (tau >= 0) & (response.time <= s.end)
         pushes[inside] = s.steady + s.ramp * tau[inside] + s.fading * np.exp(-relay.slope * tau[inside])
     axes[1].plot(response.time, pushes, color=COLOURS[0])
-    axes[1].set(xlabel="time [s]", ylabel="modal force", title="modal force; its mean where the mode slides")
+    axes[1].set(xlabel="time [s]", ylabel="modal force [N/√kg]", title="modal force (its mean in the sliding mode)")
     return figure
 
 

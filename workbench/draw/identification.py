@@ -16,7 +16,7 @@ from workbench.records.record import Record
 from workbench.structure.modes import Modes, SampledModes
 
 SYMBOLS = {"omega": "frequency", "zeta": "damping ratio"}
-LABELS = ("printed in 1981", "two delays, as in 1981", "this project's default")
+LABELS = ("published in 1981", "Ibrahim, two delays", "this package, default")
 # the complex to real: seen on white and on black alike
 REAL = LinearSegmentedColormap.from_list("real", ["#8f979f", COLOURS[0]])
 Case = tuple[LocatedDamage, Callable[[np.ndarray], np.ndarray], np.ndarray]
@@ -85,10 +85,10 @@ def eigenfunction(found: Modes, exact: Modes, *, mode: int, positions: np.ndarra
     top.plot(x, truth, color=GREY, lw=4, alpha=0.6, label="exact")
     top.plot(x, sign * identified, color=COLOURS[0], label="identified")
     top.plot(positions, sign * found.phi(positions)[:, mode], "o", color=COLOURS[1], label="at the sensors")
-    top.set_ylabel(f"φ{mode + 1}(x), mass-normalised")
+    top.set_ylabel(f"φ{mode + 1}(x) [1/√kg]")
     top.legend(ncols=3)
     bottom.plot(x, sign * identified - truth, color=COLOURS[0])
-    bottom.set(ylabel="difference", xlabel="x [m]")
+    bottom.set(ylabel="difference [1/√kg]", xlabel="x [m]")
     return figure
 
 
@@ -97,7 +97,7 @@ def distribution_errors(
 ) -> Figure:
     """Errors of mass and stiffness along x; curves[m, terms, what] are (printed, cubic splines, default splines)."""
     figure, axes = new_figure(2, len(sensors), width=11, height=6, sharex=True, sharey=True)
-    labels = ("printed in 1981", "cubic splines", "this project's default")
+    labels = ("published in 1981", "cubic splines", "this package, default")
     for column, m in enumerate(sensors):
         for row, what in enumerate(("mass", "stiffness")):
             for curve, label, colour in zip(curves[m, terms, what], labels, (GREY, *COLOURS), strict=False):
@@ -105,8 +105,8 @@ def distribution_errors(
             axes[row, column].set_ylim(1e-8, 1e-1)
         axes[0, column].set_title(f"{m} sensors")
         axes[1, column].set_xlabel("x [m]")
-    axes[0, 0].set_ylabel("error of m(x)")
-    axes[1, 0].set_ylabel("error of EA(x)")
+    axes[0, 0].set_ylabel("error of m(x) [kg/m]")
+    axes[1, 0].set_ylabel("error of EA(x) [N]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure
 
@@ -174,13 +174,13 @@ def placement_on_shapes(modes: Modes, placements: Mapping[str, Any], *, n_contro
         colour = COLOURS[i + 1]
         level = bottom - 0.35 * (i + 1)
         left.plot(placement.positions, np.full(len(placement.positions), level), "^", color=colour, ms=9)
-        label = f"{name}: W_R = {placement.residual_work:.2e}, effort {placement.effort:.3g}"
+        label = f"{name}: W_R = {placement.residual_work:.2e} J, effort {placement.effort:.3g}"
         number = np.arange(n_controlled + 1, modes.n_modes + 1)
         work = np.maximum(placement.by_mode, 1e-12)
         right.bar(number + (i - 1) * width, work, width, bottom=1e-12, color=colour, label=label)
-    left.set(xlabel="x / length", ylabel="mode shape; actuators below")
+    left.set(xlabel="x / length", ylabel="mode shape [1/√kg]; triangles: actuators")
     left.legend(loc="upper center", ncols=2)
-    right.set(yscale="log", ylim=(1e-12, None), xticks=number, xlabel="residual mode", ylabel="residual work")
+    right.set(yscale="log", ylim=(1e-12, None), xticks=number, xlabel="residual mode", ylabel="spillover work W_r [J]")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure
 

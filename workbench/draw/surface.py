@@ -66,9 +66,9 @@ def plot_surface_modes(
         Line2D([], [], color="black", linewidth=1.2, label="nodal line: at rest"),
     ]
     if _held_edges(x, y, fields):
-        handles.append(Line2D([], [], color=COLOURS[6], linewidth=4, label="edge that is held"))
+        handles.append(Line2D([], [], color=COLOURS[6], linewidth=4, label="supported edge"))
     if places is not None:
-        label = "sensor" if values is None else "sensor, in the colour of what was found there"
+        label = "sensor" if values is None else "sensor (fill: identified value)"
         handles.append(Line2D([], [], **DOT, label=label))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
     return figure
@@ -139,7 +139,7 @@ def plot_surface_motion(
     for ax in grid.flat:
         _bare(ax, first.modes)
     a, b = cast(Rectangle, first.modes.domain).length
-    grid[-1, 0].set(xticks=[0.0, a], yticks=[0.0, b], xlabel="x, y [m]")
+    grid[-1, 0].set(xticks=[0.0, a], yticks=[0.0, b], xlabel="x [m]", ylabel="y [m]")
     ticks = [tick for tick in MaxNLocator(5).tick_values(-limit, limit) if abs(tick) <= limit]
     figure.colorbar(image, ax=grid, label="displacement [m]", shrink=0.8, ticks=ticks)
     handles, labels = grid[0, 0].get_legend_handles_labels()
