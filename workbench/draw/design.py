@@ -70,7 +70,7 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
     width = 0.8 / len(works)
     for i, (name, work) in enumerate(works.items()):
         numbers = first + 1 + np.arange(work.size)
-        ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, work, width, label=f"{name}: W_R = {work.sum():.3g}")
+        ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, work, width, label=f"{name}: W_R = {work.sum():.3g} J")
     ax.set(xticks=numbers, xlabel="residual mode", ylabel="spillover work in the mode, W_r [J]")
     ax.set_title("spillover work by residual mode")
     ax.legend()
@@ -88,7 +88,7 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
     for i, (name, work) in enumerate(spillovers.items()):
         at = modes + (i - 0.5 * (len(spillovers) - 1)) * width
         values = np.maximum(work.residual_work, 0.1 * least)
-        bars = ax.bar(at, values, width, label=f"{name}: W_R = {work.residual_total:.3g}")
+        bars = ax.bar(at, values, width, label=f"{name}: W_R = {work.residual_total:.3g} J")
         for x, value in zip(at, work.residual_work, strict=True):
             if value < least:
                 ax.text(x, 1.3 * least, "≈ 0", ha="center", color=bars.patches[0].get_facecolor())

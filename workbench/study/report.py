@@ -270,11 +270,11 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         for name, one, at in zip(names, placements, places, strict=True)
     ]
     first, bound = placements[0]["residual_work"], content.get("lower_bound")
-    proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g}."
+    proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g} J."
     n = len(content.get("controlled", ()))
     return {
         "title": "Actuator placement",
-        "lead": f"Actuators at {_between(places[0])} m leave spillover work W_R = {float(first):.4g}.{proof}",
+        "lead": f"Actuators at {_between(places[0])} m leave spillover work W_R = {float(first):.4g} J.{proof}",
         "standing": "good" if bound is not None else "",
         "lines": [f"The search: {placements[0]['status']}."],
         "blocks": [
