@@ -96,7 +96,7 @@ def test_a_design_says_which_loops_are_unstable(tmp_path):
 def test_a_placement_shows_where_and_how_surely(tmp_path):
     shown = page_content_in(written(tmp_path, PLACED))
     assert shown.lead.startswith("Actuators at 2, 6 m leave spillover work W_R = 0.25 J. ")
-    assert shown.lead.endswith("No placement within the limits has W_R below 0.2.")
+    assert shown.lead.endswith("No placement within the limits has W_R below 0.2 J.")
     [places] = [m for m in shown.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "line"]
     assert places["x"] == [2.0, 6.0]
 
