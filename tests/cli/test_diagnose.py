@@ -54,7 +54,7 @@ def test_a_validation_record_that_repeats_a_fit_record_is_refused(run, tmp_path,
 
 
 def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, monkeypatch, nothing_hidden):
-    rng, seen, real = np.random.default_rng(0), [], nothing_hidden
+    rng, seen, settled, real = np.random.default_rng(0), [], [], nothing_hidden
     dt = real.fit[0].sample_time
     rig = replace(real.rig, modes=real.rig.modes.select(range(2)), actuators=real.rig.actuators[:1], structure=None)
     for name, level in (("low", 1.0), ("high", 10.0)):
@@ -66,6 +66,7 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
 
     def search(rig, records, **options):
         seen.extend([rig, *records])
+        settled.append(options["settle"])
         raise ValueError("the search has begun")
 
     monkeypatch.setattr("workbench.gap.diagnose.diagnose", search)
@@ -81,3 +82,5 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
     assert "INPUT,OUTPUT" in run("diagnose", *options, "F1").output
     assert "driving_point is (input, output)" in run("diagnose", *options, "F1,nowhere").output
     assert "the search has begun" in run("diagnose", *options, f"F1,{real.rig.sensors[0].name}").output
+    options = (*options, f"F1,{real.rig.sensors[0].name}", "--settle", "0.5")
+    assert "the search has begun" in run("diagnose", *options).output and settled == [0.0, 0.0, 0.5]

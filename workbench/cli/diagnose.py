@@ -8,7 +8,7 @@ import typer
 
 from workbench.cli import options
 from workbench.cli.possible import write_verdict
-from workbench.cli.terminal import as_typed, check_target, guarded, names_in, reporting, say, short
+from workbench.cli.terminal import as_typed, by_options, check_target, guarded, names_in, reporting, say, short
 
 SHOWN_RIVALS = 3
 
@@ -42,6 +42,9 @@ def diagnose(
     as_wired: Annotated[
         bool, typer.Option("--as-wired", help="Go on in spite of faults of wiring and units, without correcting them.")
     ] = False,
+    settle: Annotated[
+        float, typer.Option(help="Time at the start of each record that is not counted, where it starts in motion, s.")
+    ] = 0.0,
     workers: Annotated[int | None, typer.Option(help="Processes sharing the work; one per core unless given.")] = None,
     seconds: Annotated[float, typer.Option(help="Processor time to search for, s; twice as long on one core.")] = 120.0,
 ) -> None:
@@ -76,13 +79,11 @@ def diagnose(
     elif case is not None:
         found = read_case(case)
     check_kept_apart(found.fit, found.validation)
-    faults = wiring(found.rig, found.fit)
+    faults = () if settle else wiring(found.rig, found.fit)
     for fault in faults:
         say(f"  {'corrected' if mend and fault.certain else 'wiring'}     {fault.sentence}")
     if any(fault.certain for fault in faults) and not (mend or as_wired):
-        raise ValueError(
-            "diagnose again with --mend to go on with this corrected, or with --as-wired to go on as it is"
-        )
+        raise ValueError("diagnose again with --mend to correct this and go on, or with --as-wired to go on as it is")
     if mend:
         rig, fit = mended(faults, found.rig, found.fit)
         found = replace(found, rig=rig, fit=fit, validation=mended(faults, found.rig, found.validation)[1])
@@ -93,6 +94,7 @@ def diagnose(
             validation=found.validation,
             name=found.name,
             free_nominal=free_nominal,
+            settle=settle,
             workers=workers,
             seconds=seconds,
             report=report,
@@ -115,7 +117,7 @@ def diagnose(
     for words, probability in verdict.rivals[:SHOWN_RIVALS]:
         say(f"  rival      {words} ({probability:.2g})")
     for note in verdict.notes:
-        say(f"  {note}")
+        say(f"  {by_options(note)}")
     if json_path is not None:
         write_verdict(verdict, json_path)
         say(f"  verdict    {short(json_path)}")

@@ -9,6 +9,7 @@ import typer
 from workbench.cli import options
 from workbench.cli.terminal import (
     as_typed,
+    by_options,
     check_target,
     guarded,
     names_in,
@@ -71,7 +72,7 @@ def identify(
             read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz, seconds=seconds, progress=report
         )
     as_read = dict.fromkeys(remark for measured in read for remark in getattr(measured, "remarks", ()))
-    lines = [line.replace("`seconds`", "--seconds") for line in found.lines]
+    lines = [by_options(line) for line in found.lines]
     found = replace(found, lines=(*lines, *(f"as read: {remark}" for remark in as_read)))
     say(found.heading, bold=True)
     show_table(HEADINGS, found.rows, right=[heading for heading in HEADINGS if "[" in heading])

@@ -59,6 +59,11 @@ def complain(fault: str) -> None:
     errors.print(f"workbench: {_one_line(fault)}", style="red")
 
 
+def by_options(text: str) -> str:
+    """The text with options where the library names arguments, such as `seconds`."""
+    return re.sub(r"`(\w+)`", lambda named: "--" + named[1].replace("_", "-"), text)
+
+
 def say(text: str, *, bold: bool = False) -> None:
     """Print a line as it stands."""
     console.print(text, style="bold" if bold else None)

@@ -278,7 +278,7 @@ def _notes(
     """What is said beside the sentence; `silent` are the sensors whose noise was not stated."""
     taken = f"noise_std of {', '.join(silent)} is not stated; it was taken from the records."
     seen = "The nearest set explains the records it was fitted to, but not the validation records: over-fitting."
-    cut = f"The search reached its limit of {seconds} s of processor time; the best set so far is reported (seconds=)."
+    cut = f"The search reached its limit of {seconds} s of processor time with this best set; allow more by `seconds`."
     notes = (
         *([taken] if silent else []),
         *([cut] if found.is_cut else []),
