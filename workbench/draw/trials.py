@@ -30,15 +30,16 @@ _ERRORS = {
     "mixed": "several of these",
     "triple": "no test errors, three effects",
 }
-BOTH, OTHER = "both effects", "another two"
+BOTH, OTHER, ALWAYS_RIGHT = "both effects", "another two", "always right"
+MANY = 12  # kinds that are shown one by one; of more, those that were always named have one row together
 
 
 def plot_confusion(tally: Tally) -> Figure:
-    """Hidden against named effects, one square a case or more; on the diagonal, the right answers."""
+    """True against diagnosed effects, one square a case or more; on the diagonal, the correct answers."""
     counts = _gathered(tally)
     rows = sorted({hidden for hidden, _ in counts}, key=_order)
     columns = rows + sorted({named for _, named in counts} - set(rows), key=_order)
-    figure, ax = new_figure(width=3.6 + 0.27 * len(columns), height=2.6 + 0.24 * len(rows))
+    figure, ax = new_figure(width=max(8.0, 3.6 + 0.27 * len(columns)), height=2.6 + 0.24 * len(rows))
     for (hidden, named), count in counts.items():
         x, y, right = columns.index(named), rows.index(hidden), hidden == named
         ax.add_patch(Rectangle((x - 0.46, y - 0.44), 0.92, 0.88, color=COLOURS[0 if right else 1], linewidth=0))
@@ -50,7 +51,8 @@ def plot_confusion(tally: Tally) -> Figure:
         xlim=(-0.6, len(columns) - 0.4), ylim=(len(rows) - 0.4, -0.6), xlabel="diagnosed effect", ylabel="true effect"
     )
     total = sum(of for _, of in tally.shares.values())
-    words = "; ".join(f"{_FAMILY[family]} {right} of {of}" for family, (right, of) in tally.shares.items())
+    each = [f"{_FAMILY[family]} {right} of {of}" for family, (right, of) in tally.shares.items()]
+    words = "\n".join("; ".join(each[i : i + 2]) for i in range(0, len(each), 2))
     ax.set_title(f"{total} blind cases; number of each, blue correct, orange wrong\n{words}")
     return figure
 
@@ -109,20 +111,29 @@ def plot_reliability(points: Sequence[Reliability]) -> Figure:
 
 
 def _gathered(tally: Tally) -> dict[tuple[str, str], int]:
-    """Counts with all pairs in one row and two columns."""
+    """Counts with all pairs in one row and two columns, and of many kinds those always named in one."""
     gathered: dict[tuple[str, str], int] = {}
+
+    def add(hidden: str, named: str, count: int) -> None:
+        gathered[hidden, named] = gathered.get((hidden, named), 0) + count
+
+    singles = {hidden for hidden, _ in tally.counts if " + " not in hidden} - {"none", "unknown"}
+    mixed_up = {name for pair in tally.counts if pair[0] != pair[1] for name in pair}
+    sure = singles - mixed_up if len(singles) > MANY else set()
     for (hidden, named), count in tally.counts.items():
         if " + " in hidden:
-            key = (BOTH, BOTH if named == hidden else OTHER if " + " in named else named)
+            add(BOTH, BOTH if named == hidden else OTHER if " + " in named else named, count)
+        elif hidden in sure:
+            add(ALWAYS_RIGHT, ALWAYS_RIGHT, count)
         else:
-            key = (hidden, OTHER if " + " in named else named)
-        gathered[key] = gathered.get(key, 0) + count
+            add(hidden, OTHER if " + " in named else named, count)
     return gathered
 
 
 def _order(name: str) -> tuple[int, str]:
-    return ({"none": 1, BOTH: 2, OTHER: 3, "unknown": 4}.get(name, 0), name)
+    return ({ALWAYS_RIGHT: 1, "none": 2, BOTH: 3, OTHER: 4, "unknown": 5}.get(name, 0), name)
 
 
 def _plain(name: str) -> str:
-    return {"none": "nothing", "unknown": "outside the catalogue"}.get(name, label_in_words(name))
+    plain = {"none": "nothing", "unknown": "outside the catalogue", ALWAYS_RIGHT: "one effect, always named"}
+    return plain.get(name, label_in_words(name))
