@@ -9,6 +9,7 @@ from matplotlib.patches import Rectangle
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.effect import label_in_words
 from workbench.structure.printed import counted
+from workbench.trials.dirt import CLEAN, TRIPLE
 from workbench.trials.scoring import Reliability, Tally
 
 _FAMILY = {
@@ -75,20 +76,23 @@ def plot_dirt(scores: Sequence[Mapping[str, Any]]) -> Figure:
     classes, sizes = list(dict.fromkeys(s["class"] for s in scores)), sorted({s["size"] for s in scores})
     figure, ax = new_figure(width=9, height=1.6 + 0.45 * len(classes))
     for row, name in enumerate(classes):
-        for column, size in enumerate(sizes):
-            there = [s for s in scores if s["class"] == name and s["size"] == size]
+        own = [s for s in scores if s["class"] == name]
+        by_size = [[s for s in own if s["size"] == size] for size in sizes]
+        shown = list(enumerate(by_size)) if name not in (CLEAN, TRIPLE) else [((len(sizes) - 1) / 2, own)]
+        for column, there in shown:
             if not there:
                 continue
-            share = sum(s["named"] for s in there) / len(there)
-            ax.barh(row + 0.27 * (column - (len(sizes) - 1) / 2), 100 * share, 0.24, color=COLOURS[column])
-            words = f"{sum(s['named'] for s in there)} of {len(there)}"
-            ax.text(101, row + 0.27 * (column - (len(sizes) - 1) / 2), words, va="center", fontsize=7)
+            at, named = row + 0.27 * (column - (len(sizes) - 1) / 2), sum(s["named"] for s in there)
+            colour = COLOURS[int(column)] if name not in (CLEAN, TRIPLE) else GREY
+            ax.barh(at, 100 * named / len(there), 0.24, color=colour)
+            ax.text(101, at, f"{named} of {len(there)}", va="center", fontsize=7)
     for column, size in enumerate(sizes):
-        ax.barh(0, 0, color=COLOURS[column], label=f"{size:g} × the errors of a careful test")
+        ax.barh(0, 0, color=COLOURS[column], label=f"{size:g} ×")
     ax.set_yticks(range(len(classes)), [_ERRORS[name] for name in classes])
     ax.set(xlim=(0, 112), ylim=(len(classes) - 0.4, -0.6), xlabel="correct verdicts [%]")
     ax.set_ylabel("class of test error")
-    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(sizes), fontsize=8)
+    title = "errors, relative to those of a careful test"
+    ax.legend(title=title, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(sizes), fontsize=8)
     return figure
 
 
