@@ -79,5 +79,5 @@ def test_a_hardening_spring_is_named_at_the_input_where_it_stands(case):
     assert labels == ["F", "w"]
     left, right = plot_unmodelled_force(verdict, length="V", force="V").axes
     assert "at F" in left.get_xlabel()
-    assert left.get_xlabel().startswith("displacement [V]") and right.get_xlabel().startswith("velocity [V/s]")
+    assert left.get_xlabel() == "displacement at F [V]" and right.get_xlabel() == "velocity at F [V/s]"
     assert left.get_ylabel() == "unmodelled force [V]"

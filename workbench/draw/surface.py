@@ -139,7 +139,7 @@ def plot_surface_motion(
     for ax in grid.flat:
         _bare(ax, first.modes)
     a, b = cast(Rectangle, first.modes.domain).length
-    grid[-1, 0].set(xticks=[0.0, a], yticks=[0.0, b], xlabel="x [m]", ylabel="y [m]")
+    grid[-1, 0].set(xticks=[0.0, a], yticks=[0.0, b], xlabel="x, y [m]")
     ticks = [tick for tick in MaxNLocator(5).tick_values(-limit, limit) if abs(tick) <= limit]
     figure.colorbar(image, ax=grid, label="displacement [m]", shrink=0.8, ticks=ticks)
     handles, labels = grid[0, 0].get_legend_handles_labels()
