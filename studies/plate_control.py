@@ -147,7 +147,8 @@ def study(outcome, data=None):
     outcome.check("W_r in closed form against quadrature, relative to W_R", difference, 1e-8)
     outcome.say(f"{found.n_modes} modes identified, their frequencies to {error:.1e}")
     outcome.say(
-        f"after {time[-1]:.2f} s the controlled modes keep {kept['controlled']:.1e} of their energy, {kept['uncontrolled']:.2g}"
+        f"after {time[-1]:.2f} s the controlled modes keep {kept['controlled']:.1e}"
+        f" of their energy, {kept['uncontrolled']:.2g}"
         " without control"
     )
 
