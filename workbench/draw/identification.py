@@ -174,13 +174,13 @@ def placement_on_shapes(modes: Modes, placements: Mapping[str, Any], *, n_contro
         colour = COLOURS[i + 1]
         level = bottom - 0.35 * (i + 1)
         left.plot(placement.positions, np.full(len(placement.positions), level), "^", color=colour, ms=9)
-        label = f"{name}: W_R = {placement.residual_work:.2e} J, effort {placement.effort:.3g}"
+        label = f"{name}: W_R = {placement.residual_work:.2e}, effort {placement.effort:.3g}"
         number = np.arange(n_controlled + 1, modes.n_modes + 1)
         work = np.maximum(placement.by_mode, 1e-12)
         right.bar(number + (i - 1) * width, work, width, bottom=1e-12, color=colour, label=label)
-    left.set(xlabel="x / length", ylabel="mode shape [1/√kg]; triangles: actuators")
+    left.set(xlabel="x / length", ylabel="mode shape; triangles: actuators")
     left.legend(loc="upper center", ncols=2)
-    right.set(yscale="log", ylim=(1e-12, None), xticks=number, xlabel="residual mode", ylabel="spillover work W_r [J]")
+    right.set(yscale="log", ylim=(1e-12, None), xticks=number, xlabel="residual mode", ylabel="spillover work W_r")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -77,15 +78,16 @@ def plot_dirt(scores: Sequence[Mapping[str, Any]]) -> Figure:
     figure, ax = new_figure(width=9, height=1.6 + 0.45 * len(classes))
     for row, name in enumerate(classes):
         own = [s for s in scores if s["class"] == name]
-        by_size = [[s for s in own if s["size"] == size] for size in sizes]
-        shown = list(enumerate(by_size)) if name not in (CLEAN, TRIPLE) else [((len(sizes) - 1) / 2, own)]
-        for column, there in shown:
-            if not there:
-                continue
-            at, named = row + 0.27 * (column - (len(sizes) - 1) / 2), sum(s["named"] for s in there)
-            colour = COLOURS[int(column)] if name not in (CLEAN, TRIPLE) else GREY
-            ax.barh(at, 100 * named / len(there), 0.24, color=colour)
-            ax.text(101, at, f"{named} of {len(there)}", va="center", fontsize=7)
+        bars = [(own, 0.0, GREY)]
+        if name not in (CLEAN, TRIPLE):
+            apart = 0.27 * (np.arange(len(sizes)) - (len(sizes) - 1) / 2)
+            by_size = [[s for s in own if s["size"] == size] for size in sizes]
+            bars = list(zip(by_size, apart, COLOURS, strict=False))
+        for there, offset, colour in bars:
+            if there:
+                named = sum(s["named"] for s in there)
+                ax.barh(row + offset, 100 * named / len(there), 0.24, color=colour)
+                ax.text(101, row + offset, f"{named} of {len(there)}", va="center", fontsize=7)
     for column, size in enumerate(sizes):
         ax.barh(0, 0, color=COLOURS[column], label=f"{size:g} ×")
     ax.set_yticks(range(len(classes)), [_ERRORS[name] for name in classes])

@@ -56,7 +56,7 @@ def widened(search: Search, found: Fit) -> Fit:
     The wider law may make another effect needless: a constant force beside friction stood in for friction that differs
     between the two directions. That is no richer a set, so any sure gain is one.
     """
-    sets = list(wider_sets(found.effects))
+    sets, kinds = list(wider_sets(found.effects)), {effect.kind for effect in found.effects}
     if not sets:
         return found
     data = search.data.finely(SELECTION.fine)
@@ -73,7 +73,7 @@ def widened(search: Search, found: Fit) -> Fit:
             trial.cost, anew(found.effects).cost, extra
         ):
             return trial
-        instead = [anew(fewer) for fewer in each_left_out(trial.effects) if fewer]
+        instead = [anew(fewer) for fewer in each_left_out(trial.effects) if {e.kind for e in fewer} - kinds]
         best = min(instead, key=lambda f: f.cost, default=found)
         if best.n_parameters <= found.n_parameters and search.surely_better(best, cost, 0):
             return best

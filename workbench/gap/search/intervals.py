@@ -44,9 +44,9 @@ def with_intervals(
     if jacobian.shape[1] == 0:
         return found
     parameters = parameters_of(rig, found.effects)
-    jacobian = _along_places(rig, found.effects, data, residual, jacobian)
-    least = np.array([_least(found.effects[i], p) for i, p in parameters])
     level = max(float(residual @ residual) / residual.size, 1.0)
+    jacobian = _along_places(rig, found.effects, data, residual, jacobian, level)
+    least = np.array([_least(found.effects[i], p) for i, p in parameters])
     priors = np.array([_precision(p) for _, p in parameters])
     scale = np.sqrt(np.maximum((jacobian**2).sum(axis=0) + level * priors, 1e-300))
     jacobian, priors = jacobian / scale, priors / scale**2
@@ -68,14 +68,13 @@ def with_intervals(
 
 
 def _along_places(
-    rig: Rig, effects: Sequence[Effect], data: FitData, residual: np.ndarray, jacobian: np.ndarray
+    rig: Rig, effects: Sequence[Effect], data: FitData, residual: np.ndarray, jacobian: np.ndarray, level: float
 ) -> np.ndarray:
     """The slopes, along a place that its tangent leaves open by the secant over its deviation.
 
     Where the structure moves most, at the free end of a bar or in the middle of a beam, the tangent is none: readings
     change with the square of the distance, and a deviation of half the extent would be said of a place known well.
     """
-    level = max(float(residual @ residual) / residual.size, 1.0)
     jacobian = jacobian.copy()
     for j, (i, parameter) in enumerate(parameters_of(rig, effects)):
         if parameter.name not in COORDINATES:

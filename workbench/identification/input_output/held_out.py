@@ -187,6 +187,6 @@ def unpredictive_remarks(fit: Fit, poles: Iterable[complex]) -> tuple[str, ...]:
     if not which:
         return ()
     return (
-        f"the response about {which} is more than linear modes make of the measured inputs: time variance, a"
-        f" nonlinearity or an unmeasured force; {IS_MEAN}",
+        "modes change within the record, perhaps with amplitude, something is nonlinear, or a force is not measured:"
+        f" the response about {which} is more than linear modes make of the inputs; {IS_MEAN}",
     )
