@@ -246,3 +246,9 @@ def test_records_that_cannot_be_of_the_rig_are_refused(nothing_hidden):
         diagnose(Rig(case.rig.modes, case.rig.actuators, case.rig.sensors[1:]), case.fit)
     with pytest.raises(ValueError, match="at least one record"):
         diagnose(case.rig, ())
+
+
+@pytest.mark.parametrize("settle", [-1.0, 1e6, np.nan])
+def test_a_time_to_settle_that_no_record_has_is_refused(nothing_hidden, settle):
+    with pytest.raises(ValueError, match="settle must be 0 or more and less than the shortest record"):
+        diagnose(nothing_hidden.rig, nothing_hidden.fit, settle=settle, workers=1)

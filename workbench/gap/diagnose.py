@@ -97,6 +97,11 @@ def diagnose(
         _check(rig, record)
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
+    shortest = min(record.n_samples * record.sample_time for record in (*records, *validation))
+    if not 0.0 <= settle < shortest:
+        raise ValueError(
+            f"settle must be 0 or more and less than the shortest record, {shortest:g} s; got {settle:g} s"
+        )
     check_modes(rig)
     check_records(rig, records, settle=settle)
     check_kept_apart(records, validation)
