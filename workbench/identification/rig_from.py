@@ -99,7 +99,7 @@ def rig_from(
 
 
 def _channels(identified: Any, name: str, given: Sequence[Channel | str] | None, count: int) -> tuple[Channel, ...]:
-    records = getattr(identified, "records", ()) or getattr(identified, "decays", ())
+    records = getattr(identified, "records", ()) or getattr(identified, "correlations", ())
     found = given if given is not None else getattr(identified, name, getattr(next(iter(records), None), name, None))
     side = name.split("_")[0] + "s"
     if found is None:
