@@ -16,13 +16,20 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from workbench.arrays import Floats
+from workbench.identification.input_output.after_blows import after_blows
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.force_window import force_window
 from workbench.identification.input_output.held_out import left_about, unpredictive_remarks, without_unpredictive
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, added_misfit, only, projected, scaled_vectors, settled
-from workbench.identification.input_output.model_order import ORDER, Selected, fit_of_poles, select_modes
+from workbench.identification.input_output.model_order import (
+    ORDER,
+    Selected,
+    fit_of_poles,
+    is_about_distorted,
+    select_modes,
+)
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.peak_shape import overlap_remarks
 from workbench.identification.input_output.subspace_poles import subspace_poles
@@ -222,12 +229,15 @@ def identify_driven(
         raise ValueError(f"input_hold is {' or '.join(map(repr, HOLDS))}; got {input_hold!r}")
     _check_inputs(records)
     records, windowed = force_window(records)
+    by_amplitude = after_blows(records, budget)
     data = KnownInputs(
         records,
         at_rest=at_rest,
         straight=hold == "first",
         feedthrough=feedthrough,
         delays=_checked_delays(records, delays),
+        distorted=by_amplitude.changing,
+        free=by_amplitude.poles,
     )
     rows, columns = data.fixed.shape
     if rows < columns + 4 * (data.n_excitations + 2):
@@ -252,10 +262,26 @@ def identify_driven(
     selected = selected if fit is selected.fit else selected.refitted(fit)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     late = budget.spent("check of modes that change within the record")
-    changes, named = ((), ()) if late else change_remarks(data, fit, changing)
-    left = [pole for pole in left_about(data, fit) if pole not in named]
-    changes = (*changes, *unpredictive_remarks(fit, (*selected.distorted, *left)))
-    return _report(records, data, selected, (*windowed, *remarks, *overlap, *changes, *budget.remarks))
+    in_decay = by_amplitude.among(fit.poles)
+    changes, named = ((), in_decay) if late else change_remarks(data, fit, changing, in_decay)
+    beside = (*selected.distorted, *left_about(data, fit))
+    left = [pole for pole in beside if pole not in (*named, *by_amplitude.changing)]
+    changes = (*changes, *unpredictive_remarks(fit, left))
+    found = _report(records, data, selected, (*windowed, *remarks, *overlap, *changes, *budget.remarks))
+    deviation = found.modes.omega * found.zeta_std + 1j * found.omega_std
+    decays = by_amplitude.remarks(fit.poles, _sizes(data, fit), deviation)
+    return replace(found, remarks=(*decays, *found.remarks))
+
+
+def _sizes(data: KnownInputs, fit: Fit) -> Floats:
+    """Of the response of each mode over the records, outputs in units of their noise, (n_modes,)."""
+    each = zip(fit.poles, fit.participation, fit.amplitudes.T, strict=True)
+    return np.array(
+        [
+            np.linalg.norm(a / fit.noise) * np.linalg.norm(np.concatenate(data.modal_coordinate(p, l_r)))
+            for p, l_r, a in each
+        ]
+    )
 
 
 def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:
@@ -340,6 +366,7 @@ def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selec
     """Those of a start, or else of a subspace model, and as many more as the first estimate of the noise needs."""
     if start is None:
         poles = subspace_poles(data.records, data.whole, 2 * how["max_modes"] + DRIVEN.spare)
+        poles = np.append(poles[~is_about_distorted(data, poles)], data.free)
         start = fit_of_poles(data, poles, how["false_alarm"])
     few = _few(how)
     few["max_modes"] = max(few["max_modes"], start.poles.size)

@@ -79,7 +79,7 @@ class RingDown(OfRefined):
 
     def _remarks(self) -> tuple[str, ...]:
         of_modes = (f"mode {r + 1}: {remark}" for r, remark in enumerate(self.remarks) if remark)
-        return (*of_modes, *self.notes)
+        return (*of_modes, *self.notes, *self.by_amplitude.remarks)
 
 
 @one_blas_thread

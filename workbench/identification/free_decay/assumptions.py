@@ -63,6 +63,19 @@ class AmplitudeDependence:
         """Modes (n_modes,) that depend on amplitude: chance under one in a thousand over all that was compared."""
         return np.asarray(np.any(self.probability < ASSUMPTIONS.chance / self.probability.size, axis=0))
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """One on each mode that depends on amplitude."""
+        return tuple(
+            f"mode {r + 1} depends on amplitude: {self.figures(r)}" for r in np.flatnonzero(self.depends).tolist()
+        )
+
+    def figures(self, r: int) -> str:
+        """Frequency and damping of mode r by amplitude, in words."""
+        seen = np.flatnonzero(np.isfinite(self.omega[:, r]))
+        each = zip(self.omega[seen, r] / (2.0 * np.pi), self.zeta[seen, r], self.amplitude[seen, r], strict=True)
+        return "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at {size:.3g}" for f, zeta, size in each)
+
 
 @one_blas_thread
 def amplitude_dependence(

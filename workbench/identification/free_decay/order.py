@@ -18,6 +18,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.arrays import Complexes, Floats
+from workbench.identification.free_decay.assumptions import amplitude_dependence
 from workbench.identification.free_decay.backbone import are_two, band_about
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
@@ -96,7 +97,8 @@ def identify(
     """
     records = of_same_sensors(records)
     found = identify_within(records, Budget(seconds, progress), max_modes=max_modes, false_alarm=false_alarm)
-    return found.without_artefacts(np.pi / records[0].sample_time)
+    found = found.without_artefacts(np.pi / records[0].sample_time)
+    return replace(found, remarks=(*found.remarks, *amplitude_dependence(records, found.refined).remarks))
 
 
 def identify_within(

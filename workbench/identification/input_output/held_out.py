@@ -34,8 +34,8 @@ class HeldOutSettings:
     loud: float = 10.0
     free: float = 4.0 / 3.0  # degrees of freedom of a line through Hann's window, which shares them with its neighbours
     faint: float = 0.01  # of the power of the outputs: what a mode with no other about it makes, to be taken for a line
-    # of the response about a mode, 3 % of its amplitude, and of what is left about another: what is left to be remarked
-    matters: float = 1e-3
+    matters: float = 1e-3  # of the response about a mode, 3 % of its amplitude: what is left to be remarked
+    beside: float = 0.03  # of what is left about another mode, likewise: least squares spread up to 0.01 of that
 
 
 HELD_OUT = HeldOutSettings()
@@ -177,7 +177,7 @@ def left_about(data: KnownInputs, fit: Fit) -> tuple[complex, ...]:
     left = _Left(whole, projected(whole, fit.poles, fit.participation))
     bands = fit.poles.imag[:, None] * (1.0 + 0.5 * HELD_OUT.reach * np.array([-1.0, 1.0]))
     about, response = np.array([left.between(*band) for band in bands]).reshape(-1, 2).T
-    enough = about > HELD_OUT.matters * np.maximum(response, about.max(initial=0.0))
+    enough = about > np.maximum(HELD_OUT.matters * response, HELD_OUT.beside * about.max(initial=0.0))
     return tuple(complex(fit.poles[r]) for r in np.flatnonzero(enough) if left.stands_out(*bands[r]))
 
 

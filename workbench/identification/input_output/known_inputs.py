@@ -58,6 +58,7 @@ class KnownInputs:
         beside: (n_samples, n_columns) of all records, fixed columns beside those of the inputs and the constants.
         changing: poles of the modes that move along these.
         distorted: poles about which no further mode is looked for.
+        free: poles of the modes of a free decay within the records, to start from where some of them are distorted.
     """
 
     def __init__(
@@ -73,8 +74,9 @@ class KnownInputs:
         beside: Floats | None = None,
         changing: tuple[complex, ...] = (),
         distorted: tuple[complex, ...] = (),
+        free: tuple[complex, ...] = (),
     ) -> None:
-        self.distorted = distorted
+        self.distorted, self.free = distorted, free
         self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
         self.dt, self.places = records[0].sample_time, records[0].positions
         self.delays = np.zeros(records[0].n_inputs) if delays is None else np.asarray(delays, float)
@@ -190,6 +192,7 @@ class KnownInputs:
             "beside": self.beside,
             "changing": self.changing,
             "distorted": self.distorted,
+            "free": self.free,
         }
         return KnownInputs(**{**same, **changed})
 

@@ -38,6 +38,7 @@ class Measurement(Protocol):
         n_inputs: of the excitations, that are no initial states.
         cells: number of poles that could be distinguished, for the chance of a false alarm.
         distorted: poles of modes that are more than linear ones; about these no further mode is looked for.
+        free: poles of modes that a free decay holds, where some of them are distorted.
     """
 
     values: np.ndarray
@@ -48,6 +49,7 @@ class Measurement(Protocol):
     n_inputs: int
     cells: int
     distorted: tuple[complex, ...]
+    free: tuple[complex, ...]
 
     def responses(self, pole: complex) -> Pair:
         """Real and imaginary parts of x_p(λ), (n_rows, n_excitations) each."""

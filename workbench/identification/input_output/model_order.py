@@ -196,7 +196,7 @@ class _Modes:
         return self.limit * self.data.noise_ratio(model.residual / model.noise, pole)
 
     def splits(self, model: Fit, trial: Fit) -> bool:
-        return bool(_spurious(self.data, trial).any() or _is_about_distorted(self.data, trial.poles[-1:]).any())
+        return bool(_spurious(self.data, trial).any() or is_about_distorted(self.data, trial.poles[-1:]).any())
 
     def settled(self, model: Fit) -> Fit:
         return settled(self.data, model, budget=self.budget)
@@ -242,15 +242,18 @@ def _to_try(data: Measurement, fit: Fit) -> np.ndarray:
     width = np.maximum(np.abs(fit.poles.real), 0.5 * data.resolution)
     beside = [fit.poles + 1j * k * width for k in (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)]
     tries = np.concatenate([data.candidates(fit.residual / fit.noise), *beside])
-    return np.asarray(tries[_can_ring(data, tries) & ~_is_about_distorted(data, tries)])
+    return np.asarray(tries[_can_ring(data, tries) & ~is_about_distorted(data, tries)])
 
 
-def _is_about_distorted(data: Measurement, poles: np.ndarray) -> np.ndarray:
+def is_about_distorted(data: Measurement, poles: np.ndarray) -> np.ndarray:
     """Which poles stand about modes that are more than linear, or beside such ring on through the record.
 
-    What else a nonlinear structure does is seen as lines here and there, which rise far above noise of the sensors.
+    What else a nonlinear structure does is seen as lines here and there, which rise far above noise of the sensors;
+    what a free decay holds is none of it.
     """
     out = (-poles.real < 0.5 * data.resolution) & bool(data.distorted)
+    for pole in data.free:
+        out &= np.abs(poles.imag - pole.imag) > ORDER.distorted_share * pole.imag
     for pole in data.distorted:
         about = max(ORDER.distorted_rates * abs(pole.real), ORDER.distorted_share * pole.imag)
         out |= np.abs(poles.imag - pole.imag) < about

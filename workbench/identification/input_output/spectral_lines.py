@@ -54,6 +54,7 @@ class Lines:
     ) -> None:
         self.h, self.powers, self.stated = h, powers, noise
         self.distorted: tuple[complex, ...] = ()
+        self.free: tuple[complex, ...] = ()
         self.guessed, self.beside, self.changing = guessed, beside, changing
         self.omega, (_, self.refs, self.lines) = omega, h.shape
         self.n_inputs = self.refs

@@ -248,20 +248,24 @@ def named_near(fit: Fit, poles: Iterable[complex]) -> dict[int, str]:
 
 
 def change_remarks(
-    data: KnownInputs, fit: Fit, changing: tuple[complex, ...] = ()
+    data: KnownInputs, fit: Fit, changing: tuple[complex, ...] = (), named: tuple[complex, ...] = ()
 ) -> tuple[tuple[str, ...], tuple[complex, ...]]:
     """A remark on the modes that change within a record: evenly with time, or, near the poles named, in another way.
 
+    Args:
+        changing: poles of modes that were found to change.
+        named: those of the fit that there is a remark on already.
+
     Returns:
-        The remarks, and the poles of the modes they name.
+        The remarks, and the poles of the modes that there is a remark on.
     """
     if not fit.poles.size:
         return (), ()
     change = changes_in_time(data, fit)
     names = named_near(fit, fit.poles)
-    sure = change.sure & (np.abs(change.frequency) < CHANGING.reach)
+    sure = change.sure & (np.abs(change.frequency) < CHANGING.reach) & ~np.isin(fit.poles, named)
     words = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure).tolist()]
-    others = [r for r in named_near(fit, changing) if not sure[r]]
+    others = [r for r in named_near(fit, changing) if not sure[r] and fit.poles[r] not in named]
     remarks = []
     if words:
         evenly = f"frequencies change within the record, from its beginning to its end: {'; '.join(words)}; {IS_MEAN}"
@@ -269,4 +273,4 @@ def change_remarks(
     if others:
         which = ", ".join(names[r] for r in others)
         remarks.append(f"modes change within the record, perhaps with amplitude: {which}; {IS_MEAN}")
-    return tuple(remarks), tuple(fit.poles[[*np.flatnonzero(sure), *others]].tolist())
+    return tuple(remarks), (*named, *fit.poles[[*np.flatnonzero(sure), *others]].tolist())

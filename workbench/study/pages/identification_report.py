@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.identification.ambient import AmbientModes, identify_ambient
 from workbench.identification.driven import Driven, identify_driven
-from workbench.identification.free_decay.assumptions import ProportionalFit
+from workbench.identification.free_decay.assumptions import AmplitudeDependence, ProportionalFit
 from workbench.identification.ring_down import RingDown, ring_down
 from workbench.identification.signal.data_quality import check_data_quality
 from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
@@ -106,9 +106,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
     """Free decays."""
     found = decay.refined
     lines = [f"mode {r + 1}: {remark}" for r, remark in enumerate(decay.remarks) if remark]
-    lines += [*decay.notes, *_proportional(decay.proportional)]
-    more, by_amplitude = _by_amplitude(decay)
-    lines += more
+    lines += [*decay.notes, *_proportional(decay.proportional), *decay.by_amplitude.remarks]
     if decay.noise_modes.n_modes:
         rejected = ", ".join(f"{f:.4g}" for f in decay.noise_modes.frequencies_hz)
         lines.append(f"rejected as noise or as parts of another mode: {rejected} Hz")
@@ -118,7 +116,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
         **_content(decay.records[0].output_channels, found),
         "start": [record.start_time for record in decay.records],
         "remarks": decay.remarks,
-        "depends_on_amplitude": by_amplitude,
+        "depends_on_amplitude": _by_amplitude(decay.by_amplitude),
         "proportional_damping": None if damping is None else {
             "g1": damping.damping.g1,
             "g2": damping.damping.g2,
@@ -263,14 +261,11 @@ def _proportional(fit: ProportionalFit | None) -> list[str]:
     return [f"damping may be proportional: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
 
 
-def _by_amplitude(decay: RingDown) -> tuple[list[str], dict[str, Any]]:
+def _by_amplitude(segments: AmplitudeDependence) -> dict[str, Any]:
     """The modes that depend on amplitude, segment by segment."""
-    segments, lines, content = decay.by_amplitude, [], {}
+    content = {}
     for r in np.flatnonzero(segments.depends):
         seen = np.flatnonzero(np.isfinite(segments.omega[:, r]))
-        at = [(segments.amplitude[w, r], segments.omega[w, r] / TURN, segments.zeta[w, r]) for w in seen]
-        shown = "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at {size:.3g}" for size, f, zeta in at)
-        lines.append(f"mode {r + 1} depends on amplitude: {shown}")
         content[str(r + 1)] = {
             "record": segments.record[seen],
             "amplitude": segments.amplitude[seen, r],
@@ -279,4 +274,4 @@ def _by_amplitude(decay: RingDown) -> tuple[list[str], dict[str, Any]]:
             "damping_ratios": segments.zeta[seen, r],
             "damping_std": segments.zeta_std[seen, r],
         }
-    return lines, content
+    return content
