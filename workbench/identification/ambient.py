@@ -14,6 +14,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.output_only.subspace import StablePole, Subspace
+from workbench.identification.signal.harmonics import harmonic_remark, steady_modes
 from workbench.identification.signal.modal_estimates import (
     ModalEstimates,
     by_poles,
@@ -56,7 +57,7 @@ class AmbientModes(ModalEstimates):
             mode.
         threshold: what a mode fitted to noise alone exceeds with the chance of a false alarm.
         correlations: functions that the shapes are read off, one record a reference.
-        remarks: what was left undone, where the time was up.
+        remarks: on what may be harmonic excitation, and on what was left undone where the time was up.
     """
 
     modes: SampledModes
@@ -160,7 +161,8 @@ def _report(
         jacobian = by_poles(poles[[r]])
         covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
     statistic = np.array([mode.statistic for mode in found])
-    return AmbientModes(modes, frozen(covariance), frozen(statistic), limit, decays, budget.remarks)
+    remarks = (*harmonic_remark(poles, steady_modes([record], poles)), *budget.remarks)
+    return AmbientModes(modes, frozen(covariance), frozen(statistic), limit, decays, remarks)
 
 
 def _shapes(decays: Sequence[Record], poles: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from scipy.stats import chi2
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.after_blows import after_blows
+from workbench.identification.input_output.excitation import check_inputs, unexcited_remarks
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.force_window import force_window
 from workbench.identification.input_output.held_out import left_about, unpredictive_remarks, without_unpredictive
@@ -32,10 +33,12 @@ from workbench.identification.input_output.model_order import (
 )
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.peak_shape import overlap_remarks
+from workbench.identification.input_output.sensor_drift import beside_drift
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
 from workbench.identification.signal.data_quality import of_same_sensors
-from workbench.identification.signal.modal_estimates import ParticipatingModes, credible, time_derivatives
+from workbench.identification.signal.harmonics import harmonic_remark, steady_modes
+from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import HOLDS, Channel, Record
 from workbench.renamed import Renamed, former_arguments
@@ -52,6 +55,7 @@ class DrivenSettings:
     learnt: int = 4  # times that noise and modes are estimated in turn
     apart: int = 2  # times that modes are looked for in combinations of outputs that share no noise
     spare: int = 20  # states of a subspace model beyond two for each of the most modes: for noise
+    drifting: float = 0.2  # of the time left, for each look at what is a drift
     final: float = 5.0  # s of processor time for the last check of modes, whatever the search has left
 
 
@@ -227,7 +231,7 @@ def identify_driven(
     hold = records[0].input_hold if input_hold is None else input_hold
     if hold not in HOLDS:
         raise ValueError(f"input_hold is {' or '.join(map(repr, HOLDS))}; got {input_hold!r}")
-    _check_inputs(records)
+    check_inputs(records)
     records, windowed = force_window(records)
     by_amplitude = after_blows(records, budget)
     data = KnownInputs(
@@ -246,6 +250,9 @@ def identify_driven(
         )
     most = min(max_modes, (rows - columns) // 6)
     how = {"max_modes": most, "false_alarm": false_alarm}
+    data, drift = beside_drift(
+        data, lambda each: _strongest(each, **how, budget=Budget(budget.share(DRIVEN.drifting).seconds))
+    )
     data, selected = _selected(data, budget, **how) if delays is not None else _with_delays(data, budget, **how)
     if selected.fit.poles.size == 0:
         raise ValueError(
@@ -267,10 +274,18 @@ def identify_driven(
     beside = (*selected.distorted, *left_about(data, fit))
     left = [pole for pole in beside if pole not in (*named, *by_amplitude.changing)]
     changes = (*changes, *unpredictive_remarks(fit, left))
-    found = _report(records, data, selected, (*windowed, *remarks, *overlap, *changes, *budget.remarks))
+    found = _report(records, data, selected, (*windowed, *drift, *remarks, *overlap, *changes, *budget.remarks))
     deviation = found.modes.omega * found.zeta_std + 1j * found.omega_std
     decays = by_amplitude.remarks(fit.poles, _sizes(data, fit), deviation)
-    return replace(found, remarks=(*decays, *found.remarks))
+    unexcited = unexcited_remarks(records, fit.poles)
+    return replace(found, remarks=(*decays, *_undamped_remarks(records, found), *unexcited, *found.remarks))
+
+
+def _undamped_remarks(records: Sequence[Record], found: Driven) -> tuple[str, ...]:
+    """On modes that may be harmonic excitation: a response to the inputs may have a constant amplitude too."""
+    undamped = found.modes.zeta < SURE * found.zeta_std
+    which = [r for r in steady_modes(records, found.modes.poles) if undamped[r]]
+    return harmonic_remark(found.modes.poles, which)
 
 
 def _sizes(data: KnownInputs, fit: Fit) -> Floats:
@@ -523,30 +538,6 @@ def _with_noise(
             break
         data, selected, once = weighted, anew, how
     return data, selected
-
-
-def _check_inputs(records: Sequence[Record]) -> None:
-    first = records[0]
-    if first.n_inputs == 0:
-        raise ValueError(f"record {first.name!r} has no inputs; use `identify` for a free decay")
-    for record in records[1:]:
-        if record.input_names != first.input_names:
-            raise ValueError(
-                f"records identified together must have the same inputs; {first.name!r} has"
-                f" {', '.join(first.input_names)} and {record.name!r} has {', '.join(record.input_names)}"
-            )
-    inputs = np.hstack([record.inputs for record in records])
-    size = np.linalg.norm(inputs, axis=1)
-    if (size == 0).any():
-        name = first.input_names[int(np.argmin(size))]
-        raise ValueError(f"record {first.name!r}: input {name!r} is zero throughout; leave it out, or excite there")
-    alike = (inputs / size[:, None]) @ (inputs / size[:, None]).T - np.eye(len(size))
-    i, k = np.unravel_index(int(np.argmax(np.abs(alike))), alike.shape)
-    if abs(alike[i, k]) > 1.0 - 1e-9:
-        raise ValueError(
-            f"inputs {first.input_names[i]!r} and {first.input_names[k]!r} are the same signal but for its size, so"
-            " what each does cannot be distinguished; excite them one after the other, or by signals of their own"
-        )
 
 
 def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, remarks: tuple[str, ...]) -> Driven:

@@ -112,6 +112,8 @@ def _segments(
     modes = refined.modes
     edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
     figures = np.full((5, stretches, modes.n_modes), np.nan)
+    apart = np.abs(np.subtract.outer(modes.omega, modes.omega))
+    beats = np.where(np.eye(modes.n_modes, dtype=bool), np.inf, apart).min(axis=1)
     for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
         span, decay = (last - first) * record.sample_time, -modes.poles.real
         begun = size * np.exp(-decay * first * record.sample_time)
@@ -130,6 +132,7 @@ def _segments(
             continue
         sure = found.omega_std < ASSUMPTIONS.least_sure * found.modes.omega
         sure &= found.modes.frequencies_hz * span > ASSUMPTIONS.least_cycles
+        sure &= beats[there] * span > 2.0 * np.pi  # of two that beat more slowly, one looks like a mode that changes
         there = there[sure]
         values = (found.modes.omega, found.omega_std, found.modes.zeta, found.zeta_std)
         figures[0, w, there] = np.sqrt(mean[:, there].max(axis=0))

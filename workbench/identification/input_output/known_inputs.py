@@ -22,7 +22,9 @@ from math import factorial
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from scipy.fft import next_fast_len
+from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
 from workbench.arrays import Floats
@@ -54,6 +56,7 @@ class KnownInputs:
         delays: (n_inputs,) samples by which each input acts late; none unless given.
         any_fraction: whether each input acts later than that by any fraction of a sample, which stays unknown: then
             each has two columns of its own, that of its delay and that a sample later.
+        drift: degree of the polynomials of time that each output of each record holds; 0, a constant, unless given.
         line_std: relative noise of each line, one (n_rows, n_outputs) a record, of unit rms over all.
         beside: (n_samples, n_columns) of all records, fixed columns beside those of the inputs and the constants.
         changing: poles of the modes that move along these.
@@ -70,6 +73,7 @@ class KnownInputs:
         feedthrough: bool,
         delays: np.ndarray | None = None,
         any_fraction: bool = False,
+        drift: int = 0,
         line_std: Sequence[np.ndarray] | None = None,
         beside: Floats | None = None,
         changing: tuple[complex, ...] = (),
@@ -95,16 +99,15 @@ class KnownInputs:
         self.values = self._rows(np.vstack(self._measured()))
         if self.weights is not None:
             self.values = self.values * self.weights
-        constant = np.zeros((ends[-1], len(records)))
-        for k, rows in enumerate(self.rows):
-            constant[rows, k] = 1.0
+        self.drift = drift
+        slow = block_diag(*(legvander(np.linspace(-1.0, 1.0, length), drift) for length in lengths))
         direct = np.vstack([self.direct(record.inputs).T[self.first :] for record in records])
         self.n_inputs = records[0].n_inputs
         self.n_excitations = self.n_inputs + (0 if at_rest else len(records))
         # The offset of each output holds an input that is constant already.
         self.feedthrough = (feedthrough or any_fraction) and bool(np.ptp(direct, axis=0).all())
         self.beside, self.changing = beside, changing
-        fixed = [direct, constant] if self.feedthrough else [constant]
+        fixed = [direct, slow] if self.feedthrough else [slow]
         if beside is not None:
             starts = np.cumsum([0, *(record.n_samples for record in records)])
             fixed.append(np.vstack([beside[a + self.first : b] for a, b in zip(starts, starts[1:])]))
@@ -144,6 +147,18 @@ class KnownInputs:
             for r in self.records
         ]
         return self._with(records=halves)
+
+    def with_drift(self, degree: int) -> "KnownInputs":
+        """The same records with polynomials of time beside the modes, of this degree."""
+        return self._with(drift=degree)
+
+    def drift_of(self, fit: Fit) -> Floats:
+        """How far the drift of each output goes over each record, (n_records, n_outputs)."""
+        degree = self.drift + 1
+        first = 2 * fit.poles.size + self.fixed.shape[1] - degree * len(self.records)
+        each = fit.coefficients[first:].reshape(len(self.records), degree, -1)
+        slow = legvander(np.linspace(-1.0, 1.0, 50), self.drift)[:, 1:]
+        return np.asarray(np.ptp(np.einsum("td,kdj->ktj", slow, each[:, 1:]), axis=1))
 
     def with_distorted(self, poles: tuple[complex, ...]) -> "KnownInputs":
         """The same records, no further mode being looked for about these poles either."""
@@ -188,6 +203,7 @@ class KnownInputs:
             "feedthrough": self.may_feel,
             "delays": self.delays,
             "any_fraction": self.any_fraction,
+            "drift": self.drift,
             "line_std": self.line_std,
             "beside": self.beside,
             "changing": self.changing,

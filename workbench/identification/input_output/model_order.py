@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
+from workbench.arrays import scaled_inverse
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.modal_fit import (
     Fit,
@@ -335,7 +336,8 @@ def statistic_of(fit: Fit, r: int) -> float:
     both, noise, found = [r, fit.poles.size + r], fit.noise, 0.0
     for part, outputs in fit.outputs():
         c = part.coefficients[both] / noise[outputs]
-        found += float((c * np.linalg.solve(part.spread[np.ix_(both, both)], c)).sum())
+        # a pole at Nyquist turns by half a turn a sample: no imaginary part
+        found += float(np.einsum("ij,ik,kj->", c, scaled_inverse(part.spread[np.ix_(both, both)]), c))
     return found
 
 

@@ -1,0 +1,132 @@
+"""What a laboratory adds to the response: drift, hum, filters; modes that beat."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, dlsim, firwin, lfilter
+
+from workbench.identification.ambient import identify_ambient
+from workbench.identification.driven import identify_driven
+from workbench.identification.input_output.excitation import unexcited_remarks
+from workbench.identification.input_output.known_inputs import KnownInputs
+from workbench.identification.input_output.modal_fit import projected
+from workbench.identification.input_output.model_order import statistic_of_each
+from workbench.identification.ring_down import ring_down
+from workbench.records.record import Channel, Record
+
+HZ, DAMPING = np.array([18.0, 72.0, 75.0, 160.0]), np.array([0.01, 0.005, 0.008, 0.01])
+SHAPES = np.sin(np.pi * np.outer([0.18, 0.37, 0.61, 0.83], np.arange(1, 5)))
+
+
+def response(force, rate, hz=HZ, damping=DAMPING, shapes=SHAPES, at=0):
+    """Accelerations of a structure at its sensors to a force held between samples, at one of them."""
+    n, omega = len(hz), 2.0 * np.pi * np.asarray(hz)
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2), -np.diag(2.0 * np.asarray(damping) * omega)]])
+    b = np.r_[np.zeros(n), shapes[at]][:, None]
+    c, d = shapes @ a[n:], shapes @ b[n:]
+    held = cont2discrete((a, b, c, d), 1.0 / rate)
+    return dlsim(held, force)[1].T
+
+
+def record(force, outputs, rate, inputs=True):
+    channels = [Channel(f"a{j + 1}", "acceleration") for j in range(len(outputs))]
+    driven = (force[None], [Channel("F", "force")]) if inputs else ()
+    return Record(1.0 / rate, outputs, channels, *driven)
+
+
+def noisy(outputs, level, seed):
+    noise = np.random.default_rng(seed).standard_normal(outputs.shape)
+    return outputs + level * outputs.std(axis=1, keepdims=True) * noise
+
+
+@pytest.fixture(scope="module")
+def filtered():
+    """A shaker test, force and outputs through the same anti-aliasing filter of 420 Hz, sampled at 1 kHz."""
+    rate, over = 1000, 20
+    force = np.repeat(np.random.default_rng(7).standard_normal(3 * rate), over)
+    kernel = firwin(801, 0.42 * rate, fs=rate * over)
+    outputs = lfilter(kernel, 1.0, response(force, rate * over), axis=1)[:, ::over]
+    return lfilter(kernel, 1.0, force)[::over], outputs, rate
+
+
+def test_filtered_alike_a_shaker_test_holds_its_modes(filtered):
+    force, outputs, rate = filtered
+    found = identify_driven(record(force, noisy(outputs, 1e-3, 8), rate))
+    np.testing.assert_allclose(found.modes.frequencies_hz[:4], HZ, rtol=1e-4)
+    np.testing.assert_allclose(found.modes.zeta[:4], DAMPING, rtol=2e-2)
+
+
+def test_a_pole_at_nyquist_has_a_statistic(filtered):
+    """Half a turn a sample has no imaginary part, so that its two columns are one; such tests led there."""
+    force, outputs, rate = filtered
+    data = KnownInputs([record(force, outputs, rate)], at_rest=True, straight=False, feedthrough=True)
+    fit = projected(data, 2.0 * np.pi * HZ[:1] * (-0.01 + 1j), np.ones((1, 1), complex))
+    (part,) = fit.parts
+    spread = part.spread.copy()
+    spread[:2, :2] = spread[0, 0]
+    (statistic,) = statistic_of_each(replace(fit, parts=(replace(part, spread=spread),)))
+    assert 0.0 <= statistic < np.inf
+
+
+def test_where_the_inputs_have_no_power_a_mode_is_remarked(filtered):
+    force, outputs, rate = filtered
+    poles = 2.0 * np.pi * np.append(HZ, [410.0, 480.0]) * (-0.003 + 1j)
+    (remark,) = unexcited_remarks([record(force, outputs, rate)], poles)
+    assert remark.startswith("the inputs hardly excite mode 6 (480 Hz, 0.")
+    assert not unexcited_remarks([record(force, outputs, rate)], poles[:-1])
+
+
+@pytest.mark.parametrize("drift", [0.1, 2.0])
+def test_drifting_sensors_hide_no_slow_mode(drift):
+    """A suspended body: its slowest mode has ten periods in the record."""
+    rate, hz = 200, [1.2, 20.0, 55.0, 56.0]
+    force = np.zeros(8 * rate)
+    force[[40, 660]] = 1.0
+    outputs = response(force, rate, hz, [0.05, 0.01, 0.01, 0.01])
+    slow = drift * outputs.std() * np.linspace(0.0, 1.0, force.size) * np.arange(1, 5)[:, None]
+    found = identify_driven(record(force, noisy(outputs, 2e-3, 11) + slow, rate))
+    np.testing.assert_allclose(found.modes.frequencies_hz, hz, rtol=2e-3)
+    np.testing.assert_allclose(found.modes.zeta[0], 0.05, rtol=0.05)
+    (remark,) = [remark for remark in found.remarks if "drift" in remark]
+    name, size = remark.removeprefix("outputs drift, ").split(":")[0].split(" by ")
+    assert float(size) == pytest.approx(int(name[1]) * drift * outputs.std(), rel=0.02)
+
+
+def test_a_rigid_body_that_is_pushed_away_does_not_drift():
+    rate = 200
+    force = np.random.default_rng(2).standard_normal(1200)
+    bending = response(force, rate, [20.0], [0.01], SHAPES[:, :1])
+    away = np.cumsum(np.cumsum(force)) / rate**2
+    moved = np.cumsum(np.cumsum(bending, axis=1), axis=1) / rate**2 + away
+    found = identify_driven(
+        Record(1.0 / rate, noisy(moved, 1e-5, 3), [Channel(f"d{j}", "displacement") for j in range(4)], force[None],
+               [Channel("F", "force")], input_hold="first")
+    )  # fmt: skip
+    assert not any("drift" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize("driven", [True, False])
+def test_hum_is_remarked_and_no_mode_is(driven):
+    rate, hz = 200, [3.0, 11.0, 40.0]
+    n = (20 if driven else 200) * rate
+    forces = np.random.default_rng(12).standard_normal((2, n))
+    outputs = response(forces[0], rate, hz, [0.01, 0.01, 0.005], SHAPES[:, :3])
+    if not driven:
+        outputs += response(forces[1], rate, hz, [0.01, 0.01, 0.005], SHAPES[:, :3], at=2)
+    hum = 0.3 * outputs.std() * np.sin(2.0 * np.pi * 50.0 / rate * np.arange(n) + 0.3)
+    spoilt = record(forces[0], noisy(outputs, 0.02, 4) + hum, rate, driven)
+    found = identify_driven(spoilt) if driven else identify_ambient(spoilt)
+    (remark,) = [remark for remark in found.remarks if "harmonic excitation?" in remark]
+    (named,) = remark.split("about mode ")[1].split(" has a constant")[0].split(", ")
+    assert named.endswith("(50 Hz)")
+
+
+def test_modes_that_beat_do_not_depend_on_amplitude():
+    rate = 500
+    t = np.arange(1000) / rate
+    poles = 2.0 * np.pi * np.array([37.0, 37.4]) * (-np.array([0.004, 0.006]) + 1j)
+    decay = (np.exp(np.outer(t, poles)) @ [1.0, 0.7]).real[None]
+    found = ring_down(Record(1.0 / rate, noisy(decay, 3e-3, 6), [Channel("a", "acceleration")]), start=0.0)
+    np.testing.assert_allclose(found.modes.frequencies_hz, [37.0, 37.4], rtol=1e-3)
+    assert not found.by_amplitude.depends.any()
