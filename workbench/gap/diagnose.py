@@ -31,6 +31,7 @@ from workbench.gap.report.record_to_record import with_held_out
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.report.wiring import check_kept_apart, wiring
 from workbench.gap.search.attribute import Attribution, attribute, baseline
+from workbench.gap.search.finish import with_equals
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
@@ -125,6 +126,10 @@ def diagnose(
             tolerance=tolerance,
             identified=identified or IdentifiedPrior.of_modes(rig),
         )
+        if attribution.outcome == "explained" and attribution.random is None:
+            alike, search = ready().indistinguishable, attribution.search
+            rivals = with_equals(search, attribution.best, attribution.rivals, found.evidence, alike)
+            attribution = replace(attribution, rivals=rivals)
         attribution = _paid_for(rig, attribution, validation, settle)
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)
@@ -288,7 +293,7 @@ def _notes(
         *([taken] if silent else []),
         *([cut] if found.is_cut else []),
         *([seen] if outcome != found.outcome else []),
-        budget.noise_remark,
+        budget.noise_remark if outcome in ("none", "explained") else "",  # else more than noise is left
         *_remainders(found),
     )
     return tuple(note for note in notes if note)

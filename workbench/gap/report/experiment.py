@@ -14,6 +14,7 @@ from workbench.rig.rig import Rig
 
 LEVELS = (0.3, 1.0, 3.0)
 SEPARATED = 25.0
+LONGEST = 1e3  # times the length of the record: what would take longer is seen in rounding, not in a measurement
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class Experiment:
         like: name of the record whose input it repeats.
         inputs: names of the inputs that are driven; the others rest.
         level: factor on that record's input.
-        seconds: length at which the rivals differ by five standard deviations; inf where they never would.
+        seconds: length at which the rivals differ by five standard deviations; inf where they never would, or would
+            in a thousand times the length of the record.
         rivals: labels of the two explanations it separates.
     """
 
@@ -56,7 +58,8 @@ def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Wor
 
     def experiment(record: Record, inputs: tuple[str, ...], level: float) -> Experiment:
         rate = _separation(rig, best, rival, replace(data, records=(_varied(record, inputs, level),)))
-        return Experiment(record.name, inputs, level, SEPARATED / rate if rate > 0 else np.inf, names)
+        separates = rate * LONGEST * record.n_samples * record.sample_time > SEPARATED
+        return Experiment(record.name, inputs, level, SEPARATED / rate if separates else np.inf, names)
 
     choices = [(record, inputs, level) for record in data.records for inputs in _choices(record) for level in LEVELS]
     tried = workers.map(lambda choice: experiment(*choice), choices)

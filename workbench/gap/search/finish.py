@@ -8,11 +8,14 @@ import numpy as np
 
 from workbench.gap.effects.effect import COORDINATES, Effect, apply_all, key_of, place_values
 from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets, wider_sets, with_one_simpler
+from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit
 from workbench.gap.search.search import Search, promise
-from workbench.gap.search.settings import FINISH, SELECTION
+from workbench.gap.search.settings import FINISH, SEARCH, SELECTION
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, Domain, Interval, Rectangle, Where
+
+PORTS = ("actuator", "sensor")  # paths of effects that are not the structure's
 
 
 def finished(search: Search, candidate: Fit) -> Fit:
@@ -210,6 +213,53 @@ def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, f
     weights /= weights.sum()
     rivals = tuple((fits[i], float(w)) for i, w in zip(order[1:], weights[1:], strict=True))
     return fits[order[0]], rivals[:6]
+
+
+def with_equals(
+    search: Search,
+    best: Fit,
+    rivals: tuple[tuple[Fit, float], ...],
+    evidence: Evidence,
+    alike: Sequence[tuple[str, str, float]],
+) -> tuple[tuple[Fit, float], ...]:
+    """The rivals of a set, and those that have an effect at another actuator or sensor and explain the records as well.
+
+    To one actuator and one sensor it is the same whether the one or the other is wrong. Predictions one sample ahead
+    prefer one of them, for they weigh the noise of what is read.
+
+    Args:
+        rivals: with their probabilities.
+        alike: labels of two effects that the records could not distinguish, and how alike.
+    """
+    data = search.data.finely(SELECTION.fine)
+    enough = cost_of(search.rig, best.effects, data) + SEARCH.rival
+    known = {best.key, *(f.key for f, _ in rivals)}
+    sets = [s for s in _at_other_ports(search, best, evidence, alike) if key_of(s) not in known]
+    equals = [f for f in search.workers.map(lambda s: fit(search.rig, s, data), sets) if f.cost < enough]
+    if not equals:
+        return rivals
+    here = fit(search.rig, best.effects, data, iterations=0)
+    first, others = ranked(search, [here, *equals])
+    of_each = {first.key: 1.0 - sum(p for _, p in others), **{f.key: p for f, p in others}}
+    rest = [(f, p * of_each[here.key]) for f, p in rivals]
+    return tuple(sorted([*((f, of_each[f.key]) for f in equals), *rest], key=lambda each: -each[1]))
+
+
+def _at_other_ports(
+    search: Search, best: Fit, evidence: Evidence, alike: Sequence[tuple[str, str, float]]
+) -> Iterator[tuple[Effect, ...]]:
+    at_ports = [kind for kind in search.catalogue if kind.path in PORTS]
+    labels = {
+        Effect(kind, target, {}).label: (kind, target) for kind in at_ports for target in kind.targets(search.rig)
+    }
+    for effect in best.effects:
+        if effect.label in labels:
+            pairs = [pair[:2] for pair in alike if effect.label in pair[:2]]
+            for label in {label for pair in pairs for label in pair if label != effect.label and label in labels}:
+                kind, target = labels[label]
+                for values in list(kind.starts(evidence, target))[:1]:
+                    other = Effect(kind, target, dict(values))
+                    yield tuple(other if e is effect else e for e in best.effects)
 
 
 def best_of_each(fits: Sequence[Fit]) -> list[Fit]:

@@ -79,7 +79,8 @@ class Search:
     @property
     def enough(self) -> float:
         """The cost of a set that explains the records, at most."""
-        return float(1.0 + SEARCH.slack + SEARCH.integration_share * self.nominal.mean())
+        slack = max(SEARCH.slack, SEARCH.chance * np.sqrt(2.0 / self.data.n_values))
+        return float(1.0 + slack + SEARCH.integration_share * self.nominal.mean())
 
     def clustered(self, effects: Sequence[Effect]) -> bool:
         """Whether nonlinear effects stand for one law: two of a kind, or three of any, side by side."""

@@ -10,6 +10,8 @@ class SearchSettings:
     """Constants of what counts as an explanation, and as a better one."""
 
     slack: float = 0.03  # of the noise power: what two good finite-element models may differ by
+    # standard deviations of the mean square of noise, which in records of fewer than 20,000 values is more than that
+    chance: float = 3.0
     integration_share: float = 2e-6  # of the gap's power: errors of stepping
     sure: float = 30.0  # twice the logarithm of a likelihood ratio that settles a choice
     # of the noise power: no set is preferred to a simpler one for less, whatever the likelihood says
