@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, dlsim, firwin, lfilter
+from scipy.signal import butter, cont2discrete, dlsim, firwin, lfilter
 
 from workbench.identification.ambient import identify_ambient
 from workbench.identification.driven import identify_driven
@@ -130,3 +130,19 @@ def test_modes_that_beat_do_not_depend_on_amplitude():
     found = ring_down(Record(1.0 / rate, noisy(decay, 3e-3, 6), [Channel("a", "acceleration")]), start=0.0)
     np.testing.assert_allclose(found.modes.frequencies_hz, [37.0, 37.4], rtol=1e-3)
     assert not found.by_amplitude.depends.any()
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.0])
+def test_sensors_that_pass_no_constant_settle(offset):
+    """Accelerometers with a high-pass of 2 Hz, first order, that begin at rest or at an offset."""
+    rate, hz, damping = 500, np.array([12.0, 48.0, 110.0]), np.array([0.01, 0.02, 0.01])
+    t, rng = np.arange(2000) / rate, np.random.default_rng(3)
+    each = np.exp(np.outer(2.0 * np.pi * hz * (-damping + 1j), t) + 1j * np.array([[1.0], [2.0], [3.0]]))
+    shapes = np.sin(np.pi * np.outer(np.arange(1, 7) / 7, np.arange(1, 4))) * [1.0, 0.5, 0.2]
+    outputs = (shapes @ each).real + offset + 0.01 * rng.standard_normal((6, t.size))
+    through = lfilter(*butter(1, 2.0, "high", fs=rate), outputs, axis=1)
+    found = ring_down(Record(1.0 / rate, through, [Channel(f"a{j}", "acceleration") for j in range(6)]), start=0.0)
+    assert (np.abs(found.modes.frequencies_hz - hz) < 4.0 * found.omega_std / (2.0 * np.pi)).all()
+    assert (np.abs(found.modes.zeta - damping) < 4.0 * found.zeta_std).all()
+    (note,) = [note for note in found.notes if note.startswith("settling (time constant ")]
+    assert float(note.removeprefix("settling (time constant ").split(" s)")[0]) == pytest.approx(0.0796, rel=0.05)

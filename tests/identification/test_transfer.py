@@ -324,3 +324,22 @@ def test_one_sensor_tells_two_close_modes_as_two(apart):
     found = identify_transfer(h, lines, channels=(Channel("p", "displacement"),))
     assert found.modes.frequencies_hz == pytest.approx(hz, rel=1e-3)
     assert not found.scatter_hz.any()
+
+
+@pytest.mark.parametrize(("relative", "seed"), [(0.005, 1), (0.02, 1), (0.05, 0)])
+def test_noise_that_goes_with_size_hides_no_mode_and_makes_none_change(relative, seed):
+    """As of few averages: it is largest in the peaks."""
+    hz, damping = np.array([12.0, 40.0, 41.0, 90.0]), np.array([0.01, 0.008, 0.01, 0.012])
+    at, driven = np.arange(1, 6) / 6, [0.8, 0.7, 0.6, 0.5]
+    lines = 0.25 * np.arange(1, 400)
+    s, omega = 2j * np.pi * lines, 2.0 * np.pi * hz
+    each = [s**2 / (w**2 + s**2 + 2.0 * z * w * s) for w, z in zip(omega, damping, strict=True)]
+    h = np.einsum("jr,r,rk->jk", np.sin(np.pi * np.outer(at, np.arange(1, 5))), driven, np.array(each))[:, None]
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape)
+    channels = tuple(Channel(f"p{j}", "acceleration", at=float(x)) for j, x in enumerate(at))
+    found = identify_transfer(h * (1.0 + relative * noise), lines, channels=channels)
+    assert not found.remarks and found.modes.n_modes == 4
+    assert (np.abs(found.modes.omega - omega) < 4.0 * found.omega_std).all()
+    assert (np.abs(found.modes.zeta - damping) < 4.0 * found.zeta_std).all()
+    assert (found.omega_std < 0.02 * relative * omega).all()

@@ -14,7 +14,7 @@ from workbench.identification.free_decay.assumptions import (
 )
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes, stacked_delays
 from workbench.identification.free_decay.order import identify_within
-from workbench.identification.free_decay.preparation import decay_start, without_drift, without_polynomial
+from workbench.identification.free_decay.preparation import Drift, decay_start, without_drift, without_polynomial
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, data_faults, of_same_sensors
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
@@ -161,31 +161,35 @@ def _without_drift(
 ) -> tuple[Identified, list[Record], list[str]]:
     """Modes and drifts in turn, as each disturbs the other, until neither changes."""
     poles = np.zeros(0, complex)
-    cleared, size = records, np.zeros((len(records), records[0].n_outputs))
+    taken: list[Drift] = []  # one a record, where they are less their drifts
     # A drift larger than the modes would be searched for modes first; a parabola is none.
     drifts = [without_drift(record, poles, most=RING_DOWN.parabola) for record in records]
     variances = [(d.record.outputs.var(axis=1), r.outputs.var(axis=1)) for d, r in zip(drifts, records, strict=True)]
     if any((left < RING_DOWN.dominant * whole).any() for left, whole in variances):
-        cleared, size = [drift.record for drift in drifts], np.array([drift.size for drift in drifts])
+        taken = drifts
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(RING_DOWN.drift_rounds):
-        found = _identified(cleared, n_modes, budget)
+        found = _identified([drift.record for drift in taken] or records, n_modes, budget)
         before, poles = poles, found.modes.poles
         poles = poles[np.abs(poles) * span > 2.0 * np.pi]
         drifts = [without_drift(record, poles) for record in records]
         drifting = any(drift.size.any() for drift in drifts)
-        if not drifting and cleared is not records and not budget.unfinished:
-            cleared, size = records, np.zeros_like(size)
+        if not drifting and taken and not budget.unfinished:
+            taken = []
             continue
-        if not drifting or (poles.size == before.size and size.any()) or budget.unfinished:
+        settles = any(drift.time_constant is not None for drift in drifts)  # found better beside better modes
+        if not drifting or (poles.size == before.size and taken and not settles) or budget.unfinished:
             break
-        cleared, size = [drift.record for drift in drifts], np.array([drift.size for drift in drifts])
-    in_noise = size / found.refined.noise
+        taken = drifts
+    if not any(drift.size.any() for drift in taken):
+        return found, records, []
+    cleared = [drift.record for drift in taken]
+    in_noise = np.array([drift.size for drift in taken]) / found.refined.noise
     if not (in_noise >= 1.0).any():
-        return found, cleared if size.any() else records, []
-    i, j = np.unravel_index(int(np.argmax(in_noise)), size.shape)
-    name = records[0].output_names[j]
-    return found, cleared, [f"a drift of {size[i, j]:.3g} was removed from output {name!r}"]
+        return found, cleared, []
+    i, j = np.unravel_index(int(np.argmax(in_noise)), in_noise.shape)
+    name, drift = records[0].output_names[j], taken[int(i)]
+    return found, cleared, [f"{drift.words} of {drift.size[j]:.3g} was removed from output {name!r}"]
 
 
 def _identified(records: list[Record], n_modes: int | None, budget: Budget) -> Identified:

@@ -188,9 +188,12 @@ def _selected(
     if noise is not None:
         return _beside_changing(lines, how)
     few = how | {"max_modes": min(TRANSFER.strongest, how["max_modes"])}
-    lines, selected = _beside_changing(lines, few)
+    selected = select_modes(lines, **few)
+    guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
+    if guessed is None:  # noise that goes with size is largest in the peaks, and looks like modes that change
+        lines, selected = _beside_changing(lines, few, selected)
+        guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
     left = lines.left(selected.fit)
-    guessed = noise_with_size(left, lines.fitted(selected.fit))
     # What the modes miss of the response is smooth from line to line, noise is not: so second differences, Hann's
     # window of the impulse response, are asked. Among lines of all sizes a few large ones show any correlation.
     rough = np.diff(left if guessed is None else left / guessed, 2)
@@ -209,9 +212,9 @@ def _selected(
     return lines, selected.refitted(fit)
 
 
-def _beside_changing(lines: Lines, how: dict[str, Any]) -> tuple[Lines, Selected]:
+def _beside_changing(lines: Lines, how: dict[str, Any], selected: Selected | None = None) -> tuple[Lines, Selected]:
     """The modes, one for each that changes, and the lines with what such modes move."""
-    selected = select_modes(lines, **how)
+    selected = select_modes(lines, **how) if selected is None else selected
     while (found := beside_changing(lines, selected.fit, selected.limit, how["budget"])) is not None:
         lines, start = found
         selected = select_modes(lines, start=start, **how)
@@ -231,7 +234,9 @@ def _in_noise(lines: Lines, selected: Selected, how: dict[str, Any]) -> tuple[Li
         if budget.spent("estimation of the noise"):
             return lines, selected
         before = guessed
-        weighted, anew = _beside_changing(lines.weighted_by(guessed), how)
+        weighted = lines.without_columns().weighted_by(guessed)
+        # from those found: where noise goes with size, lines between modes weigh most, and tell least
+        weighted, anew = _beside_changing(weighted, how, select_modes(weighted, start=selected.fit, **how))
         if budget.spent("estimation of the noise") and anew.fit.poles.size < selected.fit.poles.size:
             return lines, selected
         lines, selected = weighted, anew

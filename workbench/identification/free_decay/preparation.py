@@ -24,7 +24,7 @@ from workbench.structure.modes import frozen
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Constants of the search for the start of a decay."""
+    """Constants of the search for the start of a decay, and for what settles in it."""
 
     order: int = 32  # samples that predict the one before
     block: int = 4  # samples of an update
@@ -41,6 +41,9 @@ class StartSettings:
     rise: float = 4.0
     beside: float = 16.0
     near: int = 8
+    rates: int = 8  # of exponential settling that are tried at once
+    rounds: int = 4  # of them, each about the best of the one before
+    fastest: float = 0.1  # of these, times a sample
     least_left: float = 0.01  # of the record's energy, that must follow a break for the decay to begin there
 
 
@@ -158,58 +161,112 @@ def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """Drift slower than any mode.
+    """Drift slower than any mode, or the settling of sensors that pass no constant.
 
     Attributes:
         record: without it; constants stay.
         size: (n_outputs,) from its lowest to its highest, in the unit of each output; 0 where there is none.
+        time_constant: s, of what settles exponentially, as an accelerometer with a high-pass does; None of a drift.
     """
 
     record: Record = field(repr=False)
     size: np.ndarray
+    time_constant: float | None = None
+
+    @property
+    def words(self) -> str:
+        """What it is."""
+        if self.time_constant is None:
+            return "a drift"
+        return f"settling (time constant {self.time_constant:.3g} s)"
 
 
 def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGREE) -> Drift:
     """A record less a polynomial in time, fitted beside its modes: y_j = Re Σ a_jr e^{λ_r t} + Σ_k p_jk P_k(t).
 
     The degree is the least, of those that oscillate no faster than the slowest mode, by Schwarz's criterion; and
-    nothing is taken where noise alone would show as much in one record of a thousand.
+    nothing is taken where noise alone would show as much in one record of a thousand. One decay e^{-t/τ} of all outputs
+    takes the place of a polynomial where it is likelier.
 
     Args:
         record: free decay.
         poles: (n_modes,) of its modes, rad/s; may be empty.
         most: highest degree.
     """
-    n, m = record.n_samples, record.n_outputs
-    span = n * record.sample_time
-    highest = int(min(most, np.abs(poles).min(initial=np.inf) * span / (2.0 * np.pi), (n - 4) // 4))
+    n, m, dt = record.n_samples, record.n_outputs, record.sample_time
+    highest = int(min(most, np.abs(poles).min(initial=np.inf) * n * dt / (2.0 * np.pi), (n - 4) // 4))
     nothing = Drift(record, frozen(np.zeros(m)))
     if highest < 1:
         return nothing
-    fixed = 1 + 2 * poles.size
 
-    def columns(at: np.ndarray) -> np.ndarray:
-        decay = np.exp(np.outer(record.sample_time * at, poles))
-        slow = _polynomials(at, n, highest)
-        return np.hstack([slow[:, :1], decay.real, decay.imag, slow[:, 1:]])
+    def beside(slow: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """R and Q^T y of a constant, the modes and what is slow."""
+
+        def columns(at: np.ndarray) -> np.ndarray:
+            decay = np.exp(np.outer(dt * at, poles))
+            return np.hstack([np.ones((at.size, 1)), decay.real, decay.imag, slow(at)])
+
+        return _factored(columns, record.outputs)
+
+    fixed = 1 + 2 * poles.size
+    power = (record.outputs**2).sum(axis=1)
+    a_number = np.log(n * m)
+
+    def gain(taken: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """Twice the logarithm of the likelihood ratio by what further columns take of each output, (n_tried, m)."""
+        before = power - (along[:fixed] ** 2).sum(axis=0)
+        before, after = (np.maximum(left, 1e-26 * power + 1e-300) for left in (before, before - taken))
+        return np.asarray(n * np.log(before / after).sum(axis=1))
 
     # Columns beyond constant and modes add one degree after the other.
-    r, along = _factored(columns, record.outputs)
-    power = (record.outputs**2).sum(axis=1)
-    left = power - np.vstack([(along[:fixed] ** 2).sum(axis=0), along[fixed:] ** 2]).cumsum(axis=0)
-    left = np.maximum(left, 1e-26 * power + 1e-300)
-    ratio = n * np.log(left[0] / left).sum(axis=1)
-    degree = int(np.argmax(ratio - np.log(n * m) * m * np.arange(highest + 1)))
-    if degree == 0 or ratio[degree] < chi2.isf(FALSE_ALARM / highest, m * degree):
+    r, along = beside(lambda at: _polynomials(at, n, highest)[:, 1:])
+    ratio = gain(np.vstack([np.zeros(m), along[fixed:] ** 2]).cumsum(axis=0), along)
+    degree = int(np.argmax(ratio - a_number * m * np.arange(highest + 1)))
+    likely = degree > 0 and ratio[degree] >= chi2.isf(FALSE_ALARM / highest, m * degree)
+
+    rates = np.geomspace(2.0, START.fastest * n, START.rates) / (n * dt)
+    for _ in range(START.rounds):
+        decays, tried = beside(_decays(dt * rates))
+        own = decays[fixed:, fixed:]
+        each = (own.T @ tried[fixed:]) ** 2 / np.maximum((own**2).sum(axis=0), 1e-300)[:, None]
+        settles = gain(each, tried)
+        best = int(np.argmax(settles))
+        found = rates[best], settles[best]
+        rates = np.geomspace(rates[max(best - 1, 0)], rates[min(best + 1, rates.size - 1)], START.rates)
+    rate, settling = found
+    paid = settling - a_number * (m + 1)
+    unless = ratio[degree] - a_number * m * degree if likely else 0.0
+    if paid > unless and settling > chi2.isf(FALSE_ALARM / START.rates, m + 1):
+        settled = _decays(dt * rate)
+        return _less(record, fixed, *beside(settled), settled, 1.0 / float(rate))
+    if not likely:
         return nothing
     kept = fixed + degree
-    weights = np.linalg.solve(r[:kept, :kept], along[:kept])[fixed:]
+    return _less(record, fixed, r[:kept, :kept], along[:kept], lambda at: _polynomials(at, n, degree)[:, 1:])
+
+
+def _decays(rates: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Columns (n_at, n_rates) at some samples, of rates a sample."""
+    return lambda at: np.asarray(np.exp(-np.outer(at, rates)))
+
+
+def _less(
+    record: Record,
+    fixed: int,
+    r: np.ndarray,
+    along: np.ndarray,
+    slow: Callable[[np.ndarray], np.ndarray],
+    time_constant: float | None = None,
+) -> Drift:
+    """A record less what is slow in it, of its factored columns."""
+    weights = np.linalg.solve(r, along)[fixed:]
+    m = record.n_outputs
     outputs, lowest, topmost = record.outputs.copy(), np.full(m, np.inf), np.full(m, -np.inf)
-    for part in _parts(n):
-        drift = (_polynomials(np.arange(part.start, part.stop), n, degree)[:, 1:] @ weights).T
+    for part in _parts(record.n_samples):
+        drift = (slow(np.arange(part.start, part.stop)) @ weights).T
         outputs[:, part] -= drift
         lowest, topmost = (np.minimum(lowest, drift.min(axis=1)), np.maximum(topmost, drift.max(axis=1)))
-    return Drift(replace(record, outputs=outputs), frozen(topmost - lowest))
+    return Drift(replace(record, outputs=outputs), frozen(topmost - lowest), time_constant)
 
 
 def without_polynomial(outputs: np.ndarray) -> np.ndarray:

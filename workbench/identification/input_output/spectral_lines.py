@@ -85,6 +85,10 @@ class Lines:
         changed = (*self.changing, changing)
         return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, beside, changed)
 
+    def without_columns(self) -> "Lines":
+        """The same lines without what modes that change move."""
+        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed)
+
     def only(self, which: np.ndarray, smooth: int) -> "Lines":
         """Some lines (n_lines,), beside polynomials up to a degree as well."""
         omega = self.omega[which]
