@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import group_of, parted
 from workbench.gap.effects.record_to_record import label_of
 from workbench.gap.prediction.logged_inputs import loudest_logging_noise
-from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.residuals import FitData, lead_of
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
@@ -71,7 +71,7 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
         return None
     before, after, floor, blocks = {}, {}, {}, []
     for record in records:
-        lead = round(settle / record.sample_time)
+        lead = lead_of(record, settle)
         measured = record.outputs[:, lead:]
         scale = scale_of(measured)
         predicted = [predict(rig, record)[:, lead:] for rig in (nominal, corrected)]
@@ -262,20 +262,19 @@ def mean_square(rig: Rig, record: Record, settle: float) -> float:
 
 def power_in(record: Record, readings: np.ndarray, settle: float) -> float:
     """Mean square of readings (n_outputs, n_samples), each sensor by the standard deviation of a record's."""
-    lead = round(settle / record.sample_time)
+    lead = lead_of(record, settle)
     return float(((readings[:, lead:] / scale_of(record.outputs[:, lead:])) ** 2).mean())
 
 
 def _noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
-    measured = record.outputs[:, round(settle / record.sample_time) :]
+    measured = record.outputs[:, lead_of(record, settle) :]
     return float(((noise[:, None] / scale_of(measured)) ** 2).mean())
 
 
 def power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.ndarray:
     """Mean square (n_records,) that noise of the logged inputs leaves by chance, were it as strong as they are."""
-    lead = round(settle / records[0].sample_time)
-    powers = loudest_logging_noise(rig, FitData(tuple(records), np.ones(len(rig.sensors)), lead=lead))
-    scales = np.array([scale_of(record.outputs[:, lead:])[:, 0] for record in records])
+    powers = loudest_logging_noise(rig, FitData(tuple(records), np.ones(len(rig.sensors)), settle=settle))
+    scales = np.array([scale_of(record.outputs[:, lead_of(record, settle) :])[:, 0] for record in records])
     return np.asarray((powers / scales**2).mean(axis=1))
 
 

@@ -11,7 +11,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind
 from workbench.gap.effects.structural import modes_of
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.residuals import FitData, lead_of
 from workbench.records.record import Record
 from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
@@ -70,8 +70,8 @@ def check_records(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -
     elastic = rig.modes.omega[rig.modes.omega > 0]
     _check_not_stuck(rig, records)
     signs, sizes = [], []
-    lead = round(settle / records[0].sample_time)
     for record in records:
+        lead = lead_of(record, settle)
         if elastic.size and record.n_samples * record.sample_time < 2 * np.pi / elastic[0]:
             raise RecordsError(
                 f"record {record.name!r} lasts {record.n_samples * record.sample_time:g} s, less than a period of the"
