@@ -42,3 +42,14 @@ def test_the_order_of_records_of_two_rates_changes_no_verdict(at_two_rates):
         verdict = diagnose(rig, order, catalogue=catalogue, settle=6.0, workers=1)
         assert verdict.outcome == "explained"
         assert verdict.effects[0].values["gain"] == pytest.approx(1.1, abs=1e-3)
+
+
+def test_fewer_values_than_uncertain_numbers_give_way(at_two_rates):
+    """min over δ of |r + S δ|² + |δ|², by least squares on r and δ together."""
+    rng = np.random.default_rng(0)
+    data = FitData(at_two_rates[1], np.full(4, 1e-5))
+    sensitivity, residual = rng.normal(size=(5, 9)), rng.normal(size=5)
+    stacked, target = np.vstack([sensitivity, np.eye(9)]), np.r_[-residual, np.zeros(9)]
+    left = stacked @ np.linalg.lstsq(stacked, target)[0] - target
+    data.giving_way(sensitivity).give_way(residual)
+    assert residual @ residual == pytest.approx(left @ left)

@@ -109,7 +109,7 @@ class FitData:
             return replace(self, given_way=None)
         _, sizes, turned = np.linalg.svd(_triangle(sensitivity))
         root = np.sqrt(1.0 + sizes**2)
-        return replace(self, given_way=sensitivity @ (turned.T / np.sqrt(root * (root + 1.0))))
+        return replace(self, given_way=sensitivity @ (turned[: root.size].T / np.sqrt(root * (root + 1.0))))
 
     def one_step_ahead(self, rig: Rig, loose: float = LOOSE) -> "FitData":
         """The same residual on predictions one sample ahead, by the observer gain of this rig.
