@@ -57,6 +57,7 @@ def diagnose(
     from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose as run
     from workbench.gap.effects.effect import COORDINATES
+    from workbench.gap.report.readiness import check_alive
     from workbench.gap.report.verdict import place_in_words
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
     from workbench.study.measured_case import measured_case
@@ -78,8 +79,9 @@ def diagnose(
         )
     elif case is not None:
         found = read_case(case)
+    check_alive(found.rig, found.fit, found.validation, settle=settle)
     check_kept_apart(found.fit, found.validation)
-    faults = () if settle else wiring(found.rig, found.fit)
+    faults = wiring(found.rig, found.fit, found.validation, settle=settle)
     for fault in faults:
         say(f"  {'corrected' if mend and fault.certain else 'wiring'}     {fault.sentence}")
     if any(fault.certain for fault in faults) and not (mend or as_wired):
@@ -87,6 +89,7 @@ def diagnose(
     if mend:
         rig, fit = mended(faults, found.rig, found.fit)
         found = replace(found, rig=rig, fit=fit, validation=mended(faults, found.rig, found.validation)[1])
+    corrected = [f"Corrected before the diagnosis: {fault.sentence}" for fault in faults if mend and fault.certain]
     with reporting("reading") as report:
         verdict = run(
             found.rig,
@@ -118,6 +121,7 @@ def diagnose(
         say(f"  rival      {words} ({probability:.2g})")
     for note in verdict.notes:
         say(f"  {by_options(note)}")
+    verdict = replace(verdict, notes=(*corrected, *verdict.notes))
     if json_path is not None:
         write_verdict(verdict, json_path)
         say(f"  verdict    {short(json_path)}")

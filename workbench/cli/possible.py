@@ -37,7 +37,7 @@ def possible_rig(
         return read_verdict(verdict, case.rig)
     check_kept_apart(case.fit, case.validation)
     kept = Path("out") / f"{case.name}-verdict.json"
-    for fault in wiring(case.rig, case.fit):
+    for fault in wiring(case.rig, case.fit, case.validation):
         if fault.certain:
             raise ValueError(
                 f"{fault.sentence.rstrip('.')}; correct the case, or go on as it is by `workbench diagnose CASE"

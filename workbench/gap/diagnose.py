@@ -86,8 +86,8 @@ def diagnose(
             in the end, so that intervals allow for them. Those of a rig's modes where their covariance is known.
 
     Raises:
-        ValueError: records that do not fit the rig or cannot be of it, a validation record that repeats one to be
-            fitted, or modes that are not those of the structure.
+        ValueError: records that do not fit the rig or cannot be of it, two of one name, a validation record that
+            repeats one to be fitted, or modes that are not those of the structure.
     """
     sharing = Workers.at_hand() if workers is None else Workers(workers)
     if seconds is not None and sharing.number == 1:
@@ -103,13 +103,13 @@ def diagnose(
             f"settle must be 0 or more and less than the shortest record, {shortest:g} s; got {settle:g} s"
         )
     check_modes(rig)
-    check_records(rig, records, settle=settle)
+    check_records(rig, records, validation, settle=settle)
     check_kept_apart(records, validation)
     silent = [sensor.name for sensor in rig.sensors if not sensor.noise_std]
     if silent:
         each = zip(rig.sensors, noise_guessed(rig, records), strict=True)
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
-    faults = () if settle else wiring(rig, records)
+    faults = wiring(rig, records, validation, settle=settle)
     report("looking for the unmodelled force", 0.02)
     found = baseline(rig, records, settle=settle, workers=sharing, deadline=deadline)
     nominal = found.nominal
