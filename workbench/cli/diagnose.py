@@ -105,10 +105,10 @@ def diagnose(
     say(verdict.sentence, bold=True)
     shown = verdict.to_json()
     where = verdict.where
-    if verdict.outcome != "none":  # where there is no gap, noise is everywhere
+    if verdict.shows_gap:  # where there is no gap, noise is everywhere
         say(f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on amplitude")
         say(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
-    if where.path in ("structure", "environment"):
+    if verdict.shows_gap and where.path in ("structure", "environment"):
         if verdict.place_stands:
             spread = dict.fromkeys(COORDINATES, where.at_std)
             say(f"  place      {place_in_words(where.at, spread)}, of the unmodelled point force, no law assumed")

@@ -218,7 +218,7 @@ def budget_of(
     taken = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
     by_size = sorted(range(len(labels)), key=lambda i: -taken[i].sum())
     rows = [*taken[by_size], taken[-1] if alike is not None else np.zeros_like(left)]
-    noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
+    noise = np.minimum(np.array([noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
     by_inputs = np.zeros_like(left)
     if logged:
@@ -266,7 +266,8 @@ def power_in(record: Record, readings: np.ndarray, settle: float) -> float:
     return float(((readings[:, lead:] / scale_of(record.outputs[:, lead:])) ** 2).mean())
 
 
-def _noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
+def noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
+    """Mean square of noise (n_outputs,), each sensor by the standard deviation of a record's readings."""
     measured = record.outputs[:, lead_of(record, settle) :]
     return float(((noise[:, None] / scale_of(measured)) ** 2).mean())
 

@@ -58,7 +58,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             " to the validation records.",
         ),
     ]
-    if verdict.outcome != "none":  # there is nothing to take apart in noise
+    if verdict.shows_gap:  # there is nothing to take apart in noise
         figures += [
             (
                 plot_where(verdict),
@@ -91,7 +91,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         lines=[*verdict.notes, *([verdict.experiment.sentence] if verdict.experiment else []), _could_show(verdict)],
         blocks=[
             *(block(figure, caption) for figure, caption in figures),
-            *(moving if verdict.outcome != "none" else []),
+            *(moving if verdict.shows_gap else []),
         ],
         tables=verdict_tables(verdict.to_json()),
         inputs={} if folder is None else case_inputs(folder),
