@@ -49,7 +49,7 @@ class Shrinkage:
     Attributes:
         before, after, floor: by record name; the gap of the case format.
         share: of the closable gap closed, by record name: 1 - sqrt(after² - floor²) / sqrt(before² - floor²).
-        overall: the same over all records together.
+        overall: the same over all records together, each of which counts alike.
         ci95: its 95 % interval by block bootstrap.
     """
 
@@ -69,7 +69,7 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
     """
     if not records:
         return None
-    before, after, floor, blocks = {}, {}, {}, []
+    before, after, floor, blocks, lengths = {}, {}, {}, [], []
     for record in records:
         lead = lead_of(record, settle)
         measured = record.outputs[:, lead:]
@@ -83,15 +83,20 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
         for start in range(0, measured.shape[1], length):
             piece = slice(start, start + length)
             blocks.append([errors[0][:, piece].mean(), errors[1][:, piece].mean(), (noise**2).mean()])
-    table = np.array(blocks)
+            lengths.append(errors[0][:, piece].shape[1] / measured.shape[1])
+    table, weights = np.array(blocks), np.array(lengths)  # the last block of a record may be short
     rng = np.random.default_rng(0)
-    draws = [_closed(*table[rng.integers(0, len(table), len(table))].mean(axis=0)) for _ in range(DRAWS)]
+
+    def closed(chosen: np.ndarray) -> float:
+        return _closed(*np.average(table[chosen], axis=0, weights=weights[chosen]))
+
+    draws = [closed(rng.integers(0, len(table), len(table))) for _ in range(DRAWS)]
     return Shrinkage(
         before=before,
         after=after,
         floor=floor,
         share={n: _closed(before[n] ** 2, after[n] ** 2, floor[n] ** 2) for n in before},
-        overall=_closed(*table.mean(axis=0)),
+        overall=closed(np.arange(len(table))),
         ci95=(float(np.quantile(draws, 0.025)), float(np.quantile(draws, 0.975))),
     )
 
