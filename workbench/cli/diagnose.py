@@ -101,6 +101,7 @@ def diagnose(
             workers=workers,
             seconds=seconds,
             report=report,
+            units=found.units,
         )
     say(verdict.sentence, bold=True)
     shown = verdict.to_json()

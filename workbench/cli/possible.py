@@ -44,7 +44,15 @@ def possible_rig(
                 f" --as-wired --json {kept.name}`, and give that file as --verdict"
             )
     errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
-    found = diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=workers, report=report)
+    found = diagnose(
+        case.rig,
+        case.fit,
+        validation=case.validation,
+        name=case.name,
+        workers=workers,
+        report=report,
+        units=case.units,
+    )
     write_verdict(found, kept)
     errors.print(f"  {found.sentence}")
     errors.print(f"  verdict    {short(kept)}: with --verdict {short(kept)} the next command need not diagnose")

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from workbench.cases.units import SI, Units
 from workbench.deadline import Deadline
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
@@ -67,6 +68,7 @@ def diagnose(
     free_nominal: bool = False,
     tolerance: float = TOLERANCE,
     identified: IdentifiedPrior | None = None,
+    units: Units = SI,
 ) -> Verdict:
     """Where a rig and records of the real structure disagree, which effect is missing, how far the gap then shrinks.
 
@@ -89,6 +91,7 @@ def diagnose(
             explained; nor is one below a tenth of the noise.
         identified: errors that the nominal rig has because it was itself identified: they are fitted beside the effects
             in the end, so that intervals allow for them. Those of a rig's modes where their covariance is known.
+        units: names of the units of the rig and the records, by which the verdict tells its numbers.
 
     Raises:
         ValueError: records that do not fit the rig or cannot be of it, two of one name, a validation record that
@@ -168,8 +171,9 @@ def diagnose(
             attribution=attribution,
             readiness=ready(),
             budget=budget,
-            experiment=_next(rig, attribution, sharing),
+            experiment=_next(rig, attribution, sharing, units),
             tolerance=tolerance,
+            units=units,
             notes=(
                 *(fault.sentence for fault in faults),
                 *in_records,
@@ -314,12 +318,12 @@ def _check(rig: Rig, record: Record) -> None:
             )
 
 
-def _next(rig: Rig, found: Attribution, workers: Workers) -> Experiment | None:
+def _next(rig: Rig, found: Attribution, workers: Workers, units: Units) -> Experiment | None:
     """The experiment that would separate the best set from its likeliest rival."""
     explained = found.outcome == "explained" or any_beyond(found.best.effects)
     for rival, probability in found.rivals:
         if explained and probability > RIVAL:
-            return next_experiment(rig, found.best, rival, found.search.data, workers)
+            return replace(next_experiment(rig, found.best, rival, found.search.data, workers), time=units.time)
     return None
 
 

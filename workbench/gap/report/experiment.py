@@ -26,6 +26,7 @@ class Experiment:
         level: factor on that record's input.
         seconds: length at which the rivals differ by five standard deviations; inf where they never would.
         rivals: labels of the two explanations it separates.
+        time: name of the unit of time.
     """
 
     like: str
@@ -33,6 +34,7 @@ class Experiment:
     level: float
     seconds: float
     rivals: tuple[str, str]
+    time: str = "s"
 
     @property
     def sentence(self) -> str:
@@ -42,7 +44,7 @@ class Experiment:
             return f"No experiment on this rig separates {one} from {other}."
         return (
             f"To separate {one} from {other}: drive {' and '.join(self.inputs)} as in record"
-            f" {self.like} at {self.level:g} times its level, for {max(self.seconds, 0.0):.3g} s."
+            f" {self.like} at {self.level:g} times its level, for {max(self.seconds, 0.0):.3g} {self.time}."
         )
 
 

@@ -1,11 +1,12 @@
 """The verdict on a gap: where, which, how far, in a sentence and as JSON."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from workbench.cases.units import SI, Units
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect, names_in
@@ -46,6 +47,7 @@ class Verdict:
         tolerance: of the signal's rms, below which a gap beyond the noise was not explained.
         disagreeing: names of validation records that have a gap, where the fitted ones have none; the outcome is then
             "unknown".
+        units: names of the units of its numbers.
         notes: what else a reader should know.
     """
 
@@ -63,6 +65,7 @@ class Verdict:
     experiment: Experiment | None = None
     tolerance: float = 0.0
     disagreeing: tuple[str, ...] = ()
+    units: Units = SI
     notes: tuple[str, ...] = ()
 
     @property
@@ -105,7 +108,9 @@ class Verdict:
     def record_to_record(self) -> RecordToRecord | None:
         """A figure of the nominal model that differs from record to record; None where that causes next to nothing."""
         differs = RecordToRecord.of(self.nominal, self.effects)
-        return None if differs is None or self.budget.effects.get(differs.label, 0.0) < SHOWN else differs
+        if differs is None or self.budget.effects.get(differs.label, 0.0) < SHOWN:
+            return None
+        return replace(differs, force=self.units.force)
 
     @property
     def sentence(self) -> str:
@@ -115,7 +120,7 @@ class Verdict:
             return f"In the records that were fitted, {text[0].lower()}{text[1:-1]}; but {self._disagreement}."
         if not self.shows_gap:
             return self._of_no_gap
-        named = [_described(effect, self.nominal) for effect in self._named]
+        named = [_described(effect, self.nominal, self.units) for effect in self._named]
         words = joined_in_words(named)
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if self.outcome == "explained":
@@ -210,12 +215,18 @@ class Verdict:
         words = [
             f"{n.removesuffix('_percent')} {v:.2g} %" for n, v in sizes.items() if n.endswith("percent") and v > 0.01
         ]
-        common = sizes.get("common_delay_ms", 0.0)
+        common, delays = sizes.get("common_delay_ms", 0.0), sizes.get("delays_ms", 0.0)
         if common:
-            words.append(f"all sensors, or the actuators, {'late' if common > 0 else 'early'} by {abs(common):.2g} ms")
-        elif sizes.get("delays_ms", 0.0) > 0:
-            words.append(f"timing of sensors {sizes['delays_ms']:.2g} ms")
+            late = "late" if common > 0 else "early"
+            words.append(f"all sensors, or the actuators, {late} by {self._delay_in_words(abs(common))}")
+        elif delays > 0:
+            words.append(f"timing of sensors {self._delay_in_words(delays)}")
         return f" ({', '.join(words)})" if words else ""
+
+    def _delay_in_words(self, thousandths: float) -> str:
+        """A delay in thousandths of the unit of time."""
+        time = self.units.time
+        return f"{thousandths:.2g} ms" if time == "s" else f"{1e-3 * thousandths:.2g} {time}"
 
     @property
     def rivals(self) -> tuple[tuple[str, float], ...]:
@@ -242,6 +253,7 @@ class Verdict:
         rivals = zip(self.alternatives, self.rivals, strict=True)
         return {
             "case": self.case,
+            "units": asdict(self.units),
             "outcome": self.outcome,
             "sentence": self.sentence,
             "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
@@ -336,10 +348,10 @@ def where_json(where: Where) -> dict[str, Any]:
     }
 
 
-def _described(effect: Effect, nominal: Rig) -> str:
+def _described(effect: Effect, nominal: Rig, named_units: Units) -> str:
     """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01; a wrong sensor gain (d4: gain 0.93)."""
     stated = effect.stated(nominal)
-    units = {p.name: p.unit for p in effect.parameters(nominal) if p.name in stated}
+    units = {p.name: named_units.named(p.unit) for p in effect.parameters(nominal) if p.name in stated}
     numbers = [
         " ".join((name.replace("_", " "), _with_deviation(stated[name], effect.deviations.get(name, 0.0)), unit))
         for name, unit in units.items()
