@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.cases.units import SI, Units
 from workbench.deadline import Deadline
 from workbench.gap.effects.beyond import any_beyond
@@ -232,7 +233,7 @@ def _acts(
 def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray, disagreeing: Sequence[str]) -> str:
     if disagreeing:
         return "unknown"
-    fails = found.outcome == "explained" and shrinkage is not None and _fails_unseen(found, shrinkage, beyond)
+    fails = found.outcome == "explained" and _fails_unseen(found, shrinkage, beyond)
     return "part" if fails else found.outcome
 
 
@@ -282,7 +283,7 @@ def _disagreeing(
     return tuple(record.name for record, is_gap in zip(unseen, after - noise > least, strict=True) if is_gap)
 
 
-def _fails_unseen(found: Attribution, shrinkage: Shrinkage, beyond: np.ndarray) -> bool:
+def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float | Floats = 0.0) -> bool:
     """Whether the set leaves much of a gap that it should close on records that it was not fitted to.
 
     Enough effects of the wrong kind over-fit the records: they do not predict others.
@@ -290,7 +291,7 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage, beyond: np.ndarray) 
     Args:
         beyond: (n_records,) of `_beyond_models`.
     """
-    if _remainders(found):
+    if shrinkage is None or _remainders(found):
         return False
     before, after, floor = _powers(shrinkage)
     floor = max(found.noise_ratio, 1.0) ** 2 * floor + beyond

@@ -348,7 +348,7 @@ def where_json(where: Where) -> dict[str, Any]:
     }
 
 
-def _described(effect: Effect, nominal: Rig, named_units: Units) -> str:
+def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
     """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01; a wrong sensor gain (d4: gain 0.93)."""
     stated = effect.stated(nominal)
     units = {p.name: named_units.named(p.unit) for p in effect.parameters(nominal) if p.name in stated}
