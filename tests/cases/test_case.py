@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from workbench.cases.case import Case, CaseError, read_case
+from workbench.cases.units import Units
 from workbench.cases.writing import write_case
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -253,3 +254,21 @@ def test_inputs_are_held_or_run_straight_as_the_case_says(case, tmp_path):
     (folder / "case.toml").write_text('input_hold = "second"\n' + text)
     with pytest.raises(CaseError, match=r"zero \(held\) or first"):
         read_case(folder)
+
+
+def test_units_are_named_all_four_or_none(case, tmp_path):
+    millimetres = Units("mm", "t", "s", "N")
+    write_case(replace(case, units=millimetres), tmp_path / "in mm")
+    read = read_case(tmp_path / "in mm")
+    assert read.units == millimetres and [c.unit for c in read.fit[0].output_channels] == ["mm", "mm/s^2"]
+    file = tmp_path / "in mm" / "case.toml"
+    file.write_text(file.read_text().replace('force = "N"\n', ""))
+    with pytest.raises(CaseError, match=r"\[units\]: force must be a text"):
+        read_case(tmp_path / "in mm")
+    write_case(case, tmp_path / "in m")
+    assert read_case(tmp_path / "in m").units == Units() and "[units]" not in (tmp_path / "in m/case.toml").read_text()
+    microns = Units("µm", "pg", "µs", "nN")
+    told = ["N s^2/m^2", "N/m", "1/m", "Hz", "rad", "kg", "N/m^3", ""]
+    named = ["nN µs^2/µm^2", "nN/µm", "1/µm", "1/µs", "rad", "pg", "nN/µm^3", ""]
+    assert [microns.named(unit) for unit in told] == named
+    assert [Units().named(unit) for unit in told] == told

@@ -1,12 +1,20 @@
 """`workbench diagnose`: faults of wiring are said before any search, and mended where that is asked for."""
 
+import json
 from dataclasses import replace
+from shutil import copy
 
 import numpy as np
 import pytest
 
+from workbench.cases.case import Case
 from workbench.cases.writing import write_case
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
 from workbench.trials.make import make_trial
 
 
@@ -30,7 +38,7 @@ def write_exchanged(case, folder):
 def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_path, monkeypatch, nothing_hidden):
     write_exchanged(nothing_hidden, tmp_path / "crossed")
     stopped = run("diagnose", tmp_path / "crossed", "--page", tmp_path / "p.html")
-    assert stopped.exit_code == 2 and "The inputs F1 and F2 are exchanged: swap them in case.toml." in stopped.output
+    assert stopped.exit_code == 2 and "The inputs F1 and F2 are exchanged: swap them." in stopped.output
     assert "--mend" in stopped.output and not (tmp_path / "p.html").exists()
     seen, real = [], nothing_hidden
 
@@ -44,6 +52,31 @@ def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_pa
         assert "the search has begun" in run("diagnose", tmp_path / "crossed", option).output
         for record, exact in zip(seen, (*real.fit[:2], *real.validation[:1]), strict=True):
             np.testing.assert_array_equal(record.inputs[:2], exact.inputs[order])
+
+
+def test_what_was_mended_is_told_in_the_verdict_and_on_the_page(run, tmp_path):
+    """Two outputs of records that begin in motion are exchanged; with --settle that is seen and mended too."""
+    beam = Beam(
+        length=2.0, mass_per_length=1.0, bending_stiffness=20.0, left="hinged", right="hinged",
+        damping=ModalDamping(0.3),
+    )  # fmt: skip
+    sensors = [Sensor(f"y{i}", 0.4 * i, noise_std=1e-6) for i in (1, 2)]
+    rig = Rig(beam.modes(3), [Actuator("F", 0.5)], sensors, structure=beam)
+    rng, records = np.random.default_rng(1), []
+    for name in ("low", "check"):
+        clean = simulate(rig, rng.normal(size=(1, 1200)), sample_time=0.01, name=name).between(2.0)
+        outputs = clean.outputs + 1e-6 * rng.normal(size=clean.outputs.shape)
+        records.append(replace(clean, outputs=outputs[::-1], start_time=0.0))
+    write_case(Case("crossed", rig, (records[0],), (records[1],)), tmp_path / "crossed")
+    verdict, page = tmp_path / "v.json", tmp_path / "p.html"
+    options = ("--settle", "6", "--workers", "1", "--json", verdict, "--page", page)
+    assert "The outputs y1 and y2 are exchanged" in run("diagnose", tmp_path / "crossed", *options).output
+    assert not page.exists()
+    told = run("diagnose", tmp_path / "crossed", *options, "--mend")
+    note = "Corrected before the diagnosis: The outputs y1 and y2 are exchanged: swap them."
+    assert told.exit_code == 0 and note in json.loads(verdict.read_text())["notes"]
+    assert note in page.read_text()
+    assert json.loads(verdict.read_text())["outcome"] == "none"
 
 
 def test_a_validation_record_that_repeats_a_fit_record_is_refused(run, tmp_path, nothing_hidden):
@@ -84,3 +117,12 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
     assert "the search has begun" in run("diagnose", *options, f"F1,{real.rig.sensors[0].name}").output
     options = (*options, f"F1,{real.rig.sensors[0].name}", "--settle", "0.5")
     assert "the search has begun" in run("diagnose", *options).output and settled == [0.0, 0.0, 0.5]
+    days = [tmp_path / day / "sweep.csv" for day in ("monday", "tuesday")]
+    for file in days:
+        file.parent.mkdir()
+        copy(tmp_path / "high.csv", file)
+    seen.clear()
+    options = ("--nominal", tmp_path / "low.csv", "--inputs", "F1", "--quantity", "displacement", "--as-wired")
+    run("diagnose", *options, *(part for file in days for part in ("--records", file)))
+    assert [record.name for record in seen[1:]] == ["monday/sweep", "tuesday/sweep"]
+    assert "give it once" in run("diagnose", *options, "--records", days[0], "--records", days[0]).output

@@ -12,7 +12,7 @@ from workbench.gap.effects.nonlinear import with_element
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.readiness import RecordsError
 from workbench.gap.search.fit import fit
-from workbench.rig.elements import UserLaw
+from workbench.rig.elements import OneSidedStop, UserLaw
 from workbench.rig.rig import Rig
 from workbench.trials.make import make_trial
 
@@ -107,6 +107,7 @@ def test_a_search_whose_time_is_spent_ends_with_what_it_has(nothing_hidden):
     rig = kind_named("actuator_gain").apply(nothing_hidden.rig, drive, {"gain": 0.1})
     verdict = diagnose(rig, nothing_hidden.fit[:2], workers=1, seconds=1e-3)
     assert verdict.outcome in ("part", "unknown") and any("limit of 0.002 s" in note for note in verdict.notes)
+    assert verdict.sentence.startswith("None of the effects tried before the time was spent explains the gap")
 
 
 def test_nothing_hidden_nothing_told(quiet_verdict):
@@ -246,6 +247,40 @@ def test_records_that_cannot_be_of_the_rig_are_refused(nothing_hidden):
         diagnose(Rig(case.rig.modes, case.rig.actuators, case.rig.sensors[1:]), case.fit)
     with pytest.raises(ValueError, match="at least one record"):
         diagnose(case.rig, ())
+
+
+def test_no_gap_is_told_only_where_records_held_out_have_none_either(hinged_rig, record_of):
+    """At a low level nothing touches a stop that a loud record reaches; two outputs of another one are exchanged."""
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    commands = np.repeat(rng.normal(size=40), 10)[None]
+    low = record_of(rig, 0.3 * commands, rng, name="low")
+    touched = replace(rig, elements=(OneSidedStop(0.7, 2000.0, 1.2 * float(np.abs(low.outputs).max())),))
+    commands = np.repeat(rng.normal(size=40), 10)[None]
+    sound, loud = (record_of(touched, level * commands, rng, name=f"at {level}") for level in (0.2, 2.0))
+    crossed = replace(sound, outputs=sound.outputs[[2, 1, 0, 3]], name="crossed")
+    gain = (kind_named("actuator_gain"),)
+    for held, disagreeing in (((sound,), ()), ((sound, loud), ("at 2.0",)), ((crossed,), ("crossed",))):
+        verdict = diagnose(rig, [low], validation=held, catalogue=gain, workers=1)
+        assert verdict.disagreeing == disagreeing and verdict.outcome == ("unknown" if disagreeing else "none")
+        assert verdict.effects == () and not verdict.shows_gap
+        if disagreeing:
+            share = f"{100 * verdict.shrinkage.after[disagreeing[0]]:.0f} %"
+            assert verdict.sentence == (
+                "In the records that were fitted, there is no gap beyond the noise of the sensors; but validation"
+                f" record {disagreeing[0]} disagrees by {share} of its signal: fit it too."
+            )
+    assert verdict.notes == ("In validation record crossed, the outputs d1 and d3 are exchanged: swap them.",)
+
+
+def test_a_fault_of_a_record_held_out_is_not_called_over_fitting(hinged_rig, record_of):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    real = kind_named("actuator_gain").apply(rig, rig.actuators[0].name, {"gain": 1.2})
+    commands = [np.repeat(rng.normal(size=40), 10)[None] for _ in range(2)]
+    fitted, kept = (record_of(real, command, rng, name=f"r{i}") for i, command in enumerate(commands))
+    crossed = replace(kept, outputs=kept.outputs[[2, 1, 0, 3]])
+    verdict = diagnose(rig, [fitted], validation=[crossed], catalogue=(kind_named("actuator_gain"),), workers=1)
+    assert verdict.outcome == "part" and "exchanged" in verdict.notes[0]
+    assert not any("over-fitting" in note for note in verdict.notes)
 
 
 @pytest.mark.parametrize("settle", [-1.0, 1e6, np.nan])

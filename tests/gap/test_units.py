@@ -4,8 +4,10 @@ import re
 from dataclasses import replace
 from math import isclose, prod
 
+import numpy as np
 import pytest
 
+from workbench.cases import units as named_units
 from workbench.cases.case import Case
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.beyond import BEYOND
@@ -18,6 +20,7 @@ from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Bar, Beam
 from workbench.structure.profile import Profile
+from workbench.study.pages.verdict_page import verdict_tables
 from workbench.trials.make import make_trial
 
 MILLIMETRES, TONNES, MILLISECONDS = 1e3, 1e-3, 1e3  # of a metre, a kilogram and a second
@@ -88,6 +91,17 @@ def test_bounds_of_effects_are_relative_to_the_rig():
                     wrong.append(f"{kind.name}, {one.name}: {end} {before:g} {one.unit} becomes {after:g}")
     assert not wrong, wrong
     assert {kind.name for kind in CATALOGUE} - {kind.name for kind in kinds} == {"joint_slip"}  # between named points
+
+
+def test_a_verdict_tells_its_numbers_by_the_names_of_the_units(hinged_rig, record_of):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    real = kind_named("point_mass").apply(rig, None, {"at": 0.6, "mass": 0.5})
+    record = record_of(real, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    millimetres = named_units.Units("mm", "t", "s", "N")
+    verdict = diagnose(rig, (record,), catalogue=(kind_named("point_mass"),), workers=1, units=millimetres)
+    assert re.search(r"mass 0\.5\S* (± \S+ )?t\)", verdict.sentence) and verdict.to_json()["units"]["length"] == "mm"
+    assert verdict_tables(verdict.to_json())[0][1][4] == "x [mm]"
+    assert " kg)" in replace(verdict, units=named_units.SI).sentence
 
 
 def verdict_on(case: Case, rig: Rig, fit: tuple[Record, ...], validation: tuple[Record, ...]) -> dict:

@@ -1,7 +1,7 @@
 """A case folder: a nominal model, and records measured on the real structure."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from workbench.cases.tables import (
     tables,
     text,
 )
+from workbench.cases.units import SI, Units
 from workbench.records.files import read_record
 from workbench.records.limits import RecordFileError, check_file
 from workbench.records.npz_file import arrays as load_arrays
@@ -39,7 +40,8 @@ LEAST_SAMPLES = 16
 MOST_MODES = 200
 
 # What each table may hold; a key beside these is a misspelt one.
-TABLES = ("title", "input_hold", "structure", "input", "output", "record")
+TABLES = ("title", "input_hold", "units", "structure", "input", "output", "record")
+UNITS = ("length", "mass", "time", "force")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
@@ -68,12 +70,14 @@ class Case:
         rig: nominal.
         fit: records that may be fitted.
         validation: records only for measuring how far the gap shrank.
+        units: names of its units.
     """
 
     name: str
     rig: Rig
     fit: tuple[Record, ...]
     validation: tuple[Record, ...]
+    units: Units = SI
 
 
 def read_case(folder: str | Path) -> Case:
@@ -90,9 +94,9 @@ def read_case(folder: str | Path) -> Case:
         raise CaseError(f"{folder} holds no case.toml, so it is not a case folder")
     table = table_of(path)
     rig = _rig(table, path)
-    hold = _hold(table, str(path))
+    hold, units = _hold(table, str(path)), _units(table)
     records = [
-        (_read_record(folder, {"input_hold": hold, **entry}, rig, path), _use(entry, path))
+        (_in_units(_read_record(folder, {"input_hold": hold, **entry}, rig, path), units), _use(entry, path))
         for entry in tables(table, "record", path)
     ]
     fit = tuple(record for record, use in records if use == "fit")
@@ -103,7 +107,28 @@ def read_case(folder: str | Path) -> Case:
         rig=rig,
         fit=fit,
         validation=tuple(record for record, use in records if use == "validate"),
+        units=units,
     )
+
+
+def _units(table: dict[str, Any]) -> Units:
+    """All of them or none: a force in newtons is no force of millimetres, kilograms and seconds."""
+    if "units" not in table:
+        return SI
+    units = table["units"]
+    if not isinstance(units, dict):
+        raise CaseError(f"[units] must be a table of {', '.join(UNITS)}; got {shown(units)}")
+    check_keys(units, UNITS, "[units]")
+    return Units(**{name: text(units, name, "[units]") for name in UNITS})
+
+
+def _in_units(record: Record, units: Units) -> Record:
+    """The record with its channels in the units of the case."""
+    inputs, outputs = (
+        tuple(replace(channel, unit=units.named(channel.unit)) for channel in channels)
+        for channels in (record.input_channels, record.output_channels)
+    )
+    return replace(record, input_channels=inputs, output_channels=outputs)
 
 
 def read_rig(path: str | Path) -> Rig:

@@ -1,7 +1,7 @@
 """Writing a case folder."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from workbench.cases.case import Case, signals_of
 from workbench.cases.points import write_points
+from workbench.cases.units import SI
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
@@ -39,7 +40,8 @@ def write_case(case: Case, folder: str | Path) -> Path:
     """
     folder = Path(folder)
     (folder / "records").mkdir(parents=True, exist_ok=True)
-    blocks = [f"title = {_text(case.name)}", *_rig(case.rig, folder)]
+    units = [] if case.units == SI else [_table("[units]", **asdict(case.units))]
+    blocks = [f"title = {_text(case.name)}", *units, *_rig(case.rig, folder)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
         file = f"records/{record.name}.npz"
         arrays: dict[str, Any] = {**signals_of(record)}

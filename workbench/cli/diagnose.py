@@ -57,6 +57,7 @@ def diagnose(
     from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose as run
     from workbench.gap.effects.effect import COORDINATES
+    from workbench.gap.report.readiness import check_alive
     from workbench.gap.report.verdict import place_in_words
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
     from workbench.study.measured_case import measured_case
@@ -78,8 +79,9 @@ def diagnose(
         )
     elif case is not None:
         found = read_case(case)
+    check_alive(found.rig, found.fit, found.validation, settle=settle)
     check_kept_apart(found.fit, found.validation)
-    faults = () if settle else wiring(found.rig, found.fit)
+    faults = wiring(found.rig, found.fit, found.validation, settle=settle)
     for fault in faults:
         say(f"  {'corrected' if mend and fault.certain else 'wiring'}     {fault.sentence}")
     if any(fault.certain for fault in faults) and not (mend or as_wired):
@@ -87,6 +89,7 @@ def diagnose(
     if mend:
         rig, fit = mended(faults, found.rig, found.fit)
         found = replace(found, rig=rig, fit=fit, validation=mended(faults, found.rig, found.validation)[1])
+    corrected = [f"Corrected before the diagnosis: {fault.sentence}" for fault in faults if mend and fault.certain]
     with reporting("reading") as report:
         verdict = run(
             found.rig,
@@ -98,14 +101,15 @@ def diagnose(
             workers=workers,
             seconds=seconds,
             report=report,
+            units=found.units,
         )
     say(verdict.sentence, bold=True)
     shown = verdict.to_json()
     where = verdict.where
-    if verdict.outcome != "none":  # where there is no gap, noise is everywhere
+    if verdict.shows_gap:  # where there is no gap, noise is everywhere
         say(f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on amplitude")
         say(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
-    if where.path in ("structure", "environment"):
+    if verdict.shows_gap and where.path in ("structure", "environment"):
         if verdict.place_stands:
             spread = dict.fromkeys(COORDINATES, where.at_std)
             say(f"  place      {place_in_words(where.at, spread)}, of the unmodelled point force, no law assumed")
@@ -118,6 +122,7 @@ def diagnose(
         say(f"  rival      {words} ({probability:.2g})")
     for note in verdict.notes:
         say(f"  {by_options(note)}")
+    verdict = replace(verdict, notes=(*corrected, *verdict.notes))
     if json_path is not None:
         write_verdict(verdict, json_path)
         say(f"  verdict    {short(json_path)}")

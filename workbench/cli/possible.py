@@ -37,14 +37,22 @@ def possible_rig(
         return read_verdict(verdict, case.rig)
     check_kept_apart(case.fit, case.validation)
     kept = Path("out") / f"{case.name}-verdict.json"
-    for fault in wiring(case.rig, case.fit):
+    for fault in wiring(case.rig, case.fit, case.validation):
         if fault.certain:
             raise ValueError(
                 f"{fault.sentence.rstrip('.')}; correct the case, or go on as it is by `workbench diagnose CASE"
                 f" --as-wired --json {kept.name}`, and give that file as --verdict"
             )
     errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
-    found = diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=workers, report=report)
+    found = diagnose(
+        case.rig,
+        case.fit,
+        validation=case.validation,
+        name=case.name,
+        workers=workers,
+        report=report,
+        units=case.units,
+    )
     write_verdict(found, kept)
     errors.print(f"  {found.sentence}")
     errors.print(f"  verdict    {short(kept)}: with --verdict {short(kept)} the next command need not diagnose")

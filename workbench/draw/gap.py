@@ -21,7 +21,7 @@ from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
 MOST_BARS, FEW_BARS = 16, 6  # of named points: the likeliest are shown, and few have their names level
 
 
-def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure:
+def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record], *, time_unit: str = "s") -> Figure:
     """Measured and simulated by each rig, at the sensor and in the segment where the first differs most, by record."""
     records = list(records)[-3:]
     figure, axes = new_figure(len(records), 1, width=10, height=2.6 * len(records), squeeze=False)
@@ -39,7 +39,7 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure
         for (name, values), colour, style in zip(outputs.items(), (COLOURS[1], COLOURS[0]), ("--", "-")):
             ax.plot(time, values[j, piece], color=colour, label=name, linestyle=style, linewidth=1.4)
         ax.set(title=f"record {record.name}, sensor {channel.name}", ylabel=in_units(channel.quantity, channel.unit))
-    axes[-1, 0].set_xlabel("time [s]")
+    axes[-1, 0].set_xlabel(f"time [{time_unit}]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure
 
@@ -136,7 +136,7 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
         if effect.at is not None and effect.kind.path in ("structure", "environment"):
             ax.axvline(effect.at, color=COLOURS[0])
     low = _lowest(profile)
-    ax.set(xlabel="x [m]", ylim=(low, -0.06 * low))
+    ax.set(xlabel=f"x [{verdict.units.length}]", ylim=(low, -0.06 * low))
 
 
 def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
@@ -149,7 +149,8 @@ def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
         if effect.at is not None and effect.kind.path in ("structure", "environment"):
             ax.plot(*effect.at, "o", color=COLOURS[0], fillstyle="none", markersize=9)
     a, b = domain.length
-    ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(0.0, a), ylim=(0.0, b), aspect="equal")
+    m = verdict.units.length
+    ax.set(xlabel=f"x [{m}]", ylabel=f"y [{m}]", xlim=(0.0, a), ylim=(0.0, b), aspect="equal")
 
 
 def _lowest(profile: Floats) -> float:
@@ -162,13 +163,15 @@ def _short(where: Where) -> str:
     return " to ".join(map(str, where)) if isinstance(where, Between) else str(where)
 
 
-def plot_unmodelled_force(verdict: Verdict, *, length: str = "m", force: str = "N") -> Figure:
+def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force: str | None = None) -> Figure:
     """The force missing at its place beside other effects and freed figures, over displacement and velocity.
 
     Args:
         verdict: of the diagnosis.
-        length, force: units, where the case is not in metres and newtons.
+        length, force: names of units; those of the verdict unless given.
     """
+    units = verdict.units
+    length, force = length or units.length, force or units.force
     evidence = verdict.attribution.evidence
     chosen = [e for e in verdict.effects if e.at is not None and e.kind.path == "structure"]
     beside = [e for e in verdict.effects if chosen and e is not chosen[0]]
@@ -181,7 +184,7 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str = "m", force: str = "
     step = max(1, place.force.size // 4000)
     for ax, series, (name, unit) in (
         (axes[0], place.displacement, ("displacement", length)),
-        (axes[1], place.velocity, ("velocity", f"{length}/s")),
+        (axes[1], place.velocity, ("velocity", f"{length}/{units.time}")),
     ):
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=3, alpha=0.6)
         ax.set_xlabel(f"{name} {there} [{unit}]")

@@ -1,11 +1,12 @@
 """The diagnosis from end to end: rig and records in, verdict out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from workbench.arrays import Floats
+from workbench.cases.units import SI, Units
 from workbench.deadline import Deadline
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
@@ -14,6 +15,7 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
 from workbench.gap.localisation.force_localisation import locate_force
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.noise import noise_guessed
+from workbench.gap.prediction.residuals import lead_of
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.budget import (
     Budget,
@@ -21,6 +23,7 @@ from workbench.gap.report.budget import (
     budget_of,
     mean_square,
     measure,
+    noise_power,
     power_in,
     power_of_inputs,
 )
@@ -43,9 +46,13 @@ PAID = 0.02  # of what is left of records held out: what an effect that acts the
 TRIFLE = 0.0005  # of the gap there: likewise
 CLEAR = 10.0  # times that: what is left there without an effect that counts beyond doubt
 HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
+CHANCE = 5.0  # standard deviations of the mean square of white noise: more than that is left of a record by no chance
 SECONDS = 120.0  # of processor time of this process and one beside it: twice what cases of a laboratory take at most
 SEARCH_SHARE = 0.8  # of that time; the rest is for intervals, budget and the next experiment
 BESIDE_ERRORS = 0.8  # likewise where the model itself is a little off: 4 % of the gap's power may be left
+
+
+OVER_FITTING = "The nearest set explains the records it was fitted to, but not the validation records: over-fitting."
 
 
 @one_blas_thread
@@ -63,6 +70,7 @@ def diagnose(
     free_nominal: bool = False,
     tolerance: float = TOLERANCE,
     identified: IdentifiedPrior | None = None,
+    units: Units = SI,
 ) -> Verdict:
     """Where a rig and records of the real structure disagree, which effect is missing, how far the gap then shrinks.
 
@@ -85,10 +93,11 @@ def diagnose(
             explained; nor is one below a tenth of the noise.
         identified: errors that the nominal rig has because it was itself identified: they are fitted beside the effects
             in the end, so that intervals allow for them. Those of a rig's modes where their covariance is known.
+        units: names of the units of the rig and the records, by which the verdict tells its numbers.
 
     Raises:
-        ValueError: records that do not fit the rig or cannot be of it, a validation record that repeats one to be
-            fitted, or modes that are not those of the structure.
+        ValueError: records that do not fit the rig or cannot be of it, two of one name, a validation record that
+            repeats one to be fitted, or modes that are not those of the structure.
     """
     sharing = Workers.at_hand() if workers is None else Workers(workers)
     if seconds is not None and sharing.number == 1:
@@ -104,13 +113,13 @@ def diagnose(
             f"settle must be 0 or more and less than the shortest record, {shortest:g} s; got {settle:g} s"
         )
     check_modes(rig)
-    check_records(rig, records, settle=settle)
+    check_records(rig, records, validation, settle=settle)
     check_kept_apart(records, validation)
     silent = [sensor.name for sensor in rig.sensors if not sensor.noise_std]
     if silent:
         each = zip(rig.sensors, noise_guessed(rig, records), strict=True)
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
-    faults = () if settle else wiring(rig, records)
+    faults = wiring(rig, records, validation, settle=settle)
     report("looking for the unmodelled force", 0.02)
     found = baseline(rig, records, settle=settle, workers=sharing, deadline=deadline)
     nominal = found.nominal
@@ -134,7 +143,9 @@ def diagnose(
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)
         accounted = with_held_out(rig, attribution.best.effects, validation, settle=settle)
-        outcome = _outcome(rig, attribution, shrinkage, validation, settle, accounted)
+        beyond = _beyond_models(rig, attribution, validation, settle, accounted)
+        disagreeing = _disagreeing(attribution, shrinkage, validation, settle, tolerance, beyond)
+        outcome = _outcome(attribution, shrinkage, beyond, disagreeing)
         errors = next((e for e in accounted if e.kind is NOMINAL_ERRORS), None)
         named = tuple(e for e in accounted if e is not errors)
         effects = named if outcome in ("none", "explained") else ()
@@ -149,9 +160,14 @@ def diagnose(
             logged=attribution.logged,
             settle=settle,
         )
+        sound = outcome in ("none", "explained")
+        in_records = () if sound else data_faults(rig, records, settle=settle)
+        in_unseen = () if sound else data_faults(rig, validation, settle=settle)
+        miswired = any(record.name in fault.records for fault in faults for record in validation)
         return Verdict(
             case=name,
             outcome=outcome,
+            disagreeing=disagreeing,
             effects=attribution.best.effects,
             alternatives=tuple((fit.named, probability) for fit, probability in attribution.rivals),
             where=locate(nominal, effects, place() if as_seen else locate_force(nominal.without(faulty))),
@@ -161,12 +177,15 @@ def diagnose(
             attribution=attribution,
             readiness=ready(),
             budget=budget,
-            experiment=_next(rig, attribution, sharing),
+            experiment=_next(rig, attribution, sharing, units),
             tolerance=tolerance,
+            units=units,
             notes=(
                 *(fault.sentence for fault in faults),
-                *(() if outcome in ("none", "explained") else data_faults(rig, records, settle=settle)),
-                *_notes(attribution, outcome, budget, seconds, silent),
+                *in_records,
+                *in_unseen,
+                *([OVER_FITTING] if outcome == "part" != attribution.outcome and not (in_unseen or miswired) else []),
+                *_notes(attribution, budget, seconds, silent, sound),
             ),
         )
 
@@ -216,22 +235,57 @@ def _acts(
     return sum(power_in(record, predict(one, record) - predict(other, record), settle) for record in unseen)
 
 
-def _outcome(
-    rig: Rig,
-    found: Attribution,
-    shrinkage: Shrinkage | None,
-    unseen: Sequence[Record],
-    settle: float,
-    accounted: Sequence[Effect],
-) -> str:
-    if found.outcome != "explained" or shrinkage is None:
-        return found.outcome
-    beyond: float | Floats = found.logged**2 * power_of_inputs(rig, unseen, settle) if found.logged else 0.0
+def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray, disagreeing: Sequence[str]) -> str:
+    if disagreeing:
+        return "unknown"
+    fails = found.outcome == "explained" and _fails_unseen(found, shrinkage, beyond)
+    return "part" if fails else found.outcome
+
+
+def _beyond_models(
+    rig: Rig, found: Attribution, unseen: Sequence[Record], settle: float, accounted: Sequence[Effect]
+) -> np.ndarray:
+    """Mean square (n_records,) that noise of the logged inputs, and a figure's own value in a record, leave there.
+
+    No set closes it.
+    """
+    beyond = np.zeros(len(unseen))
+    if found.logged and unseen:
+        beyond = found.logged**2 * power_of_inputs(rig, unseen, settle)
     if any(effect not in found.best.effects for effect in accounted):
         rigs = [apply_all(rig, effects) for effects in (found.best.effects, accounted)]
         common, own = (np.array([mean_square(r, record, settle) for record in unseen]) for r in rigs)
         beyond = beyond + common - own
-    return "part" if _fails_unseen(found, shrinkage, beyond) else found.outcome
+    return beyond
+
+
+def _powers(shrinkage: Shrinkage) -> Iterator[np.ndarray]:
+    """Mean squares (n_records,) of the gap before and after, and of the noise that was stated."""
+    return (np.array([*by_name.values()]) ** 2 for by_name in (shrinkage.before, shrinkage.after, shrinkage.floor))
+
+
+def _disagreeing(
+    found: Attribution,
+    shrinkage: Shrinkage | None,
+    unseen: Sequence[Record],
+    settle: float,
+    tolerance: float,
+    beyond: np.ndarray,
+) -> tuple[str, ...]:
+    """Names of the records held out that have a gap, where those that were fitted have none.
+
+    It is larger than the tolerance, than chance, and than what errors of the model may leave where these were fitted.
+    """
+    if found.outcome != "none" or shrinkage is None:
+        return ()
+    before, after, _ = _powers(shrinkage)
+    noise = beyond + [noise_power(record, found.noise, settle) for record in unseen]
+    chance = [CHANCE * np.sqrt(2.0 / (r.n_outputs * (r.n_samples - lead_of(r, settle)))) for r in unseen]
+    may_leave = (1.0 - BESIDE_ERRORS) ** 2 if found.best.effects else 0.0
+    least = np.max(
+        [np.full(len(unseen), tolerance**2), (LEFT + np.array(chance)) * noise, may_leave * (before - noise)], axis=0
+    )
+    return tuple(record.name for record, is_gap in zip(unseen, after - noise > least, strict=True) if is_gap)
 
 
 def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float | Floats = 0.0) -> bool:
@@ -240,14 +294,11 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float
     Enough effects of the wrong kind over-fit the records: they do not predict others.
 
     Args:
-        beyond: (n_records,) what noise of the logged inputs, and a figure's own value in a record, leave of them, which
-            no set closes.
+        beyond: (n_records,) of `_beyond_models`.
     """
     if shrinkage is None or _remainders(found):
         return False
-    before, after, floor = (
-        np.array([*by_name.values()]) ** 2 for by_name in (shrinkage.before, shrinkage.after, shrinkage.floor)
-    )
+    before, after, floor = _powers(shrinkage)
     floor = max(found.noise_ratio, 1.0) ** 2 * floor + beyond
     left, closable = (np.maximum(power - floor, 0.0).sum() for power in (after, before))
     closed = max(shrinkage.overall, 1.0 - float(np.sqrt(left / max(closable, 1e-300))))
@@ -273,27 +324,25 @@ def _check(rig: Rig, record: Record) -> None:
             )
 
 
-def _next(rig: Rig, found: Attribution, workers: Workers) -> Experiment | None:
+def _next(rig: Rig, found: Attribution, workers: Workers, units: Units) -> Experiment | None:
     """The experiment that would separate the best set from its likeliest rival."""
     explained = found.outcome == "explained" or any_beyond(found.best.effects)
     for rival, probability in found.rivals:
         if explained and probability > RIVAL:
-            return next_experiment(rig, found.best, rival, found.search.data, workers)
+            return replace(next_experiment(rig, found.best, rival, found.search.data, workers), time=units.time)
     return None
 
 
 def _notes(
-    found: Attribution, outcome: str, budget: Budget, seconds: float | None, silent: Sequence[str]
+    found: Attribution, budget: Budget, seconds: float | None, silent: Sequence[str], sound: bool
 ) -> tuple[str, ...]:
     """What is said beside the sentence; `silent` are the sensors whose noise was not stated."""
     taken = f"noise_std of {', '.join(silent)} is not stated; it was taken from the records."
-    seen = "The nearest set explains the records it was fitted to, but not the validation records: over-fitting."
     cut = f"The search reached its limit of {seconds} s of processor time with this best set; allow more by `seconds`."
     notes = (
         *([taken] if silent else []),
         *([cut] if found.is_cut else []),
-        *([seen] if outcome != found.outcome else []),
-        budget.noise_remark if outcome in ("none", "explained") else "",  # else more than noise is left
+        budget.noise_remark if sound else "",  # else more than noise is left
         *_remainders(found),
     )
     return tuple(note for note in notes if note)

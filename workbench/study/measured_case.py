@@ -33,15 +33,17 @@ def measured_case(
             given.
 
     Raises:
-        ValueError: no inputs, outputs of no known quantity, files of other channels, a driving point of other names.
+        ValueError: no inputs, outputs of no known quantity, files of other channels, a driving point of other names,
+            one file twice.
     """
 
-    def read(path: Path) -> Record:
+    def read(path: Path, name: str) -> Record:
         record = read_record(path, inputs=inputs)
         channels = [replace(c, quantity=c.quantity or quantity, unit=c.unit) for c in record.output_channels]
-        return replace(record, output_channels=tuple(channels), name=path.stem)
+        return replace(record, output_channels=tuple(channels), name=name)
 
-    low = read(nominal)
+    names = _names((*records, *validation))
+    low = read(nominal, nominal.stem)
     if not low.n_inputs:
         raise ValueError(f"{nominal}: no channel is an input, so no model can be simulated; name them by --inputs")
     unknown = [channel.name for channel in low.output_channels if channel.quantity not in MEASURED]
@@ -51,4 +53,16 @@ def measured_case(
         raise ValueError(f"--driving-point is INPUT,OUTPUT; got {','.join(driving_point)}")
     pair = (driving_point[0], driving_point[1]) if driving_point else None
     rig = rig_from(identify_driven([low]), driving_point=pair)
-    return Case(nominal.stem, rig, tuple(map(read, records)), tuple(map(read, validation)))
+    read_all = tuple(map(read, (*records, *validation), names))
+    return Case(nominal.stem, rig, read_all[: len(records)], read_all[len(records) :])
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """What records are called: by their files, with as many folders before as make all differ."""
+    whole = [path.resolve() for path in paths]
+    for depth in range(max(len(path.parts) for path in whole)):
+        names = ["/".join((*path.parts[-1 - depth : -1], path.stem)) for path in whole]
+        if len(set(names)) == len(names):
+            return names
+    twice = next(path for path, name in zip(paths, names, strict=True) if names.count(name) > 1)
+    raise ValueError(f"{twice}: another record is that file too, or has its name but for the ending; give it once")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.localisation import force_lines
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_lines import lines_of
@@ -178,3 +179,22 @@ def test_a_linear_gap_is_told_from_one_that_depends_on_level(rig, changed, low, 
     real = replace(rig, **changed)
     found = where(rig, [measured(real, f"{level}", level, seed) for seed, level in enumerate((0.1, 0.3, 1.0))])
     assert low <= found.linear_share <= high
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_record_of_noise_alone_says_nothing_of_where_a_gap_is(rig, measured):
+    """A gain of 1.1 of the third sensor; a quiet record, scaled by itself, would count by its noise."""
+    real = kind_named("sensor_gain").apply(rig, "d3", {"gain": 1.1})
+    driven, quiet = measured(real, "driven", 1.0, 0), measured(real, "quiet", 0.0, 1)
+    alone, beside = where(rig, (driven,)), where(rig, (driven, quiet))
+    assert beside.sensor_shares[2] > 0.99 and beside.modes == alone.modes
+    np.testing.assert_array_equal(beside.band_shares, alone.band_shares)
+    assert beside.linear_share == alone.linear_share > 0.9
+
+
+@pytest.mark.filterwarnings("error")
+def test_no_reply_is_learnt_where_no_other_record_has_inputs(rig, measured):
+    driven, free = measured(rig, "driven", 1.0, 0), measured(rig, "free", 0.0, 1)
+    disturbed = replace(free, outputs=1e-3 * np.sin(2 * np.pi * 3.0 * free.time) * np.ones((4, 1)) + free.outputs)
+    biased = replace(driven, outputs=1.1 * driven.outputs)
+    assert 0.0 <= where(rig, (biased, disturbed)).linear_share <= 1.0

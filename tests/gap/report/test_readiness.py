@@ -73,6 +73,26 @@ def test_the_channel_in_other_units_is_named(rig, data, kept):
         check_records(few, [replace(record, outputs=1e3 * record.outputs)])
 
 
+def test_faults_of_records_held_out_are_refused_like_those_of_records_to_be_fitted(rig, data):
+    (record,) = data.records
+    for factor, words in (
+        (0.0, "validation record 'v': output 'd2' is flat"),
+        (1e3, "output 'd2' reads about 1000 times what the model predicts in every validation record"),
+    ):
+        outputs = np.array([[1.0], [factor], [1.0], [1.0]]) * record.outputs
+        with pytest.raises(RecordsError, match=words):
+            check_records(rig, [record], [replace(record, outputs=outputs, name="v")])
+
+
+def test_a_rig_without_actuators_and_a_record_of_few_samples_are_refused(rig, data):
+    (record,) = data.records
+    free = replace(rig, actuators=())
+    with pytest.raises(RecordsError, match="no actuators"):
+        check_records(free, [free.record(np.zeros((0, 1000)), record.outputs, sample_time=0.01, name="free")])
+    with pytest.raises(RecordsError, match="has 10 samples to compare once settled; at least 16 are needed"):
+        check_records(rig, [record], settle=9.9)
+
+
 def test_a_strong_force_that_nobody_modelled_is_no_wrong_unit(rig, record_of):
     rng = np.random.default_rng(6)
     commands = 0.003 * np.vstack([np.repeat(rng.normal(size=100), 10), np.zeros(1000)])

@@ -10,7 +10,7 @@ from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
-from workbench.gap.report.budget import budget_of
+from workbench.gap.report.budget import budget_of, measure
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.006])
@@ -122,3 +122,14 @@ def test_effects_of_one_kind_have_shares_of_their_own(hinged_rig, record_of):
     assert budget.effects["point_mass[x = 0.4]"] > 2.0 * budget.effects["point_mass[x = 1.5]"] > 0.0
     assert sum(budget.effects.values()) + budget.unexplained + budget.noise == pytest.approx(1.0)
     assert budget.to_json()["effects"] == {"point_mass": pytest.approx(sum(budget.effects.values()), abs=1e-5)}
+
+
+def test_what_is_closed_of_one_record_is_its_share_however_it_falls_into_blocks(hinged_rig, record_of):
+    """A last block of a few samples weighs no more than they are."""
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    gain = kind_named("actuator_gain")
+    real, near = (gain.apply(rig, rig.actuators[0].name, {"gain": value}) for value in (1.3, 1.2))
+    inputs = np.repeat(rng.normal(size=40), 10)[None]
+    inputs[:, -30:] *= 20.0
+    closed = measure(rig, near, [record_of(real, inputs[:, :-7], rng, name="held out")])
+    assert closed.overall == pytest.approx(closed.share["held out"], rel=1e-12)

@@ -59,7 +59,7 @@ def test_nothing_is_wrong_with_a_case_wired_rightly(case):
 
 def test_exchanged_inputs_are_named_and_mended_to_the_last_bit(case):
     records = change(case.fit, inputs=exchanged(4, 0, 2))
-    fault = expect(case, records, "The inputs F1 and F3 are exchanged: swap them in case.toml.")
+    fault = expect(case, records, "The inputs F1 and F3 are exchanged: swap them.")
     _, again = fault.mend(case.rig, records)
     assert all(np.array_equal(a.inputs, b.inputs) for a, b in zip(again, case.fit, strict=True))
 
@@ -68,7 +68,7 @@ def test_exchanged_outputs_are_named(case):
     expect(
         case,
         change(case.fit, outputs=exchanged(7, 1, 4)),
-        "The outputs a2 and a5 are exchanged: swap them in case.toml.",
+        "The outputs a2 and a5 are exchanged: swap them.",
     )
 
 
@@ -104,14 +104,17 @@ def test_a_hammer_in_millinewton_and_an_input_with_its_sign_turned_are_named(cas
 
 def test_a_mislabelled_quantity_is_named(case):
     sensors = (replace(case.rig.sensors[0], quantity="velocity"), *case.rig.sensors[1:])
-    sentence = 'The output a1 is acceleration, not velocity: write quantity = "acceleration" in case.toml.'
+    sentence = 'The output a1 is acceleration, not velocity: state the quantity "acceleration".'
     expect(case, case.fit, sentence, rig=replace(case.rig, sensors=sensors))
 
 
 def test_a_sampling_rate_off_by_two_is_named_of_all_records_or_of_one(case):
     dt = case.fit[0].sample_time
-    told = f"write sample_time = {dt:.6g} s."
-    expect(case, change(case.fit, sample_time=2.0), f"All records are sampled at twice the stated rate: {told}")
+    told, names = f"state sample_time = {dt:.6g} s.", [r.name for r in case.fit]
+    listed = f"{', '.join(names[:-1])} and {names[-1]}"
+    expect(
+        case, change(case.fit, sample_time=2.0), f"The records {listed} are sampled at twice the stated rate: {told}"
+    )
     one = [*change(case.fit[:1], sample_time=0.5), *case.fit[1:]]
     expect(case, one, f"The record {case.fit[0].name} is sampled at half the stated rate: {told}")
 
@@ -142,7 +145,7 @@ def test_the_same_data_under_two_names_are_named(case):
 def test_one_record_twice_is_named_and_a_validation_record_that_repeats_one_is_refused(case):
     twice = [*case.fit, replace(case.fit[1], name="again")]
     first = case.fit[1].name
-    expect(case, twice, f"The records {first} and again hold the same samples: leave again out of case.toml.")
+    expect(case, twice, f"The records {first} and again hold the same samples: leave again out.")
     part = replace(case.fit[1], outputs=case.fit[1].outputs[:, :900], inputs=case.fit[1].inputs[:, :900], name="part")
     with pytest.raises(ValueError, match=f"validation record 'part' repeats the fit record '{first}'"):
         check_kept_apart(case.fit, [part])
@@ -198,3 +201,67 @@ def test_an_input_with_a_gain_near_a_unit_is_not_mended_beside_a_turned_sign_tha
 def test_a_factor_rounded_or_within_calibration_is_a_fault_of_units(case, factor):
     [fault] = wiring(case.rig, change(case.fit, outputs=diagonal(7, 2, factor)))
     assert fault.certain
+
+
+def test_a_validation_record_is_mended_by_what_it_shows_itself(case):
+    """The fit records state twice their sample time, or have two outputs exchanged; the validation record is right."""
+    held = case.validation
+    (kept,) = held
+    slow = change(case.fit, sample_time=2.0)
+    faults = wiring(case.rig, slow, held)
+    assert all(a is b for a, b in zip(mended(faults, case.rig, held)[1], held, strict=True))
+    mended_fit = mended(faults, case.rig, slow)[1]
+    assert [r.sample_time for r in mended_fit] == pytest.approx([r.sample_time for r in case.fit])
+    crossed = exchanged(7, 1, 4)
+    fit = change(case.fit, outputs=crossed)
+    (fault,) = wiring(case.rig, fit, held)
+    assert fault.sentence == f"The outputs a2 and a5 are exchanged: swap them; not in {kept.name}."
+    assert mended([fault], case.rig, held)[1] == held
+    (fault,) = wiring(case.rig, fit, change(held, outputs=crossed))
+    assert fault.sentence == "The outputs a2 and a5 are exchanged: swap them."
+    (again,) = mended([fault], case.rig, change(held, outputs=crossed))[1]
+    assert np.array_equal(again.outputs, kept.outputs)
+
+
+def test_faults_that_a_validation_record_alone_has_are_named_with_it(case):
+    (kept,) = case.validation
+    for change_of, words in (
+        (
+            {"outputs": diagonal(7, 2, 1e3)},
+            "the output a3 is 1000 times too large, such as mm for m: multiply by 0.001",
+        ),
+        ({"inputs": exchanged(4, 0, 2)}, "the inputs F1 and F3 are exchanged: swap them"),
+    ):
+        spoilt = change([kept], **change_of)
+        (fault,) = wiring(case.rig, case.fit, spoilt)
+        assert fault.sentence == f"In validation record {kept.name}, {words}."
+        rig, (again,) = mended([fault], case.rig, spoilt)
+        assert (
+            rig is case.rig and np.allclose(again.outputs, kept.outputs) and np.array_equal(again.inputs, kept.inputs)
+        )
+        assert mended([fault], case.rig, case.fit)[1] == case.fit
+    (fault,) = wiring(case.rig, case.fit, change([kept], sample_time=0.5))
+    assert fault.sentence.startswith(f"The record {kept.name} is sampled at half the stated rate")
+
+
+def test_wiring_is_compared_once_the_rig_has_settled(case):
+    """Records that begin in motion look like no wiring at first."""
+    crossed = change(case.fit, outputs=exchanged(7, 1, 4))
+    begun = [r.between(0.2 * r.n_samples * r.sample_time) for r in crossed]
+    settle = 0.5 * begun[0].n_samples * begun[0].sample_time
+    assert [fault.sentence for fault in wiring(case.rig, begun, settle=settle)] == [
+        "The outputs a2 and a5 are exchanged: swap them."
+    ]
+
+
+def test_a_dead_channel_is_no_other_quantity(case):
+    dead = change(case.fit, outputs=diagonal(7, 2, 0.0))
+    assert wiring(case.rig, dead) == ()
+
+
+def test_records_of_one_name_are_refused(case):
+    first, other = case.fit[0], replace(case.fit[1], name=case.fit[0].name)
+    with pytest.raises(ValueError, match=f"2 records are called '{first.name}'"):
+        wiring(case.rig, [first, other])
+    with pytest.raises(ValueError, match=f"2 records are called '{first.name}'"):
+        diagnose(case.rig, [first], validation=[other], workers=1)

@@ -163,14 +163,12 @@ class Moved(Protocol):
 
 
 class Measured(Protocol):
-    """The fit records, whole and without the samples at their start (`lead`) that are not counted."""
+    """The fit records, whole and without the samples at their start that are not counted."""
 
     @property
     def records(self) -> tuple[Record, ...]: ...
     @property
     def counted(self) -> tuple[Record, ...]: ...
-    @property
-    def lead(self) -> int: ...
 
 
 class Evidence(Protocol):

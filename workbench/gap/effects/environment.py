@@ -65,8 +65,9 @@ def _periodic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
             continue
         mean = np.mean([place.force[a : a + shortest] for a in ends[:-1]], axis=0)
         frequency, amplitude, phase = tone(mean, sample_time)
-        if evidence.data.lead:  # a phase counts from the start of the record
-            turned = 2.0 * np.pi * frequency * evidence.data.lead * sample_time
+        lead = records[0].start_time - evidence.data.records[0].start_time
+        if lead:  # a phase counts from the start of the record
+            turned = 2.0 * np.pi * frequency * lead
             phase = float(np.angle(np.exp(1j * (phase - turned))))
         if not _is_distortion(frequency, evidence.data.records):
             yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}

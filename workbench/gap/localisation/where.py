@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.arrays import Floats
+from workbench.arrays import Flags, Floats
 from workbench.gap.effects.effect import Effect
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_localisation import ForceLocation
@@ -40,7 +40,8 @@ RIDGES = np.logspace(-9, -1, 9)  # of the strongest direction, of which the one 
 class Where:
     """The gap of the nominal model, taken apart.
 
-    Shares are of the squared residual above the noise, each sensor scaled by its own standard deviation.
+    Shares are of the squared residual above the noise, each sensor scaled by its own standard deviation, in the records
+    with a gap that is clearly larger than their noise; in all where none is.
 
     Attributes:
         path: "actuator", "structure", "sensor", "environment", or "none".
@@ -84,9 +85,14 @@ class Where:
     @property
     def beyond_noise(self) -> float:
         """The largest gap of a record that is clearly above its noise, less that noise, as a share of the signal."""
-        clear = self.record_gaps > (1.0 + WHERE.clear) * self.record_floors
+        clear = _is_clear(self.record_gaps, self.record_floors)
         power = np.where(clear, self.record_gaps**2 - self.record_floors**2, 0.0)
         return float(np.sqrt(power.max()))
+
+
+def _is_clear(gaps: Floats, floors: Floats) -> Flags:
+    """(n_records,) whether the gap of a record is clearly larger than that of its noise."""
+    return np.asarray(gaps > (1.0 + WHERE.clear) * floors)
 
 
 def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) -> Where:
@@ -104,39 +110,45 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
     ]
     floors = [(data.noise / record.outputs.std(axis=1)) ** 2 for record in data.counted]
     excess = np.array([(s**2).mean(axis=1) - f for s, f in zip(scaled, floors, strict=True)])
-    by_sensor = np.maximum(excess, 0.0).sum(axis=0)
+    gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
+    noise = np.array([np.sqrt(floor.mean()) for floor in floors])
+    clear = _is_clear(gaps, noise)
+    telling = np.flatnonzero(clear if clear.any() else ~clear)  # scaled by itself, noise alone would count like a gap
+    by_sensor = np.maximum(excess[telling], 0.0).sum(axis=0)
+    seen = [(data.counted[i], scaled[i]) for i in telling]
     frequencies = evidence.rig.modes.frequencies_hz
     between = np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0))
-    mode_shares = _shares_between(np.r_[0.0, between, np.inf], evidence, scaled)
+    mode_shares = _shares_between(np.r_[0.0, between, np.inf], seen, data.noise)
     octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - WHERE.octaves, 1)]
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
-    gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
     return Where(
-        path=_path(evidence, excess, effects),
+        path=_path(evidence, excess, by_sensor, effects),
         modes=tuple(int(r) + 1 for r in np.flatnonzero(mode_shares > WHERE.mode_share)),
         amplitude_dependent=_amplitude_dependent(effects, excess, data),
         mode_shares=mode_shares,
         band_edges_hz=octaves,
-        band_shares=_shares_between(octaves, evidence, scaled),
+        band_shares=_shares_between(octaves, seen, data.noise),
         sensor_shares=by_sensor / max(by_sensor.sum(), 1e-300),
         time_shares=np.array([_by_eighths(s) for s in scaled]),
         record_names=tuple(record.name for record in data.counted),
         record_gaps=gaps,
-        record_floors=np.array([np.sqrt(floor.mean()) for floor in floors]),
+        record_floors=noise,
         input_levels=levels,
-        linear_share=linear_share(evidence.rig, data, evidence.residuals, mode_shares),
+        linear_share=linear_share(
+            evidence.rig, [data.counted[i] for i in telling], [evidence.residuals[i] for i in telling], mode_shares
+        ),
         place=place,
     )
 
 
-def _shares_between(edges: np.ndarray, evidence: Evidence, scaled: list[np.ndarray]) -> np.ndarray:
-    """Share of the residual's power above the noise between each edge (Hz) and the next."""
+def _shares_between(edges: np.ndarray, scaled: Sequence[tuple[Record, Floats]], noise: Floats) -> np.ndarray:
+    """Share of the residuals' power above the noise between each edge (Hz) and the next."""
     power = np.zeros(edges.size - 1)
-    for record, s in zip(evidence.data.counted, scaled, strict=True):
+    for record, s in scaled:
         spectrum = (np.abs(np.fft.rfft(s, axis=1)) ** 2).sum(axis=0) / s.shape[1]
         grid = np.fft.rfftfreq(s.shape[1], record.sample_time)
         band = np.clip(np.searchsorted(edges, grid, side="right") - 1, 0, power.size - 1)
-        floor = ((evidence.data.noise / record.outputs.std(axis=1)) ** 2).sum()
+        floor = ((noise / record.outputs.std(axis=1)) ** 2).sum()
         power += np.bincount(band, spectrum - floor, power.size)
     power = np.maximum(power, 0.0)
     return power / max(float(power.sum()), 1e-300)
@@ -147,11 +159,10 @@ def _by_eighths(scaled: Floats) -> Floats:
     return power / max(float(power.sum()), 1e-300)
 
 
-def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> str:
+def _path(evidence: Evidence, excess: np.ndarray, power: np.ndarray, effects: Sequence[Effect]) -> str:
     paths = [effect.kind.path for effect in effects]
     if paths:
         return paths[0]
-    power = np.maximum(excess, 0.0).sum(axis=0)
     left = np.concatenate([(r / evidence.data.noise[:, None]).ravel() for r in evidence.residuals])
     if power.sum() <= 0 or evidence.data.by_channel(left).mean() < 1.03:
         return "none"
@@ -179,7 +190,7 @@ def _amplitude_dependent(effects: Sequence[Effect], excess: np.ndarray, data: Fi
     return bool((gaps + floors).max() > 2.0 * (gaps + floors).min() and gaps.max() > 2.0 * floors.max())
 
 
-def linear_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray], shares: np.ndarray) -> float:
+def linear_share(rig: Rig, records: Sequence[Record], residuals: Sequence[np.ndarray], shares: np.ndarray) -> float:
     """Share of the residuals' power that one linear reply to the inputs explains in all records.
 
     The reply is learnt on all records but one and judged on that one, each in turn: a narrow-band residual has so few
@@ -187,14 +198,14 @@ def linear_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray], share
 
     Args:
         rig: nominal.
-        data: with the records.
+        records: with their inputs.
         residuals: (n_outputs, n_samples) a record, measured less predicted.
         shares: (n_modes,) of the gap around each mode; the few largest are looked at.
     """
     chosen = [int(r) for r in np.argsort(-shares)[: WHERE.most_modes] if shares[r] > 0]
-    sizes = np.sqrt(np.mean([record.outputs.var(axis=1) for record in data.counted], axis=0))[:, None]
+    sizes = np.sqrt(np.mean([record.outputs.var(axis=1) for record in records], axis=0))[:, None]
     pieces = []
-    for record, residual in zip(data.counted, residuals, strict=True):
+    for record, residual in zip(records, residuals, strict=True):
         # a record's level is taken from both sides, so that every record counts alike and the reply stays the same
         level = np.sqrt(np.mean((record.outputs / sizes) ** 2))
         pieces.append((_replies(rig, chosen, record) / level, residual / sizes / level))
@@ -207,6 +218,9 @@ def linear_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray], share
     left = np.zeros(RIDGES.size)
     for (x, y), own_normal, own_right in zip(pieces, normal, right, strict=True):
         strengths, axes = np.linalg.eigh(sum(normal) - own_normal)
+        if not (strengths > 0).any():  # no other record has inputs to learn a reply by
+            left += float((y**2).sum())
+            continue
         target, shown = axes.T @ (sum(right) - own_right), axes.T @ x
         for i, ridge in enumerate(RIDGES * strengths[-1]):
             weights = target / (np.maximum(strengths, 0.0) + ridge)[:, None]

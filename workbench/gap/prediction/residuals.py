@@ -21,6 +21,11 @@ from workbench.structure.modes import Modes
 REMEMBERED = 2  # motions of a record: of 45,000 that searches ask for, 4,400 are the last or the one before, 140 older
 
 
+def lead_of(record: Record, settle: float) -> int:
+    """Samples at the start of a record that last so many seconds."""
+    return min(round(settle / record.sample_time), record.n_samples - 1)
+
+
 @dataclass(frozen=True, eq=False)
 class FitData:
     """Records that a fit may see. Validation records never become part of one.
@@ -29,7 +34,7 @@ class FitData:
         records: measured, all with the rig's inputs and outputs.
         noise: (n_outputs,) standard deviation of each sensor's noise, rounding included.
         substeps: of a sample, for rigs that are not linear.
-        lead: samples at the start of each record that are simulated but not counted, while the rig settles from the
+        settle: seconds at the start of each record that are simulated but not counted, while the rig settles from the
             rest that the simulation assumes to the motion it really had.
         whiteners: filter of random forces on the structure, by record, through which its residual is seen; none where
             there are none. With an observer, laws then act on the motion that was measured: that of the rig has no such
@@ -45,7 +50,7 @@ class FitData:
     records: tuple[Record, ...]
     noise: np.ndarray
     substeps: int = 4
-    lead: int = 0
+    settle: float = 0.0
     whiteners: Mapping[str, ForceFilter] = field(default_factory=dict)
     given_way: Floats | None = None
     observer: Observer | None = None
@@ -104,7 +109,7 @@ class FitData:
             return replace(self, given_way=None)
         _, sizes, turned = np.linalg.svd(_triangle(sensitivity))
         root = np.sqrt(1.0 + sizes**2)
-        return replace(self, given_way=sensitivity @ (turned.T / np.sqrt(root * (root + 1.0))))
+        return replace(self, given_way=sensitivity @ (turned[: root.size].T / np.sqrt(root * (root + 1.0))))
 
     def one_step_ahead(self, rig: Rig, loose: float = LOOSE) -> "FitData":
         """The same residual on predictions one sample ahead, by the observer gain of this rig.
@@ -126,9 +131,9 @@ class FitData:
     @cached_property
     def counted(self) -> tuple[Record, ...]:
         """The records without their lead."""
-        if self.lead == 0:
+        if self.settle == 0:
             return self.records
-        return tuple(record.between(record.time[min(self.lead, record.n_samples - 1)]) for record in self.records)
+        return tuple(record.between(record.time[lead_of(record, self.settle)]) for record in self.records)
 
     def motions(self, rig: Rig) -> tuple[Motion, ...]:
         """The rig's motion on each record; the last few are remembered, since a sensor's fault does not change it."""
@@ -146,7 +151,7 @@ class FitData:
             sample_time=record.sample_time,
             substeps=self.substeps,
             input_hold=record.input_hold,
-        ).after(self.lead)
+        ).after(lead_of(record, self.settle))
         with self._lock:
             self._memory[key] = (rig.modes, motion)
             while len(self._memory) > REMEMBERED * len(self.records):
@@ -194,15 +199,16 @@ class FitData:
                 observer.errors_of_linear(rig.in_record(record.name), left, record.sample_time, self.substeps)
                 for record, left in whole
             ]
-        return np.concatenate([errors[:, self.lead :].ravel() for errors in ahead])
+        each_ahead = zip(self.records, ahead, strict=True)
+        return np.concatenate([errors[:, lead_of(record, self.settle) :].ravel() for record, errors in each_ahead])
 
     @property
     def _from_the_first_sample(self) -> "FitData":
-        return self._with_its_lead if self.lead else self
+        return self._with_its_lead if self.settle else self
 
     @cached_property
     def _with_its_lead(self) -> "FitData":
-        return replace(self, lead=0)
+        return replace(self, settle=0.0)
 
     @property
     def mixes_sensors(self) -> bool:
@@ -219,7 +225,8 @@ class FitData:
         if observer is None or not is_stepped(rig) or rig.stiffness_rate:
             return self.differences(rig)
         return [
-            observer.left(rig.in_record(record.name), record, self.substeps)[:, self.lead :] for record in self.records
+            observer.left(rig.in_record(record.name), record, self.substeps)[:, lead_of(record, self.settle) :]
+            for record in self.records
         ]
 
     def differences(self, rig: Rig) -> list[np.ndarray]:

@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import group_of, parted
 from workbench.gap.effects.record_to_record import label_of
 from workbench.gap.prediction.logged_inputs import loudest_logging_noise
-from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.residuals import FitData, lead_of
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
@@ -49,7 +49,7 @@ class Shrinkage:
     Attributes:
         before, after, floor: by record name; the gap of the case format.
         share: of the closable gap closed, by record name: 1 - sqrt(after² - floor²) / sqrt(before² - floor²).
-        overall: the same over all records together.
+        overall: the same over all records together, each of which counts alike.
         ci95: its 95 % interval by block bootstrap.
     """
 
@@ -69,9 +69,9 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
     """
     if not records:
         return None
-    before, after, floor, blocks = {}, {}, {}, []
+    before, after, floor, blocks, lengths = {}, {}, {}, [], []
     for record in records:
-        lead = round(settle / record.sample_time)
+        lead = lead_of(record, settle)
         measured = record.outputs[:, lead:]
         scale = scale_of(measured)
         predicted = [predict(rig, record)[:, lead:] for rig in (nominal, corrected)]
@@ -83,15 +83,20 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
         for start in range(0, measured.shape[1], length):
             piece = slice(start, start + length)
             blocks.append([errors[0][:, piece].mean(), errors[1][:, piece].mean(), (noise**2).mean()])
-    table = np.array(blocks)
+            lengths.append(errors[0][:, piece].shape[1] / measured.shape[1])
+    table, weights = np.array(blocks), np.array(lengths)  # the last block of a record may be short
     rng = np.random.default_rng(0)
-    draws = [_closed(*table[rng.integers(0, len(table), len(table))].mean(axis=0)) for _ in range(DRAWS)]
+
+    def closed(chosen: np.ndarray) -> float:
+        return _closed(*np.average(table[chosen], axis=0, weights=weights[chosen]))
+
+    draws = [closed(rng.integers(0, len(table), len(table))) for _ in range(DRAWS)]
     return Shrinkage(
         before=before,
         after=after,
         floor=floor,
         share={n: _closed(before[n] ** 2, after[n] ** 2, floor[n] ** 2) for n in before},
-        overall=_closed(*table.mean(axis=0)),
+        overall=closed(np.arange(len(table))),
         ci95=(float(np.quantile(draws, 0.025)), float(np.quantile(draws, 0.975))),
     )
 
@@ -218,7 +223,7 @@ def budget_of(
     taken = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
     by_size = sorted(range(len(labels)), key=lambda i: -taken[i].sum())
     rows = [*taken[by_size], taken[-1] if alike is not None else np.zeros_like(left)]
-    noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
+    noise = np.minimum(np.array([noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
     by_inputs = np.zeros_like(left)
     if logged:
@@ -262,20 +267,20 @@ def mean_square(rig: Rig, record: Record, settle: float) -> float:
 
 def power_in(record: Record, readings: np.ndarray, settle: float) -> float:
     """Mean square of readings (n_outputs, n_samples), each sensor by the standard deviation of a record's."""
-    lead = round(settle / record.sample_time)
+    lead = lead_of(record, settle)
     return float(((readings[:, lead:] / scale_of(record.outputs[:, lead:])) ** 2).mean())
 
 
-def _noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
-    measured = record.outputs[:, round(settle / record.sample_time) :]
+def noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
+    """Mean square of noise (n_outputs,), each sensor by the standard deviation of a record's readings."""
+    measured = record.outputs[:, lead_of(record, settle) :]
     return float(((noise[:, None] / scale_of(measured)) ** 2).mean())
 
 
 def power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.ndarray:
     """Mean square (n_records,) that noise of the logged inputs leaves by chance, were it as strong as they are."""
-    lead = round(settle / records[0].sample_time)
-    powers = loudest_logging_noise(rig, FitData(tuple(records), np.ones(len(rig.sensors)), lead=lead))
-    scales = np.array([scale_of(record.outputs[:, lead:])[:, 0] for record in records])
+    powers = loudest_logging_noise(rig, FitData(tuple(records), np.ones(len(rig.sensors)), settle=settle))
+    scales = np.array([scale_of(record.outputs[:, lead_of(record, settle) :])[:, 0] for record in records])
     return np.asarray((powers / scales**2).mean(axis=1))
 
 

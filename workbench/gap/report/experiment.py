@@ -28,6 +28,7 @@ class Experiment:
         seconds: length at which the rivals differ by five standard deviations; inf where they never would, or would
             in a thousand times the length of the record.
         rivals: labels of the two explanations it separates.
+        time: name of the unit of time.
     """
 
     like: str
@@ -35,6 +36,7 @@ class Experiment:
     level: float
     seconds: float
     rivals: tuple[str, str]
+    time: str = "s"
 
     @property
     def sentence(self) -> str:
@@ -44,7 +46,7 @@ class Experiment:
             return f"No experiment on this rig separates {one} from {other}."
         return (
             f"To separate {one} from {other}: drive {' and '.join(self.inputs)} as in record"
-            f" {self.like} at {self.level:g} times its level, for {max(self.seconds, 0.0):.3g} s."
+            f" {self.like} at {self.level:g} times its level, for {max(self.seconds, 0.0):.3g} {self.time}."
         )
 
 

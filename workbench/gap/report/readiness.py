@@ -11,7 +11,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind
 from workbench.gap.effects.structural import modes_of
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.residuals import FitData, lead_of
 from workbench.records.record import Record
 from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
@@ -28,6 +28,7 @@ TURNED = -0.95
 FAR_OFF, ABOVE_NOISE = 50.0, 5.0  # times the model: in other units; times the noise: worth comparing
 ALIKE_IN_SHAPE = 0.5  # correlation of a reading with the model's, whatever its unit
 STUCK = 0.5
+LEAST_SAMPLES = 16  # of a record, as in a case folder
 THINNING = 3
 COARSELY = 2  # substeps of a sample: whether an effect shows needs no more
 STRAY, MISJUDGED = 1e-3, 0.02  # of a frequency, of a damping: what solving a structure anew may differ by
@@ -57,50 +58,83 @@ class Readiness:
     invisible, alike = Renamed("undetectable"), Renamed("indistinguishable")
 
 
-def check_records(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> None:
-    """Refuse records whose channels cannot be what the rig says they are.
+def check_records(
+    rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0
+) -> None:
+    """Refuse records whose channels cannot be what the rig says they are: those to be fitted, and those held out.
 
     Args:
         settle: seconds at the start of each record that are not compared.
 
     Raises:
         RecordsError: a sensor that reads with the wrong sign or in other units, a saturated or flat channel, a record
-            shorter than a period of the first mode, inputs that are all at rest.
+            shorter than a period of the first mode, no inputs, inputs that are all at rest.
     """
+    if not rig.actuators:
+        raise RecordsError("the rig has no actuators, so nothing drives its model; a free decay is for wb.identify")
+    check_alive(rig, records, validation, settle=settle)
+    if not _compared(rig, records, "record", settle):
+        raise RecordsError("every input of every record is at rest; there is nothing to compare")
+    _compared(rig, validation, "validation record", settle)
+
+
+def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0) -> None:
+    """Refuse records of few samples and channels that are saturated or flat, which no model is needed to see.
+
+    Args, Raises: as `check_records`.
+    """
+    for these, what in ((records, "record"), (validation, "validation record")):
+        for record in these:
+            counted = record.n_samples - lead_of(record, settle)
+            if counted < LEAST_SAMPLES:
+                raise RecordsError(
+                    f"{what} {record.name!r} has {counted} samples to compare{' once settled' * (settle > 0)}; at least"
+                    f" {LEAST_SAMPLES} are needed: take a longer record"
+                )
+        _check_not_stuck(rig, these, what)
+        for record in filter(_is_driven, these):
+            for sensor, measured in zip(rig.sensors, record.outputs[:, lead_of(record, settle) :], strict=True):
+                if np.ptp(measured) == 0:
+                    raise RecordsError(
+                        f"{what} {record.name!r}: output {sensor.name!r} is flat; check the sensor and its cable, or"
+                        " leave it out"
+                    )
+
+
+def _is_driven(record: Record) -> bool:
+    return bool(np.any(record.inputs))
+
+
+def _compared(rig: Rig, records: Sequence[Record], what: str, settle: float) -> bool:
+    """Whether there were records to compare with the model; refused where they cannot be of it."""
     elastic = rig.modes.omega[rig.modes.omega > 0]
-    _check_not_stuck(rig, records)
     signs, sizes = [], []
-    lead = round(settle / records[0].sample_time)
     for record in records:
+        lead = lead_of(record, settle)
         if elastic.size and record.n_samples * record.sample_time < 2 * np.pi / elastic[0]:
             raise RecordsError(
-                f"record {record.name!r} lasts {record.n_samples * record.sample_time:g} s, less than a period of the"
+                f"{what} {record.name!r} lasts {record.n_samples * record.sample_time:g} s, less than a period of the"
                 f" first mode ({2 * np.pi / elastic[0]:g} s); take a longer record"
             )
-        if (record.n_inputs and not np.any(record.inputs)) or record.n_samples < lead + 2:
+        if not _is_driven(record):
             continue
         predicted = predict(rig, record)[:, lead:]
         outputs = record.outputs[:, lead:]
-        row = []
-        for sensor, measured, expected in zip(rig.sensors, outputs, predicted, strict=True):
-            if np.ptp(measured) == 0:
-                raise RecordsError(
-                    f"record {record.name!r}: output {sensor.name!r} is flat; check the sensor and its cable, or leave"
-                    " it out"
-                )
-            row.append(np.corrcoef(measured, expected)[0, 1] if np.ptp(expected) > 0 else 0.0)
+        pairs = zip(outputs, predicted, strict=True)
+        row = [float(np.corrcoef(y, p)[0, 1]) if np.ptp(p) > 0 else 0.0 for y, p in pairs]
         signs.append(row)
         sizes.append(_sizes(rig, outputs, predicted, np.array(row)))
     if not signs:
-        raise RecordsError("every input of every record is at rest; there is nothing to compare")
-    _check_units(rig, records[0], np.array(sizes))
+        return False
+    _check_units(rig, records[0], np.array(sizes), what)
     turned = np.flatnonzero((np.array(signs) < TURNED).all(axis=0))
     if turned.size and turned.size < len(rig.sensors):
         name = rig.sensors[turned[0]].name
         raise RecordsError(
             f"output {name!r} reads with the wrong sign: its correlation with the model is"
-            f" {np.array(signs)[:, turned[0]].mean():.2f} in every record; reverse its sign"
+            f" {np.array(signs)[:, turned[0]].mean():.2f} in every {what}; reverse its sign"
         )
+    return True
 
 
 def _sizes(rig: Rig, measured: np.ndarray, predicted: np.ndarray, alike: np.ndarray) -> np.ndarray:
@@ -116,12 +150,13 @@ def _sizes(rig: Rig, measured: np.ndarray, predicted: np.ndarray, alike: np.ndar
     return np.where(comparable, measured.std(axis=1) / np.where(comparable, expected, 1.0), np.nan)
 
 
-def _check_units(rig: Rig, record: Record, sizes: np.ndarray) -> None:
+def _check_units(rig: Rig, record: Record, sizes: np.ndarray, what: str) -> None:
     """A channel that goes as the model does, and reads fifty times too much or too little in every record.
 
     Args:
         record: any, for its units.
         sizes: (n_records, n_sensors) readings over the model's.
+        what: such records are called.
     """
     ratios_of = [column[np.isfinite(column)] for column in sizes.T]
     off = [j for j, ratios in enumerate(ratios_of) if ratios.size and _always_far_off(ratios)]
@@ -129,13 +164,13 @@ def _check_units(rig: Rig, record: Record, sizes: np.ndarray) -> None:
         return
     if len(off) == sum(ratios.size > 0 for ratios in ratios_of) > 1:
         raise RecordsError(
-            f"the outputs read about {_about(np.concatenate(ratios_of))} times the prediction of the model: are"
-            f" outputs, inputs and model in consistent units, {_units(record)}?"
+            f"the outputs read about {_about(np.concatenate(ratios_of))} times the prediction of the model in every"
+            f" {what}: are outputs, inputs and model in consistent units, {_units(record)}?"
         )
     name, unit = rig.sensors[off[0]].name, record.output_channels[off[0]].unit or "its unit"
     raise RecordsError(
-        f"output {name!r} reads about {_about(ratios_of[off[0]])} times what the model predicts in every record: is it"
-        f" in {unit}?"
+        f"output {name!r} reads about {_about(ratios_of[off[0]])} times what the model predicts in every {what}: is"
+        f" it in {unit}?"
     )
 
 
@@ -208,15 +243,15 @@ def _modal_masses(modes: Modes, structure: Structure | Plate | Membrane) -> Floa
     return masses
 
 
-def _check_not_stuck(rig: Rig, records: Sequence[Record]) -> None:
+def _check_not_stuck(rig: Rig, records: Sequence[Record], what: str) -> None:
     """A sensor that clips in some records is an effect to be named; one that clips most of the time shows nothing."""
     for j, sensor in enumerate(rig.sensors):
-        top = max(float(np.abs(record.outputs[j]).max()) for record in records)
+        top = max((float(np.abs(record.outputs[j]).max()) for record in records), default=0.0)
         stuck = [np.abs(record.outputs[j]) >= top * (1 - 1e-9) for record in records]
-        share = np.concatenate(stuck).mean()
+        share = np.concatenate(stuck).mean() if stuck else 0.0
         if top > 0 and share > STUCK:
             raise RecordsError(
-                f"record {records[int(np.argmax([s.mean() for s in stuck]))].name!r}: output {sensor.name!r} stands at"
+                f"{what} {records[int(np.argmax([s.mean() for s in stuck]))].name!r}: output {sensor.name!r} stands at"
                 f" ±{top:g} for {100 * share:.0f} % of all its samples: it is saturated; lower the level or the gain"
             )
 

@@ -25,11 +25,13 @@ class RecordToRecord:
 
     Attributes:
         figure: "stiffness" or "axial load".
-        values: by name of record, what it is there less the common value: relative, or N.
+        values: by name of record, what it is there less the common value: relative, or a force.
+        force: name of its unit.
     """
 
     figure: str
     values: dict[str, float]
+    force: str = "N"
 
     @classmethod
     def of(cls, rig: Rig, effects: Sequence[Effect]) -> "RecordToRecord | None":
@@ -60,7 +62,7 @@ class RecordToRecord:
         return f"{self._written(self.spread)}: record {more} {how} record {less}"
 
     def _written(self, size: float) -> str:
-        return f"{size:.2g} N" if self.figure == TENSION else f"{100.0 * size:.2g} %"
+        return f"{size:.2g} {self.force}" if self.figure == TENSION else f"{100.0 * size:.2g} %"
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers: relative, or N."""

@@ -1,11 +1,12 @@
 """The verdict on a gap: where, which, how far, in a sentence and as JSON."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from workbench.cases.units import SI, Units
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect, names_in
@@ -44,6 +45,9 @@ class Verdict:
         readiness: what the records could show before anything was fitted.
         experiment: what to measure next, where rivals remain.
         tolerance: of the signal's rms, below which a gap beyond the noise was not explained.
+        disagreeing: names of validation records that have a gap, where the fitted ones have none; the outcome is then
+            "unknown".
+        units: names of the units of its numbers.
         notes: what else a reader should know.
     """
 
@@ -60,7 +64,14 @@ class Verdict:
     budget: Budget
     experiment: Experiment | None = None
     tolerance: float = 0.0
+    disagreeing: tuple[str, ...] = ()
+    units: Units = SI
     notes: tuple[str, ...] = ()
+
+    @property
+    def shows_gap(self) -> bool:
+        """Whether the records that were fitted have a gap, so that where it is can be said."""
+        return self.outcome != "none" and not self.disagreeing
 
     @property
     def _named(self) -> tuple[Effect, ...]:
@@ -97,29 +108,20 @@ class Verdict:
     def record_to_record(self) -> RecordToRecord | None:
         """A figure of the nominal model that differs from record to record; None where that causes next to nothing."""
         differs = RecordToRecord.of(self.nominal, self.effects)
-        return None if differs is None or self.budget.effects.get(differs.label, 0.0) < SHOWN else differs
+        if differs is None or self.budget.effects.get(differs.label, 0.0) < SHOWN:
+            return None
+        return replace(differs, force=self.units.force)
 
     @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
-        named = [_described(effect, self.nominal) for effect in self._named]
+        if self.disagreeing:
+            text = self._of_no_gap
+            return f"In the records that were fitted, {text[0].lower()}{text[1:-1]}; but {self._disagreement}."
+        if not self.shows_gap:
+            return self._of_no_gap
+        named = [_described(effect, self.nominal, self.units) for effect in self._named]
         words = joined_in_words(named)
-        if self.outcome == "none":
-            louder = self.budget.noise_ratio > REMARKED and self.budget.unexplained < SHOWN
-            if self.nominal_errors is None:
-                beyond, tolerance = self.where.beyond_noise, self.tolerance
-                if louder or not 0.0 < beyond < tolerance:  # what is beyond the stated noise and searched for is noise
-                    return "There is no gap beyond the noise of the sensors."
-                below = f"below the tolerance of {100.0 * tolerance:g} %"
-                return f"The gap beyond the noise is {_percent(beyond)} of the signal, {below}."
-            if self.record_to_record is not None:
-                return self._differing(self.record_to_record)
-            if self.budget.errors_are_small:
-                return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
-            return (
-                "Errors of the nominal model explain the gap, but they are implausibly large"
-                f"{self._errors_in_words}: an effect outside the catalogue may be missing."
-            )
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if self.outcome == "explained":
             shares = [self._share_of(effect) for effect in self._named]
@@ -133,6 +135,8 @@ class Verdict:
             text += self._rest + self._not_excluded
         else:
             text = "No effect of the catalogue, alone or with another, explains the gap"
+            if self.attribution.is_cut:
+                text = "None of the effects tried before the time was spent explains the gap"
             if not any_beyond(self.effects):
                 near = words and (self.shrinkage is None or self.shrinkage.overall >= NEAR)
                 text += f"; the nearest, {words}, would close {closed or 'part of '}it." if near else f"{self._rest}."
@@ -141,6 +145,35 @@ class Verdict:
             else:
                 text += f"; {words} explains {closed}it."
         return text[0].upper() + text[1:]
+
+    @property
+    def _of_no_gap(self) -> str:
+        """The sentence where the records that were fitted have no gap, or only one of errors of the model."""
+        if self.nominal_errors is None:
+            louder = self.budget.noise_ratio > REMARKED and self.budget.unexplained < SHOWN
+            beyond, tolerance = self.where.beyond_noise, self.tolerance
+            if louder or not 0.0 < beyond < tolerance:  # what is beyond the stated noise and searched for is noise
+                return "There is no gap beyond the noise of the sensors."
+            below = f"below the tolerance of {100.0 * tolerance:g} %"
+            return f"The gap beyond the noise is {_percent(beyond)} of the signal, {below}."
+        if self.record_to_record is not None:
+            return self._differing(self.record_to_record)
+        if self.budget.errors_are_small:
+            return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
+        return (
+            "Errors of the nominal model explain the gap, but they are implausibly large"
+            f"{self._errors_in_words}: an effect outside the catalogue may be missing."
+        )
+
+    @property
+    def _disagreement(self) -> str:
+        """Such as: validation record high disagrees by 156 % of its signal: fit it too."""
+        by = {} if self.shrinkage is None else {n: _percent(self.shrinkage.after[n]) for n in self.disagreeing}
+        if len(by) == 1:
+            ((name, size),) = by.items()
+            return f"validation record {name} disagrees by {size} of its signal: fit it too"
+        each = joined_in_words([f"{name} by {size}" for name, size in by.items()])
+        return f"validation records disagree, {each} of their signals: fit them too"
 
     def _share_of(self, effect: Effect) -> float:
         """Share of the gap that an effect causes; of all sensors together where it stands for all of them."""
@@ -155,7 +188,7 @@ class Verdict:
     def _rest(self) -> str:
         """What the effects do not cause, in words."""
         parts, differs = [], self.record_to_record
-        if differs is not None and self.outcome != "none":
+        if differs is not None and self.shows_gap:
             share = _percent(self.budget.effects.get(differs.label, 0.0))
             parts.append(f"{share} are differences of {differs.figure} from record to record ({differs.words})")
         if self.budget.nominal >= SHOWN:
@@ -182,12 +215,18 @@ class Verdict:
         words = [
             f"{n.removesuffix('_percent')} {v:.2g} %" for n, v in sizes.items() if n.endswith("percent") and v > 0.01
         ]
-        common = sizes.get("common_delay_ms", 0.0)
+        common, delays = sizes.get("common_delay_ms", 0.0), sizes.get("delays_ms", 0.0)
         if common:
-            words.append(f"all sensors, or the actuators, {'late' if common > 0 else 'early'} by {abs(common):.2g} ms")
-        elif sizes.get("delays_ms", 0.0) > 0:
-            words.append(f"timing of sensors {sizes['delays_ms']:.2g} ms")
+            late = "late" if common > 0 else "early"
+            words.append(f"all sensors, or the actuators, {late} by {self._delay_in_words(abs(common))}")
+        elif delays > 0:
+            words.append(f"timing of sensors {self._delay_in_words(delays)}")
         return f" ({', '.join(words)})" if words else ""
+
+    def _delay_in_words(self, thousandths: float) -> str:
+        """A delay in thousandths of the unit of time."""
+        time = self.units.time
+        return f"{thousandths:.2g} ms" if time == "s" else f"{1e-3 * thousandths:.2g} {time}"
 
     @property
     def rivals(self) -> tuple[tuple[str, float], ...]:
@@ -214,6 +253,7 @@ class Verdict:
         rivals = zip(self.alternatives, self.rivals, strict=True)
         return {
             "case": self.case,
+            "units": asdict(self.units),
             "outcome": self.outcome,
             "sentence": self.sentence,
             "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
@@ -308,10 +348,10 @@ def where_json(where: Where) -> dict[str, Any]:
     }
 
 
-def _described(effect: Effect, nominal: Rig) -> str:
+def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
     """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01; a wrong sensor gain (d4: gain 0.93)."""
     stated = effect.stated(nominal)
-    units = {p.name: p.unit for p in effect.parameters(nominal) if p.name in stated}
+    units = {p.name: named_units.named(p.unit) for p in effect.parameters(nominal) if p.name in stated}
     numbers = [
         " ".join((name.replace("_", " "), _with_deviation(stated[name], effect.deviations.get(name, 0.0)), unit))
         for name, unit in units.items()

@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from workbench.arrays import Flags, Floats
+from workbench.gap.prediction.residuals import lead_of
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, predict
@@ -50,6 +51,8 @@ FACTORS = {
 IN_G = "look like g where m/s² is meant"
 RATES = {2.0: "twice", 0.5: "half", 1e3: "1000 times", 1e-3: "a thousandth of"}
 QUANTITIES = ("displacement", "velocity", "acceleration")
+OF_CHANNELS = ("exchanged inputs", "exchanged outputs", "sign", "unit")  # kinds that a record may have or not
+WORST = 1e12  # times the measured power: a prediction that leaves more is of no use
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +66,7 @@ class WiringFault:
         closes: share of the closable power of the gap that the mend takes away on the channels that it concerns; nan
             where no prediction was needed to see the fault.
         mend: (rig, records) -> (rig, records) without the fault.
+        records: names of those that show it and are mended; empty where the rig, or a channel of every record, is.
         certain: False for a factor that may be one of units, where a gain near it explains far more: an error of
             calibration is likelier. It is said and not mended.
     """
@@ -72,33 +76,97 @@ class WiringFault:
     closes: float
     mend: Mend
     certain: bool = True
+    records: tuple[str, ...] = ()
 
 
-def wiring(rig: Rig, records: Sequence[Record]) -> tuple[WiringFault, ...]:
+def wiring(
+    rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0
+) -> tuple[WiringFault, ...]:
     """The faults of wiring and units that the records show against the nominal rig, in the order to mend them.
+
+    Each validation record is judged by itself: by each fault of the fit records, then by faults that it alone has.
 
     Args:
         rig: nominal.
         records: with the rig's inputs and outputs, in its order.
+        validation: likewise, kept out of every fit.
+        settle: seconds at the start of each record that are not compared.
+
+    Raises:
+        ValueError: two records of one name.
     """
+    check_names((*records, *validation))
     found = [*_repeated(records), *_copied(rig, records)]
-    rig, seen = mended(found, rig, records)
-    for _ in range(MOST_ROUNDS):
-        faults = _best(rig, seen)
-        found += faults
-        if not any(fault.certain for fault in faults):
-            break
-        rig, seen = mended(faults, rig, seen)
+    seen_rig, seen = mended(found, rig, records)
+    found += _by_rounds(seen_rig, seen, settle, WAYS)
+    held = tuple(validation)
+    for i, fault in enumerate(found):
+        if fault.kind in OF_CHANNELS and fault.certain:
+            found[i] = fault = _judged_on(held, fault, rig, settle)
+        rig, held = mended([fault], rig, held)
+    for record in held:
+        found += [_of_one(record, fault) for fault in _by_rounds(rig, (record,), settle, WAYS_OF_ONE) if fault.certain]
     return tuple(found)
 
 
 def mended(faults: Iterable[WiringFault], rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-    """The rig and the records without the faults that are certain."""
+    """The rig without the faults that are certain, and the records without those that they show."""
     kept = tuple(records)
     for fault in faults:
         if fault.certain:
-            rig, kept = fault.mend(rig, kept)
+            each = [(r,) if fault.records and r.name not in fault.records else fault.mend(rig, (r,))[1] for r in kept]
+            kept = tuple(record for one in each for record in one)
+            rig, _ = fault.mend(rig, ())
     return rig, kept
+
+
+def _by_rounds(
+    rig: Rig, records: Sequence[Record], settle: float, ways: "Sequence[Callable[[_Gap], list[WiringFault]]]"
+) -> list[WiringFault]:
+    """Faults that hide one another, one kind after the other."""
+    found: list[WiringFault] = []
+    for _ in range(MOST_ROUNDS):
+        faults = _best(rig, records, settle, ways)
+        found += faults
+        if not any(fault.certain for fault in faults):
+            break
+        rig, records = mended(faults, rig, records)
+    return found
+
+
+def _judged_on(held: Sequence[Record], fault: WiringFault, rig: Rig, settle: float) -> WiringFault:
+    """A fault of the fit records, with the validation records that agree better with the model by its mend."""
+
+    def left(of: Rig, these: Sequence[Record]) -> float:
+        return float(np.minimum(_Gap.of(of, these, settle).before, WORST).sum())
+
+    showing = [r.name for r in held if left(*fault.mend(rig, (r,))) < left(rig, (r,))]
+    others = [r.name for r in held if r.name not in showing]
+    sentence = f"{fault.sentence[:-1]}; not in {', '.join(others)}." if others else fault.sentence
+    return replace(fault, sentence=sentence, records=(*fault.records, *showing))
+
+
+def _of_one(record: Record, fault: WiringFault) -> WiringFault:
+    """A fault of a validation record alone: the rig stays as it is."""
+    words = fault.sentence
+    if fault.kind != "sample rate":  # that names its record
+        words = f"In validation record {record.name}, {words[0].lower()}{words[1:]}"
+    return replace(fault, sentence=words, records=(record.name,), mend=partial(_records_alone, fault.mend))
+
+
+def check_names(records: Sequence[Record]) -> None:
+    """Refuse records of one name: what is found in each is known by it.
+
+    Raises:
+        ValueError: naming it.
+    """
+    names = [record.name for record in records]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(
+                f"{names.count(name)} records are called {name!r}, and results are by record: give each a name of its"
+                " own, such as replace(record, name=...)"
+            )
 
 
 def check_kept_apart(records: Sequence[Record], validation: Sequence[Record]) -> None:
@@ -139,7 +207,7 @@ def _repeated(records: Sequence[Record]) -> list[WiringFault]:
             faults.append(
                 WiringFault(
                     "repeated record",
-                    f"The records {first} and {second} hold the same samples: leave {second} out of case.toml.",
+                    f"The records {first} and {second} hold the same samples: leave {second} out.",
                     np.nan,
                     partial(_without_record, second),
                 )
@@ -190,15 +258,24 @@ class _Gap:
     measured: list[np.ndarray]
     noise: np.ndarray
     scale: np.ndarray
+    settle: float
 
     @staticmethod
-    def of(rig: Rig, records: Sequence[Record], predicted: Sequence[Floats] | None = None) -> "_Gap":
-        predicted = [_predict(rig, record) for record in records] if predicted is None else predicted
-        measured = [record.outputs for record in records]
+    def of(
+        rig: Rig, records: Sequence[Record], settle: float = 0.0, predicted: Sequence[Floats] | None = None
+    ) -> "_Gap":
+        measured = [record.outputs[:, lead_of(record, settle) :] for record in records]
+        if predicted is None:
+            predicted = _counted(measured, [_predict(rig, record) for record in records])
         power = sum((y**2).sum(axis=1) for y in measured) / sum(y.shape[1] for y in measured)
         scale = np.where(power > 0, power, 1.0)
         noise = np.array([s.noise_std for s in rig.sensors]) ** 2 / scale
-        return _Gap(rig, records, predicted, measured, noise, scale)
+        return _Gap(rig, records, predicted, measured, noise, scale, settle)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the records."""
+        return tuple(record.name for record in self.records)
 
     @cached_property
     def before(self) -> Floats:
@@ -207,8 +284,13 @@ class _Gap:
 
     @property
     def wide(self) -> Flags:
-        """(n_outputs,) where that is too much for an effect."""
-        return np.asarray(self.before > np.maximum(WIDE_GAP**2, 4.0 * self.noise))
+        """(n_outputs,) where that is too much for an effect; a channel that never moves shows no wiring."""
+        moves = np.any([np.ptp(y, axis=1) > 0 for y in self.measured], axis=0)
+        return np.asarray(moves & (self.before > np.maximum(WIDE_GAP**2, 4.0 * self.noise)))
+
+    def predict(self, rig: Rig, records: Sequence[Record]) -> list[Floats]:
+        """What another rig reads on other records, (n_outputs, n_samples) each, at the samples that are compared."""
+        return _counted(self.measured, [_predict(rig, record) for record in records])
 
     def power(self, predicted: Sequence[Floats]) -> Floats:
         """(n_outputs,) mean square of what is left, as a share of the mean square measured."""
@@ -224,27 +306,33 @@ class _Gap:
 
     def closes(self, rig: Rig, records: Sequence[Record]) -> float:
         """The share that another rig and other records close, in the median of the channels with a wide gap."""
-        after = self.power([_predict(rig, record) for record in records])
+        after = self.power(self.predict(rig, records))
         return float(np.median(self.closed(after)[self.wide]))
 
 
-def _best(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
+def _counted(measured: Sequence[Floats], predicted: Sequence[Floats]) -> list[Floats]:
+    """The end of each prediction that is as long as what is compared of its record."""
+    return [p[:, p.shape[1] - y.shape[1] :] for y, p in zip(measured, predicted, strict=True)]
+
+
+def _best(
+    rig: Rig, records: Sequence[Record], settle: float, ways: Sequence[Callable[[_Gap], list[WiringFault]]]
+) -> list[WiringFault]:
     """The faults of the kind that closes most, doubtful ones where none is certain; none where no mend closes most."""
-    gap = _Gap.of(rig, records)
-    ways = (_scaled_outputs, _exchanged_outputs, _exchanged_inputs, _scaled_inputs, _quantities, _rates, _structure)
+    gap = _Gap.of(rig, records, settle)
     # a record at a low level may be sampled wrongly and yet leave no wide gap over all records
     found = [way(gap) for way in (ways if gap.wide.any() else (_rates,))]
     doubtful = [fault for faults in found for fault in faults if not fault.certain]
     found = [faults for faults in ([f for f in faults if f.certain] for faults in found) if faults]
     if not found:
         return doubtful
-    return found[0] if len(found) == 1 else max(found, key=lambda faults: _overall(faults, rig, records), default=[])
+    return found[0] if len(found) == 1 else max(found, key=lambda faults: _overall(faults, gap), default=[])
 
 
-def _overall(faults: Sequence[WiringFault], rig: Rig, records: Sequence[Record]) -> float:
+def _overall(faults: Sequence[WiringFault], gap: _Gap) -> float:
     """Minus the share of the measured power that remains with the mends."""
-    rig, kept = mended(faults, rig, records)
-    return -float(np.minimum(_Gap.of(rig, kept).before, 1.0).mean())
+    rig, kept = mended(faults, gap.rig, gap.records)
+    return -float(np.minimum(_Gap.of(rig, kept, gap.settle).before, 1.0).mean())
 
 
 def _scaled_outputs(gap: _Gap) -> list[WiringFault]:
@@ -286,7 +374,7 @@ def _scaled_outputs(gap: _Gap) -> list[WiringFault]:
         if not certain:
             sentence = _doubtful(f"{who} {what}{rest}", gains[outputs] / factor - 1.0)
         mend = partial(_outputs_times, dict.fromkeys(names, 1.0 / factor))
-        faults.append(WiringFault(kind, sentence, closes, mend, certain))
+        faults.append(WiringFault(kind, sentence, closes, mend, certain, gap.names))
     return faults
 
 
@@ -324,8 +412,9 @@ def _exchanged_outputs(gap: _Gap) -> list[WiringFault]:
         closes = float(gap.closed(after)[[i, j]].min())
         if closes >= CLOSED:
             one, other = rig.sensors[i].name, rig.sensors[j].name
-            sentence = f"The outputs {one} and {other} are exchanged: swap them in case.toml."
-            return [WiringFault("exchanged outputs", sentence, closes, partial(_exchanged, "outputs", one, other))]
+            sentence = f"The outputs {one} and {other} are exchanged: swap them."
+            mend = partial(_exchanged, "outputs", one, other)
+            return [WiringFault("exchanged outputs", sentence, closes, mend, records=gap.names)]
     return []
 
 
@@ -340,8 +429,8 @@ def _exchanged_inputs(gap: _Gap) -> list[WiringFault]:
         mend = partial(_exchanged, "inputs", one, other)
         closes = gap.closes(*mend(rig, records))
         if closes >= CLOSED:
-            sentence = f"The inputs {one} and {other} are exchanged: swap them in case.toml."
-            found.append(WiringFault("exchanged inputs", sentence, closes, mend))
+            sentence = f"The inputs {one} and {other} are exchanged: swap them."
+            found.append(WiringFault("exchanged inputs", sentence, closes, mend, records=gap.names))
     return sorted(found, key=lambda fault: -fault.closes)[:1]
 
 
@@ -355,7 +444,7 @@ def _scaled_inputs(gap: _Gap) -> list[WiringFault]:
     responses = []
     for p in range(n):
         alone = [r.inputs * (np.arange(n) == p)[:, None] for r in records]
-        parts = [predict(rig, replace(r, inputs=u)) for u, r in zip(alone, records, strict=True)]
+        parts = gap.predict(rig, [replace(r, inputs=u) for u, r in zip(alone, records, strict=True)])
         responses.append(np.concatenate([(weights * part).ravel() for part in parts]))
     matrix = np.array(responses).T
     sizes = np.linalg.norm(matrix, axis=0)
@@ -390,7 +479,7 @@ def _scaled_inputs(gap: _Gap) -> list[WiringFault]:
             sentence = _doubtful(what, gains[inputs] / factor - 1.0)
         kind = "sign" if factor == -1.0 else "unit"
         own = partial(_inputs_times, dict.fromkeys(names, factor))
-        faults.append(WiringFault(kind, sentence, closes, own, certain))
+        faults.append(WiringFault(kind, sentence, closes, own, certain, gap.names))
     return faults
 
 
@@ -407,16 +496,16 @@ def _quantities(gap: _Gap) -> list[WiringFault]:
         if not here:
             continue
         every = {rig.sensors[j].name for j in here}
-        closed = gap.closed(gap.power([_predict(_relabelled(rig, every, quantity), r) for r in records]))
+        closed = gap.closed(gap.power(gap.predict(_relabelled(rig, every, quantity), records)))
         for j in here:
             if closed[j] >= CLOSED:
                 meant.setdefault((rig.sensors[j].quantity, quantity), []).append(int(j))
     faults = []
     for (said, quantity), outputs in meant.items():
         names = [rig.sensors[j].name for j in outputs]
-        closed = gap.closed(gap.power([_predict(_relabelled(rig, set(names), quantity), r) for r in records]))
+        closed = gap.closed(gap.power(gap.predict(_relabelled(rig, names, quantity), records)))
         what = _one(f"{_named('output', names)} are {quantity}, not {said}", names)
-        sentence = f'{what}: write quantity = "{quantity}" in case.toml.'
+        sentence = f'{what}: state the quantity "{quantity}".'
         mend = partial(_quantity_set, frozenset(names), quantity)
         faults.append(WiringFault("quantity", sentence, float(closed[outputs].min()), mend))
     return faults
@@ -427,26 +516,27 @@ def _rates(gap: _Gap) -> list[WiringFault]:
     rig, records = gap.rig, gap.records
     wrong: dict[float, list[int]] = {}
     for i, record in enumerate(records):
-        own = _Gap.of(rig, [record], [gap.predicted[i]])
+        own = _Gap.of(rig, [record], gap.settle, [gap.predicted[i]])
         if not own.wide.any():
             continue
+        others = {factor: replace(record, sample_time=record.sample_time / factor) for factor in RATES}
         shares = {
-            factor: own.closes(rig, [replace(record, sample_time=record.sample_time / factor)]) for factor in RATES
+            factor: own.closes(rig, [other])
+            for factor, other in others.items()
+            if 2 * lead_of(other, gap.settle) < other.n_samples  # else next to nothing would be left to compare
         }
-        best = max(shares, key=lambda factor: shares[factor])
-        if shares[best] >= CLOSED:
+        best = max(shares, key=lambda factor: shares[factor], default=None)
+        if best is not None and shares[best] >= CLOSED:
             wrong.setdefault(best, []).append(i)
     faults = []
     for factor, at in wrong.items():
         names = [records[i].name for i in at]
-        every = len(at) == len(records)
-        who = "All records" if every and len(at) > 1 else _named("record", names)
         times = ", ".join(dict.fromkeys(f"{records[i].sample_time / factor:.6g}" for i in at))
-        what = _one(f"{who} are sampled at {RATES[factor]} the stated rate", names)
-        sentence = f"{what}: write sample_time = {times} s."
-        mend = partial(_rate_times, None if every else frozenset(names), factor)
-        whole = gap.closes(*mend(rig, records)) if every else np.nan
-        faults.append(WiringFault("sample rate", sentence, whole, mend))
+        what = _one(f"{_named('record', names)} are sampled at {RATES[factor]} the stated rate", names)
+        sentence = f"{what}: state sample_time = {times} s."
+        mend = partial(_rate_times, factor)
+        whole = gap.closes(*mend(rig, records)) if len(at) == len(records) else np.nan
+        faults.append(WiringFault("sample rate", sentence, whole, mend, records=tuple(names)))
     return faults
 
 
@@ -492,7 +582,16 @@ def _one(sentence: str, names: Sequence[str]) -> str:
     return sentence
 
 
+WAYS_OF_ONE = (_scaled_outputs, _exchanged_outputs, _exchanged_inputs, _scaled_inputs, _rates)  # a record by itself
+WAYS = (*WAYS_OF_ONE[:-1], _quantities, _rates, _structure)
+
+
 # --- mends: of (rig, records), once all before these is given
+
+
+def _records_alone(mend: Mend, rig: Rig, records: Sequence[Record]) -> Mended:
+    """The rig as it is."""
+    return rig, mend(rig, records)[1]
 
 
 def _without_record(name: str, rig: Rig, records: Sequence[Record]) -> Mended:
@@ -533,11 +632,8 @@ def _quantity_set(names: frozenset[str], quantity: str, rig: Rig, records: Seque
     return _relabelled(rig, names, quantity), tuple(records)
 
 
-def _rate_times(names: frozenset[str] | None, factor: float, rig: Rig, records: Sequence[Record]) -> Mended:
-    """Of the named records, or of all."""
-    return rig, tuple(
-        replace(r, sample_time=r.sample_time / factor) if names is None or r.name in names else r for r in records
-    )
+def _rate_times(factor: float, rig: Rig, records: Sequence[Record]) -> Mended:
+    return rig, tuple(replace(r, sample_time=r.sample_time / factor) for r in records)
 
 
 def _modes_times(omega: float, zeta: float, rig: Rig, records: Sequence[Record]) -> Mended:

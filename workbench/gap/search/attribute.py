@@ -139,8 +139,7 @@ def baseline(
     if not (noise > 0).all():
         name = rig.sensors[int(np.argmin(noise))].name
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weights every residual by it")
-    lead = round(settle / records[0].sample_time)
-    seen, data = _plain_to_see(rig, FitData(tuple(records), noise, lead=lead, deadline=deadline))
+    seen, data = _plain_to_see(rig, FitData(tuple(records), noise, settle=settle, deadline=deadline))
     evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
     _ = evidence.at_peaks  # found once, before the work parts
     if not seen:

@@ -10,7 +10,7 @@ import numpy as np
 
 from workbench.cases.case import Case
 from workbench.draw.gap import plot_budget, plot_responses, plot_rivals, plot_unmodelled_force, plot_where
-from workbench.draw.motion import mode_motion
+from workbench.draw.motion import ALONG, mode_motion
 from workbench.draw.spectra import plot_distortion
 from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import label_in_words
@@ -53,12 +53,12 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             + (" the validation records." if case.validation else " the records that were fitted."),
         ),
         (
-            plot_responses(rigs, records),
+            plot_responses(rigs, records, time_unit=verdict.units.time),
             f"Measured and simulated response ({', '.join(rigs)}) where they differ most. Nothing was fitted"
             " to the validation records.",
         ),
     ]
-    if verdict.outcome != "none":  # there is nothing to take apart in noise
+    if verdict.shows_gap:  # there is nothing to take apart in noise
         figures += [
             (
                 plot_where(verdict),
@@ -82,7 +82,9 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         )
         figures.append((plot_distortion(distortions), seen))
     moving = moving_modes(
-        verdict.nominal, {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})}
+        verdict.nominal,
+        {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})},
+        length=verdict.units.length,
     )
     page_content = PageContent(
         title=f"Diagnosis of {verdict.case}",
@@ -91,7 +93,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         lines=[*verdict.notes, *([verdict.experiment.sentence] if verdict.experiment else []), _could_show(verdict)],
         blocks=[
             *(block(figure, caption) for figure, caption in figures),
-            *(moving if verdict.outcome != "none" else []),
+            *(moving if verdict.shows_gap else []),
         ],
         tables=verdict_tables(verdict.to_json()),
         inputs={} if folder is None else case_inputs(folder),
@@ -114,6 +116,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
         for name, value in effect["parameters"].items()
     ]
     gap, closed = content["gap"], content.get("shrinkage", {})
+    length = content.get("units", {}).get("length", "m")
     gaps = [
         [record, *(_short(gap[name].get(record)) for name in ("before", "after", "floor")), _short(closed.get(record))]
         for record in gap["before"]
@@ -122,7 +125,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
         [rival.get("words") or in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]
     ]
     tables = [
-        ("Effects", ("effect", "parameter", "value", "standard error", "x [m]", "input or output"), effects),
+        ("Effects", ("effect", "parameter", "value", "standard error", f"x [{length}]", "input or output"), effects),
         ("Gap (rms error / rms signal)", ("record", "before", "after", "floor", "share closed"), gaps),
         ("Other explanations", ("set of effects", "probability"), rivals),
     ]
@@ -144,13 +147,16 @@ def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
     return found if len(found) < 2 else [found[0], found[-1]]
 
 
-def moving_modes(rig: Rig, modes: Mapping[str, Modes]) -> list[dict[str, Any]]:
+def moving_modes(rig: Rig, modes: Mapping[str, Modes], *, length: str = "m") -> list[dict[str, Any]]:
     """A block of modes that move, where they are known all over a structure or at points with positions."""
     domain = rig.modes.domain
     placed = isinstance(domain, NamedPoints) and domain.positions is not None and len(set(domain.nodes)) > 2
     if not placed and (rig.structure is None or isinstance(domain, NamedPoints)):
         return []
-    return [block(mode_motion(modes, actuators=rig.actuators, sensors=rig.sensors), MOVING)]
+    motion = mode_motion(modes, actuators=rig.actuators, sensors=rig.sensors)
+    if motion.get("label") == ALONG:
+        motion["label"] = f"x [{length}]"
+    return [block(motion, MOVING)]
 
 
 def case_inputs(folder: Path) -> dict[str, str]:
