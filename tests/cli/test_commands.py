@@ -143,6 +143,16 @@ def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
     assert "coupled LQR" in (tmp_path / "p.html").read_text() and (tmp_path / "p.page.json").is_file()
 
 
+def test_design_has_observers_of_rigid_modes_and_says_what_is_on_the_axis(tmp_path):
+    free = tmp_path / "free.toml"
+    second = '[[output]]\nname = "z"\nquantity = "displacement"\nat = 7.5\n'  # two rigid modes take two sensors
+    free.write_text(RIG.replace('"hinged"', '"free"') + second)
+    result = run("design", free, "--control", 2)
+    assert result.exit_code == 0 and "IMSC on a Luenberger observer" in result.output, result.output
+    # two undamped laws, through exact modal coordinates: whatever rounding makes of poles on the axis
+    assert [line.split()[-2:] for line in result.output.splitlines()[2:4]] == [["marginally", "stable"]] * 2
+
+
 def test_design_offers_what_can_be_had(rig, tmp_path):
     found = tmp_path / "design.json"
     nodes = run("design", rig, "--control", 5)
@@ -344,6 +354,7 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         (("design", "{rig}", "--weight", -1), "positive"),
         (("design", "{rig}", "--control", -1), "-1 modes cannot be controlled of 9"),
         (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),
+        (("design", "{rig}", "--final-time", 0), "final time must be positive and finite; got 0"),
         (("design", "{rig}", "--json", "nowhere/found.json"), "there is no folder nowhere"),
         (("place", "{rig}", "--control", 4, "--json", "nowhere/found.json"), "there is no folder nowhere"),
         (

@@ -67,9 +67,8 @@ def observed(
     """
     from workbench.design.estimation.controller import filtered
     from workbench.design.estimation.modal_filter import filter_on
-    from workbench.design.estimation.observers import kalman, luenberger
+    from workbench.design.estimation.observers import kalman, luenberger, usual_poles
     from workbench.design.laws.law import Law
-    from workbench.design.spillover.comparison import OBSERVER_POLES
     from workbench.rig.sensors import MEASURED
 
     if estimator not in ESTIMATORS:
@@ -93,7 +92,7 @@ def observed(
         own = [next(s for s in sensors if (s.at, s.quantity) == (one.at, one.quantity)) for one in found.sensors]
         return replace(found, sensors=tuple(own))
     if estimator == "luenberger":
-        return luenberger(rig.modes, law, sensors, poles=OBSERVER_POLES * rig.modes.omega[list(law.controlled)])
+        return luenberger(rig.modes, law, sensors, poles=usual_poles(rig.modes, law.controlled))
     # a noise of variance σ² held over each sample has the intensity σ² T
     noise = [s.noise_std**2 * sample_time for s in sensors]
     return kalman(rig.modes, law, sensors, disturbance=disturbance, noise=noise)

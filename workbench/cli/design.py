@@ -53,15 +53,13 @@ def design(
     state[modes.n_modes + n :] = 0.0
     perturbed = None if errors is None else perturbed_modes(modes, errors)
     laws, refused = laws_of(modes, n, actuators, weight=weight, damping=damping)
-    end = final_time or PERIODS * 2.0 * np.pi / modes.omega[modes.omega > 0][0]
+    end = PERIODS * 2.0 * np.pi / modes.omega[modes.omega > 0][0] if final_time is None else final_time
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     shown = []
     for row in rows:
         numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
-        fastest = row.poles.real.max()
-        stable = "stable" if fastest < 0 else "unstable" if fastest > 0 else "marginally stable"
-        shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, stable))
+        shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, row.stability))
     say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {modes.domain.text(at)}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
@@ -77,7 +75,8 @@ def design(
             continue
         share = None if perturbed is None else stable_share(perturbed, controller)
         robust = [] if share is None else [f"{share:.0%}"]
-        margin = f"{explained.margin:.3g}" + ("" if explained.loop.stable else " unstable")
+        stability, margin = explained.loop.stability, f"{explained.margin:.3g}"
+        margin = {"stable": margin, "unstable": f"{margin} unstable"}.get(stability, stability)
         limiting, path = _limit(explained)
         sensed.append((controller.name, margin, limiting, path, *robust))
         written.append(
@@ -120,10 +119,10 @@ def design(
 
 def _limit(explained: "Explanation") -> tuple[str, str]:
     """The residual mode that limits the stability margin, and the path by which it does."""
-    worst = explained.destabilising or (explained.shifts[0] if explained.shifts else None)
+    worst = explained.limiting if explained.loop.stable else explained.destabilising
+    if worst is None and explained.loop.stable:
+        return "none", ""
     if worst is None:
-        return "", ""
-    if not explained.loop.stable and explained.destabilising is None:
         return "none: unstable without them" if explained.reduced_margin <= 0 else "no single mode", ""
     grows = explained.loop.stable or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without it"

@@ -9,10 +9,10 @@ from scipy.optimize import linprog
 
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
+from workbench.design.loop.peak import largest
 from workbench.design.placement.cell_bounds import CellBounds
 from workbench.design.placement.certificate import _Search, certify
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.peak import largest
 from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task, scan, symbolic_work
 from workbench.design.placement.task import batch_costs, batch_work
 from workbench.design.spillover.spillover import effort, finite_spillover, spillover

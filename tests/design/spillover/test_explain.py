@@ -6,8 +6,9 @@ import pytest
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
-from workbench.design.estimation.observers import kalman, luenberger
-from workbench.design.laws.coupled import controlled_plant, coupled_lqr
+from workbench.design.estimation.observers import kalman, luenberger, usual_poles
+from workbench.design.laws.coupled import controlled_plant, coupled_lqr, coupled_poles
+from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state, initial_response
 from workbench.design.spillover.explain import explain_spillover
@@ -15,6 +16,7 @@ from workbench.design.spillover.remedies import spillover_remedies, sufficient_s
 from workbench.design.spillover.spillover import finite_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
+from workbench.rig.statespace import state_space
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 
@@ -129,6 +131,64 @@ def test_paths_add_up_to_the_movement_of_the_pole(controller):
     for moved in explained.shifts:
         assert sum(path.shift for path in moved.paths) == pytest.approx(moved.shift, abs=1e-9 * abs(moved.pole))
         assert np.abs(explained.poles - moved.closed_pole).min() == 0.0
+
+
+def poles_by_python_control(modes, controller):
+    plant = state_space(modes, controller.law.actuators, controller.sensors)
+    own = control.ss(controller.state, controller.reads, controller.commands, controller.direct)
+    return control.feedback(plant, own, sign=1).poles()
+
+
+@pytest.mark.parametrize(
+    ("ends", "zeta", "controlled"),
+    [
+        ("free", 0.01, (2, 3)),
+        ("hinged", [0.01, 0.01, 1.5, 0.01], (0, 1)),
+        ("hinged", [0.01, 0.01, 1.0, 0.01], (0, 1)),
+    ],
+)
+def test_rigid_and_overdamped_residual_modes_have_their_poles_too(ends, zeta, controlled):
+    modes = Beam(
+        length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left=ends, right=ends, damping=ModalDamping(zeta)
+    ).modes(6)
+    law = imsc(modes, controlled, [Actuator("A", 0.2), Actuator("B", 0.45)], weight=0.1)
+    sensors = [Sensor("y1", 0.15), Sensor("y2", 0.4)]
+    told = explain_spillover(modes, luenberger(modes, law, sensors, poles=usual_poles(modes, controlled)))
+    peer = poles_by_python_control(modes, luenberger(modes, law, sensors, poles=usual_poles(modes, controlled)))
+    assert {moved.mode for moved in told.shifts} == set(range(6)) - set(controlled)
+    assert told.margin == pytest.approx(-peer.real.max(), rel=1e-6)
+    for moved in told.shifts:
+        assert np.abs(peer - moved.closed_pole).min() < 1e-5 * abs(modes.omega[-1])
+        assert sum(path.shift for path in moved.paths) == pytest.approx(moved.shift, abs=1e-7 * modes.omega[-1])
+    if ends == "free":  # what the sensors see of a rigid mode makes it grow; nothing else is at its pole
+        assert told.destabilising is told.limiting is told.shifts[0] and told.shifts[0].mode in (0, 1)
+    else:  # ζ of 1.5 and 1 in open loop: -ω (ζ - √(ζ² - 1))
+        slow = {moved.mode: moved for moved in told.shifts}[2]
+        assert slow.pole == pytest.approx(-modes.omega[2] * (zeta[2] - np.sqrt(zeta[2] ** 2 - 1)))
+        assert told.limiting.mode == 3
+
+
+def test_no_residual_mode_is_blamed_for_what_a_controlled_one_does():
+    modes = Beam(length=1.2, mass_per_length=0.62, bending_stiffness=13.0, left="hinged", right="hinged").modes(6)
+    poles = modes.omega[:3] * (-0.2 + 1j * np.sqrt(0.96))
+    law = coupled_poles(modes, 3, [Actuator("F1", 0.3), Actuator("F2", 0.7)], poles=poles)
+    controller = filtered(law, displacement_filter(modes.select(range(3)), [0.35, 0.95], 0.62))
+    told = explain_spillover(modes, controller)
+    assert told.reduced_margin < 0 and told.shifts[0].closed_pole.real > 0
+    assert all(close_with(modes.select(np.delete(range(6), r)), controller).margin < 0 for r in (3, 4, 5))
+    assert told.destabilising is None and told.limiting is None
+
+
+def test_a_law_alone_has_no_paths_and_says_so():
+    with pytest.raises(DesignError, match="put it on an observer"):
+        explain_spillover(beam(), coupled_lqr(beam(), 3, ACTUATORS, weight=1.0))
+
+
+def test_rigid_modes_alone_set_no_speed_of_an_observer():
+    free = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(3)
+    assert usual_poles(free, (0, 1, 2)) == pytest.approx((-0.3 + 1j) * free.omega[2] * np.array([1 / 3, 2 / 3, 1]))
+    with pytest.raises(DesignError, match="rigid modes alone"):
+        usual_poles(free.select([0, 1]), (0, 1))
 
 
 def test_first_order_is_the_derivative():

@@ -16,7 +16,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from workbench.arrays import Floats, symmetric_root
 from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError, Law, weighed_states
-from workbench.design.placement.peak import largest
+from workbench.design.loop.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
