@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from workbench.arrays import Complexes, Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.laws.coupled import controlled_plant
-from workbench.design.laws.law import DesignError, Law, positive_definite
+from workbench.design.laws.law import DesignError, Law, linear, positive_definite
 from workbench.design.laws.pole_assignment import assign
 from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes
@@ -96,8 +96,9 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
     """A, B and C of the controlled modes alone, from forces to readings.
 
     Raises:
-        DesignError: no sensors, or a mode that none sees.
+        DesignError: a law that has no gain, no sensors, or a mode that none sees.
     """
+    law = linear(law)
     index = list(law.controlled)
     own = modes.select(index)
     c = reading(own, sensors)

@@ -11,12 +11,12 @@ from scipy.linalg import expm
 from workbench.arrays import Complexes, Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.estimation.modal_filter import ModalFilter
-from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.law import DesignError, Law, linear
 from workbench.design.loop.peak import largest
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze, frozen
-from workbench.structure.printed import place_text
+from workbench.structure.printed import counted, place_text
 
 UNSEEN = 1e-9
 WELL_CONDITIONED = 1e6
@@ -107,14 +107,12 @@ def close_loop(modes: Modes, law: Law | Controller, filter_: ModalFilter | None 
     """
     if isinstance(law, Controller) and filter_ is None:
         return close_with(modes, law)
-    if not isinstance(law, Law):
-        raise DesignError(
-            f"{law.name} has no gain of its own to close a loop with: its loop is"
-            + (" closed without filter_" if isinstance(law, Controller) else " simulated by respond_on_off")
-        )
+    law = linear(law)
     n = modes.n_modes
     if max(law.controlled) >= n:
-        raise DesignError(f"the law controls mode {max(law.controlled) + 1}, and {n} modes are given; give more modes")
+        raise DesignError(
+            f"the law controls mode {max(law.controlled) + 1} and the plant has {counted(n, 'mode')}; give more modes"
+        )
     if filter_ is None:
         seen = np.zeros((law.n_controlled, n))
         seen[np.arange(law.n_controlled), list(law.controlled)] = 1.0
