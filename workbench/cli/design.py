@@ -7,7 +7,7 @@ import typer
 from workbench.cli import options
 from workbench.cli.rig_file import impulse_place, read_structure_rig
 from workbench.cli.terminal import check_target, guarded, say, show_table, write_json
-from workbench.structure.printed import place_text
+from workbench.structure.printed import command_headings, place_text
 
 if TYPE_CHECKING:
     from workbench.design.spillover.explain import Explanation
@@ -43,6 +43,7 @@ def design(
     from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.comparison import compare, laws_of, through_sensors
     from workbench.design.spillover.robustness import perturbed_modes, stable_share
+    from workbench.rig.actuators import command_unit
 
     check_target(json_path)
     found = read_structure_rig(rig)
@@ -60,10 +61,11 @@ def design(
         numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
         shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, row.stability))
-    say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {modes.domain.text(at)}, R = {weight:g}", bold=True)
+    struck, unit = modes.domain.text(at, 6), command_unit(actuators)
+    say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {struck}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
-    show_table(("law", "cost", "effort [N² s]", "peak force [N]", "W_C [J]", "W_R [J]", "largest W_r", "loop"), shown)
+    show_table(("law", "cost", *command_headings(unit), "W_C [J]", "W_R [J]", "largest W_r", "loop"), shown)
     tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
@@ -97,6 +99,7 @@ def design(
         {
             "impulse_at": at,
             "weight": weight,
+            "command_unit": unit,
             "final_time": end,
             "controlled": list(range(1, n + 1)),
             "laws": [

@@ -20,6 +20,7 @@ from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
+from workbench.structure.printed import command_headings
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
 from workbench.study.pages.page import FORMAT, PageContent, Table, block, page_content_of, tables_of, to_its_error
@@ -233,7 +234,11 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
             ),
         ],
         "tables": [
-            ("Laws", ("law", "cost", "effort [N² s]", "peak force [N]", "W_R [J]", "loop"), rows),
+            (
+                "Laws",
+                ("law", "cost", *command_headings(str(content.get("command_unit", "N"))), "W_R [J]", "loop"),
+                rows,
+            ),
             *([("With sensors", heads, sensed)] if sensed else []),
         ],
     }
@@ -271,7 +276,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     ]
     first, bound = placements[0]["residual_work"], content.get("lower_bound")
     proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g} J."
-    n = len(content.get("controlled", ()))
+    n, headings = len(content.get("controlled", ())), command_headings(str(content.get("command_unit", "N")))
     return {
         "title": "Actuator placement",
         "lead": f"Actuators at {_between(places[0])} m leave spillover work W_R = {float(first):.4g} J.{proof}",
@@ -286,7 +291,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         "tables": [
             (
                 "Placements",
-                ("placement", "W_R [J]", "effort [N² s]", "peak force [N]", "condition number of B", "places [m]"),
+                ("placement", "W_R [J]", *headings, "condition number of B", "places [m]"),
                 rows,
             )
         ],

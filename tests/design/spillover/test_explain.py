@@ -1,5 +1,7 @@
 """Observers and filters in one loop: separation, peers, spillover explained to the path, remedies that hold."""
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
@@ -14,11 +16,14 @@ from workbench.design.loop.closed_loop import close_loop, close_with, impulse_st
 from workbench.design.spillover.explain import explain_spillover
 from workbench.design.spillover.remedies import spillover_remedies, sufficient_sensors
 from workbench.design.spillover.spillover import finite_spillover
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import NamedPoints
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
+from workbench.structure.plate import Plate
 
 ACTUATORS = (Actuator("F1", 10 / 6),)
 
@@ -217,6 +222,56 @@ def test_every_remedy_stabilises_the_loop_and_less_does_not():
     share = 1 - found["gain"].size
     assert explain_spillover(modes, redesign(ACTUATORS, [50 / 6], min(share * 1.01, 1.0))).margin < 0
     assert found["sensors added"].size == 1
+
+
+CHAIN = NamedPoints(
+    names=tuple(f"S{i}" for i in range(1, 9)),
+    positions=np.array([[0.0, 0.0, 3.0 * i] for i in range(8)]),
+    directions=("x",) * 8,
+)
+
+
+def surroundings(kind):
+    """A loop that spillover destabilises: modes, how many are controlled, actuators, places of sensors, R."""
+    light = ModalDamping(0.0005)
+    if kind == "frame":
+        stiffness = 2e6 * (2 * np.eye(8) - np.eye(8, k=1) - np.eye(8, k=-1))
+        stiffness[-1, -1] = 2e6
+        modes = FiniteElements(np.diag([1200.0] * 7 + [900.0]), stiffness, nodes=CHAIN, damping=light).modes(5)
+        return modes, 1, [Actuator("F", "S8")], ["S3"], 1e-9
+    if kind == "plate":
+        edges = dict.fromkeys(("left", "right", "bottom", "top"), "simply supported")
+        sides = {"length": (0.9, 0.5), "mass_per_area": 8.0, "bending_stiffness": 40.0, "poisson_ratio": 0.3}
+        modes = Plate(**sides, edges=edges, damping=ModalDamping(0.0001)).modes(6)
+        return modes, 2, [Actuator("F1", (0.2, 0.2)), Actuator("F2", (0.6, 0.3))], [(0.3, 0.3), (0.7, 0.1)], 1e-4
+    modes = Beam(
+        length=1.2, mass_per_length=0.62, bending_stiffness=13.0, left="hinged", right="hinged", damping=light
+    ).modes(6)
+    return modes, 2, [piezo_patch("P1", 0.3, length=0.1), piezo_patch("P2", 0.7, length=0.1)], [0.35, 0.95], 1e-4
+
+
+@pytest.mark.parametrize("kind", ["frame", "patches", pytest.param("plate", marks=pytest.mark.slow)])
+def test_remedies_move_whatever_stands_anywhere(kind):
+    modes, count, actuators, places, weight = surroundings(kind)
+
+    def redesign(actuators, sensors, share):
+        law = imsc(modes, count, actuators, weight=weight)
+        sensors = [Sensor(f"y{i}", at) for i, at in enumerate(sensors)]
+        return luenberger(modes, replace(law, gain=share * law.gain), sensors, poles=usual_poles(modes, range(count)))
+
+    assert close_with(modes, redesign(actuators, places, 1.0)).margin < 0
+    found = {r.kind: r for r in spillover_remedies(modes, redesign, actuators, places)}
+    assert {"actuator", "sensors added"} <= set(found)
+    assert all(-poles_by_python_control(modes, r.controller).real.max() > 0 for r in found.values())
+    moved = found["actuator"].controller.law.actuators
+    if kind == "patches":  # as long as they were
+        assert [a.at.first - a.at.second for a in moved] == pytest.approx([0.1, 0.1])
+    if kind == "frame":  # of the points nearer than the nearest that will do none does
+        assert moved[0].at == "S3" and found["actuator"].size == pytest.approx(15.0)
+        nearer = [redesign([replace(actuators[0], at=f"S{i}")], places, 1.0) for i in (4, 5, 6, 7)]
+        assert all(close_with(modes, one).margin <= 0 for one in nearer)
+    cured = found["sensors added"].controller
+    assert spillover_remedies(modes, redesign, actuators, cured.places) == ()
 
 
 def test_the_filter_cures_it_with_sensors_enough():
