@@ -151,6 +151,8 @@ def test_design_has_observers_of_rigid_modes_and_says_what_is_on_the_axis(tmp_pa
     assert result.exit_code == 0 and "IMSC on a Luenberger observer" in result.output, result.output
     # two undamped laws, through exact modal coordinates: whatever rounding makes of poles on the axis
     assert [line.split()[-2:] for line in result.output.splitlines()[2:4]] == [["marginally", "stable"]] * 2
+    free.write_text(free.read_text().replace("modes = 9", "modes = 2"))
+    assert "rigid modes alone set no time" in run("design", free, "--control", 2).output
 
 
 def test_design_offers_what_can_be_had(rig, tmp_path):

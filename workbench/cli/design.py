@@ -54,7 +54,10 @@ def design(
     state[modes.n_modes + n :] = 0.0
     perturbed = None if errors is None else perturbed_modes(modes, errors)
     laws, refused = laws_of(modes, n, actuators, weight=weight, damping=damping)
-    end = PERIODS * 2.0 * np.pi / modes.omega[modes.omega > 0][0] if final_time is None else final_time
+    elastic = modes.omega[modes.omega > 0]
+    if final_time is None and not elastic.size:
+        raise ValueError("rigid modes alone set no time until which work is counted; give --final-time")
+    end = PERIODS * 2.0 * np.pi / elastic[0] if final_time is None else final_time
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     shown = []
     for row in rows:

@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from workbench.cases.case import read_case
+from workbench.design.loop.closed_loop import stability
 from workbench.draw.design import plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.identification import stabilisation_diagram
@@ -29,7 +30,6 @@ from workbench.study.runs.cases import StudyError
 
 TURN = 2.0 * np.pi
 MOST_BYTES = 200_000_000
-ON_AXIS = 1e-9  # rad/s from the imaginary axis within which a pole is undamped
 MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram
 BEYOND = 8  # orders more than modes that it shows
 SAMPLES_AN_ORDER = 8  # at least
@@ -198,7 +198,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
             law["law"],
             *(_short(law[key]) for key in ("cost", "effort", "peak_force")),
             _short(works[law["law"]].sum()),
-            _loop(poles[law["law"]]),
+            stability(poles[law["law"]]),
         ]
         for law in laws
     ]
@@ -246,12 +246,6 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
 
 def _poles_of(row: Mapping[str, Any]) -> np.ndarray:
     return np.array(row["poles_real"], float) + 1j * np.array(row["poles_imag"], float)
-
-
-def _loop(poles: np.ndarray) -> str:
-    """Stable, marginally stable or unstable, by the rightmost pole."""
-    rightmost = float(poles.real.max())
-    return "stable" if rightmost < -ON_AXIS else "marginally stable" if rightmost <= ON_AXIS else "unstable"
 
 
 def _stability(loops: list[str], unstable: list[str]) -> str:

@@ -25,6 +25,12 @@ EVEN = 1e-15
 ON_AXIS = 1e-9  # of the fastest pole
 
 
+def stability(poles: np.ndarray) -> str:
+    """Of a loop: stable, unstable, or marginally stable where its rightmost pole is on the axis but for rounding."""
+    rightmost, rounding = poles.real.max(), ON_AXIS * max(np.abs(poles).max(), 1.0)
+    return "stable" if rightmost < -rounding else "unstable" if rightmost > rounding else "marginally stable"
+
+
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
     """x' = A x, x = (q, q') of every mode, then the states of an observer where there is one, forces u = -K x̂ in it.
@@ -53,9 +59,8 @@ class ClosedLoop:
 
     @property
     def stability(self) -> str:
-        """ "stable", "unstable", or "marginally stable" where the rightmost pole sits on the axis but for rounding."""
-        rounding = ON_AXIS * max(np.abs(self.poles).max(), 1.0)
-        return "stable" if self.margin > rounding else "unstable" if self.margin < -rounding else "marginally stable"
+        """As of `stability`."""
+        return stability(self.poles)
 
     @property
     def stable(self) -> bool:
