@@ -15,6 +15,7 @@ from workbench.design.laws.imsc import imsc, imsc_poles, pole_gains, riccati_gai
 from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import on_off
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
+from workbench.design.spillover.explain import explain_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
@@ -135,6 +136,7 @@ def test_a_state_of_another_size_starts_no_response():
         (lambda: luenberger(modes(), relay(), [Sensor("y", 3.0)], poles=[-1 + 1j]), "on-off, which has no gain"),
         (lambda: filtered(relay(), hermite_filter(modes(1), [1.0, 8.0], 1.0)), "on-off, which has no gain"),
         (lambda: close_loop(modes(), relay()), "on-off, which has no gain"),
+        (lambda: explain_spillover(modes(), relay()), "on-off, which has no gain"),
         (lambda: close_loop(modes(1), imsc(modes(), 2, actuators(2.0, 3.0), weight=1.0)), "mode 2 .*has 1 mode;"),
         (lambda: export(modes(), relay(), sample_rate_hz=100.0), "switches.*redesign"),
     ],

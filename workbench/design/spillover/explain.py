@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 
 from workbench.arrays import Complexes
 from workbench.design.estimation.controller import Controller, reading
-from workbench.design.laws.law import DesignError
+from workbench.design.laws.law import DesignError, linear
 from workbench.design.loop.closed_loop import ClosedLoop, close_with
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Place
@@ -144,12 +144,12 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
         controller: from `filtered`, `luenberger` or `kalman`.
 
     Raises:
-        DesignError: a law alone, which reads no sensor and so shifts no residual mode.
+        DesignError: a law alone, which reads no sensor and so shifts no residual mode, or one that has no gain.
     """
     if not isinstance(controller, Controller):
         raise DesignError(
-            f"{controller.name} alone reads exact modal coordinates, so it shifts no residual mode; put it on an"
-            " observer (luenberger, kalman) or through a modal filter, and give the controller"
+            f"{linear(controller).name} alone reads exact modal coordinates, so it shifts no residual mode; put it on"
+            " an observer (luenberger, kalman) or through a modal filter, and give the controller"
         )
     loop = close_with(modes, controller)
     rest = _Rest(modes, controller)
