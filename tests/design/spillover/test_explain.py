@@ -173,6 +173,20 @@ def test_rigid_and_overdamped_residual_modes_have_their_poles_too(ends, zeta, co
         assert told.limiting.mode == 3
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("quantities", [("velocity", "velocity"), ("velocity", "displacement")])
+def test_the_rigid_displacement_that_no_sensor_reads_stays_where_it_is(quantities):
+    free = Beam(
+        length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free", damping=ModalDamping(0.01)
+    ).modes(6)
+    law = imsc(free, (2, 3), [Actuator("A", 0.2), Actuator("B", 0.45)], weight=0.1)
+    sensors = [Sensor(f"y{at}", at, quantity) for at, quantity in zip((0.15, 0.4), quantities)]
+    told = explain_spillover(free, luenberger(free, law, sensors, poles=usual_poles(free, (2, 3))))
+    rigid = [moved for moved in told.shifts if moved.mode in (0, 1)]
+    still = [moved for moved in rigid if abs(moved.closed_pole) < 1e-9]
+    assert len(still) == quantities.count("velocity") and all(path.shift == 0 for m in still for path in m.paths)
+
+
 def test_no_residual_mode_is_blamed_for_what_a_controlled_one_does():
     modes = Beam(length=1.2, mass_per_length=0.62, bending_stiffness=13.0, left="hinged", right="hinged").modes(6)
     poles = modes.omega[:3] * (-0.2 + 1j * np.sqrt(0.96))

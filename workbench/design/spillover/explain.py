@@ -203,7 +203,7 @@ class _Rest:
 
     def __init__(self, modes: Modes, controller: Controller) -> None:
         self.modes, self.controller, self._apart = modes, controller, modes.proportional
-        self._slowest = modes.omega[modes.omega > 0].min() if modes.omega.any() else 1.0
+        self.slowest = modes.omega[modes.omega > 0].min() if modes.omega.any() else 1.0
         self.pushed = input_matrix(modes, controller.law.actuators)
         self.seen = reading(modes, controller.sensors)
 
@@ -216,13 +216,15 @@ class _Rest:
         if self._apart:
             stiff = s**2 + s * np.diag(self.modes.damping)[others] + self.modes.omega[others] ** 2
             # an undamped twin of the mode answers without bound at their pole: a hair beside it
-            hair = TWIN * max(abs(s), self._slowest) ** 2
+            hair = TWIN * max(abs(s), self.slowest) ** 2
             plant = (seen / np.where(stiff == 0, hair, stiff)) @ pushed
         else:
             stiff = np.diag(s**2 + self.modes.omega[others] ** 2) + s * self.modes.damping[np.ix_(others, others)]
             plant = seen @ np.linalg.solve(stiff, pushed)
         own = c.direct + c.commands @ np.linalg.solve(s * np.eye(len(c.state)) - c.state, c.reads)
-        return np.linalg.solve(np.eye(len(own)) - own @ plant, own)
+        # least squares: where the rest has this pole too, as of several rigid modes that one sensor reads, no one
+        # solution is the mode's share of it
+        return np.asarray(np.linalg.lstsq(np.eye(len(own)) - own @ plant, own, rcond=None)[0])
 
 
 class _OneMode:
@@ -239,8 +241,10 @@ class _OneMode:
     def _terms(self, s: complex) -> Complexes:
         """Shares (n_actuators, n_channels) of the movement that s would be."""
         forces, read = self._rest.forces(self._r, s), self._seen @ np.array([1.0, s])
-        terms: Complexes = self._pushed[:, None] * forces * read / (s - self._other)
-        return terms
+        terms: Complexes = self._pushed[:, None] * forces * read
+        # of a double pole one may stay, that of a rigid mode whose velocity alone is read say: nothing moves it
+        stays = abs(s - self._other) <= DOUBLE * self._rest.slowest
+        return 0.0 * terms if stays else terms / (s - self._other)
 
     def shifted(self, closed: complex) -> PoleShift:
         return PoleShift(self._r, self.pole, closed, self._paths(closed))
