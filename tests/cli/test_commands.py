@@ -143,6 +143,18 @@ def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
     assert "coupled LQR" in (tmp_path / "p.html").read_text() and (tmp_path / "p.page.json").is_file()
 
 
+def test_design_has_observers_of_rigid_modes_and_says_what_is_on_the_axis(tmp_path):
+    free = tmp_path / "free.toml"
+    second = '[[output]]\nname = "z"\nquantity = "displacement"\nat = 7.5\n'  # two rigid modes take two sensors
+    free.write_text(RIG.replace('"hinged"', '"free"') + second)
+    result = run("design", free, "--control", 2)
+    assert result.exit_code == 0 and "IMSC on a Luenberger observer" in result.output, result.output
+    # two undamped laws, through exact modal coordinates: whatever rounding makes of poles on the axis
+    assert [line.split()[-2:] for line in result.output.splitlines()[2:4]] == [["marginally", "stable"]] * 2
+    free.write_text(free.read_text().replace("modes = 9", "modes = 2"))
+    assert "rigid modes alone set no time" in run("design", free, "--control", 2).output
+
+
 def test_design_offers_what_can_be_had(rig, tmp_path):
     found = tmp_path / "design.json"
     nodes = run("design", rig, "--control", 5)
@@ -306,11 +318,12 @@ def test_patches_on_a_plate_are_placed_and_designed(plate, tmp_path):
     found = tmp_path / "places.json"
     result = run("place", plate, "--control", 2, "--weight", 10, "--json", found)
     assert result.exit_code == 0, result.output
+    assert "effort [(N m/m)² s]  peak moment [N m/m]" in result.output  # a line moment along the edges
     best, own = json.loads(found.read_text())["placements"]
     assert own["positions"] == [[0.3, 0.24], [0.84, 0.52]] and best["residual_work"] < own["residual_work"]
     assert all(0.1 <= x <= 1.1 and 0.075 <= y <= 0.725 for x, y in best["positions"])
     result = run("design", plate, "--control", 2, "--weight", 10)
-    assert result.exit_code == 0 and "IMSC" in result.output, result.output
+    assert result.exit_code == 0 and "effort [(N m/m)² s]  peak moment [N m/m]" in result.output, result.output
     plate.write_text(text.replace("patch = [0.2, 0.15]", "patch = [0.2, 0.1]", 1))
     result = run("place", plate, "--control", 2)
     assert result.exit_code == 2 and "F2 is no patch like F1" in " ".join(result.output.split())
@@ -344,6 +357,7 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         (("design", "{rig}", "--weight", -1), "positive"),
         (("design", "{rig}", "--control", -1), "-1 modes cannot be controlled of 9"),
         (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),
+        (("design", "{rig}", "--final-time", 0), "final time must be positive and finite; got 0"),
         (("design", "{rig}", "--json", "nowhere/found.json"), "there is no folder nowhere"),
         (("place", "{rig}", "--control", 4, "--json", "nowhere/found.json"), "there is no folder nowhere"),
         (

@@ -48,6 +48,19 @@ def test_a_controller_of_a_case_is_written(run, rig, tmp_path, estimator):
     assert [one.step([1.0]), one.step([0.0])] != [[0.0], [0.0]]
 
 
+@pytest.mark.parametrize(("law", "asked"), [("poles", 0.3), ("imsc", 0.7)])
+def test_the_damping_that_a_law_gives_is_told(run, rig, tmp_path, law, asked):
+    """With R = 1 / (2 ζ² ω²) of IMSC and x² = 1 + 2 ζ²: 4 ζ_c² x = 4 ζ_0² + 2 ζ² + 2 (x - 1) (near ζ)."""
+    given = asked
+    if law == "imsc":
+        x = (1 + 2 * asked**2) ** 0.5
+        given = ((4 * 0.02**2 + 2 * asked**2 + 2 * (x - 1)) / (4 * x)) ** 0.5
+    rig.write_text(RIG.replace("damping_ratio = 0.01", "damping_ratio = 0.02"))
+    options = ("--law", law, "--damping", asked, "--rate-hz", 1000, "--to", tmp_path / "one.py")
+    result = run("export", rig, "--control", 1, *options)
+    assert f"every modal coordinate known: {given:.3g}\n" in result.output, result.output
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -58,6 +71,7 @@ def test_a_controller_of_a_case_is_written(run, rig, tmp_path, estimator):
         (["--rate-hz", "100", "--law", "poles", "--weight", "2"], "give --damping for poles"),
         (["--rate-hz", "100", "--law", "on-off"], "`workbench redesign --to` writes it"),
         (["--rate-hz", "100", "--weight", "2", "--damping", "0.1"], "give one of them"),
+        (["--rate-hz", "100", "--law", "on-off", "--damping", "0.1"], "on-off control gives no damping ratio"),
         (["--rate-hz", "100", "--estimator", "pid"], "--estimator is one of luenberger, kalman"),
         (["--rate-hz", "100", "--to", "one.txt"], "written as .c, .py or .mat"),
         (["--rate-hz", "100", "--to", "nowhere/one.c"], "there is no folder nowhere"),

@@ -6,7 +6,8 @@ from workbench.cases.case import read_case, read_rig
 from workbench.rig.simulate import simulate
 
 
-def test_a_new_case_is_a_case_once_its_records_are_there(run, tmp_path):
+def test_a_new_case_is_a_case_once_its_records_are_there(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     made = run("new", "case", tmp_path / "arm")
     assert made.exit_code == 0 and "workbench diagnose" in made.output
     rig = read_rig(tmp_path / "arm" / "case.toml")
@@ -24,6 +25,7 @@ def test_a_new_case_is_a_case_once_its_records_are_there(run, tmp_path):
     toml.write_text(toml.read_text(encoding="utf-8").replace("high.npz", "high.csv"), encoding="utf-8")
     case = read_case(tmp_path / "arm")
     assert [len(case.fit), len(case.validation)] == [2, 1]
+    assert "diagnose 'your arm'" in run("new", "case", "your arm").output  # as a shell takes it
     again = run("new", "case", tmp_path / "arm")
     assert again.exit_code == 2 and "is there already" in again.output
 

@@ -6,6 +6,7 @@ import pytest
 import workbench as wb
 from workbench.design.loop.closed_loop import Response
 from workbench.draw.plot import plot
+from workbench.draw.style import few_ticks
 from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.damping import ModalDamping
@@ -78,3 +79,29 @@ def test_an_explanation_at_named_points_is_printed_and_drawn():
     assert "S3 to F1" in str(explained) and str(explained).startswith("closed loop of 3 modes: ")
     assert "sensor at S3 → F1" in [label.get_text() for label in plot(explained).axes[1].get_yticklabels()]
     assert "place [m]" not in str(law)
+
+
+@pytest.mark.filterwarnings("error")
+def test_work_that_residual_modes_lose_is_drawn_below_zero():
+    modes = wb.Beam(length=2.0, mass_per_length=1.0, bending_stiffness=4.0, left="hinged", right="hinged").modes(6)
+    law = wb.imsc(modes, 2, [wb.Actuator("A", 0.45), wb.Actuator("B", 1.2)], weight=1.0)
+    for struck in (0.3, 1.3):  # residual modes move when control starts; most of the work, or a part, is taken out
+        found = wb.spillover(modes, law, wb.impulse_state(modes, struck))
+        (ax,) = plot(found).axes
+        assert min(found.residual_work) < 0
+        assert [bar.get_height() for bar in ax.patches] == pytest.approx(found.residual_work)
+        low, high = ax.get_ylim()
+        assert low < min(found.residual_work) and max(found.residual_work) < high
+
+
+@pytest.mark.filterwarnings("error")
+def test_without_residual_modes_a_figure_says_so():
+    law = wb.imsc(BEAM, 3, [wb.Actuator(f"F{i}", at) for i, at in enumerate((0.3, 0.6, 0.9))], weight=1.0)
+    explained = wb.explain_spillover(BEAM, wb.kalman(BEAM, law, [wb.Sensor("y", 0.8)], disturbance=1.0, noise=0.1))
+    for result in (explained, wb.spillover(BEAM, law, wb.impulse_state(BEAM, 0.8))):
+        assert "no mode is residual" in plot(result).axes[0].texts[0].get_text()
+
+
+def test_modes_are_numbered_as_far_as_there_is_room():
+    assert list(few_ticks(range(3, 9))) == list(range(3, 9))
+    assert list(few_ticks(range(4, 46))) == list(range(4, 46, 3))

@@ -48,6 +48,9 @@ def test_a_placement_is_drawn_over_the_nodal_lines_of_the_next_mode(size):
     placed = {"here": task.placed([(0.3, 0.2), (0.8, 0.5)], ""), "there": task.placed([(0.3, 0.5), (0.9, 0.3)], "")}
     limits = Limits(effort=1.0, forbidden=(((0.5, 0.1), (0.7, 0.3)),))
     figure = plot_surface_placement(task, placed, limits=limits, impulse_at=(0.35, 0.3))
+    figure.draw_without_rendering()
+    title, beside = figure.axes[0]._left_title, figure.axes[1].yaxis
+    assert not title.get_window_extent().overlaps(beside.get_tightbbox())
     left, right = figure.axes
     assert "nodal lines of mode 3" in left.get_title("left") and not left.lines[0].get_clip_on()
     assert "forbidden" in [text.get_text() for text in left.get_legend().get_texts()]

@@ -469,6 +469,12 @@ return { boxes: boxes, ticks: ticks };
 """
 
 
+def test_a_case_folder_has_a_bench_too(tmp_path):
+    (tmp_path / "case.toml").write_text(PLATE)
+    rig, text = read_structure(tmp_path)
+    assert text == PLATE and rig.actuators == read_structure(tmp_path / "case.toml")[0].actuators
+
+
 def test_points_without_positions_cannot_be_drawn(tmp_path):
     path = tmp_path / "modal.toml"
     path.write_text(

@@ -12,7 +12,9 @@ from workbench.cli.terminal import guarded, say
 def bench(
     rig: Annotated[
         Path | None,
-        typer.Argument(help=r"TOML file with \[structure], \[\[input]], \[\[output]]; a hinged beam unless given."),
+        typer.Argument(
+            help=r"Case folder, or TOML file with \[structure], \[\[input]], \[\[output]]; a hinged beam unless given."
+        ),
     ] = None,
     port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0 for any free one.")] = 8321,
     show: Annotated[bool, typer.Option(help="Open the page in a browser.")] = False,

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from workbench.design.laws.on_off import OnOffLaw
     from workbench.rig.rig import Rig
     from workbench.structure.domain import Where
+    from workbench.structure.modes import Modes
 
 
 def check_rate(rate_hz: float | None) -> None:
@@ -41,12 +42,14 @@ def law_from(
     """The law by its name, and by a weight or a damping ratio.
 
     Raises:
-        ValueError: both, or a law that has no weight.
+        ValueError: both, or a law that has no weight, or no damping ratio.
     """
     from workbench.design.laws.coupled import coupled_lqr
     from workbench.design.laws.imsc import imsc
     from workbench.robust.plain_law import plain_law
 
+    if damping is not None and law == "on-off":
+        raise ValueError("on-off control gives no damping ratio; leave --damping out")
     if weight is None:
         ratio = DAMPING if damping is None else damping
         return plain_law(law, rig, count, damping=ratio, impulse_at=impulse_at, impulse=impulse)
@@ -55,6 +58,22 @@ def law_from(
     if law not in (weighted := {"imsc": imsc, "coupled": coupled_lqr}):
         raise ValueError(f"--weight is of the laws {', '.join(weighted)}; give --damping for {law}")
     return weighted[law](rig.modes, count, [a for a in rig.actuators if not a.direct], weight=weight)
+
+
+def damping_by(modes: "Modes", law: "Law | OnOffLaw") -> str:
+    """The damping ratios that a law gives: not those asked for where its weights come from a rule of thumb."""
+    import numpy as np
+
+    from workbench.design.laws.law import Law
+    from workbench.design.loop.closed_loop import close_loop
+
+    if not isinstance(law, Law):
+        return f"{law.name} switches and gives no damping ratio"
+    own = [*law.controlled, *(modes.n_modes + r for r in law.controlled)]
+    poles = np.linalg.eigvals(close_loop(modes, law).matrix[np.ix_(own, own)])
+    swinging = sorted(poles[poles.imag > 0], key=abs)
+    ratios = ", ".join(f"{-p.real / abs(p):.3g}" for p in swinging) or "1 or more"
+    return f"damping ratio of the controlled modes by {law.name}, every modal coordinate known: {ratios}"
 
 
 def observed(
@@ -67,9 +86,8 @@ def observed(
     """
     from workbench.design.estimation.controller import filtered
     from workbench.design.estimation.modal_filter import filter_on
-    from workbench.design.estimation.observers import kalman, luenberger
+    from workbench.design.estimation.observers import kalman, luenberger, usual_poles
     from workbench.design.laws.law import Law
-    from workbench.design.spillover.comparison import OBSERVER_POLES
     from workbench.rig.sensors import MEASURED
 
     if estimator not in ESTIMATORS:
@@ -93,7 +111,7 @@ def observed(
         own = [next(s for s in sensors if (s.at, s.quantity) == (one.at, one.quantity)) for one in found.sensors]
         return replace(found, sensors=tuple(own))
     if estimator == "luenberger":
-        return luenberger(rig.modes, law, sensors, poles=OBSERVER_POLES * rig.modes.omega[list(law.controlled)])
+        return luenberger(rig.modes, law, sensors, poles=usual_poles(rig.modes, law.controlled))
     # a noise of variance σ² held over each sample has the intensity σ² T
     noise = [s.noise_std**2 * sample_time for s in sensors]
     return kalman(rig.modes, law, sensors, disturbance=disturbance, noise=noise)

@@ -7,7 +7,7 @@ import typer
 from workbench.cli import options
 from workbench.cli.rig_file import impulse_place, read_structure_rig
 from workbench.cli.terminal import check_target, guarded, say, show_table, write_json
-from workbench.structure.printed import place_text
+from workbench.structure.printed import command_headings, place_text
 
 if TYPE_CHECKING:
     from workbench.design.spillover.explain import Explanation
@@ -43,6 +43,7 @@ def design(
     from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.comparison import compare, laws_of, through_sensors
     from workbench.design.spillover.robustness import perturbed_modes, stable_share
+    from workbench.rig.actuators import command_unit
 
     check_target(json_path)
     found = read_structure_rig(rig)
@@ -53,19 +54,21 @@ def design(
     state[modes.n_modes + n :] = 0.0
     perturbed = None if errors is None else perturbed_modes(modes, errors)
     laws, refused = laws_of(modes, n, actuators, weight=weight, damping=damping)
-    end = final_time or PERIODS * 2.0 * np.pi / modes.omega[modes.omega > 0][0]
+    elastic = modes.omega[modes.omega > 0]
+    if final_time is None and not elastic.size:
+        raise ValueError("rigid modes alone set no time until which work is counted; give --final-time")
+    end = PERIODS * 2.0 * np.pi / elastic[0] if final_time is None else final_time
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     shown = []
     for row in rows:
         numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
-        fastest = row.poles.real.max()
-        stable = "stable" if fastest < 0 else "unstable" if fastest > 0 else "marginally stable"
-        shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, stable))
-    say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {modes.domain.text(at)}, R = {weight:g}", bold=True)
+        shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, row.stability))
+    struck, unit = modes.domain.text(at, 6), command_unit(actuators)
+    say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {struck}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
-    show_table(("law", "cost", "effort [N² s]", "peak force [N]", "W_C [J]", "W_R [J]", "largest W_r", "loop"), shown)
+    show_table(("law", "cost", *command_headings(unit), "W_C [J]", "W_R [J]", "largest W_r", "loop"), shown)
     tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
@@ -77,7 +80,8 @@ def design(
             continue
         share = None if perturbed is None else stable_share(perturbed, controller)
         robust = [] if share is None else [f"{share:.0%}"]
-        margin = f"{explained.margin:.3g}" + ("" if explained.loop.stable else " unstable")
+        stability, margin = explained.loop.stability, f"{explained.margin:.3g}"
+        margin = {"stable": margin, "unstable": f"{margin} unstable"}.get(stability, stability)
         limiting, path = _limit(explained)
         sensed.append((controller.name, margin, limiting, path, *robust))
         written.append(
@@ -98,6 +102,7 @@ def design(
         {
             "impulse_at": at,
             "weight": weight,
+            "command_unit": unit,
             "final_time": end,
             "controlled": list(range(1, n + 1)),
             "laws": [
@@ -120,10 +125,10 @@ def design(
 
 def _limit(explained: "Explanation") -> tuple[str, str]:
     """The residual mode that limits the stability margin, and the path by which it does."""
-    worst = explained.destabilising or (explained.shifts[0] if explained.shifts else None)
+    worst = explained.limiting if explained.loop.stable else explained.destabilising
+    if worst is None and explained.loop.stable:
+        return "none", ""
     if worst is None:
-        return "", ""
-    if not explained.loop.stable and explained.destabilising is None:
         return "none: unstable without them" if explained.reduced_margin <= 0 else "no single mode", ""
     grows = explained.loop.stable or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without it"

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.control import check_rate, count_of, law_from, observed
+from workbench.cli.control import check_rate, count_of, damping_by, law_from, observed
 from workbench.cli.terminal import check_target, guarded, say, short, tell
 
 
@@ -45,6 +45,7 @@ def export(
     observer = observed(found, chosen, estimator, disturbance=disturbance, sample_time=1.0 / rate_hz)
     design = hand_over(found.modes, observer, to, sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms)
     tell(design)
+    say(f"  {damping_by(found.modes, chosen)}")
     if unread:
         say(f"  not read, as accelerations: {', '.join(unread)}")
     say(f"  written to {short(to)}" + (f" and {short(to.with_suffix('.h'))}" if to.suffix == ".c" else ""))

@@ -1,5 +1,6 @@
 """`workbench new`: a commented template of a case or a study."""
 
+import shlex
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -27,9 +28,10 @@ def new(
     """
     from workbench.study.templates import new_case, new_study
 
+    typed = shlex.quote(name)
     if what is What.CASE:
         path = new_case(Path(name))
-        say(f"{short(path)}\n  records go into {short(path.parent / 'records')}/; then: workbench diagnose {name}")
+        say(f"{short(path)}\n  records go into {short(path.parent / 'records')}/; then: workbench diagnose {typed}")
     else:
         path = new_study(name, Path("studies"))
-        say(f"{short(path)}\n  run it: workbench study {name}")
+        say(f"{short(path)}\n  run it: workbench study {typed}")

@@ -38,7 +38,11 @@ LawWeight = Annotated[
     typer.Option("--weight", help="Control weight R, of the forces in the quadratic cost; in place of --damping."),
 ]
 Damping = Annotated[
-    float | None, typer.Option(help=f"Damping ratio of the controlled modes; {DAMPING:g} unless given.")
+    float | None,
+    typer.Option(
+        help=f"Damping ratio wanted of the controlled modes, {DAMPING:g} unless given: exact by poles; imsc and coupled"
+        " take weights that come near it where it is small, and the output says which they give; not for on-off."
+    ),
 ]
 Disturbance = Annotated[
     float,

@@ -10,7 +10,7 @@ from workbench.cli import options
 from workbench.cli.rig_file import impulse_place, place_in, read_structure_rig, typed_place
 from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, listed, middle
-from workbench.structure.printed import place_text
+from workbench.structure.printed import command_headings, place_text
 
 if TYPE_CHECKING:
     from workbench.design.placement.limits import Limits
@@ -34,7 +34,9 @@ def place(
     spacing: Annotated[
         float | None, typer.Option(help="Least distance between actuators, m; 1/20 of the size unless given.")
     ] = None,
-    peak_force: Annotated[float, typer.Option(help="Force limit of each actuator, N.")] = math.inf,
+    peak_force: Annotated[
+        float, typer.Option(help="Force limit of each actuator, N; moment limit of patches, N m (N m/m on a plate).")
+    ] = math.inf,
     condition: Annotated[float, typer.Option(help="Limit of the condition number of B (Frobenius).")] = math.inf,
     forbid: Annotated[
         list[str] | None, typer.Option(metavar="FROM:TO", help="Zone without actuators, m; X,Y:X,Y on a plate.")
@@ -64,6 +66,7 @@ def place(
     from workbench.design.placement.placement import nodes_of_mode, placement_task
     from workbench.design.placement.placement import place_actuators as least_work
     from workbench.design.placement.task import patch_of
+    from workbench.rig.actuators import command_unit
 
     check_target(json_path, picture)
     if proof is not None and not 0 < proof < 1:
@@ -114,11 +117,12 @@ def place(
         numbers = (row.residual_work, row.effort, row.peak_force, row.condition)
         shown.append((where, *(f"{value:.5g}" for value in numbers), row.status))
     say(
-        f"{control} of {modes.n_modes} modes controlled, unit impulse at {domain.text(struck)}, R = {weight:g}",
+        f"{control} of {modes.n_modes} modes controlled, unit impulse at {domain.text(struck, 6)}, R = {weight:g}",
         bold=True,
     )
     where = "points" if isinstance(domain, NamedPoints) else "places [m]"
-    show_table((where, "W_R [J]", "effort [N² s]", "peak force [N]", "condition number of B", ""), shown)
+    unit = command_unit([task.actuator])
+    show_table((where, "W_R [J]", *command_headings(unit), "condition number of B", ""), shown)
     if certificate is not None:
         say(f"  {certificate}")
     if picture is not None:
@@ -129,6 +133,7 @@ def place(
             "length": None if isinstance(domain, NamedPoints) else domain.length,
             "impulse_at": struck,
             "weight": weight,
+            "command_unit": unit,
             "controlled": list(range(1, control + 1)),
             "placements": [{key: getattr(row, key) for key in WRITTEN} for row in rows],
             "lower_bound": None if certificate is None else certificate.lower_bound,

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.control import check_rate, count_of, law_from, observed
+from workbench.cli.control import check_rate, count_of, damping_by, law_from, observed
 from workbench.cli.possible import possible_rig
 from workbench.cli.rig_file import impulse_place
 from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, show_table, write_json
@@ -111,6 +111,7 @@ def redesign(
         )
     say(f"{result.advice} {result.guarantee}".rstrip(), bold=True)
     say(result.comparison)
+    say(f"  in use: {damping_by(rig.modes, own)}")
     steps = [(step.name, step.what, step.lost, "yes" if step.kept else "no") for step in result.steps]
     show_table(("step", "what", "loss", "kept"), steps)
     if result.relocation is not None:

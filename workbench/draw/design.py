@@ -15,7 +15,7 @@ from workbench.design.placement.placement import Placement
 from workbench.design.placement.velocity_feedback import FeedbackPlacement
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
-from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, new_figure
 from workbench.structure.printed import place_text
 
 SHOWN_SHARE = 1e-5
@@ -71,32 +71,46 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
     for i, (name, work) in enumerate(works.items()):
         numbers = first + 1 + np.arange(work.size)
         ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, work, width, label=f"{name}: W_R = {work.sum():.3g} J")
-    ax.set(xticks=numbers, xlabel="residual mode", ylabel="spillover work in the mode, W_r [J]")
+    ax.set(xticks=few_ticks(numbers), xlabel="residual mode", ylabel="spillover work in the mode, W_r [J]")
     ax.set_title("spillover work by residual mode")
     ax.legend()
     return figure
 
 
 def plot_work(spillovers: dict[str, Spillover]) -> Figure:
-    """Spillover work in each residual mode, one group of bars per design, on a logarithmic scale."""
-    figure, ax = new_figure(1, 1, width=9, height=4)
+    """Work in each residual mode, one group of bars per design, on a logarithmic scale; below zero what it loses."""
     first = next(iter(spillovers.values()))
+    if not first.residual:
+        return _without_residual_modes()
+    figure, ax = new_figure(1, 1, width=9, height=4)
     modes = np.array(first.residual) + 1
     width = 0.8 / len(spillovers)
-    total = max(work.residual_total for work in spillovers.values())
-    least = SHOWN_SHARE * total
+    total = max(float(np.abs(work.residual_work).sum()) for work in spillovers.values()) or 1.0
+    least, lowest = SHOWN_SHARE * total, min(float(work.residual_work.min()) for work in spillovers.values())
+    signed = lowest <= -least  # a residual mode that moves already may lose energy
     for i, (name, work) in enumerate(spillovers.items()):
-        at = modes + (i - 0.5 * (len(spillovers) - 1)) * width
-        values = np.maximum(work.residual_work, 0.1 * least)
+        at, small = modes + (i - 0.5 * (len(spillovers) - 1)) * width, np.abs(work.residual_work) < least
+        values = np.where(small, 0.0 if signed else 0.1 * least, work.residual_work)
         bars = ax.bar(at, values, width, label=f"{name}: W_R = {work.residual_total:.3g} J")
-        for x, value in zip(at, work.residual_work, strict=True):
-            if value < least:
-                ax.text(x, 1.3 * least, "≈ 0", ha="center", color=bars.patches[0].get_facecolor())
-    ax.set(yscale="log", xlabel="residual mode", ylabel="spillover work W_r [J]", xticks=modes)
+        for x in at[small] if modes.size <= MOST_TICKS else ():
+            ax.text(x, 1.3 * least, "≈ 0", ha="center", color=bars.patches[0].get_facecolor())
+    if signed:
+        ax.set_yscale("symlog", linthresh=10.0 ** np.ceil(np.log10(least)))
+        ax.axhline(0.0, color=GREY, linewidth=0.8)
+    else:
+        ax.set_yscale("log")
+    ax.set(xlabel="residual mode", ylabel="spillover work W_r [J]", xticks=few_ticks(modes))
     # room above the bars for the legend
-    ax.set_ylim(least, 10.0 ** (1.0 + 0.35 * len(spillovers)) * total)
+    ax.set_ylim(3.0 * lowest if signed else least, 10.0 ** (1.0 + 0.35 * len(spillovers)) * total)
     ax.set_title("control spillover: energy that control leaves in the residual modes")
     ax.legend(loc="upper right")
+    return figure
+
+
+def _without_residual_modes() -> Figure:
+    figure, ax = new_figure(width=9, height=1.5)
+    ax.axis("off")
+    ax.text(0.5, 0.5, "every mode is controlled: no mode is residual, and nothing spills over", ha="center")
     return figure
 
 
@@ -191,6 +205,8 @@ def plot_designs(rows: Sequence[dict[str, Any]], figures: dict[str, str], title:
 
 def plot_spillover_paths(explained: Explanation) -> Figure:
     """Growth of each residual mode in the full closed loop, and the share of each path from sensor to actuator."""
+    if not explained.shifts:
+        return _without_residual_modes()
     figure, axes = new_figure(1, 2, width=11, height=4.5, width_ratios=[1, 1.2])
     moved = sorted(explained.shifts, key=lambda m: m.mode)
     numbers = [m.mode + 1 for m in moved]
@@ -199,7 +215,7 @@ def plot_spillover_paths(explained: Explanation) -> Figure:
     before = [m.pole.real for m in moved]
     axes[0].plot(numbers, before, "_", color=COLOURS[6], markersize=16, mew=2, label="uncontrolled")
     axes[0].axhline(0.0, color=GREY, linewidth=0.8)
-    axes[0].set(xlabel="residual mode", ylabel="growth rate Re λ [1/s]", xticks=numbers)
+    axes[0].set(xlabel="residual mode", ylabel="growth rate Re λ [1/s]", xticks=few_ticks(numbers))
     axes[0].set_title("real part of residual poles (above 0: unstable)")
     axes[0].legend()
     worst = explained.shifts[0]

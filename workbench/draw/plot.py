@@ -20,7 +20,7 @@ from workbench.draw.gap import plot_where
 from workbench.draw.robust import plot_prediction, plot_redesign
 from workbench.draw.sensors import plot_sensor_placement
 from workbench.draw.spectra import plot_distortion
-from workbench.draw.style import COLOURS, GREY, envelope, in_units, new_figure
+from workbench.draw.style import COLOURS, GREY, envelope, few_ticks, in_units, new_figure
 from workbench.draw.surface import (
     plot_point_modes,
     plot_scattered_modes,
@@ -114,7 +114,7 @@ def _(result: Refined) -> Figure:
     for ax, values, title in zip(axes, relative, ("frequency", "damping ratio")):
         ax.semilogy(modes, values, "o-")
         ax.set_title(f"standard error of the {title}, relative")
-    axes[1].set(xlabel="mode", xticks=modes)
+    axes[1].set(xlabel="mode", xticks=few_ticks(modes))
     return figure
 
 
@@ -149,7 +149,7 @@ def _(result: Placement) -> Figure:
     numbers = len(result.positions) + 1 + np.arange(result.by_mode.size)
     ax.bar(numbers, result.by_mode)
     where = "; ".join(place_text(place) for place in listed(result.positions))
-    ax.set(xlabel="residual mode", ylabel="spillover work, W_r [J]", xticks=numbers)
+    ax.set(xlabel="residual mode", ylabel="spillover work, W_r [J]", xticks=few_ticks(numbers))
     ax.set_title(f"actuators at {where}: W_R = {result.residual_work:.3g}, effort {result.effort:.3g}")
     return figure
 

@@ -1,5 +1,6 @@
 """The look of every figure: quiet axes, few colours that colour-blind readers can tell apart."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
@@ -15,6 +16,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 GREY = "#8a8a8a"
 MOST_POINTS = 4000  # of a curve, of which a page or a screen shows no more
 PLAIN_LEAST, PLAIN_DECADES = 1e-4, 1e6  # least value and widest range of a logarithmic axis with plain numbers
+MOST_TICKS = 20  # numbers along an axis
 FEWER_NUMBERS = 2.9  # extent of one beyond which 1, 2, 3, 5 and 7 are numbers enough: two of them lie in any such range
 
 SETTINGS: Any = {
@@ -47,6 +49,11 @@ def new_figure(
 def in_units(name: str, unit: str) -> str:
     """The label of an axis: a name, and its unit below."""
     return f"{name}\n[{unit.replace('^2', '²').replace('^3', '³')}]" if unit else name
+
+
+def few_ticks(numbers: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Of the numbers of modes those that an axis has room for: all, or every so many."""
+    return np.asarray(numbers)[:: -(-len(numbers) // MOST_TICKS)]
 
 
 def plain_ticks(figure: Figure) -> Figure:

@@ -16,7 +16,7 @@ from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement, PlacementTask
 from workbench.draw.motion import SWAY, Net, frame_net, scattered_net
-from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.draw.style import COLOURS, GREY, few_ticks, new_figure
 from workbench.identification.shapes.bands import Bands
 from workbench.renamed import former_arguments
 from workbench.structure.domain import Patch, Rectangle
@@ -184,12 +184,12 @@ def plot_surface_placement(
         right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
     if impulse_at is not None:
         left.plot(*impulse_at, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
-    first = f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, the lowest residual mode"
+    first = f"mode {n + 1},\n{modes.frequencies_hz[n]:.3g} Hz, the lowest residual mode"
     left.set_title(f"{modes.domain}, with the nodal lines of {first}", fontsize=10)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), fontsize=9, ncols=2)
     work = np.concatenate([placement.by_mode for placement in placements.values()])
     most, least = float(work.max()), float(work.min())
-    right.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=numbers, yscale="log")
+    right.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=few_ticks(numbers), yscale="log")
     # a mode at whose nodes they stand takes none but rounding
     right.set_ylim(max(SHOWN_WORK * most, 0.3 * least), 3.0 * most)
     return figure

@@ -1,5 +1,6 @@
 """Actuators: where a command becomes a force or a moment, and what it loses on the way."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,6 +67,15 @@ class Actuator:
         """Whether the force is a linear function of the command (a delay is not a finite state)."""
         unbounded = np.isinf(self.limit) and np.isinf(self.rate_limit)
         return bool(unbounded and not (self.dead_zone or self.delay or self.hysteresis_share or self.bias))
+
+
+def command_unit(actuators: Sequence[Actuator]) -> str:
+    """Unit of what all of them command: N, N m, or N m/m of patches on a plate; empty if they differ or have gains."""
+    units = {
+        "" if a.gain != 1 else "N" if a.kind == "force" else "N m/m" if isinstance(a.at, Patch) else "N m"
+        for a in actuators
+    }
+    return units.pop() if len(units) == 1 else ""
 
 
 def piezo_patch(

@@ -36,7 +36,8 @@ def plain_law(
         kind: "imsc", "coupled", "poles" or "on-off".
         rig: whose actuators drive it, hammers left out.
         controlled: how many of the lowest modes, or which; as many as actuators unless given.
-        damping: ζ that controlled modes should have.
+        damping: ζ wanted of controlled modes: poles give it, the weights of IMSC and coupled LQR come near it where it
+            is small; on-off control takes none.
         impulse_at, impulse: for which on-off forces are sized, N s.
 
     Raises:

@@ -118,11 +118,11 @@ class Interval:
         """Distance between two places over the length."""
         return abs(float(one) - float(other)) / self.length  # type: ignore[arg-type]
 
-    def text(self, place: Where) -> str:
+    def text(self, place: Where, digits: int = 3) -> str:
         """How a place is written: x = 3.4."""
         if isinstance(place, Between):
-            return f"between {self.text(place.first)} and {self.text(place.second)}"
-        return f"x = {place:.3g}"
+            return f"between {self.text(place.first, digits)} and {self.text(place.second, digits)}"
+        return f"x = {_rounded(place, digits)}"  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -251,14 +251,15 @@ class Rectangle:
         """Distance between two places over the diagonal."""
         return float(np.hypot(one[0] - other[0], one[1] - other[1])) / self.size  # type: ignore
 
-    def text(self, place: Where) -> str:
+    def text(self, place: Where, digits: int = 3) -> str:
         """How a place is written: (x, y) = (0.63, 0.72)."""
         if isinstance(place, Between):
-            return f"between {self.text(place.first)} and {self.text(place.second)}"
+            return f"between {self.text(place.first, digits)} and {self.text(place.second, digits)}"
         if isinstance(place, Patch):
-            return f"a patch of {place.width:.3g} m by {place.height:.3g} m at {self.text((place.x, place.y))}"
+            sides = (_rounded(side, digits) for side in (place.width, place.height))
+            return f"a patch of {' m by '.join(sides)} m at {self.text((place.x, place.y), digits)}"
         (x, y), *_ = self.locate(place)
-        return f"(x, y) = ({x:.3g}, {y:.3g})"
+        return f"(x, y) = ({_rounded(x, digits)}, {_rounded(y, digits)})"
 
 
 TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("rx", "ry", "rz")
@@ -425,8 +426,8 @@ class NamedPoints:
         """0 for the same place and 1 for another: there is no way from one to the other."""
         return float(_unordered(one) != _unordered(other))
 
-    def text(self, place: Where) -> str:
-        """How a place is written: its name."""
+    def text(self, place: Where, digits: int = 3) -> str:
+        """How a place is written: its name, which has no digits to round."""
         if isinstance(place, Between):
             return f"between {place.first} and {place.second}"
         return str(place)
@@ -532,6 +533,11 @@ def reach(domain: Interval | Rectangle, where: Where) -> tuple[np.ndarray, np.nd
     elif isinstance(where, Between) and isinstance(domain, Interval):
         half = np.array([0.5 * abs(position(where.first) - position(where.second))])
     return half, np.atleast_1d(domain.length) - half
+
+
+def _rounded(value: float, digits: int) -> str:
+    """To so many digits, and those before the point in full: 1341, not 1.34e+03."""
+    return f"{value:.{max(digits, len(f'{abs(value):.0f}'))}g}"
 
 
 def _unordered(place: Where) -> Any:

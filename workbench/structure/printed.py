@@ -42,6 +42,16 @@ def joined_in_words(parts: Sequence[str]) -> str:
     return " and ".join(part for part in (", ".join(parts[:-1]), *parts[-1:]) if part)
 
 
+def command_headings(unit: str) -> tuple[str, str]:
+    """Headings of the effort ∫ uᵀu dt and of the largest |u|, of commands in N, N m or N m/m; empty for others."""
+    if not unit:
+        return "effort", "peak command"
+    return (
+        f"effort [{'N² s' if unit == 'N' else f'({unit})² s'}]",
+        f"peak {'force' if unit == 'N' else 'moment'} [{unit}]",
+    )
+
+
 def place_text(place: object) -> str:
     """A place: x in m, (x, y), a name, or two of these, a patch of a plate; empty where unknown."""
     if isinstance(place, Patch):

@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from workbench.cases.case import read_case
+from workbench.design.loop.closed_loop import stability
 from workbench.draw.design import plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.identification import stabilisation_diagram
@@ -20,6 +21,7 @@ from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
+from workbench.structure.printed import command_headings
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
 from workbench.study.pages.page import FORMAT, PageContent, Table, block, page_content_of, tables_of, to_its_error
@@ -28,7 +30,6 @@ from workbench.study.runs.cases import StudyError
 
 TURN = 2.0 * np.pi
 MOST_BYTES = 200_000_000
-ON_AXIS = 1e-9  # rad/s from the imaginary axis within which a pole is undamped
 MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram
 BEYOND = 8  # orders more than modes that it shows
 SAMPLES_AN_ORDER = 8  # at least
@@ -197,7 +198,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
             law["law"],
             *(_short(law[key]) for key in ("cost", "effort", "peak_force")),
             _short(works[law["law"]].sum()),
-            _loop(poles[law["law"]]),
+            stability(poles[law["law"]]),
         ]
         for law in laws
     ]
@@ -233,7 +234,11 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
             ),
         ],
         "tables": [
-            ("Laws", ("law", "cost", "effort [N² s]", "peak force [N]", "W_R [J]", "loop"), rows),
+            (
+                "Laws",
+                ("law", "cost", *command_headings(str(content.get("command_unit", "N"))), "W_R [J]", "loop"),
+                rows,
+            ),
             *([("With sensors", heads, sensed)] if sensed else []),
         ],
     }
@@ -241,12 +246,6 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
 
 def _poles_of(row: Mapping[str, Any]) -> np.ndarray:
     return np.array(row["poles_real"], float) + 1j * np.array(row["poles_imag"], float)
-
-
-def _loop(poles: np.ndarray) -> str:
-    """Stable, marginally stable or unstable, by the rightmost pole."""
-    rightmost = float(poles.real.max())
-    return "stable" if rightmost < -ON_AXIS else "marginally stable" if rightmost <= ON_AXIS else "unstable"
 
 
 def _stability(loops: list[str], unstable: list[str]) -> str:
@@ -271,7 +270,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     ]
     first, bound = placements[0]["residual_work"], content.get("lower_bound")
     proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g} J."
-    n = len(content.get("controlled", ()))
+    n, headings = len(content.get("controlled", ())), command_headings(str(content.get("command_unit", "N")))
     return {
         "title": "Actuator placement",
         "lead": f"Actuators at {_between(places[0])} m leave spillover work W_R = {float(first):.4g} J.{proof}",
@@ -286,7 +285,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         "tables": [
             (
                 "Placements",
-                ("placement", "W_R [J]", "effort [N² s]", "peak force [N]", "condition number of B", "places [m]"),
+                ("placement", "W_R [J]", *headings, "condition number of B", "places [m]"),
                 rows,
             )
         ],

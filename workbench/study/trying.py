@@ -305,6 +305,7 @@ def _short(values: list[Any]) -> list[Any]:
 
 
 def read_structure(path: Path | None) -> tuple[Rig, str]:
-    """A rig and the TOML that describes it; the hinged beam of the dissertation unless a path is given."""
+    """A rig and the TOML that describes it, or a case folder's; the hinged beam of the dissertation unless given."""
     path = Path(__file__).with_name("assets") / "bench.toml" if path is None else path
+    path = path / "case.toml" if path.is_dir() else path
     return read_rig(path), path.read_text(encoding="utf-8")

@@ -17,11 +17,13 @@ from workbench.design.estimation.digital import DigitalController, FrictionForwa
 from workbench.design.estimation.observers import luenberger
 from workbench.design.export.export import export, write_controller
 from workbench.design.export.sampled_loop import sampled_loop
+from workbench.design.export.source import command_words, reading_words
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
+from workbench.structure.domain import Interval
 from workbench.structure.modes import Modes
 
 RATE = 200.0
@@ -65,6 +67,14 @@ def switching(rng) -> DigitalController:
     relays = Relays(rng.standard_normal((2, 3)), np.array([1.0, 2.0, 0.5]), np.array([0.3, 0.5, 0.0]))
     none = np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((3, 0)), rng.standard_normal((3, 2)), np.zeros((0, 2))
     return DigitalController(0.01, ("y1", "y2"), ("F1", "F2"), *none, relays=relays, name="on-off")
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_channels_close_to_one_another_are_told_apart_in_any_unit(unit):
+    domain, near = Interval(2.0 * unit), (1.3412 * unit, 1.3415 * unit)
+    words = command_words(domain, [Actuator("F", at) for at in near])
+    words += reading_words(domain, [Sensor("y", at) for at in near])
+    assert len(set(words)) == 4 and all(f"x = {at:g}" in text for at, text in zip(near * 2, words))
 
 
 def stepped(controller: DigitalController, readings: np.ndarray) -> np.ndarray:

@@ -1,16 +1,26 @@
 """Closed-form laws against python-control, and the refusals of a design that cannot be."""
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
 
+from workbench.design.estimation.controller import filtered
+from workbench.design.estimation.modal_filter import hermite_filter
+from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.export.export import export
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc, imsc_poles, pole_gains, riccati_gains, riccati_matrices
 from workbench.design.laws.law import DesignError
+from workbench.design.laws.on_off import on_off
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
+from workbench.design.spillover.explain import explain_spillover
 from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
+from workbench.structure.plate import Plate
 
 
 def modes(n=9, **options):
@@ -21,6 +31,10 @@ def modes(n=9, **options):
 
 def actuators(*places):
     return [Actuator(f"F{i + 1}", x) for i, x in enumerate(places)]
+
+
+def relay():
+    return on_off(modes(), 1, actuators(2.0), force=1.0, dead_band=0.1)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
@@ -111,6 +125,20 @@ def test_a_state_of_another_size_starts_no_response():
         (lambda: imsc(modes(), [11], actuators(5.0), weight=1.0), "not distinct modes"),
         (lambda: coupled_lqr(modes(), 2, actuators(2.0, 3.0), weight=[1.0, -1.0]), "positive definite"),
         (lambda: coupled_lqr(modes(), 2, actuators(2.0, 3.0), weight=np.nan), "positive definite"),
+        (lambda: coupled_lqr(modes(), 2, actuators(2.0, 3.0), weight=[[1, 0.5], [0, 1]]), "symmetric"),
+        (lambda: imsc(modes(), np.int64(11), actuators(2.0), weight=1.0), "11 modes cannot be controlled of 9"),
+        (lambda: imsc_poles(modes(), 1, actuators(2.0), poles=[np.nan]), "nan.* is not stable"),
+        (
+            lambda: on_off(modes(), 2, actuators(2.0, 3.0), force=[1, 2, 3], dead_band=0.1),
+            "force is one .*mode, 2; got 3",
+        ),
+        (lambda: kalman(modes(), relay(), [Sensor("y", 3.0)], disturbance=1, noise=1), "on-off, which has no gain"),
+        (lambda: luenberger(modes(), relay(), [Sensor("y", 3.0)], poles=[-1 + 1j]), "on-off, which has no gain"),
+        (lambda: filtered(relay(), hermite_filter(modes(1), [1.0, 8.0], 1.0)), "on-off, which has no gain"),
+        (lambda: close_loop(modes(), relay()), "on-off, which has no gain"),
+        (lambda: explain_spillover(modes(), relay()), "on-off, which has no gain"),
+        (lambda: close_loop(modes(1), imsc(modes(), 2, actuators(2.0, 3.0), weight=1.0)), "mode 2 .*has 1 mode;"),
+        (lambda: export(modes(), relay(), sample_rate_hz=100.0), "switches.*redesign"),
     ],
 )
 def test_designs_that_cannot_be_are_refused(act, words):
@@ -121,6 +149,38 @@ def test_designs_that_cannot_be_are_refused(act, words):
 def test_errors_of_design_have_one_type():
     with pytest.raises(DesignError):
         imsc(modes(), 3, actuators(2.0), weight=1.0)
+
+
+@pytest.mark.parametrize("places", [(2.0, 2.0), (2.0, 8.0)])
+def test_a_regulator_takes_actuators_that_act_alike(places):
+    """Two at one place share the force of one; of two that are symmetric modes 1 and 3 know no difference either."""
+    alone = coupled_lqr(modes(), [0, 2], actuators(2.0), weight=2.0)
+    both = coupled_lqr(modes(), [0, 2], actuators(*places), weight=4.0)
+    np.testing.assert_allclose(both.gain, 0.5 * np.vstack([alone.gain, alone.gain]), rtol=1e-6, atol=1e-8)
+    assert imsc(modes(), 1, actuators(*places), weight=1.0).gain == pytest.approx(
+        0.5 * np.vstack([imsc(modes(), 1, actuators(2.0), weight=1.0).gain] * 2)
+    )
+
+
+def test_units_of_a_command_decide_no_design():
+    alike = actuators(2.0, 4.5)
+    small = [alike[0], replace(alike[1], gain=1e-9)]
+    for one, other in (
+        (coupled_lqr(modes(), 2, alike, weight=1.0), coupled_lqr(modes(), 2, small, weight=[1.0, 1e-18])),
+        (imsc(modes(), 2, alike, weight=1.0), imsc(modes(), 2, small, weight=1.0)),
+    ):
+        np.testing.assert_allclose(other.gain * [[1.0], [1e-9]], one.gain, rtol=1e-6, atol=1e-9)
+    # a place is no matter of units: beside the support an actuator hardly acts on any mode
+    with pytest.raises(DesignError, match="singular"):
+        imsc(modes(), 2, actuators(1e-5, 1e-4), weight=1.0)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_two_modes_of_one_frequency_take_two_places(count):
+    edges = dict.fromkeys(("left", "right", "bottom", "top"), "simply supported")
+    plate = Plate(length=(1.0, 1.0), mass_per_area=1.0, bending_stiffness=1.0, poisson_ratio=0.3, edges=edges).modes(3)
+    with pytest.raises(DesignError, match="cannot all be stabilised"):
+        coupled_lqr(plate, 3, [Actuator(f"F{i}", (0.3, 0.2)) for i in range(count)], weight=1.0)
 
 
 @pytest.mark.parametrize("gain", [1e-12, 1.0])

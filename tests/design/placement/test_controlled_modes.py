@@ -33,6 +33,8 @@ def test_the_least_number_is_recommended():
     result = controlled_mode_count(found, state, weight=20.0, share=0.05)
     assert result.recommended == 2 and result.residual[0] > 0.05 * result.energy.sum()
     assert controlled_mode_count(found, state, weight=20.0, share=1e-9).recommended is None
+    # the nodes of mode 13, at which 12 actuators would stand, are not known
+    assert np.isnan(controlled_mode_count(found, state, weight=20.0, most=12).effort[11])
 
 
 def test_refusals():

@@ -9,14 +9,28 @@ from scipy.optimize import linprog
 
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
+from workbench.design.loop.peak import largest
 from workbench.design.placement.cell_bounds import CellBounds
 from workbench.design.placement.certificate import _Search, certify
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.peak import largest
 from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task, scan, symbolic_work
 from workbench.design.placement.task import batch_costs, batch_work
 from workbench.design.spillover.spillover import effort, finite_spillover, spillover
+from workbench.rig.actuators import Actuator, piezo_patch
+from workbench.structure.domain import NamedPoints, PlaceError
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
+
+
+@pytest.fixture(scope="module")
+def frame_task():
+    """Two modes of a chain of eight masses."""
+    names = tuple(f"S{i}" for i in range(1, 9))
+    positions = np.array([[0.0, 0.0, 3.0 * i] for i in range(8)])
+    stiffness = 2e6 * (2 * np.eye(8) - np.eye(8, k=1) - np.eye(8, k=-1))
+    points = NamedPoints(names=names, positions=positions, directions=("x",) * 8)
+    modes = FiniteElements(1200.0 * np.eye(8), stiffness, nodes=points).modes(5)
+    return placement_task(modes, 2, impulse_at="S5", weight=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +177,35 @@ def test_the_tail_bound_holds_and_is_not_idle(task, hinged_modes):
     left_out = all_.by_mode[16:].sum()
     bound = placement_task(many.select(range(20)), 4, impulse_at=6.3, weight=20.0).tail_bound(places, growth=2.0)
     assert left_out < bound < 100 * left_out
+
+
+@pytest.mark.parametrize("actuator", [Actuator("M", 3.0, kind="moment"), piezo_patch("P", 4.0, length=0.5)])
+def test_the_tail_bound_holds_for_what_acts_by_slopes(hinged_modes, actuator):
+    """sup |φ_r'| = √(2/L) rπ/L grows with the mode; a short patch's part grows as its square at first."""
+    many = hinged_modes(200)
+    for x in (0.5, 3.7, 8.3):
+        left_out = placement_task(many, 1, impulse_at=3.7, weight=1.0, actuator=actuator).placed([x], "").by_mode[3:]
+        few = placement_task(many.select(range(4)), 1, impulse_at=3.7, weight=1.0, actuator=actuator)
+        assert left_out.sum() < few.tail_bound([x], growth=2.0)
+    with pytest.raises(DesignError, match="for moments faster than its power 3/2; got growth 1"):
+        few.tail_bound([5.0], growth=1.0)
+
+
+def test_the_tail_bound_is_along_an_interval(frame_task):
+    with pytest.raises(DesignError, match="along an interval; these modes are of 8 named points"):
+        frame_task.tail_bound(["S2", "S5"], growth=1.0)
+
+
+def test_a_candidate_outside_is_told(task):
+    with pytest.raises(PlaceError, match="x = 110 lies outside"):
+        place_actuators(task, Limits(candidates=(1.5, 3.5, 6.5, 8.5, 110.0)))
+
+
+def test_a_choice_among_named_points_is_certified_without_a_limit(frame_task):
+    """There are finitely many: the certificate is that of all points as candidates."""
+    best = certify(frame_task, Limits())
+    assert best.complete and best.cells == 28 and best.gap == 0.0
+    assert best.placement.residual_work == place_actuators(frame_task, Limits()).residual_work
 
 
 def test_limits_on_peak_force_condition_and_stretches_are_kept(task):

@@ -1,22 +1,29 @@
 """Observers and filters in one loop: separation, peers, spillover explained to the path, remedies that hold."""
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
-from workbench.design.estimation.observers import kalman, luenberger
-from workbench.design.laws.coupled import controlled_plant, coupled_lqr
+from workbench.design.estimation.observers import kalman, luenberger, usual_poles
+from workbench.design.laws.coupled import controlled_plant, coupled_lqr, coupled_poles
+from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state, initial_response
 from workbench.design.spillover.explain import explain_spillover
 from workbench.design.spillover.remedies import spillover_remedies, sufficient_sensors
 from workbench.design.spillover.spillover import finite_spillover
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.sensors import Sensor
+from workbench.rig.statespace import state_space
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import NamedPoints
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
+from workbench.structure.plate import Plate
 
 ACTUATORS = (Actuator("F1", 10 / 6),)
 
@@ -131,6 +138,78 @@ def test_paths_add_up_to_the_movement_of_the_pole(controller):
         assert np.abs(explained.poles - moved.closed_pole).min() == 0.0
 
 
+def poles_by_python_control(modes, controller):
+    plant = state_space(modes, controller.law.actuators, controller.sensors)
+    own = control.ss(controller.state, controller.reads, controller.commands, controller.direct)
+    return control.feedback(plant, own, sign=1).poles()
+
+
+@pytest.mark.parametrize(
+    ("ends", "zeta", "controlled"),
+    [
+        ("free", 0.01, (2, 3)),
+        ("hinged", [0.01, 0.01, 1.5, 0.01], (0, 1)),
+        ("hinged", [0.01, 0.01, 1.0, 0.01], (0, 1)),
+    ],
+)
+def test_rigid_and_overdamped_residual_modes_have_their_poles_too(ends, zeta, controlled):
+    modes = Beam(
+        length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left=ends, right=ends, damping=ModalDamping(zeta)
+    ).modes(6)
+    law = imsc(modes, controlled, [Actuator("A", 0.2), Actuator("B", 0.45)], weight=0.1)
+    sensors = [Sensor("y1", 0.15), Sensor("y2", 0.4)]
+    told = explain_spillover(modes, luenberger(modes, law, sensors, poles=usual_poles(modes, controlled)))
+    peer = poles_by_python_control(modes, luenberger(modes, law, sensors, poles=usual_poles(modes, controlled)))
+    assert {moved.mode for moved in told.shifts} == set(range(6)) - set(controlled)
+    assert told.margin == pytest.approx(-peer.real.max(), rel=1e-6)
+    for moved in told.shifts:
+        assert np.abs(peer - moved.closed_pole).min() < 1e-5 * abs(modes.omega[-1])
+        assert sum(path.shift for path in moved.paths) == pytest.approx(moved.shift, abs=1e-7 * modes.omega[-1])
+    if ends == "free":  # what the sensors see of a rigid mode makes it grow; nothing else is at its pole
+        assert told.destabilising is told.limiting is told.shifts[0] and told.shifts[0].mode in (0, 1)
+    else:  # ζ of 1.5 and 1 in open loop: -ω (ζ - √(ζ² - 1))
+        slow = {moved.mode: moved for moved in told.shifts}[2]
+        assert slow.pole == pytest.approx(-modes.omega[2] * (zeta[2] - np.sqrt(zeta[2] ** 2 - 1)))
+        assert told.limiting.mode == 3
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("quantities", [("velocity", "velocity"), ("velocity", "displacement")])
+def test_the_rigid_displacement_that_no_sensor_reads_stays_where_it_is(quantities):
+    free = Beam(
+        length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free", damping=ModalDamping(0.01)
+    ).modes(6)
+    law = imsc(free, (2, 3), [Actuator("A", 0.2), Actuator("B", 0.45)], weight=0.1)
+    sensors = [Sensor(f"y{at}", at, quantity) for at, quantity in zip((0.15, 0.4), quantities)]
+    told = explain_spillover(free, luenberger(free, law, sensors, poles=usual_poles(free, (2, 3))))
+    rigid = [moved for moved in told.shifts if moved.mode in (0, 1)]
+    still = [moved for moved in rigid if abs(moved.closed_pole) < 1e-9]
+    assert len(still) == quantities.count("velocity") and all(path.shift == 0 for m in still for path in m.paths)
+
+
+def test_no_residual_mode_is_blamed_for_what_a_controlled_one_does():
+    modes = Beam(length=1.2, mass_per_length=0.62, bending_stiffness=13.0, left="hinged", right="hinged").modes(6)
+    poles = modes.omega[:3] * (-0.2 + 1j * np.sqrt(0.96))
+    law = coupled_poles(modes, 3, [Actuator("F1", 0.3), Actuator("F2", 0.7)], poles=poles)
+    controller = filtered(law, displacement_filter(modes.select(range(3)), [0.35, 0.95], 0.62))
+    told = explain_spillover(modes, controller)
+    assert told.reduced_margin < 0 and told.shifts[0].closed_pole.real > 0
+    assert all(close_with(modes.select(np.delete(range(6), r)), controller).margin < 0 for r in (3, 4, 5))
+    assert told.destabilising is None and told.limiting is None
+
+
+def test_a_law_alone_has_no_paths_and_says_so():
+    with pytest.raises(DesignError, match="put it on an observer"):
+        explain_spillover(beam(), coupled_lqr(beam(), 3, ACTUATORS, weight=1.0))
+
+
+def test_rigid_modes_alone_set_no_speed_of_an_observer():
+    free = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(3)
+    assert usual_poles(free, (0, 1, 2)) == pytest.approx((-0.3 + 1j) * free.omega[2] * np.array([1 / 3, 2 / 3, 1]))
+    with pytest.raises(DesignError, match="rigid modes alone"):
+        usual_poles(free.select([0, 1]), (0, 1))
+
+
 def test_first_order_is_the_derivative():
     """With the gain lowered the movement tends to its first order, quadratically."""
     modes = beam()
@@ -157,6 +236,56 @@ def test_every_remedy_stabilises_the_loop_and_less_does_not():
     share = 1 - found["gain"].size
     assert explain_spillover(modes, redesign(ACTUATORS, [50 / 6], min(share * 1.01, 1.0))).margin < 0
     assert found["sensors added"].size == 1
+
+
+CHAIN = NamedPoints(
+    names=tuple(f"S{i}" for i in range(1, 9)),
+    positions=np.array([[0.0, 0.0, 3.0 * i] for i in range(8)]),
+    directions=("x",) * 8,
+)
+
+
+def surroundings(kind):
+    """A loop that spillover destabilises: modes, how many are controlled, actuators, places of sensors, R."""
+    light = ModalDamping(0.0005)
+    if kind == "frame":
+        stiffness = 2e6 * (2 * np.eye(8) - np.eye(8, k=1) - np.eye(8, k=-1))
+        stiffness[-1, -1] = 2e6
+        modes = FiniteElements(np.diag([1200.0] * 7 + [900.0]), stiffness, nodes=CHAIN, damping=light).modes(5)
+        return modes, 1, [Actuator("F", "S8")], ["S3"], 1e-9
+    if kind == "plate":
+        edges = dict.fromkeys(("left", "right", "bottom", "top"), "simply supported")
+        sides = {"length": (0.9, 0.5), "mass_per_area": 8.0, "bending_stiffness": 40.0, "poisson_ratio": 0.3}
+        modes = Plate(**sides, edges=edges, damping=ModalDamping(0.0001)).modes(6)
+        return modes, 2, [Actuator("F1", (0.2, 0.2)), Actuator("F2", (0.6, 0.3))], [(0.3, 0.3), (0.7, 0.1)], 1e-4
+    modes = Beam(
+        length=1.2, mass_per_length=0.62, bending_stiffness=13.0, left="hinged", right="hinged", damping=light
+    ).modes(6)
+    return modes, 2, [piezo_patch("P1", 0.3, length=0.1), piezo_patch("P2", 0.7, length=0.1)], [0.35, 0.95], 1e-4
+
+
+@pytest.mark.parametrize("kind", ["frame", "patches", pytest.param("plate", marks=pytest.mark.slow)])
+def test_remedies_move_whatever_stands_anywhere(kind):
+    modes, count, actuators, places, weight = surroundings(kind)
+
+    def redesign(actuators, sensors, share):
+        law = imsc(modes, count, actuators, weight=weight)
+        sensors = [Sensor(f"y{i}", at) for i, at in enumerate(sensors)]
+        return luenberger(modes, replace(law, gain=share * law.gain), sensors, poles=usual_poles(modes, range(count)))
+
+    assert close_with(modes, redesign(actuators, places, 1.0)).margin < 0
+    found = {r.kind: r for r in spillover_remedies(modes, redesign, actuators, places)}
+    assert {"actuator", "sensors added"} <= set(found)
+    assert all(-poles_by_python_control(modes, r.controller).real.max() > 0 for r in found.values())
+    moved = found["actuator"].controller.law.actuators
+    if kind == "patches":  # as long as they were
+        assert [a.at.first - a.at.second for a in moved] == pytest.approx([0.1, 0.1])
+    if kind == "frame":  # of the points nearer than the nearest that will do none does
+        assert moved[0].at == "S3" and found["actuator"].size == pytest.approx(15.0)
+        nearer = [redesign([replace(actuators[0], at=f"S{i}")], places, 1.0) for i in (4, 5, 6, 7)]
+        assert all(close_with(modes, one).margin <= 0 for one in nearer)
+    cured = found["sensors added"].controller
+    assert spillover_remedies(modes, redesign, actuators, cured.places) == ()
 
 
 def test_the_filter_cures_it_with_sensors_enough():

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from workbench.design.estimation.modal_filter import ModalFilter
-from workbench.design.laws.law import Law
+from workbench.design.laws.law import Law, linear
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
 from workbench.structure.domain import Place
@@ -84,8 +84,9 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
     """A law through a modal filter: displacements and velocities at its places, slopes and theirs where it has any.
 
     Raises:
-        ValueError: a filter of other modes than the law controls.
+        ValueError: a filter of other modes than the law controls, or a law that has no gain.
     """
+    law = linear(law)
     n_filtered = len(filter_.displacement)
     if n_filtered != len(law.controlled):
         raise ValueError(

@@ -12,15 +12,17 @@ import control
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.arrays import Floats
+from workbench.arrays import Complexes, Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.laws.coupled import controlled_plant
-from workbench.design.laws.law import DesignError, Law, positive_definite
+from workbench.design.laws.law import DesignError, Law, linear, positive_definite
 from workbench.design.laws.pole_assignment import assign
 from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes
 
 UNSEEN = 1e-9
+# as fast as the mode that is watched, and damped enough to forget where it started within two periods
+USUAL = -0.3 + 1j
 
 
 def luenberger(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: ArrayLike) -> Controller:
@@ -42,6 +44,23 @@ def luenberger(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: Arra
     seen = c[:, :n] + 1j * modes.omega[list(law.controlled)] * c[:, n:]
     gain = assign(a.T, c.T, poles, seen.conj(), names).T
     return _controller(law, sensors, a, b, c, gain, "Luenberger observer", partial(luenberger, poles=poles))
+
+
+def usual_poles(modes: Modes, controlled: Sequence[int]) -> Complexes:
+    """Poles (n_controlled,) of an observer's error where none are given, rad/s: (-0.3 + i) ω of each mode.
+
+    Rigid modes have no frequency: theirs are evenly spaced below that of the slowest elastic mode at hand.
+
+    Raises:
+        DesignError: rigid modes alone, which set no speed.
+    """
+    omega = np.array(modes.omega[list(controlled)])
+    rigid, elastic = omega == 0, modes.omega[modes.omega > 0]
+    if rigid.any() and not elastic.size:
+        raise DesignError("rigid modes alone set no speed of an observer; give the poles of luenberger, or take kalman")
+    omega[rigid] = elastic[:1] * np.arange(1, rigid.sum() + 1) / (rigid.sum() + 1)
+    poles: Complexes = USUAL * omega
+    return poles
 
 
 def kalman(
@@ -77,8 +96,9 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
     """A, B and C of the controlled modes alone, from forces to readings.
 
     Raises:
-        DesignError: no sensors, or a mode that none sees.
+        DesignError: a law that has no gain, no sensors, or a mode that none sees.
     """
+    law = linear(law)
     index = list(law.controlled)
     own = modes.select(index)
     c = reading(own, sensors)

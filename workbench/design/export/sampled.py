@@ -133,6 +133,11 @@ def sample_design(
             f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by kalman,"
             " luenberger or filtered; a DigitalController is sampled already, write_controller writes it"
         )
+    if isinstance(controller, OnOffLaw):
+        raise DesignError(
+            f"{controller.name} switches, and a controller that is sampled here is linear; redesign(possible, law)"
+            " puts it on a Kalman filter, and its result's export writes it"
+        )
     if not isinstance(controller, Controller):
         raise DesignError(
             f"{controller.name} acts on modal coordinates, which no sensor reads; put it on an observer (luenberger,"

@@ -17,6 +17,7 @@ from workbench.structure.domain import Domain
 HERE = Path(__file__).parent
 TEMPLATES = {"c": ("h", "c"), "python": ("py",)}
 WIDTH = 108
+DIGITS = 6  # of a place: channels are told apart by it
 
 
 def source(
@@ -123,12 +124,12 @@ def _equations(given: _Numbers) -> list[str]:
 
 def reading_words(domain: Domain, sensors: Sequence[Sensor]) -> tuple[str, ...]:
     """What each reading is: sensor, quantity, place and unit."""
-    return tuple(f"{s.name}: {s.quantity} at {domain.text(s.at)}, {QUANTITIES[s.quantity]}" for s in sensors)
+    return tuple(f"{s.name}: {s.quantity} at {domain.text(s.at, DIGITS)}, {QUANTITIES[s.quantity]}" for s in sensors)
 
 
 def command_words(domain: Domain, actuators: Sequence[Actuator]) -> tuple[str, ...]:
     """What each command is: actuator, kind and place."""
-    return tuple(f"{a.name}: {a.kind} at {domain.text(a.at)}" for a in actuators)
+    return tuple(f"{a.name}: {a.kind} at {domain.text(a.at, DIGITS)}" for a in actuators)
 
 
 def _listed(array: str, words: Sequence[str]) -> list[str]:

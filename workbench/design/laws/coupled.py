@@ -12,7 +12,6 @@ from workbench.design.laws.law import (
     Law,
     controllable_input,
     controlled_indices,
-    participation,
     positive_definite,
     weighed_states,
 )
@@ -20,6 +19,8 @@ from workbench.design.laws.pole_assignment import assign
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes, modal_state_matrix
+
+ON_AXIS = 1e-13  # of the fastest pole: a part that rounding alone moves off the axis is not stabilised
 
 
 def controlled_plant(
@@ -48,27 +49,26 @@ def coupled_lqr(
     """
     index = controlled_indices(modes, controlled)
     actuators = tuple(actuators)
-    if len(index) <= len(actuators):
-        participation(modes, index, actuators)
-    else:
-        controllable_input(modes, [r for r in index if modes.damping[r, r] <= 0], actuators)
+    controllable_input(modes, [r for r in index if modes.damping[r, r] <= 0], actuators)
     a, b = controlled_plant(modes, index, actuators)
     omega, size = modes.omega[list(index)], len(actuators)
     states = weighed_states(omega)
     q = np.diag(np.r_[omega**2, np.ones(omega.size)][states])
-    r = positive_definite(weight, size, f"the control weight must be positive definite, {size} by {size}")
+    r = positive_definite(weight, size, f"the control weight must be symmetric and positive definite, {size} by {size}")
+    # in commands of like cost, or one in other units makes R look singular
+    unit = np.sqrt(np.diag(r).max() / np.diag(r))
     try:
-        found, _, poles = control.lqr(a[np.ix_(states, states)], b[states], q, r)
+        found, _, poles = control.lqr(a[np.ix_(states, states)], b[states] * unit, q, r * np.outer(unit, unit))
     except (np.linalg.LinAlgError, ValueError, control.ControlSlycot) as error:
         raise DesignError(
             f"no regulator stabilises modes {[i + 1 for i in index]} from these places: {error}"
         ) from error
-    if not (np.real(poles) < 0).all():
+    if not (np.real(poles) < -ON_AXIS * np.abs(poles).max()).all():
         raise DesignError(
             f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator"
         )
     gain = np.zeros((size, 2 * omega.size))
-    gain[:, states] = found
+    gain[:, states] = unit[:, None] * found
     return Law(gain, index, actuators, "coupled LQR", partial(coupled_lqr, weight=weight))
 
 

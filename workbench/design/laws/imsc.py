@@ -71,7 +71,7 @@ def pole_gains(omega: ArrayLike, poles: ArrayLike, damping: ArrayLike = 0.0) -> 
     if poles.shape != omega.shape:
         raise DesignError(f"one pole a mode is needed, {omega.shape}; got {poles.shape}")
     if not (poles.real < 0).all():
-        bad = poles[poles.real >= 0][0]
+        bad = poles[~(poles.real < 0)][0]
         raise DesignError(f"pole {bad:.4g} is not stable: its real part must be negative")
     return np.abs(poles) ** 2 - omega**2, -2.0 * poles.real - np.asarray(damping)
 

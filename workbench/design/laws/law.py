@@ -70,16 +70,30 @@ class Law(Printed):
         return line, headings, rows, ()
 
 
+def linear(law: object) -> Law:
+    """The law itself, where it has a gain; one that switches has none.
+
+    Raises:
+        DesignError: naming it.
+    """
+    if not isinstance(law, Law):
+        raise DesignError(
+            f"a law u = -K x is needed here, from imsc, imsc_poles, coupled_lqr or coupled_poles; got"
+            f" {getattr(law, 'name', type(law).__name__)}, which has no gain K"
+        )
+    return law
+
+
 def positive_definite(value: ArrayLike, size: int, refusal: str) -> np.ndarray:
     """A number, a diagonal (size,) or a matrix (size, size) as a matrix.
 
     Raises:
-        DesignError: `refusal`, and the value, where that is not positive definite.
+        DesignError: `refusal`, and the value, where that is not symmetric and positive definite.
     """
     given = np.asarray(value, float)
     matrix = given * np.eye(size) if given.ndim == 0 else np.diag(given) if given.ndim == 1 else given
     fits = matrix.shape == (size, size) and np.isfinite(matrix).all()
-    if not fits or not (np.linalg.eigvalsh(0.5 * (matrix + matrix.T)) > 0).all():
+    if not fits or not np.allclose(matrix, matrix.T) or not (np.linalg.eigvalsh(matrix) > 0).all():
         raise DesignError(f"{refusal}; got {given}")
     return matrix
 
@@ -90,6 +104,8 @@ def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[i
     Raises:
         DesignError: modes that are not there, or named twice.
     """
+    if isinstance(controlled, np.integer):
+        controlled = int(controlled)
     if isinstance(controlled, int) and not 1 <= controlled <= modes.n_modes:
         raise DesignError(
             f"{controlled} modes cannot be controlled of {modes.n_modes} at hand: control 1 or more of these"
@@ -114,7 +130,8 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     """B of the controlled modes, (n_controlled, n_actuators), checked to be of full row rank.
 
     Raises:
-        DesignError: more modes than actuators, two actuators at one place, a mode that no actuator moves.
+        DesignError: more modes than actuators, a mode that no actuator moves, or actuators, at one place say, that
+            cannot act on the modes one by one.
     """
     actuators = tuple(actuators)
     if len(controlled) > len(actuators):
@@ -122,7 +139,10 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
             f"{len(controlled)} controlled modes need as many actuators; there are {len(actuators)}:"
             " control fewer modes or add actuators"
         )
-    b = controllable_input(modes, controlled, actuators)
+    b, relative = _inputs(modes, controlled, actuators)
+    condition = np.linalg.cond(relative)
+    if condition <= SINGULAR:
+        return b
     text = modes.domain.text
     for i, first in enumerate(actuators):
         for second in actuators[i + 1 :]:
@@ -132,13 +152,10 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
                     f"actuators {first.name} and {second.name} both stand at {text(first.at)}, so B is singular;"
                     " move one by more than 1e-6 of the length"
                 )
-    condition = np.linalg.cond(b)
-    if condition > SINGULAR:
-        raise DesignError(
-            f"B of the controlled modes is singular (condition {condition:.2g}): the actuators at"
-            f" {', '.join(text(a.at) for a in actuators)} cannot act on modes {[r + 1 for r in controlled]} one by one"
-        )
-    return b
+    raise DesignError(
+        f"B of the controlled modes is singular (condition {condition:.2g}): the actuators at"
+        f" {', '.join(text(a.at) for a in actuators)} cannot act on modes {[r + 1 for r in controlled]} one by one"
+    )
 
 
 def separation(modes: Modes, first: Actuator | Sensor, second: Actuator | Sensor) -> float:
@@ -155,33 +172,42 @@ def controllable_input(modes: Modes, controlled: Sequence[int], actuators: Seque
     Raises:
         DesignError: no actuators, or a mode at whose nodes all of them stand.
     """
+    return _inputs(modes, controlled, actuators)[0]
+
+
+def _inputs(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> tuple[Floats, Floats]:
+    """B of the controlled modes, and each actuator's column of it in units of the most that it could do from anywhere.
+
+    The second says what is singular whatever the units of the commands.
+    """
     if not actuators:
         raise DesignError("there are no actuators to control with; add one")
-    b = input_matrix(modes, actuators)[list(controlled)]
-    possible = _largest_participation(modes, actuators)
-    for row, r in zip(b, controlled, strict=True):
-        if np.abs(row).max() < UNMOVED * possible[r]:
+    index = list(controlled)
+    b = input_matrix(modes, actuators)[index]
+    possible = np.array([_largest_participation(modes, actuator)[index] for actuator in actuators]).T
+    unit = np.maximum(possible.max(axis=0, initial=0.0), np.finfo(float).tiny)
+    relative, possible = b / unit, possible / unit
+    for row, most, r in zip(relative, possible, controlled, strict=True):
+        if np.abs(row).max() < UNMOVED * most.max():
             raise DesignError(f"mode {r + 1} is uncontrollable: all actuators stand at its nodes; move one")
-    return b
+    return b, relative
 
 
-def _largest_participation(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
-    """The most that the best of the actuators could do for each mode from any place, (n_modes,)."""
-    most = np.zeros(modes.n_modes)
-    for actuator in actuators:
-        turns = actuator.kind == "moment"
-        if isinstance(modes.domain, NamedPoints):
-            shapes = modes.phi(modes.domain.rotations() if turns else modes.domain.grid())
-        elif isinstance(modes.domain, Rectangle) and isinstance(actuator.at, Patch):
-            low, high = reach(modes.domain, actuator.at)
-            middles = np.clip(modes.domain.grid(PER_SIDE), low, high)
-            sides = np.broadcast_to(actuator.at[2:], middles.shape)
-            shapes = modes.edge_slopes(np.hstack([middles, sides]), direction=actuator.direction)
-        elif isinstance(modes.domain, Rectangle):
-            shapes = modes.phi(modes.domain.grid(PER_SIDE), int(turns), direction=actuator.direction)
-        else:
-            shapes = modes.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9), int(turns))
-        most = np.maximum(most, abs(actuator.gain) * np.abs(shapes).max(axis=0))
+def _largest_participation(modes: Modes, actuator: Actuator) -> Floats:
+    """The most that an actuator could do for each mode from any place, (n_modes,)."""
+    turns = actuator.kind == "moment"
+    if isinstance(modes.domain, NamedPoints):
+        shapes = modes.phi(modes.domain.rotations() if turns else modes.domain.grid())
+    elif isinstance(modes.domain, Rectangle) and isinstance(actuator.at, Patch):
+        low, high = reach(modes.domain, actuator.at)
+        middles = np.clip(modes.domain.grid(PER_SIDE), low, high)
+        sides = np.broadcast_to(actuator.at[2:], middles.shape)
+        shapes = modes.edge_slopes(np.hstack([middles, sides]), direction=actuator.direction)
+    elif isinstance(modes.domain, Rectangle):
+        shapes = modes.phi(modes.domain.grid(PER_SIDE), int(turns), direction=actuator.direction)
+    else:
+        shapes = modes.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9), int(turns))
+    most: Floats = abs(actuator.gain) * np.abs(shapes).max(axis=0)
     return most
 
 

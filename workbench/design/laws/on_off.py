@@ -92,7 +92,10 @@ def on_off(
         ("dead_band", dead_band, "0 or more"),
         ("slope", slope, "0 or more"),
     ):
-        value = np.broadcast_to(np.asarray(value, float), n)
+        value = np.asarray(value, float)
+        if value.shape not in ((), (1,), (n,)):
+            raise DesignError(f"on-off {name} is one number, or one a controlled mode, {n}; got {value.size}")
+        value = np.broadcast_to(value, n)
         if not np.isfinite(value).all() or (value < 0).any() or (least == "positive" and not value.all()):
             raise DesignError(f"on-off {name} must be {least}; got {value.min():g}")
         values.append(value)

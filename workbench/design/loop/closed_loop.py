@@ -11,16 +11,24 @@ from scipy.linalg import expm
 from workbench.arrays import Complexes, Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.estimation.modal_filter import ModalFilter
-from workbench.design.laws.law import Law
+from workbench.design.laws.law import DesignError, Law, linear
+from workbench.design.loop.peak import largest
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze, frozen
-from workbench.structure.printed import place_text
+from workbench.structure.printed import counted, place_text
 
 UNSEEN = 1e-9
 WELL_CONDITIONED = 1e6
 RESONANT = 1e-6
 EVEN = 1e-15
+ON_AXIS = 1e-9  # of the fastest pole
+
+
+def stability(poles: np.ndarray) -> str:
+    """Of a loop: stable, unstable, or marginally stable where its rightmost pole is on the axis but for rounding."""
+    rightmost, rounding = poles.real.max(), ON_AXIS * max(np.abs(poles).max(), 1.0)
+    return "stable" if rightmost < -rounding else "unstable" if rightmost > rounding else "marginally stable"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +58,14 @@ class ClosedLoop:
         return float(-self.poles.real.max())
 
     @property
+    def stability(self) -> str:
+        """As of `stability`."""
+        return stability(self.poles)
+
+    @property
     def stable(self) -> bool:
         """Whether no pole is to the right of the axis (undamped residual modes sit on it)."""
-        return bool(self.poles.real.max() <= 1e-9 * max(np.abs(self.poles).max(), 1.0))
+        return self.stability != "unstable"
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +98,26 @@ class Response:
         return 0.5 * (self.modal[n:] ** 2 + (self.modes.omega[:, None] * self.modal[:n]) ** 2)
 
 
-def close_loop(modes: Modes, law: Law, filter_: ModalFilter | None = None) -> ClosedLoop:
+def close_loop(modes: Modes, law: Law | Controller, filter_: ModalFilter | None = None) -> ClosedLoop:
     """The loop through exact modal coordinates, or through a modal filter of the controlled modes.
 
     Args:
         modes: all modes, controlled and residual.
+        law: u = -K x; or a controller, a law with its filter or observer, whose states then follow those of the modes.
         filter_: rows are the controlled modes, in the law's order; rates are read through the same weights.
 
     Raises:
+        DesignError: a law that switches, or of modes that are not there.
         ValueError: a filter of another number of modes, or one whose sensors cannot see a controlled mode.
     """
+    if isinstance(law, Controller) and filter_ is None:
+        return close_with(modes, law)
+    law = linear(law)
     n = modes.n_modes
+    if max(law.controlled) >= n:
+        raise DesignError(
+            f"the law controls mode {max(law.controlled) + 1} and the plant has {counted(n, 'mode')}; give more modes"
+        )
     if filter_ is None:
         seen = np.zeros((law.n_controlled, n))
         seen[np.arange(law.n_controlled), list(law.controlled)] = 1.0
@@ -157,6 +179,33 @@ def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] 
     return Response(time, motion, loop.feedback[:, fed] @ modal[fed], loop.modes)
 
 
+def peak_force(loop: ClosedLoop, state: np.ndarray, final_time: float) -> float:
+    """The largest |F| of any actuator up to a time, to a millionth: of all time until then, not of samples of it.
+
+    Args:
+        loop: of which every pole whose motion is fed back decays.
+        state: as for `initial_response`.
+        final_time: s; may be infinite.
+    """
+    n = loop.modes.n_modes
+    own = np.r_[list(loop.law.controlled), [n + r for r in loop.law.controlled]]
+    # residual modes of which nothing is fed back are left out: they would be poles that need not decay
+    if not _controlled_alone(loop):
+        own = np.arange(loop.matrix.shape[0])
+    own = own[loop.matrix[:, own].any(axis=0)]  # a rigid displacement that no gain answers moves nothing
+    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
+    poles, vectors = np.linalg.eig(loop.matrix[np.ix_(own, own)])
+    amplitudes = (loop.feedback[:, own] @ vectors) * np.linalg.solve(vectors, state[own].astype(complex))
+    return largest(poles, amplitudes, final_time)
+
+
+def _controlled_alone(loop: ClosedLoop) -> bool:
+    """Whether nothing but the controlled modes moves them: exact modal coordinates, no damping between modes."""
+    others = np.setdiff1d(np.arange(loop.modes.n_modes), loop.law.controlled)
+    alone = loop.matrix.shape[0] == 2 * loop.modes.n_modes and loop.modes.proportional
+    return alone and not loop.feedback[:, np.r_[others, loop.modes.n_modes + others]].any()
+
+
 def checked_times(time: ArrayLike) -> Floats:
     """Instants (n_times,) as an array.
 
@@ -198,9 +247,7 @@ def _cascade(loop: ClosedLoop, state: np.ndarray, time: np.ndarray) -> np.ndarra
     own = [*loop.law.controlled, *(n + r for r in loop.law.controlled)]
     rest = np.setdiff1d(np.arange(n), loop.law.controlled)
     c = np.diag(modes.damping)
-    others = np.setdiff1d(np.arange(loop.matrix.shape[0]), own)
-    apart = loop.matrix.shape[0] == 2 * n and modes.proportional and not loop.feedback[:, others].any()
-    if not apart or not (modes.omega[rest] > 0.5 * c[rest]).all():
+    if not _controlled_alone(loop) or not (modes.omega[rest] > 0.5 * c[rest]).all():
         return None
     values, vectors = np.linalg.eig(loop.matrix[np.ix_(own, own)])
     if not np.linalg.cond(vectors) < WELL_CONDITIONED:

@@ -109,15 +109,15 @@ def certify(
     """
     if not 0 < gap < 1:
         raise DesignError(f"the gap to be proven is a share between 0 and 1; got {gap:g}")
+    domain = task.modes.domain
+    if isinstance(domain, NamedPoints) and limits.candidates is None:
+        limits = replace(limits, candidates=tuple(listed(allowed_places(task, limits, 0))))
     if limits.candidates is None and not limits.regular:
         raise DesignError(
             "without a limit B may come as near to singular as it likes; give one of effort, peak force or condition"
         )
-    domain = task.modes.domain
     if isinstance(domain, Rectangle) and limits.candidates is None:
         raise DesignError("a proof on a rectangle is among candidate places; give limits candidates, on a grid say")
-    if isinstance(domain, NamedPoints) and limits.candidates is None:
-        limits = replace(limits, candidates=tuple(listed(allowed_places(task, limits, 0))))
     began = time.monotonic()
     best = place_actuators(task, limits) if placement is None else placement
     if limits.candidates is not None and comb(len(limits.candidates), task.n_controlled) <= MOST_TRIED:

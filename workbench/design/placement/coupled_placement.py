@@ -13,8 +13,8 @@ from scipy.optimize import OptimizeResult, minimize
 
 from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError, Law, weighed_states
+from workbench.design.loop.peak import largest
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.peak import largest
 from workbench.design.placement.task import Placement
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, modal_state_matrix

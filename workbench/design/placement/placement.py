@@ -46,7 +46,13 @@ ON_EDGE = 1e-6  # of a side: so near, an actuator stands on the edge of its box
 
 
 def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
-    """Interior nodes (n_nodes,) of a mode (zero-based), m: zeros of its shape away from the held ends (5.6)."""
+    """Interior nodes (n_nodes,) of a mode (zero-based), m: zeros of its shape away from the held ends (5.6).
+
+    Raises:
+        DesignError: a mode that is not at hand.
+    """
+    if mode >= modes.n_modes:
+        raise DesignError(f"the nodes of mode {mode + 1} are not known from {modes.n_modes} modes; ask for more modes")
     x = np.linspace(0.0, modes.length, POINTS * (mode + 2) + 1)[1:-1]
     values = modes.phi(x)[:, mode]
     crossings = np.flatnonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)

@@ -109,10 +109,12 @@ def allowed_places(task: PlacementTask, limits: Limits, n_places: int) -> np.nda
 
     Raises:
         DesignError: fewer than actuators.
+        PlaceError: a candidate that the structure does not have.
     """
     n, domain = task.n_controlled, task.modes.domain
     boxes = limits.boxes(task)
     if limits.candidates is not None:
+        domain.locate(list(limits.candidates))
         grid = as_places(domain, list(limits.candidates))
     elif isinstance(domain, Interval):
         edge = max(limits.edge_distance, task.reach[0], domain.length / n_places / 2)

@@ -16,7 +16,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from workbench.arrays import Floats, symmetric_root
 from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError, Law, weighed_states
-from workbench.design.placement.peak import largest
+from workbench.design.loop.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
@@ -197,21 +197,37 @@ class PlacementTask(Printed):
     def tail_bound(self, positions: ArrayLike, *, growth: float) -> float:
         """A bound on the work in all modes beyond those at hand, for frequencies that grow as ω_r >= ω_N (r/N)^growth.
 
-        With ω|f̂_j| <= C_j beyond ω_N, W_tail <= ½ max φ² (Σ_ij |B⁻¹|_ij C_j)² Σ_{r>N} ω_r⁻², and Σ_{r>N} (N/r)^{2g} <=
-        N / (2g - 1). Growth is 2 for a beam in bending, 1 for a bar.
+        With ω|f̂_j| <= C_j beyond ω_N, W_tail <= ½ (Σ_ij |B⁻¹|_ij C_j)² Σ_{r>N} max b_r² / ω_r². A force takes part in a
+        mode by its shape, whose maximum does not grow; a moment by the slope, which grows with the number of waves as
+        ω^(1/growth), s = 1: max b_r <= S ω_r^(s/growth), S from the modes at hand, twice that of what acts between two
+        places. Then Σ_{r>N} (N/r)^{2 (growth - s)} <= N / (2 (growth - s) - 1). Growth is 2 for a beam in bending, 1
+        for a bar.
 
         Raises:
-            DesignError: growth of ½ or less, for which the sum has no bound, or a finite time.
+            DesignError: frequencies that grow too slowly for the sum to have a bound, a finite time, or modes that are
+                not along an interval.
         """
-        if not growth > 0.5:
-            raise DesignError(f"the frequencies must grow faster than the root of their number; got growth {growth:g}")
+        domain, moment = self.modes.domain, int(self.actuator.kind == "moment")
+        if not isinstance(domain, Interval):
+            raise DesignError(f"the bound on the tail is along an interval; these modes are of {domain}")
+        power = 2 * (growth - moment)
+        if not power > 1:
+            raise DesignError(
+                "the frequencies must grow faster than the root of their number, and for moments faster than its power"
+                f" 3/2; got growth {growth:g}"
+            )
         if not np.isfinite(self.envelope).all():
             raise DesignError("the bound on the tail is for t_f to infinity and frequencies above the closed loop's")
         n, modes = self.n_controlled, self.modes
         inverse = np.abs(np.linalg.inv(self.shapes(positions)[:, :n].T))
-        largest = np.abs(self.shapes(np.linspace(*self.reach, 20 * modes.n_modes))).max()
-        series = modes.n_modes / (2 * growth - 1) / modes.omega[-1] ** 2
-        return float(0.5 * (largest * (inverse @ self.envelope).sum()) ** 2 * series)
+        elastic = modes.select(np.flatnonzero(modes.omega > 0).tolist())
+        shapes = elastic.phi(np.linspace(0.0, domain.length, 20 * modes.n_modes), moment)
+        ends = abs(self.actuator.gain) * (2 if extent(self.actuator) else 1)
+        steepest = (
+            ends * np.abs(shapes / elastic.omega ** (moment / growth)).max() * modes.omega[-1] ** (moment / growth)
+        )
+        series = modes.n_modes / (power - 1) / modes.omega[-1] ** 2
+        return float(0.5 * (steepest * (inverse @ self.envelope).sum()) ** 2 * series)
 
 
 @former_arguments(chances="probabilities")

@@ -7,11 +7,11 @@ import numpy as np
 
 from workbench.design.estimation.controller import Controller, filtered
 from workbench.design.estimation.modal_filter import filter_on
-from workbench.design.estimation.observers import luenberger
+from workbench.design.estimation.observers import luenberger, usual_poles
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices
-from workbench.design.loop.closed_loop import close_loop, initial_response
+from workbench.design.loop.closed_loop import close_loop, peak_force
 from workbench.design.spillover.explain import Explanation, explain_spillover
 from workbench.design.spillover.spillover import Spillover, check_final_time, effort, finite_spillover, quadratic_cost
 from workbench.rig.actuators import Actuator
@@ -22,10 +22,6 @@ from workbench.structure.modes import Modes, freeze
 from workbench.structure.plate import Membrane, Plate
 from workbench.threads import one_blas_thread
 
-# as fast as the mode that is watched, and damped enough to forget where it started within two periods
-OBSERVER_POLES = -0.3 + 1j
-SHOWN_INSTANTS = 2000
-
 
 @dataclass(frozen=True, eq=False)
 class Compared:
@@ -35,9 +31,10 @@ class Compared:
         law: it.
         cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt of the controlled modes, over all time.
         effort: ∫ FᵀF dt over all time.
-        peak_force: largest |F| of any actuator up to the final time.
+        peak_force: largest |F| of any actuator up to the final time, at any instant, to a millionth.
         work: in every mode up to the final time.
         poles: (2 n_modes,) of the loop through exact modal coordinates, rad/s.
+        stability: of that loop, as of a `ClosedLoop`.
     """
 
     law: Law
@@ -46,6 +43,7 @@ class Compared:
     peak_force: float
     work: Spillover
     poles: np.ndarray
+    stability: str
 
     def __post_init__(self) -> None:
         freeze(self, "poles", dtype=complex)
@@ -94,7 +92,6 @@ def compare(
         final_time: s, of work and peak force.
     """
     check_final_time(final_time)
-    time = np.linspace(0.0, final_time, SHOWN_INSTANTS)
     rows = []
     for law in laws:
         loop = close_loop(modes, law)
@@ -103,9 +100,10 @@ def compare(
                 law=law,
                 cost=quadratic_cost(modes, law, state, weight),
                 effort=effort(modes, law, state),
-                peak_force=float(np.abs(initial_response(loop, state, time).forces).max()),
+                peak_force=peak_force(loop, state, final_time),
                 work=finite_spillover(loop, state, final_time),
                 poles=loop.poles,
+                stability=loop.stability,
             )
         )
     return tuple(rows)
@@ -129,14 +127,13 @@ def through_sensors(
     tried: list[tuple[Controller | None, Explanation | None, str]] = []
     ways = (True, False) if structure is not None or isinstance(modes.domain, NamedPoints) else (False,)
     for law in laws:
-        own = modes.select(law.controlled)
         sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(stands)]
         for by_filter in ways:
             try:
                 if by_filter:
                     controller = filtered(law, filter_on(structure, modes, law.controlled, stands))
                 else:
-                    controller = luenberger(modes, law, sensors, poles=OBSERVER_POLES * own.omega)
+                    controller = luenberger(modes, law, sensors, poles=usual_poles(modes, law.controlled))
                 tried.append((controller, explain_spillover(modes, controller), ""))
             except ValueError as error:
                 tried.append((None, None, f"{law.name}: {error}"))
