@@ -59,6 +59,30 @@ def read(tmp_path, text, encoding="utf-8", ending=".csv", **options):
                      [[G, 3 * G], [2 * G, 4 * G]], id="names that differ in the lines above"),
         pytest.param('"Time","Acc"\n"0,0","1,5"\n"0,5","2,5"\n', "utf-8", 0.5, {"Acc": ("", "")}, [[1.5, 2.5]],
                      id="decimal commas in quotes between commas"),
+        pytest.param("Zeit [s];a\n0;0\n0,5;1,5\n1;2,5\n", "utf-8", 0.5, {"a": ("", "")}, [[0, 1.5, 2.5]],
+                     id="decimal commas that begin below whole numbers"),
+        pytest.param('t,a\n0,5\n"0,5","1,5"\n', "utf-8", 0.5, {"a": ("", "")}, [[5, 1.5]],
+                     id="decimal commas in quotes that begin below whole numbers"),
+        pytest.param("t\ta\n0\t0\n1,953\t1\n3,906\t2\n", "utf-8", 1.953, {"a": ("", "")}, [[0, 1, 2]],
+                     id="three decimals that separate no thousands"),
+        pytest.param("ms;m/s²;mm/s²\nTime;A1;A2\n0;1;1000\n1;2;2000\n", "utf-8", 1e-3,
+                     {"A1": ("acceleration", "m/s^2"), "A2": ("acceleration", "m/s^2")}, [[1, 2], [1, 2]],
+                     id="a line of units above the names"),
+        pytest.param("Time;A1;A2\nms;m/s²;mm/s²\n-;left;right\n0;1;1000\n1;2;2000\n", "utf-8", 1e-3,
+                     {"A1": ("acceleration", "m/s^2"), "A2": ("acceleration", "m/s^2")}, [[1, 2], [1, 2]],
+                     id="a line of units between the names and a text"),
+        pytest.param("Time;Acc;Speed\ns;m/s²;rpm\n0;1;3\n1;2;4\n", "utf-8", 1.0,
+                     {"Acc": ("acceleration", "m/s^2"), "Speed [rpm]": ("", "")}, [[1, 2], [3, 4]],
+                     id="a unit that is not known among the others"),
+        pytest.param("Time;A1\n-;left\n0;1\n1;2\n", "utf-8", 1.0, {"A1": ("", "")}, [[1, 2]],
+                     id="a line of text below the names"),
+        pytest.param("Date\t2024-03-04\nTime\t12:03:04\nPoint\tA\nt [s]\tB\n0\t1\n1\t2\n", "utf-8", 1.0,
+                     {"B": ("", "")}, [[1, 2]], id="a time of day above the names"),
+        pytest.param("Zeit  1 - Standardmessrate\tCH 1\nms\tmm\n0\t1\n1\t2\n", "latin-1", 1e-3,
+                     {"CH 1": ("displacement", "m")}, [[1e-3, 2e-3]], id="catman's time"),
+        pytest.param("Time [s];a [g];Time [s];b [g]\n0;1;0;2\n1;3;1;4\n", "utf-8", 1.0,
+                     {"a": ("acceleration", "m/s^2"), "b": ("acceleration", "m/s^2")}, [[G, 3 * G], [2 * G, 4 * G]],
+                     id="the same time beside each channel"),
         pytest.param("Sample,Time (us),V (mm/s)\n1,0,1\n2,500,3\n3,1000,2\n", "utf-8", 5e-4,
                      {"Sample": ("", ""), "V": ("velocity", "m/s")}, [[1, 2, 3], [1e-3, 3e-3, 2e-3]],
                      id="time behind the numbers of the samples"),
@@ -69,6 +93,41 @@ def test_a_table_in_any_layout(tmp_path, text, encoding, step, channels, values)
     assert record.sample_time == pytest.approx(step, rel=1e-9)
     assert {c.name: (c.quantity, c.unit) for c in record.output_channels} == channels
     np.testing.assert_allclose(record.outputs, values, rtol=1e-12)
+
+
+LABVIEW = (
+    "LabVIEW Measurement\t\nSeparator\tTab\nX_Columns\t{}\n***End_of_Header***\t\n\t\nChannels\t2\t\t\n"
+    "Date\t2024/03/04\t2024/03/04\t\nY_Unit_Label\tg\tmm\t\nX_Dimension\t{}\t{}\t\nX0\t0.5E+0\t{}\t\n"
+    "Delta_X\t0.250\t0.250\t\n***End_of_Header***\t\t\t\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("columns", "table"),
+    [
+        ("One", "X_Value\tA\tB\tComment\n0.50\t1\t3\n0.75\t2\t4\n"),
+        ("One", "X_Value\tA\tB\tComment\n0.50\t1\t3\tsegment 1\n0.75\t2\t4\n"),
+        ("One", "X_Value\tA\tB\tComment\n0.50\t1\t3\n0.75\t2\t4\t2.5\n"),
+        ("No", "X_Value\tA\tB\tComment\n\t1\t3\tsegment 1\n\t2\t4\n"),
+        ("Multi", "X_Value\tA\tX_Value\tB\tComment\n0.50\t1\t0.50\t3\n0.75\t2\t0.75\t4\n"),
+    ],
+)
+def test_labview_text(tmp_path, columns, table):
+    """As its format is specified: the unit of each channel in the header, texts in a column of their own, and
+    instants beside the first channel, beside each, or as a start and a step in the header alone."""
+    record = read(tmp_path, LABVIEW.format(columns, "Time", "Time", 0.5) + table, ending=".lvm")
+    assert (record.sample_time, record.start_time) == (0.25, 0.5)
+    assert [(c.name, c.unit) for c in record.output_channels] == [("A", "m/s^2"), ("B", "m")]
+    np.testing.assert_allclose(record.outputs, [[G, 2 * G], [3e-3, 4e-3]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("over", "start", "words"), [("Frequency", 0.5, "X_Dimension is Frequency"), ("Time", 0.6, "differ in X0")]
+)
+def test_labview_text_that_is_no_record(tmp_path, over, start, words):
+    with pytest.raises(RecordFileError, match=words):
+        text = LABVIEW.format("No", over, over, start) + "X_Value\tA\tB\tComment\n\t1\t3\n\t2\t4\n"
+        read(tmp_path, text, ending=".lvm")
 
 
 def test_what_was_changed_is_remarked(tmp_path):
