@@ -2,13 +2,15 @@
 
 import itertools
 
+import h5py
 import numpy as np
 import pytest
+import pyuff
 from nptdms import ChannelObject, TdmsWriter
 from scipy.io import wavfile
 
 from workbench.records import csv_file, limits
-from workbench.records.files import read_record
+from workbench.records.files import read_measured, read_record
 from workbench.records.limits import Limits, RecordFileError
 from workbench.records.units import split_unit, unit_named
 
@@ -190,6 +192,105 @@ def test_labview_channels(tmp_path):
     assert (record.sample_time, record.start_time) == pytest.approx((0.01, 0.5))
     assert record.output_channels[0].unit == "m/s^2"
     np.testing.assert_allclose(record.outputs[0], G * np.arange(5.0))
+
+
+def test_labview_channels_that_start_apart_are_no_record(tmp_path):
+    def write(*starts):
+        with TdmsWriter(tmp_path / "x.tdms") as file:
+            properties = ({"wf_increment": 0.01, "wf_start_time": np.datetime64(start, "us")} for start in starts)
+            file.write_segment([ChannelObject("run", f"a{i}", np.arange(5.0), p) for i, p in enumerate(properties)])
+        return read_record(tmp_path / "x.tdms")
+
+    assert write("2024-03-04T12:00:00", "2024-03-04T12:00:00.00005").n_outputs == 2
+    with pytest.raises(RecordFileError, match="channel 'a1' starts 1 s after 'a0'"):
+        write("2024-03-04T12:00:00", "2024-03-04T12:00:01")
+
+
+def test_units_beside_hdf5_data(tmp_path):
+    """As attributes: of signals they are remarked, of their instants and of a rate applied."""
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        for name, values, unit in (("time", [0, 1, 2], "ms"), ("a", [1, 2, 3], b"g"), ("b", [1, 2, 3], "rpm")):
+            file[name] = values
+            file[name].attrs["units"] = unit
+    record = read_record(tmp_path / "x.h5")
+    assert record.sample_rate_hz == pytest.approx(1000.0) and record.remarks == ("a: g taken as 9.80665 m/s^2",)
+    assert [(c.name, c.unit) for c in record.output_channels] == [("a", "m/s^2"), ("b [rpm]", "")]
+    np.testing.assert_allclose(record.outputs, [[G, 2 * G, 3 * G], [1, 2, 3]])
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["fs"], file["a"] = 2.0, [1.0, 2.0, 3.0]
+        file["fs"].attrs["unit"] = "kHz"
+    assert read_record(tmp_path / "x.h5").sample_rate_hz == 2000.0
+
+
+UNIVERSAL = {"binary": 0, "func_type": 1, "rsp_node": 1, "rsp_dir": 3, "ref_node": 2, "ref_dir": 3, "num_pts": 4,
+             "abscissa_spacing": 1, "abscissa_min": 0.0, "abscissa_inc": 0.5, "x": 0.5 * np.arange(4.0),
+             "data": np.arange(4.0), "ordinate_spec_data_type": 12, "abscissa_spec_data_type": 17,
+             "orddenom_spec_data_type": 13}  # fmt: skip
+MILLIMETRES = {"type": 164, "units_code": 5, "units_description": "mm", "temp_mode": 1, "length": 1000.0,
+               "force": 1000.0, "temp": 1.0, "temp_offset": 273.15}  # fmt: skip
+
+
+def universal(path, *sets, system=None):
+    file = pyuff.UFF(str(path))
+    if system:
+        file.write_sets(system, "overwrite")
+    for i, changed in enumerate(sets):
+        how = "add" if system or i else "overwrite"
+        file.write_sets(pyuff.prepare_58(**(UNIVERSAL | changed), return_full_dict=False), how)
+    return read_measured(path)
+
+
+@pytest.mark.parametrize(
+    ("axes", "system", "scale", "step", "remark"),
+    [
+        ({"ordinate_axis_units_lab": "g"}, None, G, 0.5, "g taken as 9.80665 m/s^2"),
+        ({"ordinate_axis_units_lab": "mm/s^2"}, None, 1e-3, 0.5, "mm/s^2 taken as 0.001 m/s^2"),
+        ({"ordinate_axis_units_lab": "m/s^2", "abscissa_axis_units_lab": "ms"}, None, 1.0, 5e-4, None),
+        ({}, None, 1.0, 0.5, None),
+        ({}, MILLIMETRES, 1e-3, 0.5, "mm/s^2 taken as 0.001 m/s^2"),
+        ({"ordinate_axis_units_lab": "m/s^2"}, MILLIMETRES, 1.0, 0.5, None),
+    ],
+)
+def test_units_of_universal_files(tmp_path, axes, system, scale, step, remark):
+    record = universal(tmp_path / "x.uff", axes, system=system)
+    np.testing.assert_allclose(record.outputs, [scale * np.arange(4.0)])
+    assert record.sample_time == pytest.approx(step)
+    assert record.remarks == ((f"node 1 direction 3: {remark}",) if remark else ())
+    assert [(c.name, c.quantity, c.unit) for c in record.output_channels] == [
+        ("node 1 direction 3", "acceleration", "m/s^2")
+    ]
+
+
+@pytest.mark.parametrize("labels", [("g", "kN"), ("g/kN", "NONE")])
+def test_units_of_universal_transfer_functions(tmp_path, labels):
+    spectrum = np.arange(4.0) + 1j
+    axes = {"func_type": 4, "data": spectrum, "abscissa_spec_data_type": 18, "ordinate_axis_units_lab": labels[0],
+            "orddenom_axis_units_lab": labels[1], "abscissa_axis_units_lab": "kHz"}  # fmt: skip
+    found = universal(tmp_path / "x.uff", axes)
+    np.testing.assert_allclose(found.values[0, 0], G / 1e3 * spectrum)
+    np.testing.assert_allclose(found.frequencies_hz, 500.0 * np.arange(4))
+    said = "node 1 direction 3: g taken as 9.80665 m/s^2", "node 2 direction 3: kN taken as 1000 N"
+    assert found.remarks == found.only(("node 1 direction 3",)).remarks == said
+
+
+@pytest.mark.parametrize(
+    ("axes", "words"),
+    [
+        ({"func_type": 2, "abscissa_spec_data_type": 18}, "no transfer function, but auto spectrum"),
+        ({"func_type": 9, "abscissa_spec_data_type": 18}, "no transfer function, but power spectral density"),
+        ({"func_type": 6, "abscissa_spec_data_type": 18}, "no transfer function, but coherence"),
+        ({"func_type": 0, "abscissa_spec_data_type": 18}, "no signal over time"),
+        ({"ordinate_axis_units_lab": "N"}, "acceleration by its type and force by its unit"),
+    ],
+)
+def test_universal_files_that_are_no_record(tmp_path, axes, words):
+    with pytest.raises(RecordFileError, match=words):
+        universal(tmp_path / "x.uff", axes)
+
+
+def test_spectra_beside_signals_are_left_out(tmp_path):
+    record = universal(tmp_path / "x.uff", {"func_type": 6, "abscissa_spec_data_type": 18}, {})
+    assert record.output_names == ("node 1 direction 3",) and record.sample_time == 0.5
 
 
 def test_sound_files(tmp_path):

@@ -118,7 +118,7 @@ def record_of(
     written: dict[tuple[str, Unit], list[str]] = {}
     for key, unit in units.items():
         written.setdefault((split_unit(_name(key))[1], unit), []).append(names[key])
-    remarks = [_unit_remark(", ".join(alike), text, unit) for (text, unit), alike in written.items()]
+    remarks = [unit_remark(", ".join(alike), text, unit) for (text, unit), alike in written.items()]
     try:
         return Record(
             sample_time=sampling.step,
@@ -205,7 +205,8 @@ def _units(keys: Iterable[str]) -> dict[str, Unit]:
     return {key: unit for key, unit in found.items() if unit is not None and unit.quantity != "time"}
 
 
-def _unit_remark(name: str, written: str, unit: Unit) -> str:
+def unit_remark(name: str, written: str, unit: Unit) -> str:
+    """What to say of a signal that was brought to SI; nothing where it was in it."""
     if unit.si == "counts":
         return f"{name}: in counts of unstated sensitivity; modes have no scale"
     return "" if unit.factor == 1.0 else f"{name}: {written} taken as {unit.factor:g} {unit.si}"

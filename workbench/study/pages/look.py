@@ -130,12 +130,12 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
     page_content = PageContent(
         title=f"What {path.name} holds",
         lead=heading,
-        lines=[f"Go on with: {_command(path, [])}"],
+        lines=[*measured.remarks, f"Go on with: {_command(path, [])}"],
         blocks=[block(plot_transfer(measured), "Magnitude of the transfer functions.")],
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
     )
-    return Look(heading, tuple(rows), (), _command(path, []), page_content)
+    return Look(heading, tuple(rows), measured.remarks, _command(path, []), page_content)
 
 
 def _row(channel: Channel, row: np.ndarray, rate_hz: float) -> tuple[str, ...]:
