@@ -60,11 +60,13 @@ class Description:
         channels: by signal: kind, name, quantity, unit, at, noise_std, as far as given.
         name: of the record; None where only channels are described.
         sampling: (start, step), s; None where there are times alone.
+        input_hold: "zero" or "first".
     """
 
     channels: Mapping[str, Mapping[str, Any]]
     name: str | None = None
     sampling: tuple[float, float] | None = None
+    input_hold: str = "zero"
 
 
 def record_of(
@@ -126,6 +128,7 @@ def record_of(
             output_channels=channels["output"],
             inputs=rows["input"],
             input_channels=channels["input"],
+            input_hold=described.input_hold,
             start_time=sampling.start,
             name=described.name or path.stem,
             remarks=(*filter(None, remarks), *sampling.remarks),
@@ -140,7 +143,9 @@ def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> 
         channels = {f"{c['kind']}:{c['name']}": c for c in table["channels"]}
         if "sample_time" not in table and KEY not in table:
             return Description(channels)
-        described = Description(channels, str(table["name"]), (float(table["start_time"]), float(table["sample_time"])))
+        sampling = (float(table["start_time"]), float(table["sample_time"]))
+        # files from before a description had a hold were all read as held
+        described = Description(channels, str(table["name"]), sampling, table.get("input_hold", "zero"))
         whole = table[KEY] == checksum(table, [signals[key] for key in channels]) and len(signals) == len(channels)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise RecordFileError(f"{path}: its description of the channels is damaged: {error}") from error
