@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import lfilter, lsim
 from typer.testing import CliRunner
 
 from workbench.cli.app import app
@@ -98,6 +98,26 @@ def test_identify_reads_records_with_inputs_and_ambient_ones(tmp_path):
     assert result.exit_code == 0 and "canonical variate analysis" in result.output, result.output
     ambient = json.loads(found.read_text())
     assert abs(ambient["frequencies_hz"][0] * 2 * np.pi - abs(pole)) < 4 * ambient["frequencies_std_hz"][0] * 2 * np.pi
+
+
+def test_identify_takes_inputs_that_run_straight(tmp_path):
+    """Against the closed form of a response to straight lines, whose mode is real; held, it would be complex."""
+    force, dt = np.random.default_rng(0).standard_normal(1500), 0.02
+    _, moved, _ = lsim(([81.0], [1.0, 0.6, 81.0]), force, dt * np.arange(1500), interp=True)
+    path, found = tmp_path / "measured.csv", tmp_path / "found.json"
+    table = np.column_stack(
+        [dt * np.arange(1500), force, moved + 1e-4 * np.random.default_rng(1).standard_normal(1500)]
+    )
+    np.savetxt(path, table, delimiter=",", header="time,F,a", comments="")
+    real_parts = []
+    for options in ((), ("--input-hold", "first")):
+        assert run("identify", path, "--inputs", "F", *options, "--json", found).exit_code == 0
+        [[real], [imaginary]] = json.loads(found.read_text())["state_space"]["B"]
+        real_parts.append(abs(real))
+    assert imaginary == pytest.approx(-81.0 / (2.0 * np.sqrt(81.0 - 0.3**2)), rel=1e-4)  # the residue, k / 2i ω_d
+    assert real_parts[1] < 1e-3 < 0.3 < real_parts[0]
+    refused = run("identify", path, "--inputs", "F", "--input-hold", "second")
+    assert refused.exit_code == 2 and "input_hold is zero (held) or first" in " ".join(refused.output.split())
 
 
 def test_identify_reads_transfer_functions(tmp_path):

@@ -69,6 +69,22 @@ def test_a_blow_that_rests_at_zero_is_an_input_without_fault(run, tmp_path):
     assert "--inputs force" in told and "Frequency response functions" in (tmp_path / "p.html").read_text()
 
 
+def test_a_clipped_blow_and_an_output_of_no_unit_are_said_before_modes_are(run, tmp_path):
+    time, rng = np.arange(N) / RATE, np.random.default_rng(0)
+    blow = np.zeros(N)
+    blow[10:20] = np.minimum(9.0 * np.sin(np.pi * np.arange(10) / 10), 5.0)
+    rings = np.convolve(blow, np.exp(-0.01 * 2 * np.pi * 12.3 * time) * np.sin(2 * np.pi * 12.3 * time))[:N]
+    outputs = np.outer([1.0, 0.5], rings) + 1e-3 * rng.normal(size=(2, N))
+    struck = write(tmp_path / "struck.csv", ["t", "force (N)", "a1 [m]", "a2"], [time, blow, *outputs])
+    told = " ".join(run("look", struck, "--page", tmp_path / "p.html").output.split())
+    assert "input 'force' is clipped at 5, 7 samples" in told and "'a2' states no quantity" in told
+    assert "--inputs force --outputs a1" in told
+    found = run("identify", struck, "--inputs", "force", "--outputs", "a1")
+    assert found.exit_code == 0 and "input 'force' is clipped at 5, 7 samples" in " ".join(found.output.split())
+    refused = run("identify", struck, "--inputs", "force")
+    assert refused.exit_code == 2 and "'a2' states no quantity" in " ".join(refused.output.split())
+
+
 def test_units_stand_in_the_table_as_they_are_written(run, tmp_path):
     """A style of rich's begins like a unit in brackets, which was dropped."""
     path = write(

@@ -137,7 +137,10 @@ def test_sensors_that_pass_no_constant_settle(offset):
     """Accelerometers with a high-pass of 2 Hz, first order, that begin at rest or at an offset."""
     rate, hz, damping = 500, np.array([12.0, 48.0, 110.0]), np.array([0.01, 0.02, 0.01])
     t, rng = np.arange(2000) / rate, np.random.default_rng(3)
-    each = np.exp(np.outer(2.0 * np.pi * hz * (-damping + 1j), t) + 1j * np.array([[1.0], [2.0], [3.0]]))
+    each = np.exp(
+        np.outer(2.0 * np.pi * hz * (-damping + 1j * np.sqrt(1.0 - damping**2)), t)
+        + 1j * np.array([[1.0], [2.0], [3.0]])
+    )
     shapes = np.sin(np.pi * np.outer(np.arange(1, 7) / 7, np.arange(1, 4))) * [1.0, 0.5, 0.2]
     outputs = (shapes @ each).real + offset + 0.01 * rng.standard_normal((6, t.size))
     through = lfilter(*butter(1, 2.0, "high", fs=rate), outputs, axis=1)

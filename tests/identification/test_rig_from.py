@@ -101,6 +101,57 @@ def test_a_first_response_that_noise_hides_is_no_delay(bench):
     assert not found.delays.any() and not found.remarks
 
 
+def accelerations(left, right, forces, n_modes=4):
+    """A free or hinged beam and what was identified of its response to forces, noise a five-hundredth of it."""
+    beam = Beam(
+        length=4.0, mass_per_length=1.5, bending_stiffness=20.0, left=left, right=right, damping=ModalDamping(0.01)
+    ).modes(n_modes)
+    sensors = tuple(Sensor(f"a{i + 1}", x, "acceleration") for i, x in enumerate(PLACES))
+    bench = Rig(beam, tuple(Actuator(f"F{x:g}", x) for x in forces), sensors)
+    rng = np.random.default_rng(1)
+    inputs = rng.normal(size=(len(forces), 1000))
+    record = simulate(bench, inputs, sample_time=0.25 / beam.frequencies_hz[-1], input_hold="first")
+    noise = 0.002 * record.outputs.std(axis=1, keepdims=True) * rng.normal(size=record.outputs.shape)
+    record = replace(record, outputs=record.outputs + noise)
+    return record, identify_driven(record, at_rest=True, max_modes=n_modes)
+
+
+def error_of(rig, record):
+    ours = simulate(rig, record.inputs, sample_time=record.sample_time, input_hold="first").outputs
+    return np.sqrt(((ours - record.outputs) ** 2).mean() / (record.outputs**2).mean())
+
+
+def test_a_beam_that_turns_about_its_hinge_keeps_its_rigid_mode():
+    """φ = (3 / m L³)^½ x, of the moment of inertia m L³ / 3; it was left in the direct term."""
+    record, found = accelerations("hinged", "free", [0.9])
+    rig = rig_from(found)
+    assert rig.modes.omega[0] == 0.0 and (rig.modes.omega[1:] > 0).all()
+    rigid = np.sqrt(3.0 / (1.5 * 4.0**3)) * np.array(PLACES)
+    off = np.abs(rig.modes.phi(["a1", "a2", "a3", "a4"])[:, 0]) - rigid
+    np.testing.assert_allclose(off, 0.0, atol=0.01 * rigid.max())
+    assert (np.abs(off) < 5.0 * np.sqrt(np.diag(rig.modes.shape_covariance[0]))[1:] + 5e-3 * rigid).all()
+    assert error_of(rig, record) < 0.01
+
+
+def test_a_free_beam_is_right_for_the_forces_that_moved_it():
+    record, found = accelerations("free", "free", [0.9, 2.6], n_modes=5)
+    with pytest.warns(UserWarning, match="2 rigid modes"):
+        rig = rig_from(found)
+    assert np.count_nonzero(rig.modes.omega == 0.0) == 2 and error_of(rig, record) < 0.01
+
+
+def test_a_beam_that_is_held_has_no_rigid_mode():
+    _, found = accelerations("clamped", "free", [0.9])
+    assert (rig_from(found).modes.omega > 0).all()
+
+
+def test_rigid_motion_that_cannot_be_placed_is_said_to_be_left_out():
+    record, found = accelerations("hinged", "free", [0.9])
+    relabelled = [*record.output_channels[:3], Channel("a4", "displacement")]
+    with pytest.warns(UserWarning, match="may be rigid motion, which outputs of other kinds do not show"):
+        assert (rig_from(found, outputs=relabelled).modes.omega > 0).all()
+
+
 @pytest.mark.slow
 def test_the_spread_of_shapes_over_many_records_is_what_their_covariance_says(bench):
     rng = np.random.default_rng(10)

@@ -1,5 +1,7 @@
 """Records survive every format, and damaged files are named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.io import savemat
@@ -19,6 +21,7 @@ def sample() -> Record:
         ),
         inputs=rng.standard_normal((1, 50)),
         input_channels=(Channel("hammer", "force", at=0.5),),
+        input_hold="first",
         start_time=0.1,
         name="a run",
     )
@@ -33,7 +36,28 @@ def test_a_record_comes_back_as_it_went(tmp_path, ending):
     np.testing.assert_allclose(back.inputs, record.inputs, rtol=exact, atol=0)
     assert back.output_channels == record.output_channels
     assert back.input_channels == record.input_channels
-    assert (back.sample_time, back.start_time, back.name) == (record.sample_time, record.start_time, record.name)
+    for what in ("sample_time", "start_time", "name", "input_hold"):
+        assert getattr(back, what) == getattr(record, what)
+
+
+def test_the_hold_of_inputs_is_kept_and_can_be_given(tmp_path):
+    record = replace(sample(), input_hold="zero")
+    path = write_record(record, tmp_path / "run.csv")
+    assert read_record(path).input_hold == "zero"
+    assert read_record(path, input_hold="first").input_hold == "first"
+    with pytest.raises(ValueError, match="input_hold is zero"):
+        read_record(path, input_hold="second")
+
+
+def test_files_from_before_holds_were_written_are_read(tmp_path):
+    """Line by line as `write_record` wrote it then."""
+    path = tmp_path / "run.csv"
+    path.write_text(
+        '# record {"name": "x", "sample_time": 0.5, "start_time": 0.0, "channels": [{"kind": "output", "name": "a",'
+        ' "quantity": "", "unit": "", "at": null, "noise_std": null}], "crc32": 80559312}\n'
+        "time,output:a\n0.0,1.0\n0.5,2.0\n"
+    )
+    assert read_record(path).input_hold == "zero"
 
 
 def test_a_plain_csv_of_another_program(tmp_path):

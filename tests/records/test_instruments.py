@@ -2,13 +2,15 @@
 
 import itertools
 
+import h5py
 import numpy as np
 import pytest
+import pyuff
 from nptdms import ChannelObject, TdmsWriter
 from scipy.io import wavfile
 
 from workbench.records import csv_file, limits
-from workbench.records.files import read_record
+from workbench.records.files import read_measured, read_record
 from workbench.records.limits import Limits, RecordFileError
 from workbench.records.units import split_unit, unit_named
 
@@ -59,6 +61,30 @@ def read(tmp_path, text, encoding="utf-8", ending=".csv", **options):
                      [[G, 3 * G], [2 * G, 4 * G]], id="names that differ in the lines above"),
         pytest.param('"Time","Acc"\n"0,0","1,5"\n"0,5","2,5"\n', "utf-8", 0.5, {"Acc": ("", "")}, [[1.5, 2.5]],
                      id="decimal commas in quotes between commas"),
+        pytest.param("Zeit [s];a\n0;0\n0,5;1,5\n1;2,5\n", "utf-8", 0.5, {"a": ("", "")}, [[0, 1.5, 2.5]],
+                     id="decimal commas that begin below whole numbers"),
+        pytest.param('t,a\n0,5\n"0,5","1,5"\n', "utf-8", 0.5, {"a": ("", "")}, [[5, 1.5]],
+                     id="decimal commas in quotes that begin below whole numbers"),
+        pytest.param("t\ta\n0\t0\n1,953\t1\n3,906\t2\n", "utf-8", 1.953, {"a": ("", "")}, [[0, 1, 2]],
+                     id="three decimals that separate no thousands"),
+        pytest.param("ms;m/s²;mm/s²\nTime;A1;A2\n0;1;1000\n1;2;2000\n", "utf-8", 1e-3,
+                     {"A1": ("acceleration", "m/s^2"), "A2": ("acceleration", "m/s^2")}, [[1, 2], [1, 2]],
+                     id="a line of units above the names"),
+        pytest.param("Time;A1;A2\nms;m/s²;mm/s²\n-;left;right\n0;1;1000\n1;2;2000\n", "utf-8", 1e-3,
+                     {"A1": ("acceleration", "m/s^2"), "A2": ("acceleration", "m/s^2")}, [[1, 2], [1, 2]],
+                     id="a line of units between the names and a text"),
+        pytest.param("Time;Acc;Speed\ns;m/s²;rpm\n0;1;3\n1;2;4\n", "utf-8", 1.0,
+                     {"Acc": ("acceleration", "m/s^2"), "Speed [rpm]": ("", "")}, [[1, 2], [3, 4]],
+                     id="a unit that is not known among the others"),
+        pytest.param("Time;A1\n-;left\n0;1\n1;2\n", "utf-8", 1.0, {"A1": ("", "")}, [[1, 2]],
+                     id="a line of text below the names"),
+        pytest.param("Date\t2024-03-04\nTime\t12:03:04\nPoint\tA\nt [s]\tB\n0\t1\n1\t2\n", "utf-8", 1.0,
+                     {"B": ("", "")}, [[1, 2]], id="a time of day above the names"),
+        pytest.param("Zeit  1 - Standardmessrate\tCH 1\nms\tmm\n0\t1\n1\t2\n", "latin-1", 1e-3,
+                     {"CH 1": ("displacement", "m")}, [[1e-3, 2e-3]], id="catman's time"),
+        pytest.param("Time [s];a [g];Time [s];b [g]\n0;1;0;2\n1;3;1;4\n", "utf-8", 1.0,
+                     {"a": ("acceleration", "m/s^2"), "b": ("acceleration", "m/s^2")}, [[G, 3 * G], [2 * G, 4 * G]],
+                     id="the same time beside each channel"),
         pytest.param("Sample,Time (us),V (mm/s)\n1,0,1\n2,500,3\n3,1000,2\n", "utf-8", 5e-4,
                      {"Sample": ("", ""), "V": ("velocity", "m/s")}, [[1, 2, 3], [1e-3, 3e-3, 2e-3]],
                      id="time behind the numbers of the samples"),
@@ -69,6 +95,41 @@ def test_a_table_in_any_layout(tmp_path, text, encoding, step, channels, values)
     assert record.sample_time == pytest.approx(step, rel=1e-9)
     assert {c.name: (c.quantity, c.unit) for c in record.output_channels} == channels
     np.testing.assert_allclose(record.outputs, values, rtol=1e-12)
+
+
+LABVIEW = (
+    "LabVIEW Measurement\t\nSeparator\tTab\nX_Columns\t{}\n***End_of_Header***\t\n\t\nChannels\t2\t\t\n"
+    "Date\t2024/03/04\t2024/03/04\t\nY_Unit_Label\tg\tmm\t\nX_Dimension\t{}\t{}\t\nX0\t0.5E+0\t{}\t\n"
+    "Delta_X\t0.250\t0.250\t\n***End_of_Header***\t\t\t\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("columns", "table"),
+    [
+        ("One", "X_Value\tA\tB\tComment\n0.50\t1\t3\n0.75\t2\t4\n"),
+        ("One", "X_Value\tA\tB\tComment\n0.50\t1\t3\tsegment 1\n0.75\t2\t4\n"),
+        ("One", "X_Value\tA\tB\tComment\n0.50\t1\t3\n0.75\t2\t4\t2.5\n"),
+        ("No", "X_Value\tA\tB\tComment\n\t1\t3\tsegment 1\n\t2\t4\n"),
+        ("Multi", "X_Value\tA\tX_Value\tB\tComment\n0.50\t1\t0.50\t3\n0.75\t2\t0.75\t4\n"),
+    ],
+)
+def test_labview_text(tmp_path, columns, table):
+    """As its format is specified: the unit of each channel in the header, texts in a column of their own, and
+    instants beside the first channel, beside each, or as a start and a step in the header alone."""
+    record = read(tmp_path, LABVIEW.format(columns, "Time", "Time", 0.5) + table, ending=".lvm")
+    assert (record.sample_time, record.start_time) == (0.25, 0.5)
+    assert [(c.name, c.unit) for c in record.output_channels] == [("A", "m/s^2"), ("B", "m")]
+    np.testing.assert_allclose(record.outputs, [[G, 2 * G], [3e-3, 4e-3]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("over", "start", "words"), [("Frequency", 0.5, "X_Dimension is Frequency"), ("Time", 0.6, "differ in X0")]
+)
+def test_labview_text_that_is_no_record(tmp_path, over, start, words):
+    with pytest.raises(RecordFileError, match=words):
+        text = LABVIEW.format("No", over, over, start) + "X_Value\tA\tB\tComment\n\t1\t3\n\t2\t4\n"
+        read(tmp_path, text, ending=".lvm")
 
 
 def test_what_was_changed_is_remarked(tmp_path):
@@ -131,6 +192,105 @@ def test_labview_channels(tmp_path):
     assert (record.sample_time, record.start_time) == pytest.approx((0.01, 0.5))
     assert record.output_channels[0].unit == "m/s^2"
     np.testing.assert_allclose(record.outputs[0], G * np.arange(5.0))
+
+
+def test_labview_channels_that_start_apart_are_no_record(tmp_path):
+    def write(*starts):
+        with TdmsWriter(tmp_path / "x.tdms") as file:
+            properties = ({"wf_increment": 0.01, "wf_start_time": np.datetime64(start, "us")} for start in starts)
+            file.write_segment([ChannelObject("run", f"a{i}", np.arange(5.0), p) for i, p in enumerate(properties)])
+        return read_record(tmp_path / "x.tdms")
+
+    assert write("2024-03-04T12:00:00", "2024-03-04T12:00:00.00005").n_outputs == 2
+    with pytest.raises(RecordFileError, match="channel 'a1' starts 1 s after 'a0'"):
+        write("2024-03-04T12:00:00", "2024-03-04T12:00:01")
+
+
+def test_units_beside_hdf5_data(tmp_path):
+    """As attributes: of signals they are remarked, of their instants and of a rate applied."""
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        for name, values, unit in (("time", [0, 1, 2], "ms"), ("a", [1, 2, 3], b"g"), ("b", [1, 2, 3], "rpm")):
+            file[name] = values
+            file[name].attrs["units"] = unit
+    record = read_record(tmp_path / "x.h5")
+    assert record.sample_rate_hz == pytest.approx(1000.0) and record.remarks == ("a: g taken as 9.80665 m/s^2",)
+    assert [(c.name, c.unit) for c in record.output_channels] == [("a", "m/s^2"), ("b [rpm]", "")]
+    np.testing.assert_allclose(record.outputs, [[G, 2 * G, 3 * G], [1, 2, 3]])
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["fs"], file["a"] = 2.0, [1.0, 2.0, 3.0]
+        file["fs"].attrs["unit"] = "kHz"
+    assert read_record(tmp_path / "x.h5").sample_rate_hz == 2000.0
+
+
+UNIVERSAL = {"binary": 0, "func_type": 1, "rsp_node": 1, "rsp_dir": 3, "ref_node": 2, "ref_dir": 3, "num_pts": 4,
+             "abscissa_spacing": 1, "abscissa_min": 0.0, "abscissa_inc": 0.5, "x": 0.5 * np.arange(4.0),
+             "data": np.arange(4.0), "ordinate_spec_data_type": 12, "abscissa_spec_data_type": 17,
+             "orddenom_spec_data_type": 13}  # fmt: skip
+MILLIMETRES = {"type": 164, "units_code": 5, "units_description": "mm", "temp_mode": 1, "length": 1000.0,
+               "force": 1000.0, "temp": 1.0, "temp_offset": 273.15}  # fmt: skip
+
+
+def universal(path, *sets, system=None):
+    file = pyuff.UFF(str(path))
+    if system:
+        file.write_sets(system, "overwrite")
+    for i, changed in enumerate(sets):
+        how = "add" if system or i else "overwrite"
+        file.write_sets(pyuff.prepare_58(**(UNIVERSAL | changed), return_full_dict=False), how)
+    return read_measured(path)
+
+
+@pytest.mark.parametrize(
+    ("axes", "system", "scale", "step", "remark"),
+    [
+        ({"ordinate_axis_units_lab": "g"}, None, G, 0.5, "g taken as 9.80665 m/s^2"),
+        ({"ordinate_axis_units_lab": "mm/s^2"}, None, 1e-3, 0.5, "mm/s^2 taken as 0.001 m/s^2"),
+        ({"ordinate_axis_units_lab": "m/s^2", "abscissa_axis_units_lab": "ms"}, None, 1.0, 5e-4, None),
+        ({}, None, 1.0, 0.5, None),
+        ({}, MILLIMETRES, 1e-3, 0.5, "mm/s^2 taken as 0.001 m/s^2"),
+        ({"ordinate_axis_units_lab": "m/s^2"}, MILLIMETRES, 1.0, 0.5, None),
+    ],
+)
+def test_units_of_universal_files(tmp_path, axes, system, scale, step, remark):
+    record = universal(tmp_path / "x.uff", axes, system=system)
+    np.testing.assert_allclose(record.outputs, [scale * np.arange(4.0)])
+    assert record.sample_time == pytest.approx(step)
+    assert record.remarks == ((f"node 1 direction 3: {remark}",) if remark else ())
+    assert [(c.name, c.quantity, c.unit) for c in record.output_channels] == [
+        ("node 1 direction 3", "acceleration", "m/s^2")
+    ]
+
+
+@pytest.mark.parametrize("labels", [("g", "kN"), ("g/kN", "NONE")])
+def test_units_of_universal_transfer_functions(tmp_path, labels):
+    spectrum = np.arange(4.0) + 1j
+    axes = {"func_type": 4, "data": spectrum, "abscissa_spec_data_type": 18, "ordinate_axis_units_lab": labels[0],
+            "orddenom_axis_units_lab": labels[1], "abscissa_axis_units_lab": "kHz"}  # fmt: skip
+    found = universal(tmp_path / "x.uff", axes)
+    np.testing.assert_allclose(found.values[0, 0], G / 1e3 * spectrum)
+    np.testing.assert_allclose(found.frequencies_hz, 500.0 * np.arange(4))
+    said = "node 1 direction 3: g taken as 9.80665 m/s^2", "node 2 direction 3: kN taken as 1000 N"
+    assert found.remarks == found.only(("node 1 direction 3",)).remarks == said
+
+
+@pytest.mark.parametrize(
+    ("axes", "words"),
+    [
+        ({"func_type": 2, "abscissa_spec_data_type": 18}, "no transfer function, but auto spectrum"),
+        ({"func_type": 9, "abscissa_spec_data_type": 18}, "no transfer function, but power spectral density"),
+        ({"func_type": 6, "abscissa_spec_data_type": 18}, "no transfer function, but coherence"),
+        ({"func_type": 0, "abscissa_spec_data_type": 18}, "no signal over time"),
+        ({"ordinate_axis_units_lab": "N"}, "acceleration by its type and force by its unit"),
+    ],
+)
+def test_universal_files_that_are_no_record(tmp_path, axes, words):
+    with pytest.raises(RecordFileError, match=words):
+        universal(tmp_path / "x.uff", axes)
+
+
+def test_spectra_beside_signals_are_left_out(tmp_path):
+    record = universal(tmp_path / "x.uff", {"func_type": 6, "abscissa_spec_data_type": 18}, {})
+    assert record.output_names == ("node 1 direction 3",) and record.sample_time == 0.5
 
 
 def test_sound_files(tmp_path):

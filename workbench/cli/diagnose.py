@@ -24,6 +24,7 @@ def diagnose(
         list[Path] | None, typer.Option(help="With --nominal: a record that only measures the gap; repeat.")
     ] = None,
     inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="With --nominal: channels that are inputs.")] = "",
+    input_hold: options.InputHold = None,
     quantity: Annotated[
         str, typer.Option(help="With --nominal: of outputs that state none: displacement, velocity, acceleration.")
     ] = "",
@@ -66,6 +67,10 @@ def diagnose(
     check_target(json_path)
     if (case is None) == (nominal is None):
         raise ValueError("give a case folder, or --nominal and --records; not both")
+    if case is not None and input_hold is not None:
+        raise ValueError(
+            "case.toml says how inputs run between samples: set its input_hold, and leave --input-hold out"
+        )
     if nominal is not None:
         if not records:
             raise ValueError("--nominal needs at least one record to diagnose: give --records")
@@ -74,6 +79,7 @@ def diagnose(
             records,
             validate or (),
             inputs=names_in(inputs),
+            input_hold=input_hold,
             quantity=quantity,
             driving_point=names_in(driving_point),
         )

@@ -34,6 +34,7 @@ def identify(
     inputs: Annotated[
         str, typer.Option(metavar="NAME,NAME", help="Measured inputs: identify from inputs and outputs.")
     ] = "",
+    input_hold: options.InputHold = None,
     ambient: Annotated[
         bool, typer.Option("--ambient", help="Output-only: unknown broadband forces act throughout.")
     ] = False,
@@ -63,7 +64,9 @@ def identify(
     limits = Limits.of_gib(memory)
     with reporting("reading") as report:
         read = [
-            read_measured(path, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=limits)
+            read_measured(
+                path, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), input_hold=input_hold, limits=limits
+            )
             for path in records
         ]
         if outputs:

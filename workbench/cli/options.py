@@ -11,6 +11,13 @@ ESTIMATORS = ("luenberger", "kalman", "modal-filter")
 JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the results to this file as JSON.")]
 Memory = Annotated[float, typer.Option(help="Memory that reading a file may take, GiB.")]
 SampleRate = Annotated[float | None, typer.Option(help="Sampling rate, where the file has no time axis.")]
+InputHold = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ORDER",
+        help="How inputs run between samples: zero (held) or first (straight); as the file says unless given.",
+    ),
+]
 PagePath = Annotated[Path | None, typer.Option("--page", help="HTML file to write; default out/NAME.html.")]
 CasePath = Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")]
 VerdictPath = Annotated[

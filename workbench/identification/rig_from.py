@@ -19,6 +19,8 @@ from workbench.structure.domain import NamedPoints, place_array
 from workbench.structure.modes import Modes, PointShapes, SampledModes
 
 COMPLEX = 0.1  # share of a mode's residues that the nearest real mode may leave without a warning
+# of the direct term of accelerations: what modes may leave of it, and standard errors of it, that are no rigid motion
+LEFT, SURE = 0.1, 5.0
 STEP = 1e-3  # of a standard error: of the differences that its propagation takes
 
 
@@ -34,7 +36,9 @@ def rig_from(
 
     The residue of output j and input i at the pole λ is A_ji / (2 i ω_d), and A_ji = φ_j φ_i for a real mode: its
     nearest one is the largest singular value of Re A. The product is what a simulation needs. Its parts, to which
-    masses and springs answer, follow from a driving point, where φ_i = φ_j, or from modal masses.
+    masses and springs answer, follow from a driving point, where φ_i = φ_j, or from modal masses. What the modes leave
+    of the direct term of accelerations, D - Σ_r φ_j φ_i, is the motion of a body that no spring holds: a mode at 0 Hz,
+    as far as the inputs move it.
 
     Args:
         identified: of `identify_driven` or `identify_transfer`, or of `identify_ambient`, `ring_down` or `identify`,
@@ -54,7 +58,9 @@ def rig_from(
             negative mass.
 
     Warns:
-        UserWarning: modes far from real; modes that nothing scales, so that only responses to these inputs are right.
+        UserWarning: modes far from real; modes that nothing scales, so that only responses to these inputs are right;
+            several rigid modes, likewise; a direct term that is left out, as it is not of modes, or as not all outputs
+            are accelerations.
 
     Source: Ewins, Modal Testing, 2nd ed., sections 2.4 and 4.4.
     """
@@ -85,14 +91,19 @@ def rig_from(
         Sensor(c.name, c.name, quantity, noise_std=float(std))
         for c, quantity, std in zip(out, measured, np.atleast_1d(noise), strict=True)
     )
-    order = np.argsort(modes.omega, kind="stable")
+    n = modes.n_modes
+    # rigid modes stand behind the others
+    omega, zeta = (np.append(figure, np.zeros(shapes.values.shape[1] - n)) for figure in (modes.omega, modes.zeta))
+    covariance, known = np.zeros((2 * omega.size,) * 2), np.r_[:n, omega.size : omega.size + n]
+    covariance[np.ix_(known, known)] = identified.covariance
+    order = np.argsort(omega, kind="stable")
     both = np.r_[order, order + order.size]
     found = Modes(
-        omega=modes.omega[order],
-        damping=modes.zeta[order],
+        omega=omega[order],
+        damping=zeta[order],
         shapes=PointShapes(shapes.values[:, order]),
         domain=shapes.points,
-        covariance=np.asarray(identified.covariance)[np.ix_(both, both)],
+        covariance=covariance[np.ix_(both, both)],
         shape_covariance=None if shapes.covariance is None else shapes.covariance[order],
     )
     return Rig(found, actuators, sensors)
@@ -112,7 +123,8 @@ def _channels(identified: Any, name: str, given: Sequence[Channel | str] | None,
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Mass-normalised shapes (n_points, n_modes) and their covariance (n_modes, n_points, n_points), if it is known."""
+    """Mass-normalised shapes (n_points, n_modes) and their covariance (n_modes, n_points, n_points), if it is known;
+    rigid modes stand behind those identified."""
 
     values: np.ndarray
     points: NamedPoints
@@ -156,8 +168,53 @@ def _of_residues(
     rows = {channel.name: (channel, i) for i, channel in enumerate((*into, *out), start=-len(into))}
     kept = [i % (len(out) + len(into)) for _, i in rows.values()]
     spread = _spread(identified, lambda residues: _scaled(residues.real, pair, masses)[:, kept])
-    values = np.hstack([at_out, at_in])[:, kept].T
-    return _Shapes(values, _points([channel for channel, _ in rows.values()]), spread)
+    values = np.hstack([at_out, at_in])[:, kept]
+    if isinstance(identified, Driven):
+        shape, error = _rigid(identified, out, pair, at_out.T @ at_in)
+        values = np.vstack([values, shape[:, kept]])
+        spread = np.concatenate([spread, [np.diag(row[kept] ** 2) for row in error]]) if len(error) else spread
+    return _Shapes(values.T, _points([channel for channel, _ in rows.values()]), spread)
+
+
+def _rigid(
+    identified: Driven, out: tuple[Channel, ...], pair: tuple[int, int] | None, elastic: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes of rigid modes, as far as the inputs move them, and standard errors, (n_rigid, n_outputs + n_inputs) each.
+
+    Args:
+        identified: the modes and the direct term.
+        out: of the rig.
+        pair: indices of an output and the input at its place.
+        elastic: (n_outputs, n_inputs) direct term of the accelerations of the other modes.
+    """
+    m, q = elastic.shape
+    none = np.zeros((0, m + q))
+    falls = np.array([channel.quantity == "acceleration" for channel in out])
+    direct, error = identified.feedthrough[falls], identified.feedthrough_std[falls]
+    left, least = direct - elastic[falls], max(LEFT * np.linalg.norm(direct), SURE * np.linalg.norm(error))
+    if not direct.any() or np.linalg.norm(left) <= least:
+        return none, none
+    if not falls.all() or (pair is not None and left[pair] <= 0):
+        share = 100.0 * np.linalg.norm(left) / np.linalg.norm(direct)
+        why = "is not that of modes" if falls.all() else "may be rigid motion, which outputs of other kinds do not show"
+        warnings.warn(
+            f"{share:.0f} % of the direct term of accelerations {why}, and is left out of the rig; simulate by"
+            " response() of what was identified, or identify from accelerations alone",
+            stacklevel=5,
+        )
+        return none, none
+    u, sizes, v = np.linalg.svd(left, full_matrices=False)
+    count = next(k for k in range(1, sizes.size + 1) if np.linalg.norm(sizes[k:]) <= least)
+    if count > 1:
+        warnings.warn(
+            f"accelerations show {count} rigid modes: responses to these inputs are right, those to masses, springs or"
+            " forces elsewhere are not; for these take the rigid modes from the body's mass and inertia",
+            stacklevel=5,
+        )
+    shape = _scaled(np.einsum("jk,k,ki->kji", u, sizes, v)[:count], pair, None)
+    rms = np.sqrt((error**2).mean(axis=1)), np.sqrt((error**2).mean(axis=0))
+    norms = (np.linalg.norm(part, axis=1, keepdims=True) for part in (shape[:, m:], shape[:, :m]))
+    return shape, np.hstack([own / norm for own, norm in zip(rms, norms)])
 
 
 def _residues(modes: SampledModes, shapes: np.ndarray, participation: np.ndarray) -> np.ndarray:

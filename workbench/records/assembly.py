@@ -60,11 +60,13 @@ class Description:
         channels: by signal: kind, name, quantity, unit, at, noise_std, as far as given.
         name: of the record; None where only channels are described.
         sampling: (start, step), s; None where there are times alone.
+        input_hold: "zero" or "first".
     """
 
     channels: Mapping[str, Mapping[str, Any]]
     name: str | None = None
     sampling: tuple[float, float] | None = None
+    input_hold: str = "zero"
 
 
 def record_of(
@@ -118,7 +120,7 @@ def record_of(
     written: dict[tuple[str, Unit], list[str]] = {}
     for key, unit in units.items():
         written.setdefault((split_unit(_name(key))[1], unit), []).append(names[key])
-    remarks = [_unit_remark(", ".join(alike), text, unit) for (text, unit), alike in written.items()]
+    remarks = [unit_remark(", ".join(alike), text, unit) for (text, unit), alike in written.items()]
     try:
         return Record(
             sample_time=sampling.step,
@@ -126,6 +128,7 @@ def record_of(
             output_channels=channels["output"],
             inputs=rows["input"],
             input_channels=channels["input"],
+            input_hold=described.input_hold,
             start_time=sampling.start,
             name=described.name or path.stem,
             remarks=(*filter(None, remarks), *sampling.remarks),
@@ -140,7 +143,9 @@ def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> 
         channels = {f"{c['kind']}:{c['name']}": c for c in table["channels"]}
         if "sample_time" not in table and KEY not in table:
             return Description(channels)
-        described = Description(channels, str(table["name"]), (float(table["start_time"]), float(table["sample_time"])))
+        sampling = (float(table["start_time"]), float(table["sample_time"]))
+        # files from before a description had a hold were all read as held
+        described = Description(channels, str(table["name"]), sampling, table.get("input_hold", "zero"))
         whole = table[KEY] == checksum(table, [signals[key] for key in channels]) and len(signals) == len(channels)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise RecordFileError(f"{path}: its description of the channels is damaged: {error}") from error
@@ -205,7 +210,8 @@ def _units(keys: Iterable[str]) -> dict[str, Unit]:
     return {key: unit for key, unit in found.items() if unit is not None and unit.quantity != "time"}
 
 
-def _unit_remark(name: str, written: str, unit: Unit) -> str:
+def unit_remark(name: str, written: str, unit: Unit) -> str:
+    """What to say of a signal that was brought to SI; nothing where it was in it."""
     if unit.si == "counts":
         return f"{name}: in counts of unstated sensitivity; modes have no scale"
     return "" if unit.factor == 1.0 else f"{name}: {written} taken as {unit.factor:g} {unit.si}"

@@ -19,13 +19,23 @@ import numpy as np
 
 from workbench.records.limits import DEFAULT, Deadline, Limits, RecordFileError, check_counts
 from workbench.records.named_arrays import Signals
-from workbench.records.table_layout import LONGEST_LINE, MARK, Layout, check_length, check_row, encoding_of, layout_of
-from workbench.records.units import split_unit, time_factor
+from workbench.records.table_layout import (
+    LONGEST_LINE,
+    MARK,
+    Layout,
+    check_length,
+    check_row,
+    decided,
+    encoding_of,
+    layout_of,
+)
+from workbench.records.units import split_unit, time_base, time_factor
 
 BLOCK = 2**21  # characters
 # a run of lines is one match without backtracking, so that 300 MB of them take seconds
 BLANK_LINES = re.compile(r"\n[ \t\n]+(?<=\n)")
 COMMENT_LINES = re.compile(r"^(?:#.*+\n?+)++", re.MULTILINE)
+SAME = 1e-9  # of the record's length: what two columns of the same instants differ by
 COUNTERS = ("sample", "samples", "index", "n", "no", "no.", "nr", "nr.", "#", "scan", "point", "row")  # before the time
 DATES = ("%d.%m.%Y", "%Y/%m/%d")  # beside ISO's, which numpy reads
 
@@ -39,16 +49,19 @@ def read(path: Path, limits: Limits = DEFAULT) -> Signals:
     with path.open(encoding=encoding_of(path), newline=None) as file:
         layout = layout_of(path, file)
         blocks = [*_blocks(path, file, layout, limits)] if layout.first is not None else []
-    n_columns = len(layout.names) + (layout.n_stamps > 0)
+    n_columns = len(layout.names) + layout.stamped
     columns = [np.concatenate([block[:, i] for block in blocks]) if blocks else np.empty(0) for i in range(n_columns)]
     del blocks
     names = [
         f"{name} [{unit}]" if unit and not split_unit(name)[1] else name
         for name, unit in zip_longest(layout.names, layout.units)
     ]
-    signals = dict(zip(names, columns[layout.n_stamps > 0 :]))
-    if layout.n_stamps:
+    signals = dict(zip(names, columns[layout.stamped :]))
+    if layout.stamped:
         return columns[0], signals, layout.header
+    if layout.sampling is not None:
+        start, step = layout.sampling
+        return start + step * np.arange(columns[0].size), signals, layout.header
     first, *others = signals
     if first.lower() in COUNTERS and others and time_factor(others[0]) is not None:
         first = others[0]
@@ -56,7 +69,15 @@ def read(path: Path, limits: Limits = DEFAULT) -> Signals:
     if factor is None:
         return None, signals, layout.header
     time = signals.pop(first)
-    return (time if factor == 1.0 else factor * time), signals, layout.header
+    time = time if factor == 1.0 else factor * time
+    for name in [name for name in signals if time_base(name) == time_base(first)]:
+        # a time beside each channel, as some programs write it, is all right where all are one
+        if not np.allclose((time_factor(name) or 1.0) * signals.pop(name), time, rtol=1e-9, atol=SAME * np.ptp(time)):
+            raise RecordFileError(
+                f"{path}: channels have instants of their own, {first!r} and {name!r} differ; export them at one rate"
+                " and start"
+            )
+    return time, signals, layout.header
 
 
 def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
@@ -74,7 +95,7 @@ def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> 
     deadline, clock = Deadline(path, limits), _Clock(path)
     number, rest = layout.first[0], layout.first[1] + "\n"
     size = path.stat().st_size
-    n_numbers, n_columns = 0, len(layout.names) + (layout.n_stamps > 0)
+    n_numbers, n_columns = 0, len(layout.names) + layout.stamped
     while True:
         text = file.read(BLOCK)
         block = rest + text
@@ -86,6 +107,7 @@ def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> 
         share = min(os.lseek(file.fileno(), 0, os.SEEK_CUR) / size, 1.0)
         check_counts(path, n_columns, n_numbers, limits, share)
         if lines:
+            layout = decided(path, layout, block, lines)
             yield _numbers(path, layout, number, block, lines, clock)
         if not text:
             return
@@ -107,24 +129,23 @@ def _lines(path: Path, block: str) -> list[str]:
 def _numbers(path: Path, layout: Layout, number: int, block: str, lines: list[str], clock: "_Clock") -> np.ndarray:
     delimiter = None if layout.delimiter == " " else layout.delimiter
     tails = lines
-    if layout.n_stamps:
-        split = [line.split(delimiter, layout.n_stamps) for line in lines]
+    if layout.n_front:
+        split = [line.split(delimiter, layout.n_front) for line in lines]
         tails = [parts[-1] for parts in split]
     if layout.trailing:
         tails = [line.rstrip(" ").removesuffix(layout.delimiter) for line in tails]
-    if layout.decimal_comma:
-        tails = [line.replace(",", ".") for line in tails]
+    commas = [line.replace(",", ".") for line in tails] if layout.decimal_comma else tails
     try:
-        if any(map(LONGEST_LINE.__le__, map(len, lines))):
+        if any(map(LONGEST_LINE.__le__, map(len, lines))) or (layout.decimal_comma and any("." in t for t in tails)):
             raise ValueError
-        numbers = np.loadtxt(tails, delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
+        numbers = np.loadtxt(commas, delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
         if numbers.shape != (len(lines), len(layout.names)):
             raise ValueError
     except ValueError:  # which row and field is at fault is found line by line
         numbers = np.array([*_row_by_row(path, layout, number, block)])
-    if not layout.n_stamps:
+    if not layout.stamped:
         return numbers
-    times = clock.seconds([" ".join(parts[: layout.n_stamps]) for parts in split])
+    times = clock.seconds([" ".join(parts[: layout.n_front]) for parts in split])
     return np.column_stack([times, numbers])
 
 

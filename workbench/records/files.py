@@ -1,11 +1,13 @@
 """Records on disk: text tables, NPZ, MAT, HDF5, UFF 58, TDMS and WAV, through one door each way.
 
-What a format has no room for (places, noise, which signals are inputs) travels as a JSON text: in a comment of a CSV,
-an entry of an NPZ or MAT, an attribute of HDF5, the description lines of a UFF. A checksum in it detects a file
-that was changed since. Files of other programs have none of it: their signals are all outputs, by the file's names.
+What a format has no room for (places, noise, which signals are inputs, their hold) travels as a JSON text: in a
+comment of a CSV, an entry of an NPZ or MAT, an attribute of HDF5, the description lines of a UFF. A checksum in it
+detects a file that was changed since. Files of other programs have none of it: their signals are all outputs, by the
+file's names.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -37,23 +39,31 @@ READ_ONLY = (".tdms", ".wav")
 
 
 def read_record(
-    path: str | Path, *, sample_rate_hz: float | None = None, inputs: tuple[str, ...] = (), limits: Limits = DEFAULT
+    path: str | Path,
+    *,
+    sample_rate_hz: float | None = None,
+    inputs: tuple[str, ...] = (),
+    input_hold: str | None = None,
+    limits: Limits = DEFAULT,
 ) -> Record:
     """A record from a file; the format goes by its ending.
 
-    Units behind the names, `Acc [g]`, become SI, and unequal time steps equal ones: `Record.remarks` says so.
+    Units that the file states, behind the names as in `Acc [g]` or beside the data, become SI, and unequal time steps
+    equal ones: `Record.remarks` says so.
 
     Args:
         path: of a .csv, .txt, .asc, .dat, .tsv, .npz, .mat, .h5, .hdf5, .uff, .unv, .tdms or .wav file.
         sample_rate_hz: where the file itself has no time.
         inputs: names of the signals that went in, where the file does not say.
+        input_hold: "zero" or "first", how inputs run between samples; as the file says unless given, "zero" where it
+            does not, as those of other programs never do.
         limits: of memory and processor time.
 
     Raises:
         RecordFileError: naming file, channel and row, and what would be right; transfer functions; more than the
             limits allow.
     """
-    found = read_measured(path, sample_rate_hz=sample_rate_hz, inputs=inputs, limits=limits)
+    found = read_measured(path, sample_rate_hz=sample_rate_hz, inputs=inputs, input_hold=input_hold, limits=limits)
     if isinstance(found, TransferFunctions):
         raise RecordFileError(
             f"{path} is complex: it holds transfer functions, no record. Their modes are found by `workbench identify`,"
@@ -63,7 +73,12 @@ def read_record(
 
 
 def read_measured(
-    path: str | Path, *, sample_rate_hz: float | None = None, inputs: tuple[str, ...] = (), limits: Limits = DEFAULT
+    path: str | Path,
+    *,
+    sample_rate_hz: float | None = None,
+    inputs: tuple[str, ...] = (),
+    input_hold: str | None = None,
+    limits: Limits = DEFAULT,
 ) -> Record | TransferFunctions:
     """What a file holds: a record, or transfer functions where it is complex.
 
@@ -73,7 +88,7 @@ def read_measured(
     `NAME magnitude`, `NAME phase [deg]`.
 
     Args:
-        path, inputs, limits: as `read_record`.
+        path, inputs, input_hold, limits: as `read_record`.
         sample_rate_hz: where the file itself has no time, or no lines: they then go from zero to half of it.
 
     Raises:
@@ -85,21 +100,25 @@ def read_measured(
     with reading(path):
         if module is csv_file:
             time, signals, header = csv_file.read(path, limits)
-            arrays = complex_columns(path, signals)
+            # beside sample instants, a column called F is a force
+            arrays = complex_columns(path, signals) if time is None else {}
         else:
             arrays = module.arrays(path, limits)
             if not holds_transfer(arrays):
                 time, signals, header = signals_of(path, arrays)
                 arrays = {}
     if holds_transfer(arrays):
-        if inputs:
-            raise RecordFileError(f"{path} holds transfer functions, which name no inputs; leave them out")
+        if inputs or input_hold is not None:
+            raise RecordFileError(
+                f"{path} holds transfer functions, which name no inputs; leave them and their hold out"
+            )
         return transfer_of(path, arrays, sample_rate_hz=sample_rate_hz)
-    return record_of(path, time, signals, header, sample_rate_hz=sample_rate_hz, inputs=inputs)
+    record = record_of(path, time, signals, header, sample_rate_hz=sample_rate_hz, inputs=inputs)
+    return record if input_hold is None else replace(record, input_hold=input_hold)
 
 
 def write_record(record: Record, path: str | Path) -> Path:
-    """Write a record; the format goes by the file's ending. Reading it back gives the same record.
+    """Write a record; the format goes by the file's ending. Reading it back gives the same record, without remarks.
 
     UFF 58 stores single channels with their own headers; the others hold all signals side by side.
 
@@ -116,6 +135,7 @@ def write_record(record: Record, path: str | Path) -> Path:
         "name": record.name,
         "sample_time": record.sample_time,
         "start_time": record.start_time,
+        "input_hold": record.input_hold,
         "channels": [
             {"kind": kind, "name": c.name, "quantity": c.quantity, "unit": c.unit, "at": c.at, "noise_std": c.noise_std}
             for kind, c, _ in _rows(record)

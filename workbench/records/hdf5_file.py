@@ -13,6 +13,10 @@ import numpy as np
 from workbench.records.confined import load_confined
 from workbench.records.limits import BYTES_PER_NUMBER, Limits, RecordFileError, check_counts
 from workbench.records.named_arrays import HEADER, numbered
+from workbench.records.transfer_functions import PLACES
+from workbench.records.units import unit_named
+
+UNIT = ("unit", "units")  # attributes
 
 arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
@@ -29,12 +33,26 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
                 raise RecordFileError(
                     f"{path}, dataset {name!r} keeps its values in another file; write them into this"
                 )
-        arrays = {
-            name: np.array(dataset.asstr(errors="replace")[()], str) if _is_text(dataset) else np.asarray(dataset[()])
-            for name, dataset in found.items()
-        }
+        arrays = dict(_in_units(name, dataset) for name, dataset in found.items())
         header = file.attrs.get(HEADER)
     return arrays if header is None else arrays | {HEADER: np.array(str(header))}
+
+
+def _in_units(name: str, dataset: Any) -> tuple[str, np.ndarray]:
+    """Name and values of a dataset; a unit among its attributes stands behind the name, but that of what is no signal,
+    or of its instants, is applied."""
+    if _is_text(dataset):
+        return name, np.array(dataset.asstr(errors="replace")[()], str)
+    values = np.asarray(dataset[()])
+    text = next((dataset.attrs[key] for key in dataset.attrs if key.lower() in UNIT), "")
+    text = text.decode(errors="replace") if isinstance(text, bytes) else text
+    text = text.partition(" since ")[0].strip() if isinstance(text, str) else ""  # of dates, as netCDF has them
+    unit = unit_named(text)
+    if not text or values.dtype.kind == "c" or (values.size == 1 and unit is None):
+        return name, values
+    if unit is not None and (values.size == 1 or unit.quantity in ("time", "frequency") or name.lower() in PLACES):
+        return name, unit.factor * values
+    return f"{name} [{text}]", values
 
 
 def is_hdf5(path: Path) -> bool:

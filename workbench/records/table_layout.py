@@ -1,21 +1,22 @@
 """How a text table is laid out: what stands before its numbers, and how these are separated.
 
 Instruments write comments, headers of several lines, a line of units; tabs, semicolons, commas or spaces between the
-fields; a decimal comma; a date and a time of day in place of seconds. All of it shows in the lines down to the first
-that holds numbers only.
+fields; a date and a time of day in place of seconds. All of it shows in the lines down to the first that holds numbers
+only, but for the decimal mark: whole numbers have none, so that it is the first row with one that decides.
 """
 
 import csv
 import re
 from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE, getincrementaldecoder
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import TextIOBase
 from pathlib import Path
 
 from workbench.records.assembly import KEY
+from workbench.records.labview import WITHOUT_X, labview_header
 from workbench.records.limits import RecordFileError
-from workbench.records.units import unit_named
+from workbench.records.units import split_unit, time_factor, unit_named
 
 MARK = "# record "
 LONGEST_LINE = 1_000_000  # characters
@@ -27,6 +28,13 @@ OURS = (f'"{KEY}":', '"channels":', '"kind":', '"noise_std":')
 DATE = re.compile(r"\d{4}-\d\d-\d\d|\d{4}/\d\d/\d\d|\d{1,2}\.\d{1,2}\.\d{4}")
 CLOCK = re.compile(r"\d{1,2}:\d\d:\d\d(?:[.,]\d+)?")
 STAMP = re.compile(rf"(?:{DATE.pattern})[T ]+(?:{CLOCK.pattern})Z?")
+MOMENT = re.compile(rf"{STAMP.pattern}|{DATE.pattern}|{CLOCK.pattern}")
+SMALL = re.compile(r" *[-+]?[1-9]\d{0,2} *")  # a whole number that needs no thousands separator
+THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(?:(?:,\d{3})+(?:\.\d*)?|(?:\.\d{3})+(?:,\d*)?)")
+ONE_MARK = "write numbers with one decimal mark and without thousands separators"
+MARKS = re.compile("[.,]")
+COMMENTS = re.compile(r'[\t;,] *"?comment"?\s*', re.IGNORECASE)  # the end of a line of names, as LabVIEW's
+NO_UNIT = ("", "-", "–")
 
 
 @dataclass(frozen=True)
@@ -34,28 +42,35 @@ class Layout:
     """How the rows of a table are to be read.
 
     Attributes:
-        names: one a column, without the columns of time stamps.
-        units: one a column, as written; none where no line of units stands below the names.
+        names: one a column, without those at the front.
+        units: one a column, as written; empty where none are.
         delimiter: between fields; a blank for any run of white space.
-        decimal_comma: whether numbers have a comma for a point.
-        n_stamps: columns at the front that hold a date, a time of day, or both in one.
+        n_front: columns at the front that are no numbers.
+        stamped: whether they hold a date, a time of day, or both in one; LabVIEW's of no instants are empty.
         trailing: whether each row ends in a delimiter.
+        comments: whether texts may stand behind the numbers.
         header: the description that this program wrote, as a JSON text.
         first: the first row of numbers, and which row of the file it is; None where there is none.
+        sampling: (start, step), s, where the lines above say so.
+        decimal_comma: whether numbers have a comma for a point; None as long as none has either.
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     delimiter: str
-    decimal_comma: bool
-    n_stamps: int
-    trailing: bool
-    header: str | None
-    first: tuple[int, str] | None
+    n_front: int = 0
+    stamped: bool = False
+    trailing: bool = False
+    comments: bool = False
+    header: str | None = None
+    first: tuple[int, str] | None = None
+    sampling: tuple[float, float] | None = None
+    decimal_comma: bool | None = None
 
     def fields(self, line: str) -> list[str]:
-        """The fields of a row, without its time stamps."""
-        return _fields(line, self.delimiter, self.trailing)[self.n_stamps :]
+        """The fields of a row that are to be numbers."""
+        fields = _fields(line, self.delimiter, self.trailing)[self.n_front :]
+        return fields[: len(self.names)] if self.comments else fields
 
     def number(self, text: str) -> float:
         """The number in a field.
@@ -64,6 +79,31 @@ class Layout:
             ValueError: no number.
         """
         return _number(text, self.decimal_comma)
+
+
+def decided(path: Path, layout: Layout, block: str, lines: Sequence[str]) -> Layout:
+    """The layout with the decimal mark of the first of these rows that has one; as it was where none has.
+
+    Raises:
+        RecordFileError: marks that may as well separate thousands, as in a column of 999 and 1,500.
+    """
+    signs = '."' if layout.delimiter == "," else ".,"  # whole numbers alone are seen without a look at each field
+    if layout.decimal_comma is not None or not any(sign in block for sign in signs):
+        return layout
+    fields = (field.strip() for line in lines for field in layout.fields(line))
+    mark = next((found[0] for found in map(MARKS.search, fields) if found), None)
+    if mark is None:
+        return layout
+    fields = (field.strip() for line in lines for field in layout.fields(line))
+    if all(map(THOUSANDS.fullmatch, (field for field in fields if mark in field))):
+        for name, column in zip(layout.names, zip(*map(layout.fields, lines))):
+            marked = [field for field in column if mark in field]
+            if marked and any(map(SMALL.fullmatch, column)):
+                raise RecordFileError(
+                    f"{path}, channel {name!r}: {marked[0]!r} stands beside numbers without {mark!r}: does it separate"
+                    f" thousands? {ONE_MARK[0].upper()}{ONE_MARK[1:]}, decimals in every row"
+                )
+    return replace(layout, decimal_comma=mark == ",")
 
 
 def encoding_of(path: Path) -> str:
@@ -87,6 +127,7 @@ def layout_of(path: Path, file: TextIOBase) -> Layout:
     """
     lines: list[tuple[int, str]] = []  # of text, with their rows
     header, comment, characters = None, "", 0
+    without_x = comments = False
     for number in range(1, LONGEST_HEADER[0] + 1):
         line = file.readline(LONGEST_LINE)
         characters += len(line)
@@ -101,9 +142,14 @@ def layout_of(path: Path, file: TextIOBase) -> Layout:
         elif line.startswith("#"):
             comment = line.lstrip("# ")
         elif line.strip():
-            found = _row_of_numbers(line)
+            found = _row_of_numbers(path, number, line, without_x)
+            if found is None and comments:
+                found = _row_of_numbers(path, number, _without_last(line), without_x)
             if found is not None:
-                return _with_names(path, lines, comment, header, (number, line), *found)
+                found = replace(found, header=header, first=(number, line), comments=comments)
+                return _with_names(path, lines, comment, found)
+            without_x = without_x or WITHOUT_X.fullmatch(line) is not None
+            comments = comments or COMMENTS.search(line) is not None
             lines.append((number, line))
     else:
         raise RecordFileError(f"{path}: no row of numbers in its first {LONGEST_HEADER[0]} rows; is it a table?")
@@ -111,7 +157,7 @@ def layout_of(path: Path, file: TextIOBase) -> Layout:
         raise RecordFileError(f"{path} holds no rows")
     number, line = lines[0]
     delimiter = next((d for d in DELIMITERS if d in line), ",")
-    layout = Layout(_names(path, _fields(line, delimiter, False)), (), delimiter, False, 0, False, header, None)
+    layout = Layout(_names(path, _fields(line, delimiter, False)), (), delimiter, header=header)
     for number, line in lines[1:]:
         check_row(path, layout, number, line)
     return layout
@@ -142,62 +188,103 @@ def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]
             numbers.append(layout.number(field))
         except ValueError:
             text = field if len(field) < 40 else f"{field[:40]}..."
-            raise RecordFileError(f"{path}, channel {name!r}, row {number}: {text!r} is not a number") from None
+            marked = _is_number(field, None) or THOUSANDS.fullmatch(field.strip())
+            hint = f" with the decimal mark of this table; {ONE_MARK}" if marked else ""
+            raise RecordFileError(f"{path}, channel {name!r}, row {number}: {text!r} is not a number{hint}") from None
     return numbers
 
 
-def _with_names(
-    path: Path,
-    lines: Sequence[tuple[int, str]],
-    comment: str,
-    header: str | None,
-    first: tuple[int, str],
-    delimiter: str,
-    decimal_comma: bool,
-    n_stamps: int,
-    trailing: bool,
-) -> Layout:
-    """The layout whose names stand in the last line of as many fields as the first row of numbers has."""
-    fields = _fields(first[1], delimiter, trailing)
-    rows = [(number, line, _fields(line, delimiter, trailing)) for number, line in lines]
-    rows = [row for row in rows if len(row[2]) == len(fields)]
-    titles = [row for row in rows if not any(_is_number(field, decimal_comma) for field in row[2])]
-    if not titles and lines:  # of LabVIEW: a column of comments, which rows without any leave out
-        *names, last = _fields(lines[-1][1], delimiter, trailing)
-        if len(names) == len(fields) and last.strip().lower() == "comment":
-            titles = [(*lines[-1], names)]
-    units: tuple[str, ...] = ()
-    if len(titles) > 1 and any(unit_named(field.strip(" []()")) for field in titles[-1][2]):
-        if _are_units(titles[-1][2]):
-            units = tuple(field.strip(" []()") for field in titles[-1][2][n_stamps:])
-        titles = titles[:-1]
-    names = (
-        _distinct_names([row[2] for row in titles]) if titles else _fields(comment, delimiter, trailing)
-    )  # as numpy's savetxt: behind a comment
-    if not titles and len(names) != len(fields):
-        if lines:
-            names = _fields(lines[0][1], delimiter, False)
-            layout = Layout(_names(path, names), (), delimiter, decimal_comma, 0, trailing, header, first)
-            for number, line in (*lines[1:], first):
-                check_row(path, layout, number, line)
-        raise RecordFileError(f"{path}, row {first[0]}: a header line of names is needed before the numbers")
-    layout = Layout(_names(path, names[n_stamps:]), units, delimiter, decimal_comma, n_stamps, trailing, header, first)
-    for number, line, _ in rows:
-        if titles and number > titles[-1][0] and not units:
-            check_row(path, layout, number, line)
+def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, found: Layout) -> Layout:
+    """The layout whose names stand in a line of as many fields as the first row of numbers has."""
+    assert found.first is not None
+    first, width = found.first[0], len(found.names)
+    rows = []
+    for number, line in lines:
+        fields = _fields(line, found.delimiter, found.trailing)
+        if found.comments and fields and fields[-1].strip().lower() == "comment":
+            fields = fields[:-1]
+        if len(fields) == found.n_front + width:
+            rows.append((number, line, [field.strip() for field in fields[found.n_front :]]))
+    titles = [row for row in rows if not any(_is_number(f, None) or MOMENT.fullmatch(f) for f in row[2])]
+    labview = labview_header(path, [_fields(line, found.delimiter, False) for _, line in lines])
+    if not titles:  # as numpy's savetxt: behind a comment
+        names = _fields(comment, found.delimiter, found.trailing)[found.n_front :]
+        if len(names) != width:
+            above = f"; the line above has {len(_fields(lines[-1][1], found.delimiter, False))}" if lines else ""
+            raise RecordFileError(
+                f"{path}, row {first} has {found.n_front + width} fields{above}: a header line of as many names is"
+                " needed before the numbers"
+            )
+        return replace(found, names=_names(path, names))
+    at, units = _names_and_units([fields for _, _, fields in titles])
+    names = _distinct_names([fields for i, (_, _, fields) in enumerate(titles[: at + 1]) if i != units])
+    layout = replace(
+        found,
+        names=_names(path, names),
+        units=tuple(map(_bare, titles[units][2])) if units is not None else labview.of_columns(names),
+        sampling=labview.sampling,
+    )
+    for row in rows:
+        if row[0] > titles[at][0] and row not in titles:
+            check_row(path, layout, *row[:2])
+    if units is None:
+        for number, _, fields in titles[at + 1 :]:
+            for name, text in zip(names, fields):
+                if unit_named(_bare(text)) is not None or (time_factor(name) is not None and text not in NO_UNIT):
+                    raise RecordFileError(
+                        f"{path}, row {number}: {text[:40]!r} below {name!r} is neither a number nor one of a line of"
+                        " known units; write units in brackets behind the names"
+                    )
     return layout
 
 
+def _names_and_units(titles: Sequence[list[str]]) -> tuple[int, int | None]:
+    """Which line of text is that of names, and which, if any, that of units: names are those with one of a time."""
+    timed = [{j for j, field in enumerate(fields) if time_factor(field) is not None} for fields in titles]
+    units = None
+    for i in reversed(range(len(titles))):
+        if len(titles) > 1 and _are_units(titles[i], set().union(*timed[:i], *timed[i + 1 :])):
+            units = i
+            break
+    others = [i for i in range(len(titles)) if i != units]
+    nearest = others[-1] if units in (None, 0) else units - 1
+    return next((i for i in reversed(others) if timed[i]), nearest), units
+
+
+def _are_units(fields: Sequence[str], timed: set[int]) -> bool:
+    """Whether fields are units: a time's is one of time; else all are known, in brackets, or empty, or more than half
+    are known."""
+    stated = {j: text for j, text in enumerate(fields) if text not in NO_UNIT}
+    known = {j: unit for j, text in stated.items() if (unit := unit_named(_bare(text))) is not None}
+    times = [j in known and known[j].quantity == "time" for j in timed & stated.keys()]
+    if times or not known:
+        return bool(known) and all(times)
+    return 2 * len(known) > len(stated) or all(j in known or text[0] in "[(" for j, text in stated.items())
+
+
+def _bare(unit: str) -> str:
+    return "" if unit in NO_UNIT else unit.strip(" []()")
+
+
 def _distinct_names(titles: Sequence[list[str]]) -> list[str]:
-    """The names of the last line of titles; where some are alike, behind what stands above them."""
-    names = [name.strip() for name in titles[-1]]
+    """The names of the last line of titles; where some are alike, behind what stands above them, a time numbered."""
+    names, times = list(titles[-1]), 0
+    for j, name in enumerate(names):
+        if time_factor(name) is not None and name in names[:j]:
+            times += 1
+            base, unit = split_unit(name)
+            names[j] = f"{base} {times + 1}" + (f" [{unit}]" if unit else "")
     for above in reversed(titles[:-1]):
-        names = [f"{more.strip()} {name}" if names.count(name) > 1 else name for more, name in zip(above, names)]
+        names = [f"{more} {name}" if names.count(name) > 1 else name for more, name in zip(above, names)]
     return names
 
 
-def _row_of_numbers(line: str) -> tuple[str, bool, int, bool] | None:
-    """Delimiter, decimal comma, columns of time stamps, trailing delimiter: where all else is numbers; else None."""
+def _row_of_numbers(path: Path, number: int, line: str, without_x: bool) -> Layout | None:
+    """How a row is laid out where all is numbers, or behind time stamps or LabVIEW's empty column; else None.
+
+    Raises:
+        RecordFileError: numbers with decimal points and others with decimal commas, or with thousands separators.
+    """
     for delimiter in DELIMITERS:
         if delimiter not in line and delimiter != ",":
             continue
@@ -209,11 +296,19 @@ def _row_of_numbers(line: str) -> tuple[str, bool, int, bool] | None:
         if trailing and len(fields) == 1:
             continue
         n_stamps = _n_stamps(fields)
-        numbers = fields[n_stamps:]
-        for decimal_comma in (False, True) if delimiter != "," or '"' in line else (False,):
-            if numbers and all(_is_number(field, decimal_comma) for field in numbers):
-                return delimiter, decimal_comma, n_stamps, trailing
+        n_front = int(not fields[0].strip()) if without_x else n_stamps
+        numbers = fields[n_front:]
+        if numbers and any(all(_is_number(field, comma) for field in numbers) for comma in (False, True)):
+            return Layout(("",) * len(numbers), (), delimiter, n_front, n_stamps > 0, trailing)
+        if len(numbers) > 1 and all(_is_number(f, None) or THOUSANDS.fullmatch(f.strip()) for f in numbers):
+            shown = ", ".join(repr(field) for field in numbers[:10])
+            raise RecordFileError(f"{path}, row {number} has points and commas in its numbers, {shown}; {ONE_MARK}")
     return None
+
+
+def _without_last(line: str) -> str:
+    """A row without its last field."""
+    return line.rpartition(next((d for d in DELIMITERS if d in line), ","))[0]
 
 
 def _n_stamps(fields: Sequence[str]) -> int:
@@ -221,12 +316,6 @@ def _n_stamps(fields: Sequence[str]) -> int:
     if STAMP.fullmatch(first) or CLOCK.fullmatch(first):
         return 1
     return 2 if DATE.fullmatch(first) and CLOCK.fullmatch(second) else 0
-
-
-def _are_units(fields: Sequence[str]) -> bool:
-    """Whether all fields are units, known or in brackets, or empty."""
-    texts = [field.strip() for field in fields]
-    return all(text in ("", "-", "–") or text[0] in "[(" or unit_named(text) is not None for text in texts)
 
 
 def _fields(line: str, delimiter: str, trailing: bool) -> list[str]:
@@ -246,13 +335,15 @@ def _names(path: Path, fields: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def _number(text: str, decimal_comma: bool) -> float:
-    if "_" in text:  # Python's, and nobody else's
+def _number(text: str, decimal_comma: bool | None) -> float:
+    """With a decimal point, a decimal comma, or, where it is not known, either."""
+    # an underscore is Python's, and nobody else's; a second mark would separate thousands
+    if "_" in text or (decimal_comma is not False and "." in text and (decimal_comma or "," in text)):
         raise ValueError
-    return float(text.replace(",", ".") if decimal_comma else text)
+    return float(text if decimal_comma is False else text.replace(",", "."))
 
 
-def _is_number(text: str, decimal_comma: bool) -> bool:
+def _is_number(text: str, decimal_comma: bool | None) -> bool:
     try:
         _number(text, decimal_comma)
     except ValueError:

@@ -9,6 +9,7 @@ import numpy as np
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError, check_counts
 
+TOGETHER = 0.01  # of a step: what starts of channels sampled together may differ by
 arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
 
@@ -28,14 +29,25 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         twice = Counter(channel.name for channel in channels)
         found: dict[str, np.ndarray] = {}
         sampling: set[tuple[float, float]] = set()
+        starts: dict[str, np.datetime64] = {}
         for channel in channels:
             name = channel.name if twice[channel.name] == 1 else f"{channel.group_name}/{channel.name}"
             unit = str(channel.properties.get("unit_string", "")).strip()
             found[f"{name} [{unit}]" if unit else name] = channel[:]
             step = float(channel.properties.get("wf_increment", 0.0))
-            sampling |= {(float(channel.properties.get("wf_start_offset", 0.0)), step)} if step > 0 else set()
+            if step > 0:
+                sampling.add((float(channel.properties.get("wf_start_offset", 0.0)), step))
+                if "wf_start_time" in channel.properties:
+                    starts[name] = np.datetime64(channel.properties["wf_start_time"])
     if len(sampling) > 1:
         raise RecordFileError(f"{path}: its channels have {len(sampling)} different sample instants; export one rate")
+    if starts:
+        first, last = min(starts, key=starts.__getitem__), max(starts, key=starts.__getitem__)
+        apart = (starts[last] - starts[first]) / np.timedelta64(1, "s")
+        if apart > TOGETHER * min(step for _, step in sampling):
+            raise RecordFileError(
+                f"{path}: channel {last!r} starts {apart:g} s after {first!r}; export channels that start together"
+            )
     lengths = {values.size for values in found.values()}
     if sampling and len(lengths) == 1:
         ((start, step),) = sampling

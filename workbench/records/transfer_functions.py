@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ class TransferFunctions(Printed):
         output_channels: one `Channel` an output.
         references: one name an input, whether it was struck or shaken.
         name: how messages call it.
+        remarks: what reading the file changed: units.
 
     Raises:
         ValueError: shapes that do not fit, repeated names, frequencies that do not increase.
@@ -54,6 +55,7 @@ class TransferFunctions(Printed):
     output_channels: tuple[Channel, ...]
     references: tuple[str, ...] = ("input",)
     name: str = "transfer functions"
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "values", dtype=complex)
@@ -79,7 +81,7 @@ class TransferFunctions(Printed):
         pairs = f"{counted(len(self.output_channels), 'output')} by {counted(len(self.references), 'reference')}"
         span = f"{f.min(initial=np.inf):.4g} to {f.max(initial=0.0):.4g} Hz"
         line = f"{self.name}: {pairs}, {f.size} lines, {span}"
-        return line, ("output", "quantity", "unit", "at", "peak"), rows, ()
+        return line, ("output", "quantity", "unit", "at", "peak"), rows, self.remarks
 
     @property
     def output_names(self) -> tuple[str, ...]:
@@ -96,7 +98,7 @@ class TransferFunctions(Printed):
                 raise ValueError(f"{self.name} has no output {name!r}; it has {', '.join(self.output_names)}")
         rows = [self.output_names.index(name) for name in outputs]
         channels = tuple(self.output_channels[row] for row in rows)
-        return TransferFunctions(self.values[rows], self.frequencies_hz, channels, self.references, self.name)
+        return replace(self, values=self.values[rows], output_channels=channels)
 
 
 def holds_transfer(arrays: Mapping[str, np.ndarray]) -> bool:
@@ -166,9 +168,9 @@ def transfer_of(
     if values.ndim < 3:
         values = np.array([*spectra.values()]).reshape(-1, 1, lines.size)
     points = list(spectra) if len(spectra) > 1 else [f"{name} {i + 1}" for i in range(len(values))]
-    channels, references = _points(path, arrays, points, values.shape[1])
+    channels, references, remarks = _points(path, arrays, points, values.shape[1])
     try:
-        return TransferFunctions(values, lines, channels, references, path.stem)
+        return TransferFunctions(values, lines, channels, references, path.stem, remarks)
     except ValueError as error:
         raise RecordFileError(f"{path}: {error}") from error
 
@@ -219,13 +221,15 @@ def _frequency_last(path: Path, name: str, values: np.ndarray, n_lines: int) -> 
 
 def _points(
     path: Path, arrays: Mapping[str, Any], names: list[str], n_references: int
-) -> tuple[tuple[Channel, ...], tuple[str, ...]]:
-    """Channels and references: as the file names them, else numbered."""
+) -> tuple[tuple[Channel, ...], tuple[str, ...], tuple[str, ...]]:
+    """Channels and references, as the file names them, else numbered; and what reading changed."""
     if DESCRIPTION in arrays:
         try:
             described = json.loads(str(arrays[DESCRIPTION]))
-            channels = tuple(Channel(legible(path, str(c["name"])), str(c["quantity"])) for c in described["outputs"])
-            return channels, tuple(legible(path, str(name)) for name in described["references"])
+            outputs = [[str(c[fact]) for fact in ("name", "quantity", "unit")] for c in described["outputs"]]
+            channels = tuple(Channel(legible(path, name), quantity, unit) for name, quantity, unit in outputs)
+            references, remarks = (map(str, described[key]) for key in ("references", "remarks"))
+            return channels, tuple(legible(path, name) for name in references), tuple(remarks)
         except RecordFileError:
             raise
         except (ValueError, KeyError, TypeError, RecursionError) as error:
@@ -238,7 +242,7 @@ def _points(
         raise RecordFileError(f"{path} gives places that are no numbers, {text!r} among them; give metres")
     places = [float(x) for x in at[0]] if at else [None] * len(names)
     channels = tuple(Channel(legible(path, name), at=x) for name, x in zip(names, places, strict=True))
-    return channels, tuple(f"input {i + 1}" for i in range(n_references))
+    return channels, tuple(f"input {i + 1}" for i in range(n_references)), ()
 
 
 def read_transfer(

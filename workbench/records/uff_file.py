@@ -9,16 +9,23 @@ from typing import Any
 import numpy as np
 import pyuff
 
+from workbench.records.assembly import unit_remark
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError
 from workbench.records.named_arrays import HEADER
 from workbench.records.transfer_functions import DESCRIPTION
+from workbench.records.units import BY_QUANTITY, unit_named
 
 # ordinate_spec_data_type of the format
 TYPES = {"displacement": 8, "velocity": 11, "acceleration": 12, "force": 13}
 QUANTITIES = {code: name for name, code in TYPES.items()}
 LINE = 80
 TRANSFER = 4  # func_type of the format
+FUNCTIONS = {2: "auto spectrum", 3: "cross spectrum", 5: "transmissibility", 6: "coherence",
+             9: "power spectral density", 10: "energy spectral density", 12: "spectrum"}  # fmt: skip
+OVER_TIME = (0, 1, 7, 8)  # general or unknown, time response, auto and cross correlation
+TIME = (0, 1, 17)  # abscissa_spec_data_type of the format: unknown, general, time
+ALIKE = 1e-3  # relative, of factors of units as data sets 164 round them
 MARK = b"    -1"
 BINARY = re.compile(rb"^ +58b ", re.MULTILINE)
 OURS = ('{"kind"', '"kind":', '"name":')
@@ -29,32 +36,47 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """The signals of all data sets 58, their instants and their header; to be called in a process of its own."""
     if not _whole(path.read_bytes()):
         raise RecordFileError(f"{path} is damaged: its last data set has no end")
-    sets = [s for s in data_sets(path) if s.get("type") == 58]
+    every = data_sets(path)
+    sets = [s for s in every if s.get("type") == 58]
     if not sets:
         raise RecordFileError(f"{path} holds no data set 58")
+    system = next((s for s in every if s.get("type") == 164), None)
     transfer = [s for s in sets if s["func_type"] == TRANSFER]
     if transfer:
-        return _transfer(path, transfer)
+        return _transfer(path, transfer, system)
+    over_time = [
+        (number, entry)
+        for number, entry in enumerate(sets, start=1)
+        if entry["func_type"] in OVER_TIME and entry["abscissa_spec_data_type"] in TIME
+    ]
+    if not over_time:
+        held = [
+            ("complex " if np.iscomplexobj(s["data"]) else "") + FUNCTIONS.get(s["func_type"], f"type {s['func_type']}")
+            for s in sets
+        ]
+        raise RecordFileError(
+            f"{path} holds no signal over time and no transfer function, but {', '.join(dict.fromkeys(held))}; export"
+            " time responses (function type 1) or transfer functions (4)"
+        )
     arrays: dict[str, np.ndarray] = {}
     channels, record = [], None
-    for number, entry in enumerate(sets, start=1):
+    for number, entry in over_time:
         where = f"{path}, data set {number}"
         data = np.asarray(entry["data"])
         if np.iscomplexobj(data):
             raise RecordFileError(f"{where} is complex, but not marked as a transfer function (function type 4)")
         if data.size != entry["num_pts"]:
             raise RecordFileError(f"{where} holds {data.size} samples and says {entry['num_pts']}: it is damaged")
-        facts = _facts(where, entry)
+        key, facts = _channel(where, entry, system)
         record = facts.pop("record", record)
-        key = f"{facts['kind']}:{facts['name']}"
         if key in arrays:
-            raise RecordFileError(f"{where}: a second channel is called {facts['name']!r}")
-        time = np.asarray(entry["x"], float)
+            raise RecordFileError(f"{where}: a second channel is called {key.partition(':')[2]!r}")
+        time = _abscissa(entry, "time")
         first = arrays.setdefault("t", time)
         if time.size != first.size or np.abs(time - first).max() > 1e-6 * max(np.abs(first).max(), 1e-300):
-            raise RecordFileError(f"{where} ({facts['name']}) has other sample instants than the first")
+            raise RecordFileError(f"{where} ({key.partition(':')[2]}) has other sample instants than the first")
         arrays[key] = data
-        channels.append(facts)
+        channels += [facts] if facts else []
     if record is None and any("noise_std" in facts for facts in channels):
         raise RecordFileError(f"{path} is damaged: its description of the record is missing")
     header = (record or {}) | {"channels": channels}
@@ -75,22 +97,29 @@ def _whole(data: bytes) -> bool:
     return sum(line.rstrip() == MARK for line in data.splitlines()) % 2 == 0
 
 
-def _transfer(path: Path, sets: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """All pairs of response and reference as one array, with their lines and names."""
-    lines = np.asarray(sets[0]["x"], float)
+def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | None) -> dict[str, np.ndarray]:
+    """All pairs of response and reference as one array, in SI, with their lines and names."""
+    lines = _abscissa(sets[0], "frequency")
     found: dict[tuple[str, str], np.ndarray] = {}
-    outputs: dict[str, str] = {}
+    outputs: dict[str, dict[str, str]] = {}
+    remarks: dict[str, None] = {}
     for number, entry in enumerate(sets, start=1):
-        where, x = f"{path}, transfer function {number}", np.asarray(entry["x"], float)
+        where, x = f"{path}, transfer function {number}", _abscissa(entry, "frequency")
         data = np.asarray(entry["data"], complex)
         if x.shape != lines.shape or data.shape != lines.shape or np.abs(x - lines).max() > 1e-6 * np.abs(lines).max():
             raise RecordFileError(f"{where} has other lines than the first; keep those of one measurement")
-        pair = (f"node {entry['rsp_node']} direction {entry['rsp_dir']}",
-                f"node {entry['ref_node']} direction {entry['ref_dir']}")  # fmt: skip
+        pair = _node(entry, "rsp"), _node(entry, "ref")
         if pair in found:
             raise RecordFileError(f"{where}: a second one from {pair[1]} to {pair[0]}; keep one of them")
-        found[pair] = data
-        outputs[pair[0]] = QUANTITIES.get(entry["ordinate_spec_data_type"], "")
+        quantity, output = _measured(where, entry, "ordinate", system)
+        _, reference = _measured(where, entry, "orddenom", system)
+        if unit_named(output) is None and "/" in output:  # of both, as in g/N
+            output, _, reference = output.rpartition("/")
+        top, bottom = unit_named(output.strip("() ")), unit_named(reference)
+        found[pair] = data * (top.factor if top else 1.0) / (bottom.factor if bottom else 1.0)
+        outputs[pair[0]] = {"quantity": top.quantity if top else quantity, "unit": top.si if top else output}
+        remarks |= {unit_remark(name, text, unit): None
+                    for name, text, unit in zip(pair, (output, reference), (top, bottom)) if unit}  # fmt: skip
     references = list(dict.fromkeys(pair[1] for pair in found))
     for pair in ((output, reference) for output in outputs for reference in references):
         if pair not in found:
@@ -98,7 +127,11 @@ def _transfer(path: Path, sets: list[dict[str, Any]]) -> dict[str, np.ndarray]:
                 f"{path} lacks the transfer function from {pair[1]} to {pair[0]}; the others are there"
             )
     values = np.array([[found[output, reference] for reference in references] for output in outputs])
-    described = {"outputs": [{"name": n, "quantity": q} for n, q in outputs.items()], "references": references}
+    described = {
+        "outputs": [{"name": name, **facts} for name, facts in outputs.items()],
+        "references": references,
+        "remarks": [*filter(None, remarks)],
+    }
     return {"frequency_hz": lines, "transfer": values, DESCRIPTION: np.array(json.dumps(described))}
 
 
@@ -107,17 +140,59 @@ def as_stored(values: np.ndarray) -> np.ndarray:
     return np.array(("%.11e " * values.size % tuple(values)).split(), float)
 
 
-def _facts(where: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """Our own description out of the five text lines, or what the data set itself says."""
+def _channel(where: str, entry: dict[str, Any], system: dict[str, Any] | None) -> tuple[str, dict[str, Any]]:
+    """Key and description: ours out of the five text lines, or what the data set itself says; none where a unit that is
+    known stands behind the name."""
     text = "".join(str(entry.get(f"id{i}", "")) for i in range(1, 6))
     if not any(sign in text for sign in OURS):
-        name = f"node {entry['rsp_node']} direction {entry['rsp_dir']}"
-        return {"kind": "output", "name": name, "quantity": QUANTITIES.get(entry["ordinate_spec_data_type"], "")}
+        name, (quantity, unit) = _node(entry, "rsp"), _measured(where, entry, "ordinate", system)
+        if unit_named(unit) is not None:
+            return f"output:{name} [{unit}]", {}
+        return f"output:{name}", {"kind": "output", "name": name, "quantity": quantity, "unit": unit}
     try:
         facts = json.loads(text[text.index("{") :])
-        return {**facts, "kind": str(facts["kind"]), "name": str(facts["name"])}
+        return f"{facts['kind']}:{facts['name']}", {**facts, "kind": str(facts["kind"]), "name": str(facts["name"])}
     except (ValueError, KeyError, TypeError) as error:
         raise RecordFileError(f"{where}: its description is damaged: {error}") from error
+
+
+def _node(entry: dict[str, Any], which: str) -> str:
+    return f"node {entry[f'{which}_node']} direction {entry[f'{which}_dir']}"
+
+
+def _label(entry: dict[str, Any], axis: str) -> str:
+    """The unit that stands at an axis, as written; empty where none does."""
+    label = str(entry.get(f"{axis}_axis_units_lab", "")).strip()
+    return "" if label.upper() == "NONE" else label
+
+
+def _abscissa(entry: dict[str, Any], quantity: str) -> np.ndarray:
+    """Instants in s, or lines in Hz."""
+    unit = unit_named(_label(entry, "abscissa"))
+    factor = unit.factor if unit is not None and unit.quantity == quantity else 1.0
+    return np.asarray(entry["x"], float) * factor
+
+
+def _measured(where: str, entry: dict[str, Any], axis: str, system: dict[str, Any] | None) -> tuple[str, str]:
+    """Quantity, by its code, and unit as written, or of the file's system of units where none is.
+
+    Raises:
+        RecordFileError: a unit of another quantity, or a system whose unit is not known.
+    """
+    quantity, label = QUANTITIES.get(entry[f"{axis}_spec_data_type"], ""), _label(entry, axis)
+    unit = unit_named(label)
+    if unit is not None and quantity and unit.quantity in TYPES and unit.quantity != quantity:
+        raise RecordFileError(
+            f"{where} is {quantity} by its type and {unit.quantity} by its unit, {label}; correct one"
+        )
+    if label or not quantity or system is None:
+        return quantity, label
+    scale = float(system["force" if quantity == "force" else "length"])  # of its units, in one of SI
+    names = BY_QUANTITY[quantity][1]
+    named = next((name for name, factor in names.items() if abs(factor * scale - 1.0) < ALIKE), None)
+    if named is None:
+        raise RecordFileError(f"{where} states no unit, and that of data set 164, {scale:g} in SI's, is not known")
+    return quantity, named
 
 
 def write(path: Path, time: np.ndarray, signals: dict[str, Any], header: dict[str, Any]) -> None:

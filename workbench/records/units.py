@@ -62,6 +62,7 @@ BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*([^()]*(?:\(s\^2\))?[
 AFTER_SLASH = re.compile(r"(.*\S)\s+/\s+(\S.*)")  # as DIN and ISO label axes
 TIME = {"t", "time", "zeit", "temps", "tiempo", "x_value", "timestamp", "time stamp", "elapsed time", "relative time"}
 TIME_UNDERSCORE = re.compile(r"(t|time)_(s|sec|ms|us)", re.IGNORECASE)
+NUMBERED = re.compile(r"(\S\D*?\S)\s+\d+\b.*")  # one time of several, as catman's `Time 1 - default sample rate`
 
 
 def unit_named(text: str) -> Unit | None:
@@ -88,8 +89,16 @@ def split_unit(name: str) -> tuple[str, str]:
 def time_factor(name: str) -> float | None:
     """Seconds in one unit of a column of sample instants; None where the name is not that of one."""
     underscore = TIME_UNDERSCORE.fullmatch(name)
-    base, text = (underscore[1], underscore[2].lower()) if underscore else split_unit(name)
-    if base.strip().lower() not in TIME:
+    text = underscore[2].lower() if underscore else split_unit(name)[1]
+    if not time_base(name):
         return None
     unit = unit_named(text) if text else UNITS["s"]
     return unit.factor if unit is not None and unit.quantity == "time" else None
+
+
+def time_base(name: str) -> str:
+    """What a column of sample instants is called, without unit and number, in small letters; empty where it is none."""
+    underscore, base = TIME_UNDERSCORE.fullmatch(name), split_unit(name)[0].strip()
+    numbered = NUMBERED.fullmatch(base)
+    base = (underscore[1] if underscore else numbered[1] if numbered else base).lower()
+    return base if base in TIME else ""

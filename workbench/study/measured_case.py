@@ -18,6 +18,7 @@ def measured_case(
     validation: Sequence[Path] = (),
     *,
     inputs: tuple[str, ...] = (),
+    input_hold: str | None = None,
     quantity: str = "",
     driving_point: tuple[str, ...] = (),
 ) -> Case:
@@ -28,6 +29,7 @@ def measured_case(
         records: files to diagnose, of the same channels.
         validation: files that only measure how far the gap shrinks.
         inputs: names of the input channels, where the files do not say.
+        input_hold: "zero" or "first", how they run between samples; as the files say unless given.
         quantity: of outputs whose files state none: "displacement", "velocity" or "acceleration".
         driving_point: an input and the output at its place, which scale the shapes; those of one name or place unless
             given.
@@ -38,7 +40,7 @@ def measured_case(
     """
 
     def read(path: Path, name: str) -> Record:
-        record = read_record(path, inputs=inputs)
+        record = read_record(path, inputs=inputs, input_hold=input_hold)
         channels = [replace(c, quantity=c.quantity or quantity, unit=c.unit) for c in record.output_channels]
         return replace(record, output_channels=tuple(channels), name=name)
 

@@ -84,6 +84,55 @@ def test_sensor_of_another_rate(sound):
     assert "held" in held.message and "straight lines" in joined.message
 
 
+def test_an_output_of_no_quantity_among_accelerations(sound):
+    channels = sound.output_channels[:2] + (Channel("y3"),) + sound.output_channels[3:]
+    found = only(replace(sound, output_channels=channels))
+    assert (found.kind, found.outputs) == ("unstated", ("y3",)) and "'y3 [m/s^2]'" in found.message
+    assert data_faults(replace(sound, output_channels=tuple(Channel(c.name) for c in channels))) == ()
+    with pytest.raises(ValueError, match="'y3' states no quantity, and 'y1' measures displacement"):
+        check_data_quality(replace(sound, output_channels=channels))
+
+
+def driven(sound, force):
+    return replace(sound, inputs=force[None], input_channels=(Channel("F", "force"),))
+
+
+BLOWS = np.zeros(800)
+BLOWS[100:108] = 50.0 * np.sin(np.pi * np.arange(8) / 8)
+BLOWS[500:508] = 60.0 * np.sin(np.pi * np.arange(8) / 8)
+NOISE = np.random.default_rng(0).standard_normal(800)
+
+
+@pytest.mark.parametrize(
+    ("force", "said"),
+    [
+        (np.clip(NOISE, -1.2, 1.2), "clipped at 1.2 and -1.2"),
+        (np.minimum(NOISE, 1.2), "clipped at 1.2,"),
+        (np.round(50 * np.clip(NOISE, -1.2, 1.2)), "clipped at 60 and -60"),
+        (np.minimum(BLOWS, 35.0), "clipped at 35, 10 samples"),
+        (np.minimum(BLOWS, 35.0) + 0.01 * np.abs(NOISE) * (BLOWS < 35.0), "clipped at 35, 10 samples"),
+    ],
+)
+def test_a_clipped_input_is_said_and_not_refused(sound, force, said):
+    [found] = data_faults(driven(sound, force))
+    assert (found.kind, found.outputs, found.inputs) == ("clipped", (), ("F",)) and said in found.message
+    check_data_quality(driven(sound, force))
+
+
+@pytest.mark.parametrize(
+    "force",
+    [
+        NOISE, np.round(20 * NOISE), BLOWS, np.round(BLOWS), np.sign(NOISE), np.repeat(np.sign(NOISE[:100]), 8),
+        np.repeat(np.append(NOISE[:40], 3.0), 20)[:800], np.r_[0.0, np.ones(799)], np.zeros(800),
+        np.sin(2.0 * np.pi * 0.013 * np.arange(800)), np.round(30 * np.sin(2.0 * np.pi * 0.013 * np.arange(800))),
+        np.maximum(np.sin(2.0 * np.pi * 0.013 * np.arange(800)), 0.0),
+    ],
+)  # fmt: skip
+def test_inputs_as_they_are_sent_are_not_clipped(sound, force):
+    """Noise, blows, switched levels, held levels, a step, nothing, sines, half sines from rest; some rounded."""
+    assert data_faults(driven(sound, force)) == ()
+
+
 def test_identify_refuses_what_ails(sound):
     with pytest.raises(ValueError, match="'y3' stays at 5"):
         identify(with_row(sound, 2, 5.0))

@@ -1,4 +1,4 @@
-"""Data quality: faulty channels of a record, dead, copied, clipped or upsampled, before identification."""
+"""Data quality: faulty channels of a record, dead, copied, clipped, upsampled or of no stated quantity."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.records.record import Record
+from workbench.rig.sensors import MEASURED
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,10 @@ class DataSettings:
     # turns back of itself has at most 1 / (√2 - 1) = 2.4 times as many in its last step as in the one before
     least_piled: int = 8
     piled: float = 6.0
+    # likewise of an input, of which a blow has few: sines and pulses that are rounded have more in 3 of a thousand
+    least_piled_input: int = 4
+    piled_input: float = 4.0
+    held: float = 0.5  # of an input's samples in the outer half of its range, that repeat: from there on it has levels
     fewest_changes: int = 16  # of an output, from which a rate at which it was held can be read
     slowest: int = 64  # samples between changes: what changes less often rests
     copied: float = 1e-2  # of the innovation, what its past does not predict: signals that differ by less are one
@@ -34,16 +39,18 @@ class DataFault:
     """Something in a record that would make identification wrong.
 
     Attributes:
-        kind: "dead", "copied", "clipped" or "upsampled".
-        outputs: names of those that have it.
+        kind: "dead", "copied", "clipped", "upsampled" or "unstated".
+        outputs: names of those that have it; none where an input does.
         message: what, where, why it matters and the way out.
         until: the last time it touches, s; None where it is all through.
+        inputs: names of those that have it.
     """
 
     kind: str
     outputs: tuple[str, ...]
     message: str
     until: float | None = None
+    inputs: tuple[str, ...] = ()
 
 
 def data_faults(record: Record) -> tuple[DataFault, ...]:
@@ -52,21 +59,52 @@ def data_faults(record: Record) -> tuple[DataFault, ...]:
     dead: an output takes fewer than four values, or is a straight line. copied: two outputs are the same but for scale
     and a constant, so that their noise would count as two. clipped: samples pile up at an end of an output's range.
     upsampled: an output changes at every k-th sample only, because it was sampled at another rate and held, or joined
-    by straight lines.
+    by straight lines. unstated: an output has no quantity, and others measure motion. Inputs are looked at by
+    `input_faults`.
     """
     dead = list(_dead(record))
     names = {fault.outputs[0] for fault in dead}
     alive = [j for j, name in enumerate(record.output_names) if name not in names]
-    return (*dead, *_copied(record, alive), *_clipped(record, alive), *_upsampled(record, alive))
+    found = _copied(record, alive), _clipped(record, alive), _upsampled(record, alive), _unstated(record, alive)
+    return (*dead, *(fault for faults in found for fault in faults), *input_faults(record))
+
+
+def input_faults(record: Record) -> tuple[DataFault, ...]:
+    """The faults of inputs, empty where there are none.
+
+    clipped: samples pile up at an end of an input's range that is not zero, where it rests. One that was sent like that
+    is right as it is, so that it is said, and not refused.
+    """
+    found = []
+    for channel, row in zip(record.input_channels, record.inputs, strict=True):
+        stops = [
+            at
+            for at in _piled(row).values()
+            if row[at[0]] and _ends(row, at, DATA.least_piled_input, DATA.piled_input) and not _has_levels(row, at)
+        ]
+        if stops:
+            ends, count = " and ".join(f"{row[at[0]]:g}" for at in stops), sum(at.size for at in stops)
+            found.append(
+                DataFault(
+                    "clipped",
+                    (),
+                    f"input {channel.name!r} is clipped at {ends}, {count} samples: unless it was sent like that, what"
+                    " acted beyond is lost, and modes, their masses above all, are wrong; measure with a larger range",
+                    inputs=(channel.name,),
+                )
+            )
+    return tuple(found)
 
 
 def check_data_quality(record: Record) -> None:
-    """Refuse a record with a fault.
+    """Refuse a record whose outputs have a fault.
 
     Raises:
-        ValueError: the first of `data_faults`.
+        ValueError: the first of `data_faults` that is one of outputs.
     """
     for fault in data_faults(record):
+        if fault.inputs:
+            continue
         raise ValueError(f"record {record.name!r}: {fault.message}")
 
 
@@ -158,24 +196,35 @@ def _innovation_std(row: np.ndarray) -> float:
 def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
     for j in alive:
         row, name = record.outputs[j], record.output_channels[j].name
-        ends = {"above": row.max(), "below": row.min()}
-        piled = {side: np.flatnonzero(row == end) for side, end in ends.items()}
-        clear = [
-            side
-            for side, at in piled.items()
-            if at.size >= DATA.least_piled and at.size > DATA.piled * _beside(row, at)
-        ]
+        piled = _piled(row)
+        clear = [side for side, at in piled.items() if _ends(row, at, DATA.least_piled, DATA.piled)]
         if clear:
             # Where one end of the range is too near, so may be the other: two equal samples are enough there.
-            last = float(record.time[max(at[-1] for at in piled.values() if at.size > 1)])
+            at, last = piled[clear[0]], float(record.time[max(a[-1] for a in piled.values() if a.size > 1)])
             yield DataFault(
                 "clipped",
                 (name,),
-                f"output {name!r} is clipped {clear[0]} at {ends[clear[0]]:g}, {piled[clear[0]].size} samples; up to"
-                f" {last:g} s motion beyond the range is lost and would be read as modes; begin later, or measure with"
-                " a larger range",
+                f"output {name!r} is clipped {clear[0]} at {row[at[0]]:g}, {at.size} samples; up to {last:g} s motion"
+                " beyond the range is lost and would be read as modes; begin later, or measure with a larger range",
                 until=last,
             )
+
+
+def _piled(row: np.ndarray) -> dict[str, np.ndarray]:
+    """The samples at each end of a signal's range."""
+    return {"above": np.flatnonzero(row == row.max()), "below": np.flatnonzero(row == row.min())}
+
+
+def _ends(row: np.ndarray, at: np.ndarray, least: int, ratio: float) -> bool:
+    """Whether the samples `at` an end of a signal's range are so many as where the range is too small for it."""
+    return least <= at.size < row.size and at.size > ratio * _beside(row, at)
+
+
+def _has_levels(row: np.ndarray, at: np.ndarray) -> bool:
+    """Whether a signal is a sequence of levels, as it repeats near its end too: of these one is the highest."""
+    outer = row[1:] / row[at[0]] > 0.5
+    outer &= row[1:] != row[at[0]]
+    return not outer.any() or float(np.mean(np.diff(row)[outer] == 0)) > DATA.held
 
 
 def _beside(row: np.ndarray, at: np.ndarray) -> int:
@@ -201,3 +250,17 @@ def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
                     " out, or bring all outputs to that rate",
                 )
                 break
+
+
+def _unstated(record: Record, alive: list[int]) -> Iterator[DataFault]:
+    channels = [record.output_channels[j] for j in alive]
+    moving = [channel for channel in channels if channel.quantity in MEASURED]
+    for channel in channels:
+        if moving and not channel.quantity:
+            yield DataFault(
+                "unstated",
+                (channel.name,),
+                f"output {channel.name!r} states no quantity, and {moving[0].name!r} measures {moving[0].quantity}: it"
+                f" would be taken for a displacement; state its unit in the file, as in '{channel.name} [m/s^2]', or"
+                " leave it out",
+            )

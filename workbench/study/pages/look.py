@@ -13,7 +13,7 @@ from scipy.signal import find_peaks
 from workbench.draw.plot import plot
 from workbench.draw.spectra import SEGMENTS, plot_frf, plot_spectra, plot_transfer, power_spectrum
 from workbench.identification.free_decay.preparation import decay_start
-from workbench.identification.signal.data_quality import data_faults
+from workbench.identification.signal.data_quality import data_faults, input_faults
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.study.pages.page import PageContent, block
@@ -54,10 +54,13 @@ def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
 
 
 def _record(record: Record, path: Path) -> Look:
-    faults = data_faults(record)
+    faults = [fault for fault in data_faults(record) if not fault.inputs]
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
     applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
     forces = [] if record.n_inputs else [name for name in record.output_names if name in applied]
+    # a force rests at zero for long, and may be held from sample to sample
+    faults = [fault for fault in faults if fault.outputs[-1] not in forces]
+    faulty |= {fault.outputs[-1] for fault in faults if fault.kind == "unstated"}
     kept = [name for name in record.output_names if name not in faulty | set(forces)]
     if forces and kept:
         record = _with_inputs(record, forces)
@@ -71,8 +74,7 @@ def _record(record: Record, path: Path) -> Look:
         f"{outputs} output{'s' * (outputs != 1)} and {inputs} input{'s' * (inputs != 1)}, {record.n_samples} samples at"
         f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
     )
-    # a force rests at zero for long, and may be held from sample to sample
-    remarks = [*record.remarks, *(fault.message for fault in faults if fault.outputs[-1] not in forces)]
+    remarks = [*record.remarks, *(fault.message for fault in (*faults, *input_faults(record)))]
     if len(channels) > MOST_ROWS:
         remarks.append(f"the first {MOST_ROWS} of {len(channels)} channels are shown")
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
@@ -130,12 +132,12 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
     page_content = PageContent(
         title=f"What {path.name} holds",
         lead=heading,
-        lines=[f"Go on with: {_command(path, [])}"],
+        lines=[*measured.remarks, f"Go on with: {_command(path, [])}"],
         blocks=[block(plot_transfer(measured), "Magnitude of the transfer functions.")],
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
     )
-    return Look(heading, tuple(rows), (), _command(path, []), page_content)
+    return Look(heading, tuple(rows), measured.remarks, _command(path, []), page_content)
 
 
 def _row(channel: Channel, row: np.ndarray, rate_hz: float) -> tuple[str, ...]:
