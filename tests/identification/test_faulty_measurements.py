@@ -149,3 +149,9 @@ def test_sensors_that_pass_no_constant_settle(offset):
     assert (np.abs(found.modes.zeta - damping) < 4.0 * found.zeta_std).all()
     (note,) = [note for note in found.notes if note.startswith("settling (time constant ")]
     assert float(note.removeprefix("settling (time constant ").split(" s)")[0]) == pytest.approx(0.0796, rel=0.05)
+
+
+def test_a_clipped_force_is_remarked():
+    force = np.random.default_rng(1).standard_normal(600)
+    spoilt = record(np.clip(force, -1.2, 1.2), noisy(response(force, 1000), 0.05, 1), 1000)
+    assert any("input 'F' is clipped at 1.2 and -1.2" in remark for remark in identify_driven(spoilt).remarks)

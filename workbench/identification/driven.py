@@ -36,7 +36,7 @@ from workbench.identification.input_output.peak_shape import overlap_remarks
 from workbench.identification.input_output.sensor_drift import beside_drift
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
-from workbench.identification.signal.data_quality import of_same_sensors
+from workbench.identification.signal.data_quality import input_faults, of_same_sensors
 from workbench.identification.signal.harmonics import harmonic_remark, steady_modes
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
@@ -232,6 +232,7 @@ def identify_driven(
     if hold not in HOLDS:
         raise ValueError(f"input_hold is {' or '.join(map(repr, HOLDS))}; got {input_hold!r}")
     check_inputs(records)
+    clipped = dict.fromkeys(fault.message for record in records for fault in input_faults(record))
     records, windowed = force_window(records)
     by_amplitude = after_blows(records, budget)
     data = KnownInputs(
@@ -274,7 +275,9 @@ def identify_driven(
     beside = (*selected.distorted, *left_about(data, fit))
     left = [pole for pole in beside if pole not in (*named, *by_amplitude.changing)]
     changes = (*changes, *unpredictive_remarks(fit, left))
-    found = _report(records, data, selected, (*windowed, *drift, *remarks, *overlap, *changes, *budget.remarks))
+    found = _report(
+        records, data, selected, (*clipped, *windowed, *drift, *remarks, *overlap, *changes, *budget.remarks)
+    )
     deviation = found.modes.omega * found.zeta_std + 1j * found.omega_std
     decays = by_amplitude.remarks(fit.poles, _sizes(data, fit), deviation)
     unexcited = unexcited_remarks(records, fit.poles)

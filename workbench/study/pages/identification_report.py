@@ -10,7 +10,7 @@ from workbench.identification.ambient import AmbientModes, identify_ambient
 from workbench.identification.driven import Driven, identify_driven
 from workbench.identification.free_decay.assumptions import AmplitudeDependence, ProportionalFit
 from workbench.identification.ring_down import RingDown, ring_down
-from workbench.identification.signal.data_quality import check_data_quality, input_faults
+from workbench.identification.signal.data_quality import check_data_quality
 from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
 from workbench.identification.signal.searches import SECONDS, STOPPED, Progress
 from workbench.identification.transfer import TransferModes, identify_transfer
@@ -134,8 +134,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
 
 def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
     """Records with their inputs."""
-    clipped = {fault.message: None for record in records for fault in input_faults(record)}
-    lines = [*clipped, *found.remarks, *_on_convergence(found.converged, found.remarks, "try other --modes")]
+    lines = [*found.remarks, *_on_convergence(found.converged, found.remarks, "try other --modes")]
     a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
     content = {
         **_content(records[0].output_channels, found),
