@@ -10,9 +10,9 @@ import pytest
 from workbench.cases import units as named_units
 from workbench.cases.case import Case
 from workbench.gap.diagnose import diagnose
-from workbench.gap.effects.beyond import BEYOND
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Parameter
+from workbench.gap.effects.nonlinear import BEYOND
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, in_units, new_figure, plain_ticks
-from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import Effect, apply_all, label_in_words
+from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.report.budget import Budget
 from workbench.gap.report.verdict import Verdict

@@ -8,12 +8,11 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.cases.units import SI, Units
 from workbench.deadline import Deadline
-from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
-from workbench.gap.localisation.force_localisation import locate_force
-from workbench.gap.localisation.where import locate
+from workbench.gap.effects.nonlinear import any_beyond
+from workbench.gap.localisation.where import locate, locate_force
 from workbench.gap.prediction.noise import noise_guessed
 from workbench.gap.prediction.residuals import lead_of
 from workbench.gap.prediction.workers import Workers
@@ -26,11 +25,11 @@ from workbench.gap.report.budget import (
     noise_power,
     power_in,
     power_of_inputs,
+    with_held_out,
 )
 from workbench.gap.report.data_faults import data_faults
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.readiness import check_modes, check_records, readiness
-from workbench.gap.report.record_to_record import with_held_out
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.report.wiring import check_kept_apart, wiring
 from workbench.gap.search.attribute import Attribution, attribute, baseline

@@ -9,10 +9,10 @@ import numpy as np
 
 from workbench.arguments import whole
 from workbench.arrays import Floats
-from workbench.gap.effects.beyond import BEYOND
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
+from workbench.gap.effects.nonlinear import BEYOND
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.search.fit import Fit, parameters_of
 from workbench.rig.rig import Rig

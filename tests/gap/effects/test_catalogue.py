@@ -6,11 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from workbench.gap.effects.beyond import POWER_DAMPER, POWER_SPRING, in_catalogue
 from workbench.gap.effects.catalogue import CATALOGUE, in_words, kind_named
-from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all
+from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all, contained, simpler_forms
 from workbench.gap.effects.environment import _is_distortion
-from workbench.gap.effects.limiting_cases import contained, simpler_forms
+from workbench.gap.effects.nonlinear import POWER_DAMPER, POWER_SPRING, in_catalogue
 from workbench.gap.effects.ports import clipped_level, exchanged_last
 from workbench.gap.report.verdict import _described, effect_json
 from workbench.records.record import Channel, Record

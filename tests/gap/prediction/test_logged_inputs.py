@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
-from workbench.gap.prediction.logged_inputs import (
+from workbench.gap.prediction.noise import (
     LOGGED,
     input_filters,
     likeliest_share,

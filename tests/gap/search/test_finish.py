@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
-from workbench.gap.effects.effect import Effect
-from workbench.gap.effects.limiting_cases import contained
+from workbench.gap.effects.effect import Effect, contained
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search import attribute, selection
+from workbench.gap.search import attribute, screening
 from workbench.gap.search.finish import finished, simplest, widened
 from workbench.gap.search.fit import fit
+from workbench.gap.search.screening import on_whole_records
 from workbench.gap.search.search import Search
-from workbench.gap.search.selection import on_whole_records
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import BoucWen, CoulombFriction, CubicSpring
 
@@ -73,7 +72,7 @@ def test_a_fit_on_its_way_to_more_than_is_of_use_stays_where_it_is(rig, search, 
         ended.append(iterations)
         return replace(fit(search.rig, effects, search.data, iterations=2), falling=0.003)
 
-    monkeypatch.setattr(selection, "whole", whole)
+    monkeypatch.setattr(screening, "whole", whole)
     wrong = fit(one.rig, (Effect(SPRING, None, {"at": 0.6, "stiffness": 1.0}),), one.data, iterations=1)
     on_whole_records(one, [wrong], 1)
     assert ended == [5, 25]

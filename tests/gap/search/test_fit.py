@@ -7,8 +7,7 @@ import pytest
 
 from workbench.gap.diagnose import _fails_unseen
 from workbench.gap.effects.catalogue import kind_named
-from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.limiting_cases import fewer, merged_sets, simpler_forms
+from workbench.gap.effects.effect import Effect, apply_all, fewer, merged_sets, simpler_forms
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.prediction.innovations import LOOSE
 from workbench.gap.prediction.random_force import tonal

@@ -7,13 +7,12 @@ import pytest
 
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.nominal import NominalPrior, nominal_errors
-from workbench.gap.effects.record_to_record import TENSION
+from workbench.gap.effects.nominal import TENSION, NominalPrior, nominal_errors
 from workbench.gap.effects.structural import buckling_load
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.report.record_to_record import RecordToRecord, with_held_out
-from workbench.gap.search.record_to_record import deviations
+from workbench.gap.report.budget import RecordToRecord, with_held_out
+from workbench.gap.search.nominal_figures import deviations
 from workbench.gap.search.search import Search
 from workbench.records.record import Record
 from workbench.rig.rig import Rig

@@ -14,9 +14,8 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.pairs import Pairs, _evidence
-from workbench.gap.search.screening import Screening
+from workbench.gap.search.screening import Screening, one_more, pairs_at_once
 from workbench.gap.search.search import Search
-from workbench.gap.search.selection import one_more, pairs_at_once
 from workbench.gap.search.settings import SELECTION
 from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import prediction_errors

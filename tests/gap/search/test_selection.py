@@ -10,8 +10,8 @@ from workbench.gap.effects.effect import Effect
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import fit
+from workbench.gap.search.screening import by_continuation
 from workbench.gap.search.search import Search
-from workbench.gap.search.selection import by_continuation
 from workbench.rig.elements import CubicSpring
 
 CUBIC, NOISE = kind_named("cubic_spring"), 1e-5

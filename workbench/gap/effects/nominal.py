@@ -1,4 +1,4 @@
-"""Small errors of the nominal model: uncertain parameters with normal priors, marginalised beside every effect."""
+"""Errors of the nominal model: small ones, with normal priors, beside every effect; figures that differ by record."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -10,17 +10,24 @@ from scipy.linalg import block_diag
 
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Kind, Parameter
-from workbench.gap.effects.record_to_record import STIFFNESS, differing
-from workbench.gap.effects.structural import RESOLUTION, solved_once, stiffness_name
+from workbench.gap.effects.structural import (
+    AXIAL_LOAD,
+    MODULUS_ERROR,
+    RESOLUTION,
+    buckling_load,
+    solved_once,
+    stiffness_name,
+)
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, derivative_of, shape_of
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints, centred_at, middle, reach
-from workbench.structure.member import Structure
+from workbench.structure.member import Beam, Structure
 from workbench.structure.modes import Modes, PointShapes, Shapes
 from workbench.structure.profile import Profile
 
+STIFFNESS, TENSION = "stiffness", "axial load"  # the first stands for all that warmth does to a modulus too
 FEW = 9  # cosines that may be as large as one another; of more, those beyond SMOOTH half waves fall off by the square,
 SMOOTH = 3  # as those of any function do that has a slope at its ends
 PROFILE_UNIT, RATIO_UNIT, DELAY_UNIT = 0.01, 0.1, 0.1  # of free coordinates: relative, of a logarithm, of a sample
@@ -379,3 +386,49 @@ NOMINAL_ERRORS = Kind(
     phrase="small errors of the nominal model",
     first=True,
 )
+
+
+@dataclass(frozen=True)
+class OfOneRecord:
+    """What a figure is in one record, as a change of rig.
+
+    Attributes:
+        kind: of the catalogue, with no target and one number.
+        name, value: of that number.
+    """
+
+    kind: Kind
+    name: str
+    value: float
+
+    def __call__(self, rig: Rig) -> Rig:
+        return self.kind.apply(rig, None, {self.name: self.value})
+
+
+def figures_of(rig: Rig) -> tuple[str, ...]:
+    """Figures of a rig that may differ from record to record."""
+    if not rig.modes.omega.any():
+        return ()
+    return (STIFFNESS, TENSION) if isinstance(rig.structure, Beam) else (STIFFNESS,)
+
+
+def differing(rig: Rig, figure: str, deviations: Mapping[str, float]) -> Rig:
+    """The rig with a figure that differs from record to record.
+
+    Args:
+        figure: of `figures_of`.
+        deviations: by name of record: of all stiffness, relative; of the axial load, over that which buckles the beam.
+    """
+
+    def change(deviation: float) -> OfOneRecord:
+        if figure == TENSION:
+            return OfOneRecord(AXIAL_LOAD, "tension", deviation * buckling_load(rig))
+        return OfOneRecord(MODULUS_ERROR, "factor", 1.0 + deviation)
+
+    changes = tuple((name, change(deviation)) for name, deviation in deviations.items() if deviation)
+    return replace(rig, by_record=changes) if changes else rig
+
+
+def label_of(figure: str) -> str:
+    """What a budget calls a figure that differs from record to record."""
+    return f"{figure.replace(' ', '_')}_record_to_record"

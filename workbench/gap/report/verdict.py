@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 
 from workbench.cases.units import SI, Units
-from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
+from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.where import Where
-from workbench.gap.report.budget import REMARKED, Budget, Shrinkage, labels_of
+from workbench.gap.report.budget import REMARKED, Budget, RecordToRecord, Shrinkage, labels_of
 from workbench.gap.report.experiment import Experiment
 from workbench.gap.report.readiness import Readiness
-from workbench.gap.report.record_to_record import RecordToRecord
 from workbench.gap.search.attribute import Attribution
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints

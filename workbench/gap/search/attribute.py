@@ -8,30 +8,26 @@ import numpy as np
 
 from workbench.deadline import NEVER, Deadline
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.effect import Effect, Kind, apply_all
-from workbench.gap.effects.limiting_cases import each_left_out, simpler_forms
+from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out, simpler_forms
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
+from workbench.gap.effects.nonlinear import BEYOND, any_beyond, in_catalogue
 from workbench.gap.effects.ports import clipped_level, exchanged_last, rounding_step
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
-from workbench.gap.prediction.logged_inputs import logging_noise
-from workbench.gap.prediction.noise import is_noise_alone, noise_found
+from workbench.gap.prediction.noise import is_noise_alone, logging_noise, noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
-from workbench.gap.search.beside_modes import beside_modes
 from workbench.gap.search.beside_random import decide_on_random, random_beside, random_beside_errors
 from workbench.gap.search.finish import finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
-from workbench.gap.search.one_law import compared_with, one_law, unless_another
+from workbench.gap.search.nominal_figures import beside_modes, beside_records
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import are_common, common_as_errors, may_be_error
-from workbench.gap.search.record_to_record import beside_records
-from workbench.gap.search.screening import Screening
+from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, most_informative, promise, spread_over_kinds
-from workbench.gap.search.selection import on_whole_records, one_more
-from workbench.gap.search.settings import ATTRIBUTION, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
+from workbench.gap.search.settings import ATTRIBUTION, LAW, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -517,3 +513,51 @@ def _beside_nominal_errors(search: Search, tolerance: float) -> Decision:
         return varied.decision()
     beside.run()
     return beside.decision()
+
+
+def one_law(search: Search, evidence: Evidence) -> Fit | None:
+    """The force that explains the records alone, of another law or by its power of the catalogue, or None.
+
+    Two effects side by side bend to many a law between them, so it is sought before any two are believed.
+    """
+    search.report("one force of another law", 0.35)
+    beyond = replace(search, catalogue=BEYOND)
+    promising = [f for f in one_more(beyond, (), evidence) if f.cost < SELECTION.promising]
+    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.enough)
+    return next((f for f in (_named(search, f) for f in fits) if search.explains(f)), None)
+
+
+def _named(search: Search, law: Fit) -> Fit:
+    """A force of another law; where its power is that of a kind of the catalogue, that kind fitted from there."""
+    known = in_catalogue(law.effects[0])
+    return law if known is None else finished(search, fit(search.rig, (known,), search.data))
+
+
+def unless_another(search: Search, decision: Decision, evidence: Evidence) -> Decision:
+    """The decision for one law of the catalogue at a point, or for another law where the records are sure of that one.
+
+    Args:
+        evidence: of the nominal rig.
+    """
+    best = decision.best
+    if decision.outcome != "explained" or len(best.effects) != 1:
+        return decision
+    (effect,) = best.effects
+    if not effect.kind.nonlinear or effect.at is None:
+        return decision
+    search.report("one force of another law", 0.9)
+    beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.at)
+    as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
+    promising = [f for f in one_more(beyond, (), there) if f.cost < as_near]
+    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.enough)
+    other = [f for f in fits if in_catalogue(f.effects[0]) is None]
+    sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
+    law = next(sure, None)
+    return decision if law is None else compared_with(law, search, decision)
+
+
+def compared_with(law: Fit, search: Search, decision: Decision) -> Decision:
+    """What is claimed where one force of another law explains the records: the likelier of it and of the decision's."""
+    named = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
+    best, rivals = ranked(search, [law, *named])
+    return Decision("unknown" if any_beyond(best.effects) else "explained", best, rivals=rivals)

@@ -15,8 +15,8 @@ from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_ran
 from workbench.gap.search.finish import finished, plainest, ranked, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import Step, fit_jointly
+from workbench.gap.search.screening import on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, spread_over_kinds
-from workbench.gap.search.selection import on_whole_records, one_more
 from workbench.gap.search.settings import INTERVALS, RANDOM, SEARCH, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped

@@ -6,8 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import COORDINATES, Effect, apply_all, key_of, place_values
-from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets, wider_sets, with_one_simpler
+from workbench.gap.effects.effect import (
+    COORDINATES,
+    Effect,
+    apply_all,
+    each_left_out,
+    key_of,
+    place_values,
+    simpler_sets,
+    wider_sets,
+    with_one_simpler,
+)
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit
 from workbench.gap.search.search import Search, promise

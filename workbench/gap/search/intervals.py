@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_all
-from workbench.gap.prediction.logged_inputs import noise_of_inputs
+from workbench.gap.prediction.noise import noise_of_inputs
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.fit import Fit, finite_residual, parameters_of, slopes

@@ -1,4 +1,4 @@
-"""Effects and errors of the nominal model fitted together, the sizes of the errors learnt from the records."""
+"""Effects fitted beside errors of the nominal model, or noise of the inputs, of sizes that the records tell."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,12 +8,11 @@ import numpy as np
 from workbench.arrays import Floats, scaled_inverse
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
-from workbench.gap.prediction.logged_inputs import logging_noise
-from workbench.gap.prediction.noise import is_noise_alone, noise_found
+from workbench.gap.prediction.noise import LEAST_LOGGED, is_noise_alone, likeliest_share, logging_noise, noise_found
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Fit, fit, parameters_of
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import JOINT, SELECTION
+from workbench.gap.search.settings import INPUTS, JOINT, SELECTION
 from workbench.rig.rig import Rig
 
 
@@ -312,3 +311,40 @@ def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = (
     early = tuple(name for name, delay in sided.items() if delay <= 0)
     starts = {**errors.values, **{f"delay_{name}": delay for name, delay in sided.items()}}
     return nominal_errors(search.rig, replace(errors.target, late=late, early=early), starts)
+
+
+def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Search | None:
+    """The search beside noise of the logged inputs as a set shows it; None where that is not what the set leaves.
+
+    What most records would have louder than any logger's noise is none: a law that is missing grows with the level too.
+
+    Args:
+        search: without that noise.
+        fitted: the set, errors of the nominal model among it.
+        sensor_noise: (n_outputs,) mean square of each sensor's noise as found without it, over that of the stated one.
+    """
+    rig = apply_all(search.rig, fitted.effects)
+    left, found = search.data.differences(rig), search.with_noise(np.sqrt(sensor_noise) * search.data.noise)
+    # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
+    shares = [likeliest_share(rig, s.data, left) for s in (search, found)]
+    (share, _, is_beyond), louder = min(zip(shares, (search, found), strict=True), key=lambda each: each[0].loss)
+    if share < LEAST_LOGGED or is_beyond:
+        return None
+    beside = louder.beside_inputs(rig, share)
+    white = measured(beside, fitted).fit
+    if INPUTS.white < white.cost < INPUTS.bent * fitted.cost:
+        fitted = white = fit_jointly(beside, fitted.effects[:-1], fitted.effects[-1]).fit
+        rig = apply_all(search.rig, fitted.effects)
+        left = search.data.differences(rig)
+    if white.cost > INPUTS.white:
+        return None
+    for _ in range(INPUTS.rounds):  # each sensor's noise by the power of its innovations
+        louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
+        beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
+        white = measured(beside, fitted).fit
+    return beside
+
+
+def likeliest_loss(search: Search, rig: Rig) -> float:
+    """Minus the log-likelihood of what a rig leaves, beside as much noise of the logged inputs as is likeliest."""
+    return likeliest_share(rig, search.data, search.data.differences(rig)).loss

@@ -9,9 +9,8 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
-from workbench.gap.search.screening import Screening
+from workbench.gap.search.screening import Screening, is_promising, on_whole_records, one_more, pairs_at_once
 from workbench.gap.search.search import Decision, Search, in_one_valley, unexplained
-from workbench.gap.search.selection import is_promising, on_whole_records, one_more, pairs_at_once
 from workbench.gap.search.settings import PAIRS, RANDOM
 from workbench.structure.domain import Between
 

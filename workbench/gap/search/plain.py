@@ -6,8 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind, apply_all
-from workbench.gap.effects.limiting_cases import contained, each_left_out, simpler_sets
+from workbench.gap.effects.effect import Effect, Kind, apply_all, contained, each_left_out, simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, nominal_errors
 from workbench.gap.effects.ports import ACTUATOR_DELAY, ACTUATOR_LAG, SENSOR_DELAY, SENSOR_LAG
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
@@ -16,9 +15,8 @@ from workbench.gap.search.finish import finished, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import Step, on_their_sides, surely_late
-from workbench.gap.search.screening import Screening
+from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Search, promise
-from workbench.gap.search.selection import on_whole_records, one_more
 from workbench.gap.search.settings import JOINT, PAIRS, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.structure.domain import middle

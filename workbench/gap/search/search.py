@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind
-from workbench.gap.effects.nominal import NominalPrior
-from workbench.gap.effects.record_to_record import STIFFNESS
+from workbench.gap.effects.nominal import STIFFNESS, NominalPrior
 from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
 from workbench.gap.prediction.innovations import Observer
-from workbench.gap.prediction.logged_inputs import input_filters, logging_noise_power
+from workbench.gap.prediction.noise import input_filters, logging_noise_power
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter

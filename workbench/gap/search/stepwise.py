@@ -6,10 +6,14 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, key_of
-from workbench.gap.effects.limiting_cases import (
+from workbench.gap.effects.effect import (
+    Effect,
+    Kind,
+    apply_all,
+    can_be,
     contained,
     each_left_out,
+    key_of,
     merged_sets,
     simpler_sets,
     wider_sets,
@@ -19,11 +23,20 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_erro
 from workbench.gap.effects.ports import ACTUATOR_GAIN, SENSOR_DELAY, SENSOR_GAIN, SENSOR_LAG
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
-from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
+from workbench.gap.prediction.noise import LEAST_LOGGED
 from workbench.gap.search.finish import other_places
 from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of, slopes
-from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened, size_of
+from workbench.gap.search.jointly import (
+    Step,
+    are_plausible,
+    beside_inputs,
+    fit_jointly,
+    likeliest_loss,
+    measured,
+    on_their_sides,
+    opened,
+    size_of,
+)
 from workbench.gap.search.plain import (
     COMMON,
     NO_COMMON,
@@ -36,8 +49,8 @@ from workbench.gap.search.plain import (
     lateness,
     other_causes,
 )
+from workbench.gap.search.screening import fitted_ahead, one_more
 from workbench.gap.search.search import Decision, Search, apart, most_informative, spread_over_kinds
-from workbench.gap.search.selection import fitted_ahead, one_more
 from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
 from workbench.rig.simulate import is_stepped
 
