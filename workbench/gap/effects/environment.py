@@ -103,17 +103,12 @@ PERIODIC_DISTURBANCE = Kind(
 )
 
 
-def _random_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    for place in [place for place in evidence.at_peaks if not isinstance(place.at, Between)][:2]:
-        yield {**place_values(place.at), "rms": float(np.sqrt(np.mean(place.force**2)))}
-
-
 RANDOM_DISTURBANCE = Kind(
     name="random_disturbance",
     path="environment",
     parameters=lambda rig, _: (*place_parameters(rig), _force("rms", rig)),
     apply=lambda rig, _, v: with_element(rig, RandomForce(place_of(v), v["rms"])),
-    starts=_random_starts,
+    starts=lambda *_: [],  # found by what it does to the statistics
     found_in="residual",
     remainder="A random disturbance leaves an unpredictable residual; only its statistics were estimated.",
     phrase="a random disturbance",

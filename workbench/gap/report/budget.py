@@ -135,7 +135,6 @@ class Budget:
         errors: root mean squares of the small errors: "frequencies_percent", "inputs_percent", "delays_ms" and so on;
             "common_delay_ms", what all sensors are late by.
         noise_stated, noise_found: (n_outputs,) standard deviation of each sensor's noise, in its unit.
-        sensors: (n_outputs,) names.
     """
 
     effects: Mapping[str, float]
@@ -146,7 +145,6 @@ class Budget:
     errors: Mapping[str, float] = field(default_factory=dict)
     noise_stated: tuple[float, ...] = ()
     noise_found: tuple[float, ...] = ()
-    sensors: tuple[str, ...] = ()
 
     @property
     def noise_ratio(self) -> float:
@@ -246,7 +244,6 @@ def budget_of(
         errors={**sizes_of(alike), **({"inputs_percent": 100.0 * logged} if by_inputs.sum() > 0 else {})},
         noise_stated=tuple(float(s.noise_std) for s in rig.sensors),
         noise_found=tuple(noise_found.tolist()),
-        sensors=tuple(s.name for s in rig.sensors),
     )
 
 

@@ -26,7 +26,7 @@ from workbench.gap.search.nominal_figures import beside_modes, beside_records
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import are_common, common_as_errors, may_be_error
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
-from workbench.gap.search.search import Decision, Search, most_informative, promise, spread_over_kinds
+from workbench.gap.search.search import Decision, Search, best_of_each_kind, most_informative, promise
 from workbench.gap.search.settings import ATTRIBUTION, LAW, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
@@ -90,7 +90,7 @@ class Attribution:
     def singles(self) -> tuple[Fit, ...]:
         """The likeliest kinds alone on whole records, best first; those that were no rivals are fitted now."""
         kinds = {f.effects[0].kind for f in self.tried if f.effects}
-        others = [f for f in spread_over_kinds(self.ahead, 1) if f.effects[0].kind not in kinds][: ATTRIBUTION.shown]
+        others = [f for f in best_of_each_kind(self.ahead) if f.effects[0].kind not in kinds][: ATTRIBUTION.shown]
 
         def on_all(candidate: Fit) -> Fit:
             return fit(self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ATTRIBUTION.alike)

@@ -16,7 +16,7 @@ from workbench.gap.search.finish import finished, plainest, ranked, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import Step, fit_jointly
 from workbench.gap.search.screening import on_whole_records, one_more
-from workbench.gap.search.search import Decision, Search, spread_over_kinds
+from workbench.gap.search.search import Decision, Search, best_of_each_kind
 from workbench.gap.search.settings import INTERVALS, RANDOM, SEARCH, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
@@ -72,7 +72,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
 def random_beside(search: Search, found: Sequence[Fit]) -> Decision | None:
     """A random disturbance beside stronger effects that leave what looks random; None where none holds."""
     tried = []
-    for given in spread_over_kinds(found, 1)[: RANDOM.likeliest_sets]:
+    for given in best_of_each_kind(found)[: RANDOM.likeliest_sets]:
         evidence = search.evidence_of(apply_all(search.rig, given.effects))
         unclipped, evidence = _without_clipped(search, given.effects, evidence)
         evidence = _by_laws_on_measured_motion(unclipped, evidence)
@@ -138,7 +138,7 @@ def _gaining(search: Search, beside: Search, evidence: Evidence) -> list[Fit]:
     places = [f.effects[0].at for f in found if f.effects[0].at is not None]
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
-    likely = [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RANDOM.rival]
+    likely = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.rival]
     return [f for f in likely if _matters(search, f)]
 
 

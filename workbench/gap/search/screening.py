@@ -12,7 +12,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all, contained
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit, slopes
-from workbench.gap.search.search import Search, apart, in_one_valley, promise, spread_over_kinds
+from workbench.gap.search.search import Search, apart, best_of_each_kind, in_one_valley, promise
 from workbench.gap.search.settings import SCREENING, SEARCH, SELECTION
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
@@ -236,7 +236,7 @@ def _exchanged(found: Sequence[Fit], screened: Screening) -> list[Effect]:
     of_port = [e for e in starts if isinstance(e.target, str) and e.target == best.target and e.kind is not best.kind]
     if isinstance(screened.domain, NamedPoints):
         return of_port
-    likeliest = [f.effects[-1] for f in spread_over_kinds(found, 1) if is_linear(f.effects[-1])][: SELECTION.exchanged]
+    likeliest = [f.effects[-1] for f in best_of_each_kind(found) if is_linear(f.effects[-1])][: SELECTION.exchanged]
     linear = {effect.kind: effect for effect in reversed(starts) if is_linear(effect)}
     there = [e.moved_to(one.at) for one in likeliest for e in linear.values() if e.kind is not one.kind]
     return [*there, *of_port]

@@ -222,18 +222,13 @@ def most_informative(data: FitData, by_channel: np.ndarray) -> tuple[FitData, Fi
     return data.only(tuple(names)).stepped(2), data.only((names[0],)).stepped(2)
 
 
-def spread_over_kinds(fits: Sequence[Fit], most: int) -> list[Fit]:
-    """The fits in their order, at most so many whose last effect is of one kind, none twice."""
-    chosen: list[Fit] = []
-    counts: dict[str, int] = {}
-    keys = set()
+def best_of_each_kind(fits: Sequence[Fit]) -> list[Fit]:
+    """The first fit of every kind that its last effect is of, in the order of the fits, but for hopeless ones."""
+    chosen: dict[str, Fit] = {}
     for candidate in fits:
-        name = candidate.effects[-1].kind.name
-        if candidate.cost < HOPELESS and counts.get(name, 0) < most and candidate.key not in keys:
-            chosen.append(candidate)
-            keys.add(candidate.key)
-            counts[name] = counts.get(name, 0) + 1
-    return chosen
+        if candidate.cost < HOPELESS:
+            chosen.setdefault(candidate.effects[-1].kind.name, candidate)
+    return list(chosen.values())
 
 
 def apart(one: Effect, other: Effect, domain: Domain) -> bool:

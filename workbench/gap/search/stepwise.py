@@ -50,7 +50,7 @@ from workbench.gap.search.plain import (
     other_causes,
 )
 from workbench.gap.search.screening import fitted_ahead, one_more
-from workbench.gap.search.search import Decision, Search, apart, most_informative, spread_over_kinds
+from workbench.gap.search.search import Decision, Search, apart, best_of_each_kind, most_informative
 from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
 from workbench.rig.simulate import is_stepped
 
@@ -128,7 +128,7 @@ class Stepwise:
         if not (found or self.is_believed):  # errors that no model has are what leaves it nothing to do
             return alike[: STEPWISE.singles]
         chosen: list[Fit] = []
-        for single in spread_over_kinds(found, 1):
+        for single in best_of_each_kind(found):
             comes_to = contained(single.effects, search.rig)
             as_likely = {f.key for f in found if f.cost < (1.0 + SEARCH.significant) * single.cost}
             if not comes_to & as_likely:
@@ -140,7 +140,7 @@ class Stepwise:
     @property
     def _like_errors(self) -> list[Fit]:
         """The likeliest linear effects of the structure one sample ahead without errors, best first."""
-        return spread_over_kinds([f for f in self.ahead if is_like_errors(f.effects[0].kind)], 1)
+        return best_of_each_kind([f for f in self.ahead if is_like_errors(f.effects[0].kind)])
 
     def without_errors(self) -> bool:
         """Whether few effects explain the records as well as errors of the nominal model that no model has."""
@@ -726,7 +726,7 @@ class Stepwise:
         size = len(parameters_of(self.search.rig, best.effects))
         nominal = self.search.nominal_ahead
         good = nominal - STEPWISE.as_good * (nominal - self.ahead[0].cost)
-        likely = [f.effects for f in spread_over_kinds(self.ahead, 1) if f.cost <= good and f.n_parameters < size]
+        likely = [f.effects for f in best_of_each_kind(self.ahead) if f.cost <= good and f.n_parameters < size]
         quickly = self._fitted(likely, best, self._slopes(best)) if likely else []
         return [self._whole(step) for step in quickly if step.fit.cost < STEPWISE.near * best.fit.cost]
 

@@ -168,12 +168,10 @@ class StableModes:
     Attributes:
         modes: each as identified at the order where its phase collinearity is highest.
         presence: (n_modes,) share of the orders at which it was found.
-        frequency_spread: (n_modes,) standard deviation of its frequency over the orders, relative.
     """
 
     modes: SampledModes
     presence: np.ndarray
-    frequency_spread: np.ndarray
 
 
 def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], delays: int | None = None) -> Stabilisation:
@@ -239,8 +237,7 @@ def stable_modes(
         np.array([m.shapes[:, r] for m, r in best]).reshape(len(best), len(positions)).T,
         positions,
     )
-    spread = np.array([np.std([m.omega[r] for m, r in g]) for g in stayed]) / np.maximum(modes.omega, 1e-300)
-    return StableModes(modes, np.array([len(g) for g in stayed]) / len(diagram.orders), spread)
+    return StableModes(modes, np.array([len(g) for g in stayed]) / len(diagram.orders))
 
 
 def _nearest(
