@@ -6,6 +6,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.optimize import least_squares
 
+from workbench.cases.units import Units
 from workbench.draw.gap import plot_budget, plot_unmodelled_force
 from workbench.gap.diagnose import diagnose
 from workbench.records.record import Channel, Record
@@ -79,7 +80,17 @@ def study(outcome, data: Path) -> None:
     arrow = record("arrow", ARROW)
 
     nominal = best_linear(fitted)
-    verdict = diagnose(nominal, (fitted,), validation=(held_out,), name="silverbox", settle=SETTLE, free_nominal=True)
+    verdict = diagnose(
+        nominal,
+        (fitted,),
+        validation=(held_out,),
+        name="silverbox",
+        settle=SETTLE,
+        free_nominal=True,
+        units=Units(
+            length="V", mass="s^2", time="s", force="V"
+        ),  # of a circuit
+    )
     errors = {
         name: {"before": rmse(nominal, r, settle), "after": rmse(verdict.corrected, r, settle)}
         for name, r, settle in (("multisines", held_out, SETTLE), ("arrow", arrow, 0.0))
