@@ -13,6 +13,7 @@ from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import projected
 from workbench.identification.input_output.model_order import statistic_of_each
 from workbench.identification.ring_down import ring_down
+from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel, Record
 
 HZ, DAMPING = np.array([18.0, 72.0, 75.0, 160.0]), np.array([0.01, 0.005, 0.008, 0.01])
@@ -155,3 +156,62 @@ def test_a_clipped_force_is_remarked():
     force = np.random.default_rng(1).standard_normal(600)
     spoilt = record(np.clip(force, -1.2, 1.2), noisy(response(force, 1000), 0.05, 1), 1000)
     assert any("input 'F' is clipped at 1.2 and -1.2" in remark for remark in identify_driven(spoilt).remarks)
+
+
+@pytest.mark.parametrize("gusts", [True, False])
+def test_gusts_are_remarked_and_steady_forces_are_not(gusts):
+    rate, n = 50, 6000
+    force = np.random.default_rng(5).standard_normal(n)
+    if gusts:
+        force *= np.where(np.abs(np.arange(n) - 3000) < 100, 20.0, 1.0)
+    outputs = noisy(response(force, rate, [3.0, 8.0], [0.02, 0.02], SHAPES[:, :2]), 0.02, 6)
+    found = identify_ambient(record(force, outputs, rate, inputs=False))
+    assert any("in some parts of the record" in remark for remark in found.remarks) == gusts
+
+
+def test_noise_free_modes_do_not_depend_on_amplitude():
+    """What rounding leaves of their figures is no change."""
+    t = np.arange(3000) / 200
+    each = np.exp(np.outer(2.0 * np.pi * np.array([5.0, 12.0, 30.0]) * (-0.02 + 1j), t))
+    outputs = (SHAPES[:, :3] @ each).real
+    found = ring_down(Record(1.0 / 200, outputs, [Channel(f"a{j}", "acceleration") for j in range(4)]), start=0.0)
+    np.testing.assert_allclose(found.modes.zeta, 0.02 / np.sqrt(1.0004), rtol=1e-6)
+    assert not found.by_amplitude.depends.any()
+
+
+def transfer_functions(noise):
+    lines = 0.5 * np.arange(1, 360)
+    s, omega = 2j * np.pi * lines, 2.0 * np.pi * HZ
+    each = np.array([s**2 / (w**2 + s**2 + 2.0 * z * w * s) for w, z in zip(omega, DAMPING, strict=True)])
+    h = np.einsum("jr,r,rk->jk", SHAPES, SHAPES[0], each)
+    rng = np.random.default_rng(1)
+    h += noise * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+    return h, lines, {"channels": tuple(Channel(f"a{j}", "acceleration", at=j / 4) for j in range(4))}
+
+
+def test_transfer_functions_of_the_other_sign_are_remarked():
+    h, lines, channels = transfer_functions(0.01)
+    assert not identify_transfer(h, lines, **channels).remarks
+    (remark, *_) = identify_transfer(h.conj(), lines, **channels).remarks
+    assert "complex conjugates" in remark
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
+def test_noise_stated_ten_times_off_is_remarked(factor):
+    h, lines, channels = transfer_functions(0.01)
+    found = identify_transfer(h, lines, noise_std=0.01 * factor, **channels)
+    said = [float(remark.split()[4]) for remark in found.remarks if "times noise_std" in remark]
+    assert said == ([] if factor == 1.0 else [pytest.approx(1.0 / factor, rel=0.15)])
+
+
+def test_numbers_of_modes_below_one_are_refused():
+    h, lines, channels = transfer_functions(0.01)
+    spoilt = record(np.ones(200), np.random.default_rng(0).standard_normal((2, 200)), 100)
+    with pytest.raises(ValueError, match="max_modes is a number of modes, 1 or more; got 0"):
+        identify_transfer(h, lines, max_modes=0, **channels)
+    with pytest.raises(ValueError, match="max_modes is"):
+        identify_driven(spoilt, max_modes=0)
+    with pytest.raises(ValueError, match="n_modes is a number of modes, 1 or more; got -1"):
+        identify_ambient(spoilt, n_modes=-1)
+    with pytest.raises(ValueError, match="noise_std must have the shape of transfer"):
+        identify_transfer(h, lines, noise_std=np.ones(3), **channels)

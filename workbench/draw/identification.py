@@ -124,7 +124,8 @@ def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz:
     figure.colorbar(dots, ax=ax, label="phase collinearity of the shape")
     ax.set(xlabel="frequency [Hz]", ylabel="model order (modes)")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-    figure.legend(loc="outside upper right")
+    if stayed.n_modes:
+        figure.legend(loc="outside upper right")
     return figure
 
 

@@ -22,7 +22,7 @@ from workbench.identification.signal.modal_estimates import (
     time_derivatives,
 )
 from workbench.identification.signal.projection import project
-from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress, check_count
 from workbench.records.record import Channel, Record
 from workbench.renamed import Renamed
 from workbench.structure.modes import SampledModes, frozen
@@ -41,6 +41,8 @@ class AmbientSettings:
     # standard error of a frequency up to which a mode counts as found, over √(ζω/T) of a mode alone without noise:
     # poles that only fit noise are not as sure
     least_sure: float = 5.0
+    level_parts: int = 60  # of a record, of which the level is compared
+    uneven: float = 3.5  # rms of the strongest over the median of them, that steady forces do not come to
 
 
 AMBIENT = AmbientSettings()
@@ -121,6 +123,7 @@ def identify_ambient(
     Raises:
         ValueError: as `correlation_functions`; no mode found, or fewer than asked for.
     """
+    check_count("n_modes", n_modes)
     budget = Budget(seconds, progress)
     lags, rows = _lags(record, longest, references)
     decays = _as_records(record, _correlations(record, lags, rows, 1)[0] / record.n_samples, rows)
@@ -161,8 +164,22 @@ def _report(
         jacobian = by_poles(poles[[r]])
         covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
     statistic = np.array([mode.statistic for mode in found])
-    remarks = (*harmonic_remark(poles, steady_modes([record], poles)), *budget.remarks)
+    remarks = (*_uneven_level(record), *harmonic_remark(poles, steady_modes([record], poles)), *budget.remarks)
     return AmbientModes(modes, frozen(covariance), frozen(statistic), limit, decays, remarks)
+
+
+def _uneven_level(record: Record) -> tuple[str, ...]:
+    """A remark where the motion is much stronger in some parts of a record: then a few gusts make the estimates."""
+    about = record.outputs - record.outputs.mean(axis=1, keepdims=True)
+    parts = np.array_split(about / about.std(axis=1, keepdims=True), AMBIENT.level_parts, axis=1)
+    rms = np.sqrt([float((part**2).mean()) for part in parts])
+    ratio = float(rms.max() / np.median(rms))
+    if ratio < AMBIENT.uneven:
+        return ()
+    return (
+        f"the motion is {ratio:.2g} times as strong in some parts of the record as it mostly is: modes may be missing,"
+        " and standard errors too small; measure while the forces are steady, or longer",
+    )
 
 
 def _shapes(decays: Sequence[Record], poles: np.ndarray) -> np.ndarray:

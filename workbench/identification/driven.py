@@ -39,7 +39,7 @@ from workbench.identification.input_output.time_variance import beside_changing,
 from workbench.identification.signal.data_quality import input_faults, of_same_sensors
 from workbench.identification.signal.harmonics import harmonic_remark, steady_modes
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, credible, time_derivatives
-from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress, check_count
 from workbench.records.record import HOLDS, Channel, Record
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.statespace import signal_names
@@ -223,6 +223,7 @@ def identify_driven(
     Raises:
         ValueError: no inputs, inputs that never move or move alike; records that differ; too few samples; no mode.
     """
+    check_count("max_modes", max_modes)
     budget = Budget(seconds, progress)
     records = of_same_sensors(records)
     if straight is not None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
+from workbench.arrays import Floats
 from workbench.identification.input_output.changing_decay import beside_changing
 from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
@@ -23,7 +24,7 @@ from workbench.identification.input_output.spectral_lines import Lines, noise_wi
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, time_derivatives
 from workbench.identification.signal.overtones import overtone_remarks
 from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of
-from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress, check_count
 from workbench.records.record import Channel
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.sensors import MEASURED
@@ -43,6 +44,8 @@ class TransferSettings:
     unsure: float = 0.01  # relative standard error of a frequency from which on a mode is not reported
     strongest: int = 4  # modes for the first estimate of the noise
     reweighted: int = 2  # times that it is estimated
+    acausal: float = 10.0  # energy of impulse responses before the impulse, times that after it
+    disagrees: float = 1.5  # factor between the noise found and that stated, from which on it is remarked
     alike: float = 0.2  # rms of the logarithm by which two estimates may differ and be one
 
 
@@ -134,10 +137,11 @@ def identify_transfer(
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
         channels: one per output; where no quantity is stated, the residual terms are those of any motion.
         band_hz: lowest and highest line to fit; modes beyond are held by residual terms.
-        noise_std: standard error of real and imaginary part, of the shape of `transfer`: from repeated measurements,
-            or by `coherence_noise`. Without it, noise is taken to be the same at all lines of an output, or to go with
-            its size in part where neighbouring lines differ so (`noise_with_size`), and standard errors grow with the
-            residual about each mode where that is larger than elsewhere.
+        noise_std: standard error of real and imaginary part, one or of the shape of `transfer`: from repeated
+            measurements, or by `coherence_noise`. It weighs the lines; how large it is as a whole is found from what is
+            left, and remarked where that disagrees. Without it, noise is taken to be the same at all lines of an
+            output, or to go with its size in part where neighbouring lines differ so (`noise_with_size`), and standard
+            errors grow with the residual about each mode where that is larger than elsewhere.
         max_modes: of a band, where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
@@ -147,6 +151,7 @@ def identify_transfer(
     Raises:
         ValueError: shapes that do not fit, values that are not finite, a band with too few lines, no mode.
     """
+    check_count("max_modes", max_modes)
     budget = Budget(seconds, progress)
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
     n_bands, each_own = (
@@ -171,7 +176,8 @@ def identify_transfer(
     overlap = overlap_remarks(whole.modes.poles, h.shape[0] * h.shape[1])
     deviation = whole.modes.omega * whole.zeta_std + 1j * whole.omega_std
     overtones = overtone_remarks(whole.modes.poles, np.sqrt(whole.statistic), 2.0 * np.pi * whole.scatter_hz, deviation)
-    whole = replace(whole, remarks=(*whole.remarks, *overlap, *_uneven(whole), *overtones, *budget.remarks))
+    about = (*_acausal(h, f), *([] if noise is None else _of_stated_noise(whole.misfit)))
+    whole = replace(whole, remarks=(*about, *whole.remarks, *overlap, *_uneven(whole), *overtones, *budget.remarks))
     if whole.modes.n_modes == 0:
         raise ValueError(
             f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
@@ -291,6 +297,29 @@ def _modes_of(
     )
 
 
+def _acausal(h: np.ndarray, f: np.ndarray) -> tuple[str, ...]:
+    """A remark where impulse responses grow towards the impulse: transfer functions of the other sign convention."""
+    step = np.diff(f)
+    if np.ptp(step) > 1e-6 * step.max():
+        return ()
+    power = (np.abs(np.fft.ifft(h * np.hanning(f.size), axis=-1)) ** 2).sum(axis=(0, 1))
+    after, before = power[1 : f.size // 2].sum(), power[-(f.size // 2) + 1 :].sum()
+    if before < TRANSFER.acausal * after:
+        return ()
+    return (
+        "the impulse responses come before the impulse: these are transfer functions of e^(-iωt)? Then take their"
+        " complex conjugates",
+    )
+
+
+def _of_stated_noise(misfit: Floats) -> tuple[str, ...]:
+    """A remark where what is left is not as large as the noise stated, the median of all outputs."""
+    ratio = float(np.median(misfit))
+    if 1.0 / TRANSFER.disagrees < ratio < TRANSFER.disagrees:
+        return ()
+    return (f"what is left is {ratio:.2g} times noise_std; standard errors go by what is left",)
+
+
 def _uneven(whole: TransferModes) -> tuple[str, ...]:
     """A remark on the modes whose peaks are not those of one pole."""
     which = [
@@ -377,7 +406,10 @@ def _checked(
         )
     if not np.isfinite(f).all() or (np.diff(f) <= 0).any():
         raise ValueError("transfer functions need finite frequencies that increase; sort them, each once")
-    noise = None if noise_std is None else np.asarray(noise_std, float).reshape(np.shape(transfer)).reshape(h.shape)
+    noise = None if noise_std is None else np.asarray(noise_std, float)
+    if noise is not None and noise.shape not in ((), np.shape(transfer)):
+        raise ValueError(f"noise_std must have the shape of transfer, {np.shape(transfer)}; got {noise.shape}")
+    noise = None if noise is None else np.broadcast_to(noise, np.shape(transfer)).reshape(h.shape)
     if noise is not None and not ((noise > 0) & np.isfinite(noise)).all():
         raise ValueError("noise_std must be positive and finite at every line; give lines without noise a floor")
     low, high = (0.0, np.inf) if band_hz is None else band_hz

@@ -189,7 +189,10 @@ class Record(Printed):
             while last >= 0 and not self._instant(last) <= stop + slack:
                 last -= 1
         if first > last:
-            raise ValueError(f"record {self.name!r} runs from {ends[0]:g} to {ends[1]:g} s: nothing in {start}..{stop}")
+            asked = [f"{word} {time:g} s" for word, time in (("from", start), ("to", stop)) if time is not None]
+            raise ValueError(
+                f"record {self.name!r} runs from {ends[0]:g} to {ends[1]:g} s: it has no sample {' '.join(asked)}"
+            )
         if last - first == self.n_samples - 1:
             return self
         kept = slice(first, last + 1)

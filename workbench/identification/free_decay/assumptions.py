@@ -27,6 +27,7 @@ class AssumptionsSettings:
     least_statistic: float = 100.0  # χ² of a mode in a segment, for its frequency there to mean something
     least_cycles: float = 3.0  # likewise
     least_sure: float = 0.01  # relative standard error of a frequency up to which a segment counts
+    shown: tuple[float, float] = (1e-5, 1e-3)  # of a frequency, a damping ratio: less is not seen in their figures
     chance: float = 1e-3  # that a linear structure is said to depend on amplitude
 
 
@@ -98,7 +99,12 @@ def amplitude_dependence(
     values = [_segments(record, refined, np.abs(a), noise, stretches) for record, a, noise in each]
     start = np.concatenate([each[0] for each in values])
     amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in values]))
-    alike = np.stack([_alike(omega, omega_std), _alike(zeta, zeta_std)])
+    alike = np.stack(
+        [
+            _alike(omega, np.hypot(omega_std, ASSUMPTIONS.shown[0] * omega)),
+            _alike(zeta, np.hypot(zeta_std, ASSUMPTIONS.shown[1] * zeta)),
+        ]
+    )
     which = np.repeat(np.arange(len(records)), stretches)
     return AmplitudeDependence(
         frozen(which, int), frozen(start), amplitude, omega, omega_std, zeta, zeta_std, frozen(alike)

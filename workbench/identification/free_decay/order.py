@@ -33,6 +33,7 @@ from workbench.identification.signal.searches import (
     Budget,
     Progress,
     Stepwise,
+    check_count,
     spurious_modes,
 )
 from workbench.records.record import Record
@@ -95,6 +96,7 @@ def identify(
         ValueError: no mode rises above the noise; a faulty channel (`check_data_quality`); records that differ in
             sensors or rate; too few samples.
     """
+    check_count("max_modes", max_modes)
     records = of_same_sensors(records)
     found = identify_within(records, Budget(seconds, progress), max_modes=max_modes, false_alarm=false_alarm)
     found = found.without_artefacts(np.pi / records[0].sample_time)

@@ -138,6 +138,16 @@ class DampingSettings:
 DAMPING = DampingSettings()
 
 
+def check_count(name: str, number: int | None) -> None:
+    """Refuse a number of modes below one.
+
+    Raises:
+        ValueError: naming it.
+    """
+    if number is not None and number < 1:
+        raise ValueError(f"{name} is a number of modes, 1 or more; got {number}")
+
+
 class LeastSquares(Protocol[State]):
     """What the engine asks of a problem."""
 
