@@ -61,3 +61,25 @@ def test_no_word_on_noise_where_more_than_noise_is_left(rig):
     verdict = wb.diagnose(rig, [rig.record(loud.inputs, strange, sample_time=STEP, name="r")], seconds=3.0)
     assert verdict.outcome in ("part", "unknown")
     assert not any("noise of the sensors is" in note for note in verdict.notes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seconds": -5.0}, "seconds must be positive; got -5"),
+        ({"tolerance": float("nan")}, "tolerance is a share of the signal's rms, from 0 to below 1; got nan"),
+        ({"tolerance": 2.0}, "tolerance is a share"),
+        ({"catalogue": ()}, "catalogue holds kinds of effects"),
+        ({"catalogue": ("cubic_spring",)}, "such as kind_named"),
+        ({"workers": 1.5}, "workers is a number of processes"),
+    ],
+)
+def test_arguments_out_of_their_ranges_are_refused(rig, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        wb.diagnose(rig, measured(rig, 1, 200), **arguments)
+
+
+def test_one_record_or_any_iterable_of_them_will_do(rig):
+    one = measured(rig, 1, 200)
+    alone, of_generator = wb.diagnose(rig, one), wb.diagnose(rig, (record for record in [one]))
+    assert alone.outcome == of_generator.outcome == "none"

@@ -1,6 +1,6 @@
 """The diagnosis from end to end: rig and records in, verdict out."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -57,9 +57,9 @@ OVER_FITTING = "The nearest set explains the records it was fitted to, but not t
 @one_blas_thread
 def diagnose(
     rig: Rig,
-    records: Sequence[Record],
+    records: Record | Iterable[Record],
     *,
-    validation: Sequence[Record] = (),
+    validation: Record | Iterable[Record] = (),
     catalogue: tuple[Kind, ...] = CATALOGUE,
     name: str = "case",
     report: Callable[[str, float], None] = lambda text, share: None,
@@ -77,7 +77,7 @@ def diagnose(
 
     Args:
         rig: nominal; for a sensor without noise_std, what the quietest bands of its spectrum hold is taken.
-        records: with the rig's inputs and outputs, in its order.
+        records: one or several, with the rig's inputs and outputs, in its order.
         validation: kept out of every fit.
         catalogue: kinds of effects to try.
         name: of the case.
@@ -95,9 +95,18 @@ def diagnose(
         units: names of the units of the rig and the records, by which the verdict tells its numbers.
 
     Raises:
-        ValueError: records that do not fit the rig or cannot be of it, two of one name, a validation record that
-            repeats one to be fitted, or modes that are not those of the structure.
+        ValueError: arguments out of their ranges; records that do not fit the rig or cannot be of it, two of one name,
+            a validation record that repeats one to be fitted; modes that are not those of the structure.
     """
+    records, validation = (_sequence_of(each) for each in (records, validation))
+    if not 0.0 <= tolerance < 1.0:
+        raise ValueError(f"tolerance is a share of the signal's rms, from 0 to below 1; got {tolerance}")
+    if not catalogue or not all(isinstance(kind, Kind) for kind in catalogue):
+        raise ValueError(
+            f"catalogue holds kinds of effects, such as kind_named('cubic_spring'), one or more; got {catalogue}"
+        )
+    if seconds is not None and not seconds > 0:
+        raise ValueError(f"a search needs time: seconds must be positive; got {seconds:g}")
     sharing = Workers.at_hand() if workers is None else Workers(workers)
     if seconds is not None and sharing.number == 1:
         seconds *= 2.0
@@ -187,6 +196,10 @@ def diagnose(
                 *_notes(attribution, budget, seconds, silent, sound),
             ),
         )
+
+
+def _sequence_of(records: Record | Iterable[Record]) -> tuple[Record, ...]:
+    return (records,) if isinstance(records, Record) else tuple(records)
 
 
 def _faulty(effects: Sequence[Effect]) -> set[str]:

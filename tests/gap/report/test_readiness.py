@@ -84,6 +84,16 @@ def test_faults_of_records_held_out_are_refused_like_those_of_records_to_be_fitt
             check_records(rig, [record], [replace(record, outputs=outputs, name="v")])
 
 
+def test_records_held_out_may_clip_more_than_those_to_be_fitted(rig, data):
+    """Clipping is an effect of the catalogue; where fitted records show it, those held out may be louder."""
+    (record, *_) = data.records
+    top = 0.3 * np.abs(record.outputs).max(axis=1, keepdims=True)
+    clipped = replace(record, outputs=np.clip(record.outputs, -top, top), name="louder")
+    check_records(rig, data.records, [clipped])
+    with pytest.raises(RecordsError, match="it is saturated"):
+        check_records(rig, [clipped])
+
+
 def test_a_rig_without_actuators_and_a_record_of_few_samples_are_refused(rig, data):
     (record,) = data.records
     free = replace(rig, actuators=())

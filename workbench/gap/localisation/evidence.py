@@ -39,7 +39,7 @@ class EvidenceSettings:
     narrow: float = 0.03  # likewise, once they are refined
     finer: int = 5  # steps from one place of a rectangle's grid to the next, once the likeliest are known
     points_tried: int = 4  # named points whose motion is looked at
-    pairs_tried: int = 4  # pairs of them, likewise
+    pairs_tried: int = 12  # pairs of them, likewise
     alike: float = 1e-4  # 1 - cos² of the angle between the motions of two pairs of points: less is one place
     many_points: int = 12  # named points, of which all are looked at
 

@@ -52,7 +52,7 @@ class Workers:
     number: int = 1
 
     def __post_init__(self) -> None:
-        if self.number < 1:
+        if self.number < 1 or self.number != int(self.number):
             raise ValueError(f"workers is a number of processes, this one included: 1 or more; got {self.number}")
 
     @classmethod

@@ -12,11 +12,13 @@ from workbench.gap.effects.nominal import TENSION, deviations_of, group_of, labe
 from workbench.gap.effects.structural import buckling_load
 from workbench.gap.prediction.noise import loudest_logging_noise
 from workbench.gap.prediction.residuals import FitData, lead_of
+from workbench.gap.search.settings import JOINT
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 from workbench.structure.domain import Domain
 
+AT_MOST = 0.99  # of the most that a search takes noise found for
 REMARKED = 1.3  # factor between stated and found noise from which on it is remarked
 # per cent, root mean square: a quarter to a half more than the worst models of trials have; in false valleys it is more
 MOST = (
@@ -157,6 +159,11 @@ class Budget:
         ratio = self.noise_ratio
         if 1.0 / REMARKED < ratio < REMARKED:
             return None
+        if ratio > AT_MOST * JOINT.credible:
+            return (
+                f"What is left is {ratio:.2g} times the stated noise_std or more: louder noise, or errors of the model"
+                " that no effect and no small error describes."
+            )
         return f"The noise of the sensors is {ratio:.2g} times the stated noise_std."
 
     @property

@@ -83,6 +83,7 @@ def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record
 
     Args, Raises: as `check_records`.
     """
+    _check_not_stuck(rig, records)
     for these, what in ((records, "record"), (validation, "validation record")):
         for record in these:
             counted = record.n_samples - lead_of(record, settle)
@@ -91,7 +92,6 @@ def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record
                     f"{what} {record.name!r} has {counted} samples to compare{' once settled' * (settle > 0)}; at least"
                     f" {LEAST_SAMPLES} are needed: take a longer record"
                 )
-        _check_not_stuck(rig, these, what)
         for record in filter(_is_driven, these):
             for sensor, measured in zip(rig.sensors, record.outputs[:, lead_of(record, settle) :], strict=True):
                 if np.ptp(measured) == 0:
@@ -243,15 +243,18 @@ def _modal_masses(modes: Modes, structure: Structure | Plate | Membrane) -> Floa
     return masses
 
 
-def _check_not_stuck(rig: Rig, records: Sequence[Record], what: str) -> None:
-    """A sensor that clips in some records is an effect to be named; one that clips most of the time shows nothing."""
+def _check_not_stuck(rig: Rig, records: Sequence[Record]) -> None:
+    """A sensor that clips in some records is an effect to be named; one that clips most of the time shows nothing.
+
+    Records held out may clip more: what was named predicts that.
+    """
     for j, sensor in enumerate(rig.sensors):
         top = max((float(np.abs(record.outputs[j]).max()) for record in records), default=0.0)
         stuck = [np.abs(record.outputs[j]) >= top * (1 - 1e-9) for record in records]
         share = np.concatenate(stuck).mean() if stuck else 0.0
         if top > 0 and share > STUCK:
             raise RecordsError(
-                f"{what} {records[int(np.argmax([s.mean() for s in stuck]))].name!r}: output {sensor.name!r} stands at"
+                f"record {records[int(np.argmax([s.mean() for s in stuck]))].name!r}: output {sensor.name!r} stands at"
                 f" ±{top:g} for {100 * share:.0f} % of all its samples: it is saturated; lower the level or the gain"
             )
 

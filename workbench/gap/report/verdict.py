@@ -138,7 +138,12 @@ class Verdict:
                 text = "None of the effects tried before the time was spent explains the gap"
             if not any_beyond(self.effects):
                 near = words and (self.shrinkage is None or self.shrinkage.overall >= NEAR)
-                text += f"; the nearest, {words}, would close {closed or 'part of '}it." if near else f"{self._rest}."
+                beside = f" beside {self._errors_named}" if self.budget.nominal >= SHOWN else ""
+                text += (
+                    f"; the nearest, {words}{beside}, would close {closed or 'part of '}it."
+                    if near
+                    else f"{self._rest}."
+                )
             elif self.alternatives:
                 text += f" as likely as {words}, which explains {closed}it{self._not_excluded}"
             else:
@@ -191,10 +196,7 @@ class Verdict:
             share = _percent(self.budget.effects.get(differs.label, 0.0))
             parts.append(f"{share} are differences of {differs.figure} from record to record ({differs.words})")
         if self.budget.nominal >= SHOWN:
-            small = (
-                "small errors of the model" if self.budget.errors_are_small else "implausibly large errors of the model"
-            )
-            parts.append(f"{_percent(self.budget.nominal)} are {small}{self._errors_in_words}")
+            parts.append(f"{_percent(self.budget.nominal)} are {self._errors_named}")
         if self.budget.unexplained >= SHOWN:
             parts.append(f"{_percent(self.budget.unexplained)} remain unexplained")
         if self.budget.noise >= SHOWN:
@@ -206,6 +208,12 @@ class Verdict:
         share = _percent(self.budget.effects.get(differs.label, 0.0))
         how = f"The {differs.figure} differs from record to record by {differs.words}"
         return f"{how}. This causes {share} of the gap{self._rest}."
+
+    @property
+    def _errors_named(self) -> str:
+        """Such as: small errors of the model (stiffness 0.4 %)."""
+        size = "small" if self.budget.errors_are_small else "implausibly large"
+        return f"{size} errors of the model{self._errors_in_words}"
 
     @property
     def _errors_in_words(self) -> str:
