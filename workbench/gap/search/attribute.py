@@ -19,7 +19,7 @@ from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.beside_random import decide_on_random, random_beside, random_beside_errors
-from workbench.gap.search.finish import finished, ranked, relocated, simplest, widened
+from workbench.gap.search.finish import best_of_each, finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.nominal_figures import beside_modes, beside_records
@@ -96,7 +96,7 @@ class Attribution:
             return fit(self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ATTRIBUTION.alike)
 
         fitted = one_blas_thread(self.search.workers.map)(on_all, others)
-        return tuple(sorted((*self.tried, *fitted), key=lambda f: f.cost))
+        return tuple(best_of_each(sorted((*self.tried, *fitted), key=lambda f: f.cost)))
 
 
 @dataclass(frozen=True, eq=False)

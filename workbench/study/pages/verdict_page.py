@@ -71,7 +71,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             ),
         ]
         if verdict.attribution.singles:  # none were tried where errors of the model were fitted from the first
-            each = "Residual with each effect alone: at the noise floor, it explains all of the gap."
+            each = "Residual with each effect alone, without errors of the model: at the noise floor, it explains all."
             figures.append((plot_rivals(verdict), each))
     distortions = _of_lowest_and_highest(records)
     if distortions:
