@@ -215,3 +215,18 @@ def test_numbers_of_modes_below_one_are_refused():
         identify_ambient(spoilt, n_modes=-1)
     with pytest.raises(ValueError, match="noise_std must have the shape of transfer"):
         identify_transfer(h, lines, noise_std=np.ones(3), **channels)
+
+
+def test_a_repeated_root_is_remarked():
+    """Two references tell both modes of a square plate, and no more than the plane of their shapes."""
+    lines = 0.5 * np.arange(1, 160)
+    s, hz = 2j * np.pi * lines, np.array([21.0, 21.0, 55.0])
+    shapes = np.array([[1.0, 0.2, 0.5], [0.3, 1.0, -0.7], [-0.6, 0.8, 0.9], [0.7, -0.4, 0.2]])
+    each = np.array([1.0 / (w**2 + s**2 + 0.02 * w * s) for w in 2.0 * np.pi * hz])
+    h = np.einsum("jr,ir,rk->jik", shapes, shapes[:2], each)
+    rng = np.random.default_rng(3)
+    h = h + 1e-3 * np.abs(h).max() * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+    found = identify_transfer(h, lines, channels=tuple(Channel(f"p{j}", "displacement", at=j / 3) for j in range(4)))
+    np.testing.assert_allclose(found.modes.frequencies_hz, hz, rtol=1e-3)
+    (remark,) = found.remarks
+    assert remark.startswith("modes 1 and 2 (21 Hz) may be one repeated root")

@@ -244,6 +244,22 @@ def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, n
     return np.asarray(~growing & (omega_std < modes.omega) & (modes.omega < nyquist))
 
 
+def repeated_remarks(found: "ModalEstimates") -> tuple[str, ...]:
+    """A remark on neighbours whose frequency and damping are the same within their errors: a repeated root."""
+    modes, pairs = found.modes, []
+    for r in range(modes.n_modes - 1):
+        apart = np.abs(np.diff([modes.omega[r : r + 2], modes.zeta[r : r + 2]], axis=1)).ravel()
+        errors = np.hypot(*np.array([found.omega_std[r : r + 2], found.zeta_std[r : r + 2]]).T)
+        if (apart < SURE * errors).all() and apart[0] < modes.zeta[r] * modes.omega[r]:
+            pairs.append(f"{r + 1} and {r + 2} ({modes.frequencies_hz[r]:.4g} Hz)")
+    if not pairs:
+        return ()
+    return (
+        f"modes {', '.join(pairs)} may be one repeated root: only the plane of their two shapes is determined, and each"
+        " shape is one of many in it, which need not be real",
+    )
+
+
 def by_poles(poles: np.ndarray) -> np.ndarray:
     """∂(ω, ζ)/∂(x, y) of poles λ = x + iy, (2 n_modes, 2 n_modes): dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³."""
     x, y, omega = poles.real, poles.imag, np.abs(poles)
