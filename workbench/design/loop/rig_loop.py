@@ -18,6 +18,7 @@ from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.simulate import law_arrays, participation_of, structure_arrays
 from workbench.rig.statespace import output_matrix
 from workbench.structure.domain import Where
+from workbench.structure.modes import freeze
 from workbench.threads import cores
 
 SUBSTEPS = 4
@@ -59,6 +60,8 @@ class LoopTest:
                 f"LoopTest.forces must have shape ({len(self.ports)} ports, {self.n_samples} samples); got"
                 f" {np.shape(self.forces)}. Is time last?"
             )
+        if self.forces is not None:
+            freeze(self, "forces")
 
     @property
     def time(self) -> np.ndarray:
@@ -82,6 +85,9 @@ class LoopRun:
     elements: np.ndarray
     bounded: bool
     into: np.ndarray
+
+    def __post_init__(self) -> None:
+        freeze(self, "commands", "elements", "into")
 
     @property
     def work(self) -> np.ndarray:
@@ -218,7 +224,7 @@ def _seen(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
 
 def _disturbances(rig: Rig, test: LoopTest, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
     """Forces (n_forces, n_samples) that are no commands, and their participation (n_modes, n_forces)."""
-    rows = [] if test.forces is None else list(np.asarray(test.forces, float))
+    rows = [] if test.forces is None else list(test.forces)
     columns = list(participation_of(Rig(rig.modes, test.ports, ())).T) if test.ports else []
     middle = test.time + 0.5 * test.sample_time
     for element in rig.elements:
