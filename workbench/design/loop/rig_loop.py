@@ -155,7 +155,8 @@ def run_loop(
         out,
     )
     q, v, f, u, *elements = out
-    response = Response(test.sample_time * np.arange(n_samples), np.vstack([q, v]), f, modes)
+    time = test.sample_time * np.arange(n_samples, dtype=float)
+    response = Response(time, np.vstack([q, v]), f, modes)
     return LoopRun(response, u, np.array(elements), bool(bounded), into)
 
 
@@ -167,7 +168,7 @@ def run_loops(rigs: Sequence[Rig], controller: DigitalController, test: LoopTest
 def of_loops(
     rigs: Sequence[Rig], controller: DigitalController, test: LoopTest, kept: Callable[[Rig, LoopTest, LoopRun], K]
 ) -> list[K]:
-    """What is kept of the run of each of many rigs, each under its own test: a thousand runs fill the memory, a few figures of each do not."""
+    """What is kept of the run of each of many rigs, from rig, its own test and run: a thousand runs fill the memory."""
     tests = [test if test.seed is None else replace(test, seed=test.seed + i) for i in range(len(rigs))]
     with ThreadPoolExecutor(cores()) as pool:
         return list(pool.map(lambda rig, one: kept(rig, one, run_loop(rig, controller, one)), rigs, tests))
