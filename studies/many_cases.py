@@ -76,7 +76,7 @@ def seconds(call) -> float:
 def study(outcome, data=None):
     cases = many.grid(weight=WEIGHTS, shift=SHIFTS)
     found = outcome.run(cases, spilled)
-    again = outcome.run(cases, spilled, workers=1)
+    again = outcome.run(cases, spilled, "again", workers=1)
     plain = [spilled(**case) for case in cases]
     apart = max(abs(r[name] - p[name]) for r in (found, again) for r, p in zip(r, plain) for name in p)
     outcome.check("run, run again and a plain loop: largest difference of any result", apart, 0.0)

@@ -438,6 +438,22 @@ def test_an_unfinished_study_keeps_no_other_from_running(tmp_path, monkeypatch):
     assert "begun.py is not a study" in every.output and "falls: OSError" in every.output
 
 
+def test_studies_share_what_lies_beside_them(tmp_path, monkeypatch):
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies/shared_by_mine.py").write_text("LENGTH = 0.6\n")
+    (tmp_path / "studies/uses.py").write_text(
+        '"""Does it?"""\nimport shared_by_mine\n\ndef study(outcome, data=None):\n'
+        '    outcome.check("length", shared_by_mine.LENGTH, 1.0)\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    every = run("study", "--all")
+    assert every.exit_code == 0 and "1 of 1 checks hold" in every.output
+    assert run("study", "shared_by_mine").exit_code == 2
+    for given in (("uses",), ("--data", ".")):
+        refused = run("study", "--all", *given)
+        assert refused.exit_code == 2 and "--all runs every study that makes its own data" in refused.output
+
+
 def test_words_of_several_lines_are_told_in_one(tmp_path, monkeypatch):
     (tmp_path / "studies").mkdir()
     (tmp_path / "studies/torn.py").write_text(
@@ -445,7 +461,8 @@ def test_words_of_several_lines_are_told_in_one(tmp_path, monkeypatch):
     )
     monkeypatch.chdir(tmp_path)
     result = run("study", "torn")
-    assert result.exit_code == 2 and result.output.splitlines()[-1] == "workbench: a matrix [[1]]"
+    assert result.exit_code == 2 and result.output.splitlines()[-1].startswith("workbench: a matrix [[1]] (")
+    assert result.output.splitlines()[-1].endswith("torn.py, line 3)")
 
 
 MANY = """'Is a third of two an error?'
@@ -457,6 +474,7 @@ def third(at):
 
 def study(outcome, data=None):
     found = outcome.run([{"at": 1}, {"at": 2}], third, workers=1)
+    outcome.run([{"at": 1}], third, workers=1)
     outcome.check("third", found[0]["third"], 0.5)
 """
 
@@ -468,6 +486,7 @@ def test_cases_that_fail_are_reported_at_the_end_beside_the_others(tmp_path, mon
     result = run("study", "studies/many.py")
     assert result.exit_code == 1 and "1 of 2 cases failed" in result.output
     assert "{'at': 2}: ArithmeticError: two" in result.output and "1 of 1 checks hold" in result.output
+    assert len((tmp_path / "out/many-cases-2.csv").read_text().splitlines()) == 2
     rows = (tmp_path / "out/many-cases.csv").read_text().splitlines()
     assert rows[0].startswith("at,third,seed,error,seconds") and rows[1].startswith("1,0.3333333333333333,,,")
     [kept] = (tmp_path / "out/cache").rglob("*.json")

@@ -1,4 +1,6 @@
-"""What cannot be verified is refused by name."""
+"""A loop is stable exactly when it does not grow of itself; what cannot be verified is refused by name."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,6 +9,8 @@ from workbench.design.estimation.digital import sampled
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.rig_loop import LoopTest
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import LinearSpring, PeriodicForce
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.proof import verify
 
@@ -49,3 +53,25 @@ def test_what_no_loop_can_be_made_of_is_refused(rig):
         LoopTest(50.5, 0.01)
     with pytest.raises(TypeError, match=r"LoopTest.sample_time is a number in s; got '0.01'"):
         LoopTest(50, "0.01")
+
+
+def test_forces_neither_hide_growth_nor_pass_for_it(rig):
+    """A spring below zero that limited forces hold near rest alone; and a stable loop under forces of many kinds."""
+    law = imsc(rig.modes, 2, rig.actuators, weight=0.01)
+    controller = sampled(kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-4), 0.01)
+    held = replace(
+        rig,
+        actuators=tuple(replace(a, limit=0.2) for a in rig.actuators),
+        elements=(LinearSpring(0.8, -1.5 * rig.modes.omega[0] ** 2),),
+    )
+    n, port = 600, (Actuator("shaker", 0.83, direct=True),)
+    noise = np.random.default_rng(0).standard_normal((1, n))
+    for scale, stays in ((1e-4, True), (0.5, True), (2.0, False)):
+        test = LoopTest(n, 0.01, forces=scale * noise, ports=port)
+        assert verify([held], controller, test).stable.all() is np.bool_(stays)
+    ramp = np.linspace(0.0, 1.0, n)[None]
+    at_resonance = np.sin(rig.modes.omega[3] * 0.01 * np.arange(n))[None]
+    for force in (ramp, ramp**4, np.full((1, n), 0.5), at_resonance, noise):
+        assert verify([rig], controller, LoopTest(n, 0.01, forces=force, ports=port)).stable.all()
+    hummed = replace(rig, elements=(PeriodicForce(0.83, rig.modes.omega[3] / (2 * np.pi), 1.0, 0.0),))
+    assert verify([hummed], controller, LoopTest(n, 0.01)).stable.all()

@@ -374,9 +374,11 @@ def test_a_design_on_a_frame_is_what_the_library_makes_of_it(frame):
             shown(rig, asked({**plain(design), **change}))
 
 
-def test_a_design_saved_on_a_frame_is_a_study_that_runs_and_agrees(frame, tmp_path):
+@pytest.mark.parametrize("before", ["", "  "])
+def test_a_design_saved_on_a_frame_is_a_study_that_runs_and_agrees(frame, before, tmp_path):
     rig, text = frame
-    path = save(rig, text, start(rig), "found", tmp_path / "studies")
+    indented = "\n".join(before + line for line in text.splitlines())
+    path = save(rig, indented, start(rig), "found", tmp_path / "studies")
     outcome = Outcome("found", figures_folder=tmp_path / "figures")
     run_study(describe(path), None, outcome, tmp_path)
     assert outcome.holds and len(outcome.checks) == 3

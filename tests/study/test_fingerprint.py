@@ -17,19 +17,29 @@ from workbench.study.runs.fingerprint import fingerprint
 SOURCE = """
 import numpy as np
 from dataclasses import dataclass, field
+from functools import cached_property
 
 SCALE = 2.0
+
+@dataclass(frozen=True, slots=True)
+class Plate:
+    depth: float = 0.1
 
 @dataclass(frozen=True)
 class Box:
     size: float = 3.0
     names: list = field(default_factory=list)
+    sides: list = field(default_factory=lambda: [1.0])
+
+    @cached_property
+    def area(self):
+        return self.size**2
 
     def volume(self):
         return self.size**3 * SCALE
 
 def inner(x):
-    return np.sin(x) + Box().volume()
+    return np.sin(x) + Box().volume() + Plate().depth
 
 def unused(x):
     return 1
@@ -70,6 +80,9 @@ def test_a_dataclass_of_a_module_that_is_not_registered_is_read(tmp_path):
         ("SCALE = 2.0", "SCALE = 2", False),
         ("size: float = 3.0", "size: float = 4.0", False),
         ("default_factory=list", "default_factory=dict", False),
+        ("lambda: [1.0]", "lambda: [2.0]", False),
+        ("depth: float = 0.1", "depth: float = 0.2", False),
+        ("self.size**2", "self.size**4", False),
         ("self.size**3", "self.size**2", False),
         ("power=2", "power=3", False),
         ("(x, 1.0)", "(x, 1.5)", False),
@@ -94,6 +107,25 @@ def test_it_follows_the_users_own_modules(tmp_path, monkeypatch):
             sys.modules.pop("helpers_of_mine", None)
             prints.append(fingerprint(loaded(tmp_path, source)))
         assert prints[0] != prints[1]
+
+
+def test_it_follows_variables_of_modules_that_are_set_at_run_time(tmp_path, monkeypatch):
+    """Read by the function itself, or by a function of the module that it calls; what nobody reads does not count."""
+    monkeypatch.syspath_prepend(tmp_path)
+    text = "GAIN, BIAS, UNREAD, RNG = 1.0, 1.0, 1.0, None\n\ndef biased(x):\n    return x + BIAS\n"
+    (tmp_path / "settings_of_mine.py").write_text(text)
+    source = "import settings_of_mine as s\ndef function(x):\n    return s.biased(s.GAIN * x), s.RNG\n"
+    function = loaded(tmp_path, source)
+    module = sys.modules["settings_of_mine"]
+    first = fingerprint(function)
+    for name, same in (("GAIN", False), ("BIAS", False), ("UNREAD", True)):
+        monkeypatch.setattr(module, name, 2.0)
+        assert (fingerprint(function) == first) is same
+        monkeypatch.setattr(module, name, 1.0)
+        assert fingerprint(function) == first
+    monkeypatch.setattr(module, "RNG", np.random.default_rng(0))
+    with pytest.raises(StudyError, match=r"settings_of_mine\.RNG is a random generator"):
+        fingerprint(function)
 
 
 def test_it_follows_closures_parts_and_methods():

@@ -47,6 +47,19 @@ def test_results_are_plain_json_with_checks(tmp_path):
     assert path.read_bytes() == again.read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        ("found", {"W_R": 3.0}, "a table cannot be called 'found': .* rename the table"),
+        ("checks", 1.0, "a table cannot be called 'checks'"),
+        ("poles", {"first": [1j]}, "table 'poles': .* complex .* by its parts"),
+    ],
+)
+def test_a_table_that_the_results_could_not_hold_is_refused(name, values, words):
+    with pytest.raises(StudyError, match=words):
+        Outcome("x").table(name, values)
+
+
 def test_a_value_that_is_not_a_number_never_holds():
     outcome = Outcome("x")
     outcome.check("a", np.nan, 1.0)

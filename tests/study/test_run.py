@@ -211,6 +211,12 @@ def test_the_table_as_a_frame_and_as_parquet(tmp_path):
     assert np.isnan(back["third"][1]) and list(back["nest.list"][2]) == [1, 1e-300]
 
 
+def test_the_table_as_json_is_json(tmp_path):
+    found = study.run([{"x": 1.0}], lambda x: {"y": np.inf, "z": [np.nan, x]}, cache=None, workers=1)
+    [row] = json.loads(found.write(tmp_path / "t.json").read_text(), parse_constant=pytest.fail)
+    assert row["y"] is None and row["z"] == [None, 1.0]
+
+
 def test_a_table_says_what_it_cannot_do(tmp_path):
     with pytest.raises(StudyError, match=r"written as .csv, .parquet, .json; got .xls"):
         table().write(tmp_path / "t.xls")

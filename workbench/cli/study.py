@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from workbench.cli.terminal import FAILURE, complain, console, errors, guarded, progress_bar, say, short
+from workbench.cli.terminal import FAILURE, complain, console, errors, guarded, progress_bar, say, short, with_notes
 
 if TYPE_CHECKING:
     from workbench.study.catalogue import StudyFile
@@ -30,6 +30,10 @@ def study(
     """
     from workbench.study.catalogue import find_study, list_studies
 
+    if every and (name is not None or data is not None):
+        raise ValueError(
+            "--all runs every study that makes its own data; leave it out to run one by its name or with --data"
+        )
     if name is None and not every:
         entries = list_studies()
         width = max((len(entry.name) for entry in entries), default=0)
@@ -38,8 +42,8 @@ def study(
             about = f"cannot be run: {entry.fault}" if entry.fault else f"{entry.question}{needs}"
             say(f"{entry.name:<{width}}  {about}")
         return
-    if name is None or every:
-        chosen = [entry for entry in list_studies(here_first=True) if not entry.needs_data]
+    if name is None:
+        chosen = [entry for entry in list_studies(here_first=True) if entry.defined and not entry.needs_data]
     else:
         chosen = [find_study(name)]
     # of several, one that fails does not stop the others
@@ -52,7 +56,7 @@ def _run_one_of_several(found: "StudyFile", data: Path | None, scheduler: str | 
     try:
         return _run(found, data, scheduler)
     except Exception as error:
-        complain(f"{found.name}: {type(error).__name__}: {error}")
+        complain(f"{found.name}: {type(error).__name__}: {with_notes(error)}")
         return False
 
 

@@ -40,16 +40,22 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
         except typer.Exit:
             raise
         except (ValueError, OSError, MemoryError) as error:
-            complain(str(error))
+            complain(with_notes(error))
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt:
             complain("interrupted")
             raise typer.Exit(FAILURE) from None
         except Exception as error:
-            complain(f"{type(error).__name__}: {error}")
+            complain(f"{type(error).__name__}: {with_notes(error)}")
             raise typer.Exit(FAILURE) from None
 
     return run
+
+
+def with_notes(error: BaseException) -> str:
+    """What an error says, and in brackets what was noted of it, such as a line of the user's own script."""
+    notes = getattr(error, "__notes__", ())
+    return f"{error} ({'; '.join(notes)})" if notes else str(error)
 
 
 def complain(fault: str) -> None:

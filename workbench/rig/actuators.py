@@ -69,12 +69,14 @@ class Actuator:
         return bool(unbounded and not (self.dead_zone or self.delay or self.hysteresis_share or self.bias))
 
 
+def force_unit(actuator: Actuator) -> str:
+    """Unit of what it does: N, N m, or N m/m of a patch on a plate."""
+    return "N" if actuator.kind == "force" else "N m/m" if isinstance(actuator.at, Patch) else "N m"
+
+
 def command_unit(actuators: Sequence[Actuator]) -> str:
     """Unit of what all of them command: N, N m, or N m/m of patches on a plate; empty if they differ or have gains."""
-    units = {
-        "" if a.gain != 1 else "N" if a.kind == "force" else "N m/m" if isinstance(a.at, Patch) else "N m"
-        for a in actuators
-    }
+    units = {"" if a.gain != 1 else force_unit(a) for a in actuators}
     return units.pop() if len(units) == 1 else ""
 
 

@@ -11,6 +11,7 @@ from workbench.arguments import whole
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, of_loops, run_loop
 from workbench.renamed import Renamed
+from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
@@ -27,7 +28,8 @@ class Verification:
     """A controller on samples of an uncertain rig.
 
     Attributes:
-        stable: (n_draws,) whether the loop of small motion is stable and the motion under test stays.
+        stable: (n_draws,) whether the loop of small motion is stable and the motion under test does not grow, or
+            decays after it where forces act in it.
         damping: (n_draws, n_modes) ratio of each mode's pole in the closed loop, about the motion under test.
         peak_force, stroke: (n_draws,) the largest force of any actuator, N, and displacement at any actuator, m.
         work: (n_draws, n_modes) W_r; controlled: zero-based modes among them.
@@ -168,13 +170,12 @@ def verify(
     if strange:
         raise ValueError(f"controlled are modes 0 to {n_modes - 1} of the rigs, counted from zero; got {strange[0]}")
 
-    def drawn(rig: Rig, run: LoopRun) -> _Draw:
+    def drawn(rig: Rig, one: LoopTest, run: LoopRun) -> _Draw:
         poles, energy = loop_poles(rig, controller, modes_in_motion(rig, run)), run.response.energy
         with np.errstate(over="ignore", invalid="ignore"):
             total = energy.sum(axis=0)
-            stays = run.bounded and not (test.forces is None and _grows(total))
             return _Draw(
-                stable=stays and poles.spectral_radius <= 1.0 + 1e-9,
+                stable=poles.spectral_radius <= 1.0 + 1e-9 and _stays(rig, controller, one, run),
                 damping=poles.damping[:n_modes],
                 peak_force=np.abs(run.response.forces).max(),
                 stroke=_stroke(rig, controller, run),
@@ -292,6 +293,19 @@ def _band(energies: Sequence[np.ndarray]) -> np.ndarray:
 def _finite(values: ArrayLike) -> np.ndarray:
     values = np.asarray(values, float)
     return np.where(np.isfinite(values), values, np.inf)
+
+
+def _stays(rig: Rig, controller: DigitalController, test: LoopTest, run: LoopRun) -> bool:
+    """Whether the motion does not grow of itself: under test, or after it where forces act in it.
+
+    Forces may well make a stable motion grow. Once they are gone it can only decay, and as long a time as that of the
+    test shows whether it does.
+    """
+    pushed = test.forces is not None or any(isinstance(e, PeriodicForce | RandomForce) for e in rig.elements)
+    if not (run.bounded and pushed):
+        return run.bounded and not _grows(run.response.energy.sum(axis=0))
+    after = run_loop(rig, controller, test, free=test.n_samples)
+    return after.bounded and not _grows(after.response.energy.sum(axis=0)[test.n_samples :])
 
 
 def _grows(energy: np.ndarray) -> bool:

@@ -3,12 +3,17 @@
 import ast
 import hashlib
 import importlib.util
+import sys
 import sysconfig
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.study.pages.page import study_page
 from workbench.study.runs.cases import StudyError
+from workbench.study.runs.fingerprint import is_own
 from workbench.study.runs.outcome import Outcome
 
 
@@ -22,6 +27,7 @@ class StudyFile:
         question: the first line of its docstring.
         needs_data: what --data must name, where it must be given.
         fault: why it cannot be run, where it cannot.
+        defined: whether there is a function `study`; without, it may hold what the studies beside it share.
     """
 
     path: Path
@@ -29,6 +35,7 @@ class StudyFile:
     question: str
     needs_data: str | None
     fault: str | None = None
+    defined: bool = True
 
 
 def study_scripts(*, here_first: bool = False) -> dict[str, Path]:
@@ -57,6 +64,10 @@ def output_root(study: StudyFile) -> Path:
     return project if here.is_relative_to(project) and study.path.resolve().parent.name == "studies" else here
 
 
+class NoStudyError(StudyError):
+    """A script without a function `study`."""
+
+
 def describe(path: Path) -> StudyFile:
     """Read a study's question without running it."""
     try:
@@ -64,7 +75,7 @@ def describe(path: Path) -> StudyFile:
     except (SyntaxError, ValueError, RecursionError, OSError) as error:
         raise StudyError(f"{path} is not a study: {error}") from error
     if not any(isinstance(node, ast.FunctionDef) and node.name == "study" for node in tree.body):
-        raise StudyError(f"{path} defines no function study(outcome, data)")
+        raise NoStudyError(f"{path} defines no function study(outcome, data)")
     needs = None
     for node in tree.body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "NEEDS_DATA":
@@ -85,7 +96,7 @@ def _described(path: Path) -> StudyFile:
     try:
         return describe(path)
     except StudyError as error:
-        return StudyFile(path, path.stem, "", None, str(error))
+        return StudyFile(path, path.stem, "", None, str(error), defined=not isinstance(error, NoStudyError))
 
 
 def find_study(name: str) -> StudyFile:
@@ -108,11 +119,14 @@ def find_study(name: str) -> StudyFile:
 def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path) -> tuple[Path, Path]:
     """Run a study; write its JSON (studies/results of its project, else out/results), its page and its tables (out).
 
+    It can import what lies beside it.
+
     Returns:
         The paths of the JSON and of the page.
 
     Raises:
         StudyError: data that are needed and not given, or not there.
+        Exception: what the study raises, with a note of the script and the line that it comes from.
     """
     if data is None and study.needs_data:
         raise StudyError(f"study {study.name} needs --data: {study.needs_data}")
@@ -122,13 +136,31 @@ def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path)
     if spec is None or spec.loader is None:
         raise StudyError(f"{study.path} is no Python file")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    module.study(outcome, data)
+    with _own_folder(study.path):
+        spec.loader.exec_module(module)
+        module.study(outcome, data)
     outcome.write_runs(root / "out")
     made_by = f"workbench study {study.name}" + (f" --data {data}" if data else "")
     page = study_page(outcome, root / "out", inputs=_inputs(study, data), made_by=made_by)
     owned = study.path.resolve().parent == root / "studies"
     return outcome.write(study.path.parent / "results" if owned else root / "out" / "results"), page
+
+
+@contextmanager
+def _own_folder(script: Path) -> Iterator[None]:
+    """Imports from a script's folder, after all else so that no study stands for a library; errors say their line."""
+    folder = str(script.resolve().parent)
+    sys.path.append(folder)
+    try:
+        yield
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [f for f in frames if Path(f.filename).is_file() and is_own(f.filename, None)]
+        if own:
+            error.add_note(f"{own[-1].filename}, line {own[-1].lineno}")
+        raise
+    finally:
+        sys.path.remove(folder)
 
 
 def _inputs(study: StudyFile, data: Path | None) -> dict[str, str]:

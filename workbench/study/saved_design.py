@@ -29,7 +29,7 @@ def study(outcome, data=None):
     rig = read_rig(Path(__file__).with_suffix(".toml"))
     tried = try_out(rig, DESIGN)
     found = {{"W_R": tried.work.residual_total, "effort": tried.effort}}
-    outcome.table("found", found)
+    outcome.table("design", found)
     for name, value in SHOWN.items():
         outcome.check(f"{{name}}: against the bench, relative", abs(found[name] / value - 1.0) if value else 0.0, 1e-6)
     outcome.check("stable or not, against the bench", float(tried.loop.stable is not STABLE), 0.0)
@@ -37,7 +37,7 @@ def study(outcome, data=None):
     outcome.say("W_R = {{W_R:.3e}} for an effort of {{effort:.3e}}.".format(**found))
     outcome.figure("work", plot_work({{"this design": tried.work}}), "Spillover work by residual mode.")
 {motion}'''
-TABLE = re.compile(r"^points *= *.*$", re.MULTILINE)
+TABLE = re.compile(r"^([ \t]*)points[ \t]*=.*$", re.MULTILINE)
 # what shows the motion: of a member, a plate, and a frame
 MEMBER = (
     """from workbench.draw.design import plot_motion, plot_work
@@ -84,7 +84,7 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
         imports, motion = PLATE
     if isinstance(domain, NamedPoints):
         imports, motion = FRAME
-        structure = TABLE.sub(f'points = "{path.with_suffix(".csv").name}"', structure)
+        structure = TABLE.sub(rf'\1points = "{path.with_suffix(".csv").name}"', structure)
     script = SCRIPT.format(
         design=_written(design), shown=found, stable=tried.loop.stable, imports=imports, motion=motion
     )

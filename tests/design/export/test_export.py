@@ -77,6 +77,16 @@ def test_channels_close_to_one_another_are_told_apart_in_any_unit(unit):
     assert len(set(words)) == 4 and all(f"x = {at:g}" in text for at, text in zip(near * 2, words))
 
 
+def test_a_command_has_the_unit_of_what_it_does():
+    """The force itself, but for a gain: then a volt, say, makes so much of it."""
+    drives = [Actuator("F", 0.5), Actuator("M", 0.5, "moment"), Actuator("V", 0.5, "moment", gain=2.5)]
+    assert command_words(Interval(2.0), drives) == (
+        "F: force at x = 0.5, N",
+        "M: moment at x = 0.5, N m",
+        "V: command at x = 0.5, 2.5 N m per unit",
+    )
+
+
 def stepped(controller: DigitalController, readings: np.ndarray) -> np.ndarray:
     z, before, commands = np.zeros(controller.a.shape[0]), np.zeros(len(controller.actuators)), []
     for reading in readings.T:

@@ -12,7 +12,7 @@ from workbench.design.estimation.observers import kalman, luenberger
 from workbench.design.export.export import export
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc, imsc_poles, pole_gains, riccati_gains, riccati_matrices
-from workbench.design.laws.law import DesignError
+from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import on_off
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.spillover.explain import explain_spillover
@@ -189,3 +189,25 @@ def test_a_mode_nobody_moves_is_told_whatever_the_units(gain):
     assert imsc(modes(), 2, weak, weight=1.0).gain.shape == (2, 4)
     with pytest.raises(DesignError, match="mode 2 is uncontrollable"):
         imsc(modes(), [1], weak[:1], weight=1.0)
+
+
+@pytest.mark.parametrize(
+    ("gain", "controlled", "words"),
+    [
+        (np.ones((2, 4)), (-1, 0), "a mode counted from zero, is a whole number, 0 or more; got -1"),
+        (np.ones((2, 4)), (0, 1.5), "is a whole number, 0 or more; got 1.5"),
+        (np.ones((2, 4)), (0, 0), r"one mode or more, each once; got \[0, 0\]"),
+        (np.ones((2, 0)), (), r"one mode or more, each once; got \[\]"),
+        (np.full((2, 4), np.nan), (0, 1), "Law.gain must be finite; got nan"),
+    ],
+)
+def test_a_law_by_hand_that_cannot_be_is_refused(gain, controlled, words):
+    with pytest.raises(ValueError, match=words):
+        Law(gain, controlled, (Actuator("a", 2.5), Actuator("b", 7.2)))
+
+
+def test_a_closed_loop_cannot_be_written_to():
+    loop = close_loop(modes(4), imsc(modes(4), 2, (Actuator("a", 2.5), Actuator("b", 7.2)), weight=1.0))
+    for array in (loop.matrix, loop.feedback):
+        with pytest.raises(ValueError, match="read-only"):
+            array *= 0.5

@@ -155,3 +155,14 @@ def test_the_linear_part_is_pythons_control(rig):
     found = sampled(controller, DT).state_space()
     assert isinstance(controller, Controller) and found.dt == DT
     assert found.A == pytest.approx(expected.A, abs=1e-9) and found.B == pytest.approx(expected.B, abs=1e-9)
+
+
+def test_a_test_and_its_run_cannot_be_written_to(rig):
+    forces = np.zeros((1, 10))
+    test = LoopTest(10, DT, forces=forces, ports=(Actuator("h", 0.8, direct=True),))
+    forces[:] = 9.0
+    assert not test.forces.any()
+    run = run_loop(rig, restless(rig), test)
+    for array in (test.forces, run.commands, run.elements, run.into):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 1.0

@@ -10,7 +10,7 @@ from jinja2 import Environment, StrictUndefined
 
 from workbench.design.estimation.digital import DigitalController
 from workbench.records.record import QUANTITIES
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, force_unit
 from workbench.rig.sensors import Sensor
 from workbench.structure.domain import Domain
 
@@ -128,8 +128,13 @@ def reading_words(domain: Domain, sensors: Sequence[Sensor]) -> tuple[str, ...]:
 
 
 def command_words(domain: Domain, actuators: Sequence[Actuator]) -> tuple[str, ...]:
-    """What each command is: actuator, kind and place."""
-    return tuple(f"{a.name}: {a.kind} at {domain.text(a.at, DIGITS)}" for a in actuators)
+    """What each command is: actuator, kind, place and unit; where it has a gain, what a unit of the command does."""
+    return tuple(
+        f"{a.name}: {a.kind} at {domain.text(a.at, DIGITS)}, {force_unit(a)}"
+        if a.gain == 1
+        else f"{a.name}: command at {domain.text(a.at, DIGITS)}, {a.gain:.{DIGITS}g} {force_unit(a)} per unit"
+        for a in actuators
+    )
 
 
 def _listed(array: str, words: Sequence[str]) -> list[str]:

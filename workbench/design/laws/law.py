@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arguments import whole
 from workbench.arrays import Floats, Integers
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -34,6 +35,11 @@ class Law(Printed):
         name: for tables and plots.
         designed_by: designs the law anew with the settings that it has, from modes, controlled modes and actuators;
             None for a gain given by hand.
+
+    Raises:
+        TypeError: a controlled mode that is no number.
+        ValueError: a gain of another shape, or that is not finite; no controlled mode, or one that is negative, no
+            whole number, or named twice.
     """
 
     gain: np.ndarray
@@ -44,13 +50,18 @@ class Law(Printed):
 
     def __post_init__(self) -> None:
         freeze(self, "gain")
-        object.__setattr__(self, "controlled", tuple(int(r) for r in self.controlled))
+        index = tuple(whole(r, "each of Law.controlled, a mode counted from zero,") for r in self.controlled)
+        object.__setattr__(self, "controlled", index)
         object.__setattr__(self, "actuators", tuple(self.actuators))
         expected = (len(self.actuators), 2 * len(self.controlled))
         if self.gain.shape != expected:
             raise ValueError(
                 f"Law.gain must have shape (n_actuators, 2 n_controlled) = {expected}; got {self.gain.shape}"
             )
+        if not np.isfinite(self.gain).all():
+            raise ValueError(f"Law.gain must be finite; got {self.gain[~np.isfinite(self.gain)][0]}")
+        if not index or len(set(index)) != len(index):
+            raise DesignError(f"Law.controlled names one mode or more, each once; got {list(index)}")
 
     @property
     def n_controlled(self) -> int:

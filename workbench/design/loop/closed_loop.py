@@ -47,6 +47,9 @@ class ClosedLoop:
     matrix: np.ndarray
     feedback: np.ndarray
 
+    def __post_init__(self) -> None:
+        freeze(self, "matrix", "feedback")
+
     @cached_property
     def poles(self) -> np.ndarray:
         """Closed-loop poles (n_states,), rad/s."""

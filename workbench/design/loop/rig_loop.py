@@ -18,6 +18,7 @@ from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.simulate import law_arrays, participation_of, structure_arrays
 from workbench.rig.statespace import output_matrix
 from workbench.structure.domain import Where
+from workbench.structure.modes import freeze
 from workbench.threads import cores
 
 SUBSTEPS = 4
@@ -59,6 +60,8 @@ class LoopTest:
                 f"LoopTest.forces must have shape ({len(self.ports)} ports, {self.n_samples} samples); got"
                 f" {np.shape(self.forces)}. Is time last?"
             )
+        if self.forces is not None:
+            freeze(self, "forces")
 
     @property
     def time(self) -> np.ndarray:
@@ -83,6 +86,9 @@ class LoopRun:
     bounded: bool
     into: np.ndarray
 
+    def __post_init__(self) -> None:
+        freeze(self, "commands", "elements", "into")
+
     @property
     def work(self) -> np.ndarray:
         """W_r = ∫ b_rᵀ F q_r' dt (n_modes,), by the mean force over each sample: exact where it is held over it."""
@@ -97,7 +103,9 @@ class LoopRun:
         return float((self.response.forces**2).sum() * (time[1] - time[0]))
 
 
-def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substeps: int = SUBSTEPS) -> LoopRun:
+def run_loop(
+    rig: Rig, controller: DigitalController, test: LoopTest, *, substeps: int = SUBSTEPS, free: int = 0
+) -> LoopRun:
     """The motion of a rig under a controller.
 
     Args:
@@ -105,6 +113,7 @@ def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substep
         controller: of the test's sample time.
         test: what the loop is put through.
         substeps: of a sample.
+        free: samples that follow the test, in which no force acts, the rig's own among them, and no noise.
 
     Raises:
         ValueError: sensors or actuators that the rig does not have, another sample time, or what the loop cannot
@@ -120,12 +129,14 @@ def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substep
     if rng is not None:
         noise += np.array([s.noise_std for s in sensors])[:, None] * rng.standard_normal(noise.shape)
     forces, at = _disturbances(rig, test, rng)
+    noise, forces = (np.pad(acting, ((0, 0), (0, free))) for acting in (noise, forces))
+    n_samples = test.n_samples + free
     start = np.zeros((2, n))
     if test.impulse_at is not None:
         start[1] = test.impulse * modes.phi_at(test.impulse_at)
     points = [e for e in rig.elements if isinstance(e, PointElement)]
     rows = (n, n, len(actuators), len(actuators), *[len(points)] * 3)
-    out = tuple(np.zeros((size, test.n_samples)) for size in rows)
+    out = tuple(np.zeros((size, n_samples)) for size in rows)
     damping, coupling, spread = structure_arrays(rig)
     bounded = loop_record(
         (np.array(modes.omega), damping, coupling, float(rig.stiffness_rate), *spread),
@@ -144,22 +155,23 @@ def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substep
         out,
     )
     q, v, f, u, *elements = out
-    response = Response(test.time, np.vstack([q, v]), f, modes)
+    time = test.sample_time * np.arange(n_samples, dtype=float)
+    response = Response(time, np.vstack([q, v]), f, modes)
     return LoopRun(response, u, np.array(elements), bool(bounded), into)
 
 
 def run_loops(rigs: Sequence[Rig], controller: DigitalController, test: LoopTest) -> list[LoopRun]:
     """The same of many rigs, each with noise of its own, on all cores."""
-    return of_loops(rigs, controller, test, lambda _, run: run)
+    return of_loops(rigs, controller, test, lambda _rig, _test, run: run)
 
 
 def of_loops(
-    rigs: Sequence[Rig], controller: DigitalController, test: LoopTest, kept: Callable[[Rig, LoopRun], K]
+    rigs: Sequence[Rig], controller: DigitalController, test: LoopTest, kept: Callable[[Rig, LoopTest, LoopRun], K]
 ) -> list[K]:
-    """What is kept of the run of each of many rigs: a thousand runs fill the memory, a few figures of each do not."""
+    """What is kept of the run of each of many rigs, from rig, its own test and run: a thousand runs fill the memory."""
     tests = [test if test.seed is None else replace(test, seed=test.seed + i) for i in range(len(rigs))]
     with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(lambda rig, one: kept(rig, run_loop(rig, controller, one)), rigs, tests))
+        return list(pool.map(lambda rig, one: kept(rig, one, run_loop(rig, controller, one)), rigs, tests))
 
 
 def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
@@ -213,7 +225,7 @@ def _seen(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
 
 def _disturbances(rig: Rig, test: LoopTest, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
     """Forces (n_forces, n_samples) that are no commands, and their participation (n_modes, n_forces)."""
-    rows = [] if test.forces is None else list(np.asarray(test.forces, float))
+    rows = [] if test.forces is None else list(test.forces)
     columns = list(participation_of(Rig(rig.modes, test.ports, ())).T) if test.ports else []
     middle = test.time + 0.5 * test.sample_time
     for element in rig.elements:

@@ -1,6 +1,7 @@
 """What a function's result depends on besides its arguments: its code, what that code reaches, and versions."""
 
 import builtins
+import dataclasses
 import dis
 import functools
 import hashlib
@@ -26,14 +27,16 @@ def fingerprint(function: Callable[..., Any]) -> str:
     """A digest that changes whenever the function's result could: 40 hex digits.
 
     Hashed are its byte code (so that comments do not count), defaults, what its closure holds, the globals it reads,
-    and so on through the user's own functions, classes and modules; installed libraries count by version, this one by
-    its source.
+    and so on through the user's own functions, classes and modules; a module of the user's counts with its file, and
+    with what it holds now under names that this code reads. Installed libraries count by version, this one by its
+    source.
 
     Raises:
         StudyError: it depends on something that may differ from run to run, such as a random generator or a file.
     """
     walk = _Walk()
     walk.visit(function, getattr(function, "__qualname__", repr(function)))
+    walk.visit_members()
     walk.visit(versions(), "versions")
     return walk.digest.hexdigest()[:40]
 
@@ -44,6 +47,8 @@ class _Walk:
     def __init__(self) -> None:
         self.digest = hashlib.sha256()
         self.seen: dict[int, tuple[int, object]] = {}  # the things are kept, so that no identity is given twice
+        self.modules: dict[str, ModuleType] = {}  # the user's own
+        self.names: set[str] = set()  # that code reads, of modules among others
 
     def add(self, *words: object) -> None:
         for word in words:
@@ -80,10 +85,24 @@ class _Walk:
             return self._each(value, where)
         if isinstance(value, set | frozenset):
             return self.add("set", *sorted(map(repr, value)))
+        if isinstance(value, functools.cached_property):
+            return self.visit(value.func, where)
         if callable(getattr(value, "__wrapped__", None)) or callable(getattr(value, "py_func", None)):
             self.add(type(value).__qualname__)  # a cache or a compiler around a function
             return self.visit(getattr(value, "__wrapped__", None) or value.py_func, where)
         return self._state(value, where)
+
+    def visit_members(self) -> None:
+        """What the user's modules hold under names that are read: a variable of theirs may be set at any time."""
+        done: set[tuple[str, str]] = set()
+        while True:
+            held = {(at, name) for at, module in self.modules.items() for name in self.names & vars(module).keys()}
+            if not held - done:
+                return
+            for at, name in sorted(held - done):
+                self.add(at, name)
+                self.visit(vars(self.modules[at])[name], f"{at}.{name}")
+            done |= held
 
     def _each(self, values: Iterable[object], where: str) -> None:
         for value in values:
@@ -111,6 +130,7 @@ class _Walk:
             self.visit(content, f"variable {name}, seen by {where},")
 
     def _code(self, code: CodeType, where: str) -> None:
+        self.names.update(code.co_names)
         self.add(code.co_code, code.co_names, code.co_varnames, code.co_freevars, code.co_flags)
         self._each(code.co_consts, where)
 
@@ -132,8 +152,10 @@ class _Walk:
                 self.visit(member.__func__, where)
             elif name == "__dataclass_fields__":
                 for field in member.values():
-                    factory = field.default_factory
-                    self.add(field.name, field.type, factory if isinstance(factory, type) else "")
+                    self.add(field.name, field.type, field.init, field.repr, field.hash, field.compare, field.kw_only)
+                    for given in (field.default, field.default_factory):
+                        if given is not dataclasses.MISSING:
+                            self.visit(given, f"default of {cls.__qualname__}.{field.name}")
             elif not name.startswith("__") or callable(member):
                 self.visit(member, f"{cls.__qualname__}.{name}")
 
@@ -143,6 +165,7 @@ class _Walk:
         self.add("module", known or module.__name__)
         if known or file is None:
             return
+        self.modules[module.__name__] = module
         self.add(Path(file).read_bytes())
         for name, value in sorted(vars(module).items()):
             source = sys.modules.get(getattr(value, "__module__", None) or "")

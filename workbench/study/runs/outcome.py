@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,11 +11,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workbench.draw.style import plain_ticks
+from workbench.study.runs.cases import StudyError
 from workbench.study.runs.results import Results
 from workbench.study.runs.runner import CACHE, run
 from workbench.study.runs.whole_file import write_whole
 
 DIGITS = 10
+OWN = ("checks", "found")  # beside the tables in the JSON: what must hold, and the lines
 
 T = TypeVar("T")
 Shown = Figure | Mapping[str, Any]  # on a page: a figure, or the motion that `draw.motion` describes
@@ -56,8 +59,21 @@ class Outcome:
             self.on_say(text)
 
     def table(self, name: str, values: object) -> None:
-        """A table under its name: anything of numbers, texts, lists and dicts."""
-        self.tables[name] = plain(values)
+        """A table under its name: anything of numbers, texts, lists and dicts.
+
+        Raises:
+            StudyError: a name that the results need for themselves, or values that JSON cannot hold.
+        """
+        if name in OWN:
+            raise StudyError(f"a table cannot be called {name!r}: the results have an entry of it; rename the table")
+        values = plain(values)
+        try:
+            json.dumps(values)
+        except TypeError as error:
+            raise StudyError(
+                f"table {name!r}: {error}; give numbers, texts, lists and dicts, a complex number by its parts"
+            ) from None
+        self.tables[name] = values
 
     def check(self, name: str, value: float, limit: float, at_least: bool = False) -> None:
         """A figure that must hold: at most `limit`, or at least with `at_least`."""
@@ -85,10 +101,12 @@ class Outcome:
     def run(
         self, cases: Iterable[Mapping[str, Any]], function: Callable[..., Any], name: str = "cases", **options: Any
     ) -> Results:
-        """The function at every case, as `study.run` does it; the table is kept under its name."""
+        """The function at every case, as `study.run` does it; the table is kept under its name, numbered if taken."""
         options = {"cache": self.cache, "scheduler": self.scheduler, "report": self.on_report, **options}
-        self.runs[name] = run(cases, function, **options)
-        return self.runs[name]
+        found = run(cases, function, **options)
+        names = chain([name], (f"{name}-{i}" for i in count(2)))
+        self.runs[next(each for each in names if each not in self.runs)] = found
+        return found
 
     @property
     def holds(self) -> bool:

@@ -109,7 +109,8 @@ class Results(Sequence[Result]):
     def write(self, path: str | Path) -> Path:
         """Write the table: .csv, .parquet (with pyarrow) or .json, by its ending.
 
-        In CSV, lists and arrays are written as JSON, and numbers so that they read back bit for bit.
+        In CSV, lists and arrays are written as JSON, and numbers so that they read back bit for bit. In JSON, which has
+        no other, a number that is not finite is null.
 
         Raises:
             StudyError: another ending, or pyarrow is not installed.
@@ -122,7 +123,7 @@ class Results(Sequence[Result]):
         if path.suffix == ".parquet":
             _write_parquet(path, rows)
         elif path.suffix == ".json":
-            write_whole(path, json.dumps(rows, indent=1) + "\n")
+            write_whole(path, json.dumps(_finite(rows), indent=1, allow_nan=False) + "\n")
         else:
             write_whole(path, _csv(rows))
         return path
@@ -159,6 +160,14 @@ def _plain(value: object) -> object:
     if isinstance(value, complex):
         return str(value)
     return str(value) if isinstance(value, Path) else value
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _csv(rows: list[dict[str, Any]]) -> str:
