@@ -87,9 +87,7 @@ def study(outcome, data: Path) -> None:
         name="silverbox",
         settle=SETTLE,
         free_nominal=True,
-        units=Units(
-            length="V", mass="s^2", time="s", force="V"
-        ),  # of a circuit
+        units=Units(length="V", mass="s^2", time="s", force="V"),  # of a circuit
     )
     errors = {
         name: {"before": rmse(nominal, r, settle), "after": rmse(verdict.corrected, r, settle)}
