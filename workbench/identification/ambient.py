@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.output_only.subspace import StablePole, Subspace
-from workbench.identification.signal.harmonics import harmonic_remark, steady_modes
+from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import (
     ModalEstimates,
     by_poles,
@@ -164,7 +164,7 @@ def _report(
         jacobian = by_poles(poles[[r]])
         covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
     statistic = np.array([mode.statistic for mode in found])
-    remarks = (*_uneven_level(record), *harmonic_remark(poles, steady_modes([record], poles)), *budget.remarks)
+    remarks = (*_uneven_level(record), *harmonic_remarks([record], poles, range(n)), *budget.remarks)
     return AmbientModes(modes, frozen(covariance), frozen(statistic), limit, decays, remarks)
 
 

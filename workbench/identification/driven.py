@@ -37,7 +37,7 @@ from workbench.identification.input_output.sensor_drift import beside_drift
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
 from workbench.identification.signal.data_quality import input_faults, of_same_sensors
-from workbench.identification.signal.harmonics import harmonic_remark, steady_modes
+from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress, check_count
 from workbench.records.record import HOLDS, Channel, Record
@@ -252,9 +252,7 @@ def identify_driven(
         )
     most = min(max_modes, (rows - columns) // 6)
     how = {"max_modes": most, "false_alarm": false_alarm}
-    data, drift = beside_drift(
-        data, lambda each: _strongest(each, **how, budget=Budget(budget.share(DRIVEN.drifting).seconds))
-    )
+    data, drift = beside_drift(data, lambda each: _strongest(each, **how, budget=budget.aside(DRIVEN.drifting)))
     data, selected = _selected(data, budget, **how) if delays is not None else _with_delays(data, budget, **how)
     if selected.fit.poles.size == 0:
         raise ValueError(
@@ -281,15 +279,10 @@ def identify_driven(
     )
     deviation = found.modes.omega * found.zeta_std + 1j * found.omega_std
     decays = by_amplitude.remarks(fit.poles, _sizes(data, fit), deviation)
-    unexcited = unexcited_remarks(records, fit.poles)
-    return replace(found, remarks=(*decays, *_undamped_remarks(records, found), *unexcited, *found.remarks))
-
-
-def _undamped_remarks(records: Sequence[Record], found: Driven) -> tuple[str, ...]:
-    """On modes that may be harmonic excitation: a response to the inputs may have a constant amplitude too."""
-    undamped = found.modes.zeta < SURE * found.zeta_std
-    which = [r for r in steady_modes(records, found.modes.poles) if undamped[r]]
-    return harmonic_remark(found.modes.poles, which)
+    # a response to the inputs may have a constant amplitude too
+    undamped = np.flatnonzero(found.modes.zeta < SURE * found.zeta_std).tolist()
+    doubtful = (*harmonic_remarks(records, fit.poles, undamped), *unexcited_remarks(records, fit.poles))
+    return replace(found, remarks=(*decays, *doubtful, *found.remarks))
 
 
 def _sizes(data: KnownInputs, fit: Fit) -> Floats:

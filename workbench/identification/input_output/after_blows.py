@@ -89,7 +89,7 @@ def after_blows(records: Sequence[Record], budget: Budget) -> AfterBlows:
     if not all(decays):
         return AfterBlows()
     free = [decay for decay in decays if decay is not None]
-    part = Budget(budget.share(AFTER_BLOWS.share).seconds)
+    part = budget.aside(AFTER_BLOWS.share)
     with suppress(ValueError, np.linalg.LinAlgError):  # nothing decays freely: the inputs alone tell
         refined = identify_within(free, part).without_artefacts(np.pi / free[0].sample_time).refined
         if not part.unfinished:

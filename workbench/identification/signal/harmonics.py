@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.arrays import Complexes
+from workbench.arrays import Complexes, Floats
 from workbench.records.record import Record
 
 
@@ -26,37 +26,41 @@ class HarmonicSettings:
 HARMONICS = HarmonicSettings()
 
 
-def steady_modes(records: Sequence[Record], poles: Complexes) -> list[int]:
-    """The modes about whose frequencies the motion of every record has an envelope that stays the same, from 0.
+def harmonic_remarks(records: Sequence[Record], poles: Complexes, among: Sequence[int]) -> tuple[str, ...]:
+    """A remark on the modes about whose frequencies the motion of every record has an envelope that stays the same.
 
     Args:
         records: motion that is driven all along.
         poles: (n_modes,) rad/s.
+        among: the modes that may be harmonic excitation, from 0.
     """
-    return [r for r, pole in enumerate(poles) if all(_is_steady(record, complex(pole)) for record in records)]
-
-
-def _is_steady(record: Record, pole: complex) -> bool:
-    """Whether the envelope stays the same in the output that holds most of what is about this frequency."""
-    n, dt = record.n_samples, record.sample_time
-    bin_width = 2.0 * np.pi / (n * dt)
-    half = max(2.0 * abs(pole.real), HARMONICS.lines * bin_width)
-    first, last = (round((pole.imag + side * half) / bin_width) for side in (-1.0, 1.0))
-    if first < 1 or last > n // 2:
-        return False
-    about = record.outputs - record.outputs.mean(axis=1, keepdims=True)
-    lines = np.fft.rfft(about)[:, first : last + 1]
-    share = (np.abs(lines) ** 2).sum(axis=1) / np.maximum((about**2).sum(axis=1), 1e-300)
-    power = np.abs(np.fft.ifft(lines[np.argmax(share)], 4 * lines.shape[1])) ** 2
-    return bool((power**2).mean() < HARMONICS.steady * power.mean() ** 2)
-
-
-def harmonic_remark(poles: Complexes, which: Sequence[int]) -> tuple[str, ...]:
-    """A remark on the modes that may be harmonic excitation; none of none."""
-    if not which:
+    steady = list(among)
+    for record in records if steady else ():
+        about = record.outputs - record.outputs.mean(axis=1, keepdims=True)
+        lines, power = np.fft.rfft(about), np.maximum((about**2).sum(axis=1), 1e-300)
+        bin_width = 2.0 * np.pi / (record.n_samples * record.sample_time)
+        steady = [r for r in steady if _is_steady(lines, power, poles[r] / bin_width)]
+    if not steady:
         return ()
-    modes = ", ".join(f"mode {r + 1} ({abs(poles[r]) / (2.0 * np.pi):.4g} Hz)" for r in which)
+    modes = ", ".join(f"mode {r + 1} ({abs(poles[r]) / (2.0 * np.pi):.4g} Hz)" for r in steady)
     return (
         f"harmonic excitation? the motion about {modes} has a constant amplitude, as mains hum and turning machines"
         " make it; then it is no mode, and its standard errors do not hold",
     )
+
+
+def _is_steady(lines: Complexes, power: Floats, pole: complex) -> bool:
+    """Whether the envelope stays the same in the output that holds most of what is about a pole, in lines.
+
+    Args:
+        lines: (n_outputs, n_lines) of the transform.
+        power: (n_outputs,) sum of squares.
+    """
+    half = max(2.0 * abs(pole.real), HARMONICS.lines)
+    first, last = (round(pole.imag + side * half) for side in (-1.0, 1.0))
+    if first < 1 or last >= lines.shape[1]:
+        return False
+    inside = lines[:, first : last + 1]
+    strongest = inside[np.argmax((np.abs(inside) ** 2).sum(axis=1) / power)]
+    envelope = np.abs(np.fft.ifft(strongest, 4 * strongest.size)) ** 2
+    return bool((envelope**2).mean() < HARMONICS.steady * envelope.mean() ** 2)

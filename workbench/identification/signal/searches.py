@@ -101,6 +101,10 @@ class Budget(Deadline):
         part.unfinished, part._begun, part._whole = self.unfinished, self._begun, self._whole
         return part
 
+    def aside(self, share: float) -> "Budget":
+        """A share of the time left for a look on the side; what it leaves unfinished does not count here."""
+        return Budget(self.share(share).seconds)
+
     @property
     def remarks(self) -> tuple[str, ...]:
         """What was left undone, in one sentence; empty where all was finished."""
