@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from workbench.cases.case import read_case
-from workbench.gap.diagnose import diagnose
+from workbench.gap.diagnose import diagnose_case
 
 NEEDS_DATA = "a folder of case folders"
 
@@ -11,7 +11,7 @@ NEEDS_DATA = "a folder of case folders"
 def verdict_on(folder: Path) -> dict:
     """The verdict on one case, as JSON."""
     case = read_case(folder)
-    verdict = diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1, seconds=None)
+    verdict = diagnose_case(case, workers=1, seconds=None)
     return {"verdict": verdict.to_json()}
 
 

@@ -56,7 +56,7 @@ def diagnose(
     Example: workbench diagnose --nominal low.csv --records high.csv --inputs F --quantity acceleration
     """
     from workbench.cases.case import read_case
-    from workbench.gap.diagnose import diagnose as run
+    from workbench.gap.diagnose import diagnose_case
     from workbench.gap.effects.effect import COORDINATES
     from workbench.gap.report.readiness import check_alive
     from workbench.gap.report.verdict import place_in_words
@@ -97,17 +97,8 @@ def diagnose(
         found = replace(found, rig=rig, fit=fit, validation=mended(faults, found.rig, found.validation)[1])
     corrected = [f"Corrected before the diagnosis: {fault.sentence}" for fault in faults if mend and fault.certain]
     with reporting("reading") as report:
-        verdict = run(
-            found.rig,
-            found.fit,
-            validation=found.validation,
-            name=found.name,
-            free_nominal=free_nominal,
-            settle=settle,
-            workers=workers,
-            seconds=seconds,
-            report=report,
-            units=found.units,
+        verdict = diagnose_case(
+            found, free_nominal=free_nominal, settle=settle, workers=workers, seconds=seconds, report=report
         )
     say(verdict.sentence, bold=True)
     shown = verdict.to_json()

@@ -29,7 +29,7 @@ def possible_rig(
     Raises:
         ValueError: no verdict of this case, or channels that are certainly exchanged or turned.
     """
-    from workbench.gap.diagnose import SECONDS, diagnose
+    from workbench.gap.diagnose import SECONDS, diagnose_case
     from workbench.gap.report.wiring import check_kept_apart, wiring
     from workbench.robust.posterior import UncertainRig
 
@@ -44,15 +44,7 @@ def possible_rig(
                 f" --as-wired --json {kept.name}`, and give that file as --verdict"
             )
     errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
-    found = diagnose(
-        case.rig,
-        case.fit,
-        validation=case.validation,
-        name=case.name,
-        workers=workers,
-        report=report,
-        units=case.units,
-    )
+    found = diagnose_case(case, workers=workers, report=report)
     write_verdict(found, kept)
     errors.print(f"  {found.sentence}")
     errors.print(f"  verdict    {short(kept)}: with --verdict {short(kept)} the next command need not diagnose")

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from workbench.arrays import Floats
+from workbench.cases.case import Case
 from workbench.cases.units import SI, Units
 from workbench.deadline import Deadline
 from workbench.gap.effects.catalogue import CATALOGUE
@@ -196,6 +198,16 @@ def diagnose(
                 *_notes(attribution, budget, seconds, silent, sound),
             ),
         )
+
+
+def diagnose_case(case: Case, **options: Any) -> Verdict:
+    """`diagnose` of what a case holds, told by its units.
+
+    Args:
+        case: rig and records.
+        options: of `diagnose`.
+    """
+    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, units=case.units, **options)
 
 
 def _sequence_of(records: Record | Iterable[Record]) -> tuple[Record, ...]:

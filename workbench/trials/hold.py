@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from workbench.cases.case import read_case
-from workbench.gap.diagnose import diagnose
+from workbench.gap.diagnose import diagnose_case
 from workbench.trials.make import write_trials
 from workbench.trials.scoring import Tally, score, score_dirty, tally
 
@@ -89,5 +89,5 @@ def processor_times(trials: Iterable[Mapping[str, Any]]) -> dict[str, float]:
 def verdict_on(folder: Path) -> dict[str, Any]:
     """The verdict on a case folder, as JSON, by one process."""
     case = read_case(folder)
-    verdict = diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1)
+    verdict = diagnose_case(case, workers=1)
     return verdict.to_json()
