@@ -49,6 +49,15 @@ def test_an_element_is_worth_the_spring_and_damper_that_it_is(rig, controller):
     assert found.damping == pytest.approx(expected.damping, abs=2e-3 * expected.damping.max())
 
 
+def test_an_element_that_feeds_the_motion_takes_damping_away(rig, controller):
+    fed = replace(rig, elements=(LinearSpring(0.9, -8.0), LinearDamper(0.9, -0.02)))
+    silent = replace(controller, c=0.0 * controller.c, e=0.0 * controller.e)
+    found = modes_in_motion(fed, run_loop(fed, silent, LoopTest(600, DT, impulse_at=0.8)))
+    expected = attach(rig.modes, (PointSpring(0.9, -8.0), PointDamper(0.9, -0.02)))
+    assert found.omega == pytest.approx(expected.omega, rel=1e-3)
+    assert found.damping == pytest.approx(expected.damping, abs=2e-3 * expected.damping.max())
+
+
 def test_a_cubic_spring_is_worth_what_harmonic_balance_says(rig, controller):
     """k_eq = 3/4 k a² at an amplitude a; least squares over a decay weighs it by a⁴ over a²."""
     one = replace(rig, modes=rig.modes.select([0]), elements=(CubicSpring(1.0, 400.0),))

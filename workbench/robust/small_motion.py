@@ -14,7 +14,7 @@ from workbench.rig.sensors import MEASURED
 from workbench.rig.statespace import output_matrix
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
-from workbench.structure.supports import Attachment, PointDamper, PointSpring
+from workbench.structure.supports import PointDamper, PointSpring
 
 FREQUENCIES = 240
 
@@ -23,20 +23,22 @@ def modes_in_motion(rig: Rig, run: LoopRun) -> Modes:
     """The modes with each element at a point as the spring and damper that do the same in the motion of a run.
 
     (k, c) by least squares of f = -k w - c v over the run: equivalent linearisation (Caughey, J. Acoust. Soc. Am. 35
-    (1963) 1706).
+    (1963) 1706). Either may be negative: a spring that softens, a damper that feeds the motion. Springs that soften are
+    left out where the structure would have no frequency with them.
     """
     points = [e for e in rig.elements if isinstance(e, PointElement)]
-    parts: list[Attachment] = []
+    springs, dampers = [], []
     for element, motion in zip(points, np.moveaxis(run.elements, 1, 0), strict=True) if run.bounded else ():
         w, v, f = motion
         if not (np.abs(w).max() > 0 and np.abs(v).max() > 0):
             continue
         stiffness, coefficient = np.linalg.lstsq(-np.column_stack([w, v]), f, rcond=None)[0]
-        if stiffness > 0:
-            parts.append(PointSpring(element.at, float(stiffness)))
-        if coefficient > 0:
-            parts.append(PointDamper(element.at, float(coefficient)))
-    return attach(rig.modes, tuple(parts)) if parts else rig.modes
+        springs.append(PointSpring(element.at, float(stiffness)))
+        dampers.append(PointDamper(element.at, float(coefficient)))
+    try:
+        return attach(rig.modes, (*springs, *dampers))
+    except ValueError:
+        return attach(rig.modes, (*(s for s in springs if s.stiffness > 0), *dampers))
 
 
 @dataclass(frozen=True, eq=False)
