@@ -1,6 +1,6 @@
 """The diagnosis from end to end: rig and records in, verdict out."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -125,13 +125,13 @@ def diagnose(
     check_modes(rig)
     check_records(rig, records, validation, settle=settle)
     check_kept_apart(records, validation)
-    silent = [sensor.name for sensor in rig.sensors if not sensor.noise_std]
+    silent = frozenset(sensor.name for sensor in rig.sensors if not sensor.noise_std)
     if silent:
         each = zip(rig.sensors, noise_guessed(rig, records), strict=True)
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
     faults = wiring(rig, records, validation, settle=settle)
     report("looking for the unmodelled force", 0.02)
-    found = baseline(rig, records, settle=settle, workers=sharing, deadline=deadline)
+    found = baseline(rig, records, settle=settle, guessed=silent, workers=sharing, deadline=deadline)
     nominal = found.nominal
     with (
         sharing.in_background(lambda: locate_force(nominal.without(_faulty(found.seen)))) as place,
@@ -358,15 +358,16 @@ def _next(rig: Rig, found: Attribution, workers: Workers, units: Units) -> Exper
 
 
 def _notes(
-    found: Attribution, budget: Budget, seconds: float | None, silent: Sequence[str], sound: bool
+    found: Attribution, budget: Budget, seconds: float | None, silent: Collection[str], sound: bool
 ) -> tuple[str, ...]:
     """What is said beside the sentence; `silent` are the sensors whose noise was not stated."""
-    taken = f"noise_std of {', '.join(silent)} is not stated; it was taken from the records."
+    names = [sensor.name for sensor in found.search.rig.sensors if sensor.name in silent]
+    taken = f"noise_std of {', '.join(names)} is not stated; it was taken from the records."
     cut = f"The search reached its limit of {seconds} s of processor time with this best set; allow more by `seconds`."
     notes = (
         *([taken] if silent else []),
         *([cut] if found.is_cut else []),
-        budget.noise_remark if sound else "",  # else more than noise is left
+        budget.noise_remark if sound and not silent else "",  # else more than noise is left
         *_remainders(found),
     )
     return tuple(note for note in notes if note)

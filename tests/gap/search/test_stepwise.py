@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from workbench.deadline import Deadline
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_errors
-from workbench.gap.prediction.noise import noise_found
+from workbench.gap.prediction.noise import are_coloured, noise_found
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import cost_of, fit, sensitivity
@@ -134,13 +135,40 @@ def test_noise_that_was_stated_too_small_is_found(rig, measured):
     assert any("1.7 times the stated" in note for note in verdict.notes)
 
 
+def coloured(rng, shape, memory):
+    """Noise (..., n_samples) of unit variance through a low pass of first order."""
+    return lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], rng.standard_normal(shape), axis=-1)
+
+
+def test_coloured_noise_that_nobody_stated_is_no_gap(rig, measured):
+    """Noise is guessed by the quietest bands, where noise of this colour has a fourth of its strength."""
+    rng = np.random.default_rng(7)
+    quiet = [measured(rig, "low", 0.1, 5), measured(rig, "high", 1.0, 6)]
+    records = [replace(r, outputs=r.outputs + 1e-4 * coloured(rng, r.outputs.shape, 0.9)) for r in quiet]
+    unstated = replace(rig, sensors=tuple(replace(s, noise_std=0.0) for s in rig.sensors))
+    verdict = diagnose(unstated, records)
+    assert verdict.outcome == "none" and not verdict.effects
+    assert verdict.budget.noise_found == pytest.approx([1e-4] * 4, rel=0.2)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9, 0.97])
+def test_noise_of_a_colour_is_told_from_what_a_force_leaves(memory):
+    """A force that a model lacks makes peaks, or moves the sensors together; noise does neither."""
+    rng = np.random.default_rng(3)
+    noise = coloured(rng, (2, 3, 2000), memory)
+    slow = coloured(rng, (2, 1, 2000), 0.97)
+    ringing = lfilter([1.0], [1.0, -2 * 0.996 * np.cos(0.2), 0.996**2], rng.standard_normal((2, 3, 2000)))
+    assert are_coloured(list(noise)).all()
+    assert not are_coloured(list(noise + slow * [[1.0], [2.0], [-1.5]])).any()
+    assert not are_coloured(list(noise + ringing / ringing.std())).any()
+    assert not are_coloured(list(noise[:, :1])).any()
+
+
 @pytest.mark.parametrize("memory", [0.0, 0.9])
 def test_noise_is_found_beside_resonances_and_in_colours(memory):
     """White or coloured noise beside a narrow resonance a hundred times as strong; colour costs a quarter."""
-    from scipy.signal import lfilter
-
     rng = np.random.default_rng(5)
-    noise = lfilter([np.sqrt(1 - memory**2)], [1.0, -memory], rng.standard_normal((3, 2, 4000)), axis=2)
+    noise = coloured(rng, (3, 2, 4000), memory)
     ringing = np.sin(0.4 * np.arange(4000)) * np.exp(-np.arange(4000) / 2000)
     records = [noise[0] + 10 * ringing, noise[1] + 30 * ringing, noise[2]]
     assert noise_found(records) == pytest.approx([1.0, 1.0], rel=0.25 if memory else 0.08)

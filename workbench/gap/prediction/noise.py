@@ -32,6 +32,9 @@ class NoiseSettings:
     of_least: float = 0.66
     louder: float = 2.0  # times the power of the quietest record: another level
     flat: float = 0.6  # likewise, of a spectrum that has none: 0.8 and more of white noise in 1400 samples
+    peak: float = 4.0  # times what its neighbours say that a band would hold: noise has none in 16,000 samples
+    together: float = 0.2  # correlation of two sensors' noise: chance alone makes 0.15 in 600 samples
+    bands: int = 50  # in which peaks are looked for, at most, so that one is narrower than its neighbourhood
 
 
 NOISE = NoiseSettings()
@@ -53,8 +56,40 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     alike = whole[1] < NOISE.alike * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
     same = whole < NOISE.same * whole[0]
     noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
-    power: Floats = np.where(alike | (under > NOISE.loud * whole[0]), noise, under)
+    power: Floats = np.where(alike | (under > NOISE.loud * whole[0]) | are_coloured(residuals), noise, under)
     return np.sqrt(power)
+
+
+def are_coloured(residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """Whether what is left at each sensor (n_outputs,) is noise of a first-order spectrum, however loud.
+
+    Such noise has no peaks but that slope, and goes its own way at every sensor; what a structure answers to a force
+    that a model lacks has the peaks of its modes, or moves all sensors together. Of one sensor nobody can tell, nor of
+    a record too short for its bands to have neighbours.
+
+    Args:
+        residuals: (n_outputs, n_samples) measured less predicted, one per record.
+    """
+    if len(residuals[0]) < 2:
+        return np.zeros(1, bool)
+    return np.all([_is_coloured(left) for left in _levelled(residuals)], axis=0)
+
+
+def _is_coloured(levelled: Floats) -> np.ndarray:
+    n_outputs, n_samples = levelled.shape
+    means = _band_means(levelled, max(NOISE.lines, n_samples // (2 * NOISE.bands)))
+    if means.shape[1] <= 2 * NOISE.reach or not levelled.any(axis=1).all():
+        return np.zeros(n_outputs, bool)
+    together = np.abs(np.corrcoef(levelled) - np.eye(n_outputs)).max(axis=1)
+    return np.asarray((means < NOISE.peak * _floor(means)).all(axis=1) & (together < NOISE.together))
+
+
+def _levelled(residuals: Sequence[np.ndarray]) -> list[Floats]:
+    """r_n - ρ r_{n-1}, with the correlation ρ of each sensor's residuals over one sample in all records."""
+    power = sum((r**2).sum(axis=1) for r in residuals)
+    after = sum((r[:, 1:] * r[:, :-1]).sum(axis=1) for r in residuals)
+    correlation = np.divide(after, power, out=np.zeros_like(power), where=power > 0)[:, None]
+    return [r[:, 1:] - correlation * r[:, :-1] for r in residuals]
 
 
 def is_noise_alone(residuals: Sequence[np.ndarray], records: Sequence[Record]) -> bool:
@@ -65,10 +100,15 @@ def is_noise_alone(residuals: Sequence[np.ndarray], records: Sequence[Record]) -
         records: what was measured.
     """
     levels = [(record.outputs**2).mean() for record in records]
-    power = np.array([(residual**2).mean(axis=1) for residual in residuals])
-    if max(levels) <= NOISE.louder * min(levels) or (power.max(axis=0) >= NOISE.alike * power.min(axis=0)).any():
+    if max(levels) <= NOISE.louder * min(levels):
         return False
-    return all((_under_peaks(left) > NOISE.flat * own).all() for left, own in zip(residuals, power, strict=True))
+    coloured = are_coloured(residuals).all()
+    # without its colour, a record holds as many samples of it as of white noise
+    power = np.array([(left**2).mean(axis=1) for left in (_levelled(residuals) if coloured else residuals)])
+    if (power.max(axis=0) >= NOISE.alike * power.min(axis=0)).any():
+        return False
+    each = zip(residuals, power, strict=True)
+    return bool(coloured or all((_under_peaks(left) > NOISE.flat * own).all() for left, own in each))
 
 
 def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
@@ -83,12 +123,12 @@ def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
     return guess
 
 
-def _band_means(residual: Floats) -> Floats:
+def _band_means(residual: Floats, lines: int = NOISE.lines) -> Floats:
     """Means of the periodogram over bands of so many lines: (n_outputs, n_bands)."""
     n_outputs, n_samples = residual.shape
     window = np.hanning(n_samples)
     spectrum = np.abs(np.fft.rfft(residual * window, axis=1)[:, 1:]) ** 2 / (n_samples * np.mean(window**2))
-    bands = max(spectrum.shape[1] // NOISE.lines, 1)
+    bands = max(spectrum.shape[1] // lines, 1)
     means: Floats = spectrum[:, : bands * (spectrum.shape[1] // bands)].reshape(n_outputs, bands, -1).mean(axis=2)
     return means
 
@@ -96,11 +136,16 @@ def _band_means(residual: Floats) -> Floats:
 def _under_peaks(residual: Floats) -> Floats:
     """Mean square (n_outputs,) under the peaks of the spectrum."""
     means = _band_means(residual)
+    under: Floats = np.minimum(means, _floor(means)).mean(axis=1)
+    return under
+
+
+def _floor(means: Floats) -> Floats:
+    """What each band of a spectrum (n_outputs, n_bands) would hold by the quieter of its neighbours."""
     reach = min(NOISE.reach, (means.shape[1] - 1) // 2)
     around = sliding_window_view(np.pad(means, ((0, 0), (reach, reach)), mode="reflect"), 2 * reach + 1, axis=1)
-    floor = np.quantile(around, NOISE.quiet, axis=2) * (1.0 + NOISE.lower / np.sqrt(NOISE.lines))
-    under: Floats = np.minimum(means, floor).mean(axis=1)
-    return under
+    floor: Floats = np.quantile(around, NOISE.quiet, axis=2) * (1.0 + NOISE.lower / np.sqrt(NOISE.lines))
+    return floor
 
 
 @dataclass(frozen=True)

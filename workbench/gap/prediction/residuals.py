@@ -43,6 +43,7 @@ class FitData:
             with every candidate to first order; None where none are.
         observer: of the rig's state by the records, so that its predictions are of one sample ahead; None where
             they are of the whole record.
+        guessed: names of the sensors whose noise nobody stated.
         heat: mean square of a residual that counts as noise, for now.
         deadline: of the search that these records are for; fits end with the best that they have when it is past.
     """
@@ -54,6 +55,7 @@ class FitData:
     whiteners: Mapping[str, ForceFilter] = field(default_factory=dict)
     given_way: Floats | None = None
     observer: Observer | None = None
+    guessed: frozenset[str] = frozenset()
     heat: float = 1.0
     deadline: Deadline = NEVER
     _memory: OrderedDict[Any, tuple[Modes, Motion]] = field(default_factory=OrderedDict, repr=False, init=False)

@@ -119,6 +119,7 @@ def baseline(
     records: Sequence[Record],
     *,
     settle: float = 0.0,
+    guessed: frozenset[str] = frozenset(),
     workers: Workers = ALONE,
     deadline: Deadline = NEVER,
 ) -> Baseline:
@@ -128,6 +129,7 @@ def baseline(
         rig: nominal.
         records: to fit; validation records have no business here.
         settle: seconds at the start of each record that are simulated but not counted.
+        guessed: names of the sensors whose noise nobody stated.
         workers: processes that share the work.
         deadline: of the search that follows.
     """
@@ -135,7 +137,8 @@ def baseline(
     if not (noise > 0).all():
         name = rig.sensors[int(np.argmin(noise))].name
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weights every residual by it")
-    seen, data = _plain_to_see(rig, FitData(tuple(records), noise, settle=settle, deadline=deadline))
+    whole = FitData(tuple(records), noise, settle=settle, guessed=guessed, deadline=deadline)
+    seen, data = _plain_to_see(rig, whole)
     evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
     _ = evidence.at_peaks  # found once, before the work parts
     if not seen:

@@ -224,6 +224,8 @@ class JointSettings:
     last_iterations: int = 6  # last_iterations, last_tolerance: of the last fit, which intervals are taken from
     last_tolerance: float = 1e-7
     credible: float = 3.0  # times the stated noise that noise found may be; more is a gap
+    # times noise guessed by the quietest bands: white noise through a low pass of 0.97 a sample is 8.1 times as loud
+    credible_guess: float = 10.0
     # of a sample: an accelerometer that is later stays on its side of the jumps when an effect is added; what was seen
     # of the others may have been the gap
     surely_late: float = 0.05
