@@ -72,7 +72,8 @@ def are_coloured(residuals: Sequence[np.ndarray]) -> np.ndarray:
     """
     if len(residuals[0]) < 2:
         return np.zeros(1, bool)
-    return np.all([_is_coloured(left) for left in _levelled(residuals)], axis=0)
+    coloured: np.ndarray = np.all([_is_coloured(left) for left in _levelled(residuals)], axis=0)
+    return coloured
 
 
 def _is_coloured(levelled: Floats) -> np.ndarray:
