@@ -131,14 +131,15 @@ def diagnose(
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
     faults = wiring(rig, records, validation, settle=settle)
     report("looking for the unmodelled force", 0.02)
-    found = baseline(rig, records, settle=settle, workers=sharing, deadline=deadline)
-    nominal = found.nominal
+    seen, nominal, evidence = baseline(rig, records, settle=settle, workers=sharing, deadline=deadline)
     with (
-        sharing.in_background(lambda: locate_force(nominal.without(_faulty(found.seen)))) as place,
+        sharing.in_background(lambda: locate_force(nominal.without(_faulty(seen)))) as place,
         sharing.in_background(lambda: readiness(nominal, catalogue=catalogue)) as ready,
     ):
         attribution = attribute(
-            found,
+            seen,
+            nominal,
+            evidence,
             catalogue=catalogue,
             report=report,
             free_nominal=free_nominal,
@@ -147,7 +148,7 @@ def diagnose(
         )
         if attribution.outcome == "explained" and attribution.random is None:
             alike, search = ready().indistinguishable, attribution.search
-            rivals = with_equals(search, attribution.best, attribution.rivals, found.evidence, alike)
+            rivals = with_equals(search, attribution.best, attribution.rivals, evidence, alike)
             attribution = replace(attribution, rivals=rivals)
         attribution = _paid_for(rig, attribution, validation, settle)
         corrected = apply_all(rig, attribution.best.effects)
@@ -160,7 +161,7 @@ def diagnose(
         named = tuple(e for e in accounted if e is not errors)
         effects = named if outcome in ("none", "explained") else ()
         faulty = _faulty(attribution.best.effects)
-        as_seen = faulty == _faulty(found.seen)
+        as_seen = faulty == _faulty(seen)
         budget = budget_of(
             rig,
             effects,

@@ -124,6 +124,13 @@ class Parameter:
         return float(np.hypot(value, self.scale)) if self.low < 0 else value
 
 
+def positive(
+    name: str, unit: str, size: float, low: float = 1e-12, high: float = 1e12, neutral: float | None = None
+) -> Parameter:
+    """A parameter above zero, fitted as its logarithm, within `low` and `high` times a size that the rig has itself."""
+    return Parameter(name, unit, low * size, high * size, logarithmic=True, neutral=neutral)
+
+
 def place_parameters(rig: Rig) -> tuple[Parameter, ...]:
     """The coordinates of a place, as parameters: x along an interval, x and y on a rectangle, none at named points."""
     domain = rig.modes.domain

@@ -383,8 +383,7 @@ SENSOR_MISPLACEMENT = Kind(
 
 def _size(evidence: Evidence, target: str) -> float:
     """Largest root mean square of an output among the records, in its unit."""
-    j = each_sensor(evidence.rig).index(target)
-    return float(max(np.sqrt(np.mean(record.outputs[j] ** 2)) for record in evidence.data.records))
+    return float(max(np.sqrt(np.mean(row**2)) for row in _read(evidence, target)))
 
 
 def _sensor(name: str, field: str, phrase: str, starts: Starts, unit: str = "", **options: Any) -> Kind:
@@ -427,8 +426,7 @@ SENSOR_GAIN = _sensor(
 
 
 def _mean_residual(evidence: Evidence, target: str) -> float:
-    j = each_sensor(evidence.rig).index(target)
-    return float(np.mean(np.concatenate([r[j] for r in evidence.residuals])))
+    return float(np.mean(_residual(evidence, target)))
 
 
 SENSOR_BIAS = _sensor(
@@ -540,10 +538,8 @@ SWAPPED_OUTPUTS = Kind(
 )
 
 
-def clipped_level(evidence: Evidence, target: str) -> float | None:
+def clipped_level(rows: list[np.ndarray]) -> float | None:
     """The level that a sensor's readings stop at: its largest magnitude, met again and again, where it is cut off."""
-    j = each_sensor(evidence.rig).index(target)
-    rows = [record.outputs[j] for record in evidence.data.records]
     top = max(float(np.abs(row).max()) for row in rows)
     at_top = [np.abs(row) >= top * (1 - 1e-6) for row in rows]
     if not top > 0 or sum(int(flags.sum()) for flags in at_top) < 3:
@@ -570,12 +566,6 @@ def _rests(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
     return bool(entering) and float(np.median(entering)) < SLOW * typical and float(np.mean(overstayed)) > 0.5
 
 
-def rounding_step(evidence: Evidence, target: str) -> float | None:
-    """The step that all of a sensor's readings are multiples of, or None."""
-    j = each_sensor(evidence.rig).index(target)
-    return step_of(np.concatenate([record.outputs[j] for record in evidence.data.records]))
-
-
 def step_of(readings: np.ndarray) -> float | None:
     """The step of which all readings are multiples, where there are far fewer levels than readings."""
     levels = np.unique(readings)
@@ -594,8 +584,14 @@ def step_of(readings: np.ndarray) -> float | None:
     return step if np.abs(inside - step * np.round(inside / step)).max() < 0.05 * step else None
 
 
+def _read(evidence: Evidence, target: str) -> list[np.ndarray]:
+    """The readings of a sensor, one row a record."""
+    j = each_sensor(evidence.rig).index(target)
+    return [record.outputs[j] for record in evidence.data.records]
+
+
 def _clipping_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    level = clipped_level(evidence, target)
+    level = clipped_level(_read(evidence, target))
     return [{"limit": level}] if level is not None else []
 
 
@@ -613,7 +609,7 @@ SENSOR_CLIPPING = _sensor(
 
 
 def _rounding_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    step = rounding_step(evidence, target)
+    step = step_of(np.concatenate(_read(evidence, target)))
     return [{"step": step}] if step is not None else []
 
 
