@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import combinations, permutations
 from typing import Any, ClassVar, Literal, Protocol
 from weakref import WeakValueDictionary
@@ -154,20 +154,36 @@ def place_values(where: Where) -> dict[str, Any]:
     return {"at": where}
 
 
-class Moved(Protocol):
-    """The unmodelled force (N) at a place and the motion there, each (n_total,), the records joined end to end."""
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """The unmodelled force at a point and the motion there, one row per record joined end to end.
 
-    @property
-    def at(self) -> Where: ...
-    @property
-    def force(self) -> Floats: ...
-    @property
-    def displacement(self) -> Floats: ...
-    @property
-    def velocity(self) -> Floats: ...
-    @property
-    def acceleration(self) -> Floats: ...
-    def strength_along(self, basis: Floats) -> float: ...
+    Attributes:
+        at: on the structure.
+        force: (n_total,) N.
+        displacement, velocity, acceleration: (n_total,) there, of the real structure as far as the records tell.
+        bent: whether errors of the model may have taken linear parts of the force.
+    """
+
+    at: Where
+    force: Floats
+    displacement: Floats
+    velocity: Floats
+    acceleration: Floats
+    bent: bool = False
+
+    def strength_along(self, basis: Floats) -> float:
+        """The k for which -k basis (n_total,) is nearest to the force, beside any linear force where that is bent."""
+        force = self.force
+        if self.bent:
+            force, basis = (each - self._linear @ (self._linear.T @ each) for each in (force, basis))
+        return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
+
+    @cached_property
+    def _linear(self) -> Floats:
+        """Orthonormal columns (n_total, 3) that span what errors of stiffness, damping and mass do here."""
+        motion = np.column_stack([self.displacement, self.velocity, self.acceleration])
+        return np.asarray(np.linalg.qr(motion)[0])
 
 
 class Measured(Protocol):

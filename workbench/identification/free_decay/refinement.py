@@ -34,7 +34,7 @@ from workbench.identification.signal.projection import (
     variances,
 )
 from workbench.identification.signal.searches import FIT, Budget, minimise
-from workbench.records.record import Record
+from workbench.records.record import Record, as_records
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
@@ -73,7 +73,7 @@ def in_coloured_noise(
         records: that it was identified from.
         fits: of its poles, in any order, one per record; found anew unless given.
     """
-    records = [records] if isinstance(records, Record) else list(records)
+    records = as_records(records)
     fits = fits or [project(record, refined.modes.poles, True) for record in records]
     poles = fits[0].poles
     each = zip(records, fits, refined.noise, strict=True)
