@@ -172,11 +172,12 @@ class Evidence:
     def _misfits(self, places: Sequence[Any]) -> np.ndarray:
         """What one force of any law at each of the places leaves, in units of the noise."""
         shapes = np.array([self.rig.modes.phi_at(where) for where in places])
-        misfits: np.ndarray = np.sum([screened(lines, shapes) for lines in self._lines], axis=0)
+        misfits: np.ndarray = np.sum([screened(lines, shapes) for lines in self.lines], axis=0)
         return misfits
 
     @cached_property
-    def _lines(self) -> list[Lines]:
+    def lines(self) -> list[Lines]:
+        """The lines of every record."""
         return lines_of(self.rig, self.model, self.residuals, self.data.counted[0].sample_time)
 
     @cached_property
@@ -229,7 +230,7 @@ class Evidence:
     def _misfit(self, where: Where) -> float:
         """What one force of any law there leaves, in units of the noise, the ends of records accounted for."""
         shape = self.rig.modes.phi_at(where)
-        return float(sum(lines.misfit(shape) for lines in self._lines))
+        return float(sum(lines.misfit(shape) for lines in self.lines))
 
     @cached_property
     def peaks(self) -> tuple[Any, ...]:

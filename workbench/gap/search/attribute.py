@@ -7,8 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.deadline import NEVER, Deadline
-from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.deadline import Deadline
 from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out, simpler_forms
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.nonlinear import BEYOND, any_beyond, in_catalogue
@@ -18,7 +17,7 @@ from workbench.gap.localisation.where import of_one_sensor
 from workbench.gap.prediction.noise import is_noise_alone, logging_noise, noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
-from workbench.gap.prediction.workers import ALONE, Workers
+from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.beside_random import decide_on_random, random_beside, random_beside_errors
 from workbench.gap.search.finish import best_of_each, finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Fit, cost_of, fit
@@ -101,12 +100,7 @@ class Attribution:
 
 
 def baseline(
-    rig: Rig,
-    records: Sequence[Record],
-    *,
-    settle: float = 0.0,
-    workers: Workers = ALONE,
-    deadline: Deadline = NEVER,
+    rig: Rig, records: Sequence[Record], *, settle: float, workers: Workers, deadline: Deadline
 ) -> tuple[tuple[Effect, ...], Evidence, Evidence]:
     """What shows in the readings themselves, and the evidence of the nominal rig and of the rig with that.
 
@@ -153,11 +147,11 @@ def attribute(
     nominal: Evidence,
     evidence: Evidence,
     *,
-    catalogue: tuple[Kind, ...] = CATALOGUE,
-    report: Callable[[str, float], None] = lambda text, share: None,
-    free_nominal: bool = False,
-    tolerance: float = 0.0,
-    identified: IdentifiedPrior | None = None,
+    catalogue: tuple[Kind, ...],
+    report: Callable[[str, float], None],
+    free_nominal: bool,
+    tolerance: float,
+    identified: IdentifiedPrior | None,
 ) -> Attribution:
     """Find the effects that turn the residual of a rig on its fit records into noise.
 

@@ -274,20 +274,18 @@ def cramer_rao_bound(modes: SampledModes, record: Record, *, noise_std: float | 
     return as_refined([clean], modes.poles, fits, noise, converged=True, steps=0)
 
 
-def modal_amplitudes(record: Record, modes: SampledModes, *, at: float = 0.0, offset: bool = False) -> SampledModes:
-    """The same modes with shapes of displacement that carry amplitude and phase at the time `at`, by least squares.
+def modal_amplitudes(record: Record, modes: SampledModes) -> SampledModes:
+    """The same modes with shapes of displacement that carry amplitude and phase at time 0, by least squares.
 
     Args:
         record: free decay.
         modes: poles are used.
-        at: s on the record's clock; after an impulse, the time it acted.
-        offset: whether each output may also hold a constant.
 
     Returns:
-        `SampledModes` with y = d^k/dt^k Re Σ s_r e^{λ_r (t - at)}, k the derivative each sensor measures.
+        `SampledModes` with y = d^k/dt^k Re Σ s_r e^{λ_r t}, k the derivative each sensor measures.
     """
-    fit = project(record, modes.poles, offset)
-    lag = np.exp(modes.poles * (at - record.start_time))
+    fit = project(record, modes.poles, False)
+    lag = np.exp(-modes.poles * record.start_time)
     derivative = time_derivatives(record.output_channels)
     return replace(modes, shapes=fit.complex_amplitudes * lag / modes.poles ** derivative[:, None])
 
