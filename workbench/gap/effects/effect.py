@@ -134,12 +134,11 @@ def positive(
 def place_parameters(rig: Rig) -> tuple[Parameter, ...]:
     """The coordinates of a place, as parameters: x along an interval, x and y on a rectangle, none at named points."""
     domain = rig.modes.domain
-    lengths = {} if isinstance(domain, NamedPoints) else dict(zip(domain.coordinates, _lengths(domain), strict=True))
-    return tuple(Parameter(name, "m", 0.0, length, scale=0.01 * length) for name, length in lengths.items())
-
-
-def _lengths(domain: Domain) -> tuple[float, ...]:
-    return domain.length if isinstance(domain, Rectangle) else (domain.size,)
+    if isinstance(domain, NamedPoints):
+        return ()
+    lengths = domain.length if isinstance(domain, Rectangle) else (domain.size,)
+    named = zip(domain.coordinates, lengths, strict=True)
+    return tuple(Parameter(name, "m", 0.0, length, scale=0.01 * length) for name, length in named)
 
 
 def place_of(values: Mapping[str, Any]) -> Any:

@@ -99,11 +99,11 @@ def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     return tuple(ordered)
 
 
-def _commands(evidence: Evidence, target: str) -> np.ndarray:
-    """All commands to the target that are not at rest, joined."""
+def _commands(evidence: Evidence, target: str, *, changes: bool = False) -> np.ndarray:
+    """Sizes of all commands to the target, or of their changes from sample to sample, joined; zeros left out."""
     names = each_actuator(evidence.rig) if target == ALL else (target,)
     rows = [
-        row
+        np.diff(row) if changes else row
         for record in evidence.data.records
         for channel, row in zip(record.input_channels, record.inputs, strict=True)
         if channel.name in names
@@ -251,7 +251,7 @@ ACTUATOR_BIAS = Kind(
 
 def _rate_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
     """From slower than most changes of the command to as fast as its fastest."""
-    steps = _changes(evidence, target) / _sample_time(evidence)
+    steps = _commands(evidence, target, changes=True) / _sample_time(evidence)
     return [{"rate": float(q)} for q in np.quantile(steps, (0.1, 0.3, 0.5, 0.7, 0.9, 0.99))]
 
 
@@ -267,20 +267,6 @@ ACTUATOR_RATE_LIMIT = _actuator(
     nonlinear=True,
     starts=_rate_starts,
 )
-
-
-def _changes(evidence: Evidence, target: str) -> np.ndarray:
-    """All changes of commands to the target from sample to sample, joined, those of none left out."""
-    names = each_actuator(evidence.rig) if target == ALL else (target,)
-    changes = [
-        np.abs(np.diff(row))
-        for record in evidence.data.records
-        for channel, row in zip(record.input_channels, record.inputs, strict=True)
-        if channel.name in names
-    ]
-    values = np.concatenate(changes)
-    values = values[values > 0]
-    return values if values.size else np.ones(1)
 
 
 def _hysteresis_starts(evidence: Evidence, target: str) -> Iterator[dict[str, float]]:

@@ -210,10 +210,10 @@ def _regressed(place: Moved, series: str) -> float:
 
 
 def _point_starts(
-    name: str, series: str, typical: Callable[[Rig], float], *, between: bool = True, signed: bool = False
+    name: str, series: str, unit: str, *, between: bool = True, signed: bool = False
 ) -> Callable[[Evidence, object], Iterator[dict[str, Any]]]:
     def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-        size = typical(evidence.rig)
+        size = getattr(Scales.of(evidence.rig), unit)
         for place in evidence.at_peaks:
             if isinstance(place.at, Between) and not between:
                 continue
@@ -228,28 +228,15 @@ def _point_starts(
     return starts
 
 
-def _total_mass(rig: Rig) -> float:
-    return Scales.of(rig).mass
-
-
-def _typical_stiffness(rig: Rig) -> float:
-    return Scales.of(rig).stiffness
-
-
-def _typical_damping(rig: Rig) -> float:
-    return Scales.of(rig).damping
-
-
-def _positive(name: str, unit: str, typical: Callable[[Rig], float]) -> Callable[[Rig, object], tuple[Parameter, ...]]:
-    return lambda rig, _: (*place_parameters(rig), positive(name, unit, typical(rig), 1e-8, 1e5, neutral=0.0))
-
-
 POINT_MASS = Kind(
     name="point_mass",
     path="structure",
-    parameters=_positive("mass", "kg", _total_mass),
+    parameters=lambda rig, _: (
+        *place_parameters(rig),
+        positive("mass", "kg", Scales.of(rig).mass, 1e-8, 1e5, neutral=0.0),
+    ),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointMass(place_of(v), v["mass"]))),
-    starts=_point_starts("mass", "acceleration", _total_mass, between=False),
+    starts=_point_starts("mass", "acceleration", "mass", between=False),
     phrase="an added mass",
 )
 
@@ -277,7 +264,7 @@ GROUND_SPRING = Kind(
     path="structure",
     parameters=_spring_parameters,
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointSpring(place_of(v), v["stiffness"]))),
-    starts=_point_starts("stiffness", "displacement", _typical_stiffness, signed=True),
+    starts=_point_starts("stiffness", "displacement", "stiffness", signed=True),
     phrase="a spring to ground",
     simpler=_turning_spring,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * w},
@@ -286,9 +273,12 @@ GROUND_SPRING = Kind(
 POINT_DAMPER = Kind(
     name="point_damper",
     path="structure",
-    parameters=_positive("coefficient", "N s/m", _typical_damping),
+    parameters=lambda rig, _: (
+        *place_parameters(rig),
+        positive("coefficient", "N s/m", Scales.of(rig).damping, 1e-8, 1e5, neutral=0.0),
+    ),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
-    starts=_point_starts("coefficient", "velocity", _typical_damping),
+    starts=_point_starts("coefficient", "velocity", "damping"),
     phrase="a viscous damper to ground",
     last=True,
     force_laws={"velocity": lambda v, u: -v["coefficient"] * u},
