@@ -16,8 +16,8 @@ from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import place_actuators, placement_task
 from workbench.design.spillover.spillover import effort, finite_spillover, quadratic_cost
 from workbench.draw.design import plot_motion, plot_two_works
-from workbench.draw.identification import plot_identified, plot_ring_down
 from workbench.draw.motion import response_motion
+from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
@@ -79,6 +79,41 @@ def designs(modes) -> dict[str, Law]:
         "coupled LQR": coupled_lqr(modes, N_CONTROLLED, even, weight=FORCE_WEIGHT),
         "IMSC, placed": imsc(modes, N_CONTROLLED, actuators_at(best.positions), weight=MODAL_WEIGHT),
     }
+
+
+def plot_ring_down(record, *, stretch):
+    """Every output over time, one above the other, each at its place; the first `stretch` seconds."""
+    shown = record.between(record.start_time, record.start_time + stretch)
+    figure, ax = new_figure(width=9, height=4.5)
+    size = 1.1 * np.abs(shown.outputs).max()
+    for j, channel in enumerate(shown.output_channels):
+        ax.axhline(j, color=GREY, linewidth=0.4)
+        ax.plot(shown.time, j + 0.5 * shown.outputs[j] / size, color=COLOURS[0], linewidth=0.9)
+        place = channel.name if channel.at is None else f"x = {channel.at:.3g}"
+        ax.text(shown.time[-1], j, f"  {place}", va="center")
+    ax.set(xlabel="time [s]", yticks=[], xlim=(shown.time[0], shown.time[-1]))
+    first = record.output_channels[0]
+    ax.set_title(f"{first.quantity}, one line per sensor, {2.0 * size:.2g} {first.unit} apart".lstrip(", "))
+    return figure
+
+
+def plot_identified(found, truth, positions, *, count):
+    """Identified eigenfunctions over the true ones, with their values at the sensors."""
+    figure, axes = new_figure(-(-count // 3), 3, width=10, height=4.6, sharex=True, sharey=True, squeeze=False)
+    x = np.linspace(0.0, truth.length, 301)
+    for r, ax in zip(range(count), axes.flat, strict=False):
+        sign = np.sign(found.phi(x)[:, r] @ truth.phi(x)[:, r])
+        ax.plot(x, truth.phi(x)[:, r], color=GREY, linewidth=4, alpha=0.5, label="true")
+        ax.plot(x, sign * found.phi(x)[:, r], color=COLOURS[0], label="identified")
+        at_sensors = sign * found.phi(positions)[:, r]
+        ax.plot(positions, at_sensors, "o", color=COLOURS[1], markersize=4, label="at the sensors")
+        ax.set_title(f"mode {r + 1}: {found.frequencies_hz[r]:.4f} Hz, ζ = {100 * found.zeta[r]:.2f} %", fontsize=10)
+    for ax in axes[-1]:
+        ax.set_xlabel("x [m]")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("φ(x) [1/√kg]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
 
 
 def study(outcome, data=None) -> None:

@@ -7,7 +7,8 @@ from workbench.design.estimation.modal_filter import hermite_filter
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.spillover.spillover import energy_gained, finite_spillover, spillover
-from workbench.draw.design import plot_displacements, plot_work
+from workbench.draw.design import plot_work
+from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
 
@@ -47,6 +48,28 @@ def quadrature_work(modes, law, state, r):
         for wave in (np.cos, np.sin)
     ]
     return 0.5 * (parts[0] ** 2 + parts[1] ** 2)
+
+
+def plot_displacements(responses, positions, times, x):
+    """The structure's displacement at several times, one column per design, one row per time; actuators marked."""
+    figure, axes = new_figure(
+        len(times), len(responses), width=10, height=1.55 * len(times), sharex=True, sharey=True, squeeze=False
+    )
+    for column, (name, response) in enumerate(responses.items()):
+        motion = response.displacement(x)
+        for row, time in enumerate(times):
+            ax = axes[row, column]
+            k = int(np.argmin(np.abs(response.time - time)))
+            ax.plot(x, motion[:, k], color=COLOURS[0])
+            ax.axhline(0.0, color=GREY, linewidth=0.8)
+            where = positions[name]
+            ax.plot(where, np.zeros(len(where)), "x", color=COLOURS[1], markersize=7, mew=2, label="actuator")
+            if column == 0:
+                ax.set_ylabel(f"w [m] at\nt = {time:g} s")
+        axes[0, column].set_title(f"actuators at {name}")
+        axes[-1, column].set_xlabel("x [m]")
+    axes[0, 0].legend(loc="upper right", fontsize=8)
+    return figure
 
 
 def study(outcome, data=None):

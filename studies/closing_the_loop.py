@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.gap.diagnose import diagnose
+from workbench.gap.diagnose import diagnose_case
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
@@ -61,7 +61,7 @@ def plant(index, seed, searched=False):
         impulse=test.impulse,
     )
     if searched:
-        verdict = diagnose(rig, case.fit, validation=case.validation, workers=1)
+        verdict = diagnose_case(case, workers=1)
         possible, noise = UncertainRig.of(verdict), verdict.budget.noise_found
     else:
         possible, noise = _fitted(case, true)

@@ -15,7 +15,7 @@ from workbench.design.loop.closed_loop import close_loop, impulse_state, initial
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import nodes_of_mode, place_actuators
 from workbench.design.placement.task import batch_work, placement_task
-from workbench.draw.design import plot_scaling
+from workbench.draw.style import COLOURS, new_figure
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes
 
@@ -82,6 +82,17 @@ def quiet_place(a, b, poles):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return control.place(a, b, poles)
+
+
+def plot_scaling(times, slopes):
+    """Time to design against the number of modes, one line per method, each with its slope on the log-log scale."""
+    figure, ax = new_figure(width=9, height=5)
+    for (name, series), colour, mark in zip(times.items(), COLOURS, "osD^v", strict=False):
+        label = f"{name}: slope {slopes[name]:.1f}"
+        ax.loglog(list(series), list(series.values()), mark + "-", color=colour, label=label)
+    ax.set(xlabel="number of modes", ylabel="time to design [s]", title="time to design: independent modes and coupled")
+    ax.legend()
+    return figure
 
 
 def study(outcome, data=None):

@@ -5,8 +5,9 @@ from time import perf_counter
 
 import numpy as np
 
-from workbench.draw.trials import plot_times
-from workbench.gap.diagnose import diagnose
+from workbench.draw.style import COLOURS, new_figure
+from workbench.draw.trials import FAMILY
+from workbench.gap.diagnose import diagnose_case
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
@@ -38,7 +39,7 @@ def seconds_of(kinds, seed: int) -> float:
     """By the clock, for a case that hides these kinds, from the records in memory to the verdict."""
     case, _ = make_trial(seed, kinds=kinds)
     begun = perf_counter()
-    diagnose(case.rig, case.fit, validation=case.validation, workers=WORKERS)
+    diagnose_case(case, workers=WORKERS)
     return perf_counter() - begun
 
 
@@ -62,6 +63,19 @@ def simulations(n_modes: int, n_samples: int) -> dict[str, float]:
 def growth(sizes, times: list[dict[str, float]]) -> dict[str, float]:
     """Exponent by which the time of each simulation grows with the size."""
     return {name: float(np.polyfit(np.log(sizes), np.log([each[name] for each in times]), 1)[0]) for name in times[0]}
+
+
+def plot_times(seconds, limits):
+    """How long each diagnosis took, a dot per case, and how long it may take, by family of cases."""
+    figure, ax = new_figure(width=9, height=1.2 + 0.7 * len(seconds))
+    for y, (family, times) in enumerate(seconds.items()):
+        ax.plot(times, [y] * len(times), "o", color=COLOURS[0], alpha=0.6, label="a case" if y == 0 else None)
+        ends, label = [y - 0.35, y + 0.35], "limit" if y == 0 else None
+        ax.plot([limits[family]] * 2, ends, color=COLOURS[1], linewidth=2, label=label)
+    ax.set_yticks(range(len(seconds)), [FAMILY[family].rstrip(":") for family in seconds])
+    ax.set(xlim=(0, None), ylim=(len(seconds) - 0.5, -0.5), xlabel="wall-clock time on two cores [s]")
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+    return figure
 
 
 def study(outcome, data=None) -> None:

@@ -3,7 +3,7 @@
 from itertools import cycle
 from pathlib import Path
 
-from workbench.gap.diagnose import diagnose
+from workbench.gap.diagnose import diagnose_case
 from workbench.trials.dirt import CLEAN, DIRT_CLASSES, SIZES, TRIPLE
 from workbench.trials.make import make_trial
 
@@ -14,7 +14,7 @@ DIRTY, DIRTY_SEED = 300, 20350800  # beside the small errors of a real test, eac
 def diagnosed(seed: int, dirt: str = CLEAN, size: float = 1.0) -> list[str]:
     """Kinds of the effects that the diagnosis names on a case that hides none."""
     case, _ = make_trial(seed, dirt=dirt, size=size)
-    verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1, seconds=None).to_json()
+    verdict = diagnose_case(case, workers=1, seconds=None).to_json()
     return [effect["kind"] for effect in verdict["effects"]]
 
 

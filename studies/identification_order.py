@@ -9,9 +9,10 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from scipy.optimize import linear_sum_assignment
 
-from workbench.draw.identification import order_found
+from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.signal.synthesis import free_decay
@@ -66,6 +67,25 @@ def compared(seed: int) -> dict:
         "false": modes.n_modes - hit.size,
         "seconds": took,
     }
+
+
+def order_found(rows):
+    """Modes identified, missed and falsely reported over the signal-to-noise ratio; rows as `identification_order`."""
+    figure, ax = new_figure(width=8, height=4.2)
+    level = np.array([row["level_db"] for row in rows])
+    kinds = (
+        ([row["found"] for row in rows], "identified", "o", COLOURS[0]),
+        ([-(row["count"] - row["found"]) for row in rows], "missed", "x", COLOURS[1]),
+        ([-row["false"] for row in rows], "false", "+", COLOURS[3]),
+    )
+    for values, label, marker, colour in kinds:
+        shown = np.array(values) != 0
+        ax.plot(level[shown], np.array(values)[shown], marker, color=colour, label=f"{label} ({abs(sum(values))})")
+    ax.axhline(0.0, color=GREY, lw=0.8)
+    ax.set(xlabel="signal-to-noise ratio [dB]", ylabel="modes of a structure\nerrors below the line")
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    return figure
 
 
 def study(outcome, data: Path | None = None) -> None:

@@ -10,12 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.lines import Line2D
 from scipy.integrate import solve_ivp
 from scipy.optimize import linear_sum_assignment
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from workbench.draw.accuracy import records_errors
+from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.ambient import identify_ambient
 from workbench.identification.driven import identify_driven
 from workbench.identification.free_decay.assumptions import amplitude_dependence
@@ -222,6 +223,40 @@ def scored(structure: Structure, way: str) -> dict:
     bound = own if least is None else np.sqrt(np.diag(least))[np.r_[s, s + MODES]]
     counts = {"right": r.size, "identified": found.modes.n_modes, "late": late[0] if late else 0.0}
     return {**counts, "own": errors / own, "bound": errors / bound}
+
+
+def records_errors(errors, summary):
+    """Errors of every figure by the kind of record, beside those of a method that attains the bound.
+
+    Args:
+        errors: by kind (n_figures,), in standard errors of the bound.
+        summary: by kind, with over_bound and inside, as `identification_records`.
+    """
+    figure, ax = new_figure(1, 1, width=10.5, height=5.4)
+    rng, x = np.random.default_rng(0), np.linspace(-4.0, 4.0, 201)
+    bell = 0.36 * np.exp(-0.5 * x**2)
+    for row, (kind, apart) in enumerate(errors.items()):
+        totals, spread = summary[kind], np.clip(apart, -4.0, 4.0)
+        ax.fill_between(x, row - bell, row + bell, color=GREY, alpha=0.25, lw=0)
+        at = row + rng.uniform(-0.3, 0.3, spread.size) * np.exp(-0.5 * spread**2)
+        ax.plot(spread, at, "o", ms=3, color=COLOURS[0], alpha=0.6, mew=0)
+        least = "bound" if totals["bound"] == "Cramér-Rao" else "estimated error"
+        text = (
+            f"rms error / {least} = {totals['over_bound']:.2f}\n{100 * totals['inside']:.0f} % in their 95 % intervals"
+        )
+        ax.text(4.15, row, text, va="center", fontsize=8.5)
+    ax.set_yticks(range(len(errors)), list(errors))
+    ax.set(ylim=(len(errors) - 0.5, -0.5), xlim=(-4.0, 6.2))
+    ax.set_xticks(range(-4, 5, 2))
+    ax.set_xlabel(
+        "error of a frequency or damping ratio / standard error (Cramér-Rao bound; of unknown forces, estimated)"
+    )
+    handles = [
+        Line2D([], [], marker="o", lw=0, color=COLOURS[0], ms=4, label="one estimate"),
+        Line2D([], [], color=GREY, alpha=0.4, lw=8, label="what a method that attains the bound would show"),
+    ]
+    figure.legend(handles=handles, loc="outside upper left", ncols=2)
+    return figure
 
 
 def study(outcome, data: Path | None = None) -> None:

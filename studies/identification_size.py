@@ -16,7 +16,7 @@ import numpy as np
 from scipy.fft import rfft
 from scipy.optimize import linear_sum_assignment
 
-from workbench.draw.accuracy import size_and_errors
+from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.signal.synthesis import free_decay
@@ -110,6 +110,39 @@ def many_structures(outcome) -> None:
         f" {total['false']} of {total['reported']} reported are not there; rms error {rms[0]:.3f} (frequency) and"
         f" {rms[1]:.3f} (damping) of the bound"
     )
+
+
+def size_and_errors(rows, errors):
+    """What a record costs to identify by its length, and errors (2, n_modes) of ω and ζ of the longest over the bound.
+
+    Args:
+        rows: with samples, processor_seconds, seconds, found, count, as `identification_size`.
+        errors: in standard errors of the Cramér-Rao bound.
+    """
+    figure, (left, right) = new_figure(1, 2, width=10.5, height=4.2)
+    samples = np.array([row["samples"] for row in rows])
+    spent = np.array([row["processor_seconds"] for row in rows])
+    left.loglog(samples, spent, "o-", label="processor time, both cores together")
+    left.loglog(samples, spent[-1] * samples / samples[-1], "--", color=GREY, label="in proportion to the samples")
+    left.axhline(30.0, color=COLOURS[1], lw=1.2)
+    left.annotate("limit at full size: 30 s", (samples[0], 30.0), (0, 4), textcoords="offset points", color=COLOURS[1])
+    for row in rows:
+        text, at = f"{row['found']} of {row['count']} modes", (row["samples"], row["processor_seconds"])
+        left.annotate(text, at, (-4, 7), textcoords="offset points", ha="right", fontsize=8.5)
+    left.set_xticks(samples, [f"{n:,}" for n in samples])
+    left.set_yticks([1, 3, 10, 30], ["1", "3", "10", "30"])
+    left.minorticks_off()
+    left.set(xlim=(0.3 * samples.min(), 1.4 * samples.max()), ylim=(0.25 * spent.min(), 60.0))
+    left.set(xlabel=f"samples of {rows[-1]['sensors']} sensors", ylabel="time to identify [s]")
+    left.legend(loc="lower right")
+    edges, x = np.linspace(-4.0, 4.0, 17), np.linspace(-4.0, 4.0, 201)
+    right.hist(errors.T, edges, density=True, label=("frequency", "damping"), color=COLOURS[:2], alpha=0.8)
+    normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+    right.plot(x, normal, color=GREY, lw=3, alpha=0.7, label="a method that attains the bound")
+    right.set(xlabel="error of a mode / Cramér-Rao standard deviation [-]", ylabel="density")
+    right.set_ylim(top=1.35 * right.get_ylim()[1])  # room for the legend
+    right.legend(loc="upper left")
+    return figure
 
 
 def study(outcome, data: Path | None = None) -> None:

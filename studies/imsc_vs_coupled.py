@@ -6,6 +6,7 @@ from time import perf_counter
 
 import control
 import numpy as np
+from matplotlib.ticker import NullFormatter
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
@@ -25,7 +26,7 @@ from workbench.design.spillover.spillover import (
     quadratic_cost,
     spillover,
 )
-from workbench.draw.design import plot_comparison, plot_designs, plot_switching
+from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
@@ -160,6 +161,92 @@ def every_design(places):
     )  # fmt: skip
     first = rows[0]["seconds"]
     return [{**row, "design_time": row.pop("seconds") / first} for row in rows]
+
+
+def plot_comparison(rows, title):
+    """Cost, effort and spillover of several designs as ratios to the first, on a logarithmic scale."""
+    figure, ax = new_figure(1, 1, width=9, height=4)
+    keys = ("cost", "effort", "W_R")
+    width = 0.8 / len(rows)
+    ratios = np.array([[row[key] / rows[0][key] for key in keys] for row in rows])
+    least = 10.0 ** np.floor(np.log10(ratios.min()) - 0.3)
+    for i, row in enumerate(rows):
+        at = np.arange(len(keys)) + (i - 0.5 * (len(rows) - 1)) * width
+        # bars stand on the bottom of the picture: on a logarithmic scale there is no zero to stand on
+        bars = ax.bar(at, ratios[i] - least, width, bottom=least, label=row["law"])
+        ax.bar_label(bars, [f"{ratio:.3g}" for ratio in ratios[i]], padding=2)
+    ax.set(yscale="log", ylim=(least, 4.0 * ratios.max()), ylabel=f"ratio to {rows[0]['law']} (less is better)")
+    ax.set_xticks(np.arange(len(keys)), ["quadratic cost", "actuator effort", "spillover W_R"])
+    ax.axhline(1.0, color=GREY, linewidth=0.8)
+    ax.set_title(title)
+    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def plot_designs(rows, figures, title):
+    """Designs in rows, one panel a figure of merit, one mark an estimator; infinite values are at the edge.
+
+    Args:
+        rows: dicts with "law", "state" and every figure.
+        figures: heading of each by its key; a key that ends in "share" is drawn from 0 to 1, the others on a log scale.
+    """
+    laws, states = (list(dict.fromkeys(row[key] for row in rows)) for key in ("law", "state"))
+    figure, axes = new_figure(1, len(figures), width=12, height=1.4 + 0.75 * len(laws), sharey=True)
+    for ax, (key, heading) in zip(axes, figures.items(), strict=True):
+        most = max(row[key] for row in rows if row[key] is not None and np.isfinite(row[key]))
+        for i, state in enumerate(states):
+            own = [row for row in rows if row["state"] == state and row[key] is not None]
+            at = np.array([laws.index(row["law"]) + 0.16 * (i - 0.5 * (len(states) - 1)) for row in own])
+            values = np.array([row[key] for row in own], float)
+            endless = np.isinf(values)
+            values[endless] = 6.0 * most
+            ax.plot(values, at, "o^sv"[i % 4], color=COLOURS[i], markersize=7, label=state)
+            for x, y in zip(values[endless], at[endless]):
+                ax.annotate("unstable  ", (x, y), ha="right", va="center", fontsize=8, color=COLOURS[i])
+        if key.endswith("share"):
+            ax.set(xlim=(-0.05, 1.05))
+        else:
+            ax.set(xscale="log")
+            ax.xaxis.set_minor_formatter(NullFormatter())
+        ax.set_xlabel(heading)
+        for y in np.arange(len(laws) - 1) + 0.5:
+            ax.axhline(y, color=GREY, linewidth=0.6)
+    axes[0].set_yticks(range(len(laws)), laws)
+    axes[0].set_ylim(len(laws) - 0.5, -0.5)
+    axes[0].grid(axis="y", visible=False)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(states))
+    return figure
+
+
+def plot_switching(law, switched):
+    """The first controlled mode under on-off control: its path in the phase plane, and the force over time."""
+    relay, stretches = law.relays[0], switched.stretches[0]
+    response, r = switched.response, law.controlled[0]
+    q, v = response.modal[r], response.modal[response.modes.n_modes + r]
+    figure, axes = new_figure(1, 2, width=11, height=4.5)
+    axes[0].plot(q, v, color=COLOURS[0], linewidth=1.0, label="motion")
+    for stretch in stretches:
+        if stretch.sliding:
+            inside = (response.time >= stretch.start) & (response.time <= stretch.end)
+            axes[0].plot(q[inside], v[inside], color=COLOURS[1], linewidth=3.5, label="sliding mode")
+    reach = np.array([q.min(), q.max()])
+    edges = [edge - relay.slope * reach for edge in (-relay.dead_band, relay.dead_band)]
+    axes[0].fill_between(reach, *edges, color=GREY, alpha=0.25, label="dead band: no force")
+    switches = np.array([(s.displacement, s.rate) for s in stretches[1:]]).reshape(-1, 2)
+    axes[0].plot(*switches.T, ".", color=COLOURS[6], markersize=5, label="switches")
+    handles, labels = axes[0].get_legend_handles_labels()
+    once = dict(zip(labels, handles, strict=True))
+    axes[0].legend(once.values(), once.keys(), loc="lower left")
+    axes[0].set(xlabel=f"q{r + 1} [m √kg]", ylabel=f"dq{r + 1}/dt [m √kg/s]", title=f"mode {r + 1} in the phase plane")
+    pushes = np.zeros(response.time.size)
+    for s in stretches:
+        tau = response.time - s.start
+        inside = (tau >= 0) & (response.time <= s.end)
+        pushes[inside] = s.steady + s.ramp * tau[inside] + s.fading * np.exp(-relay.slope * tau[inside])
+    axes[1].plot(response.time, pushes, color=COLOURS[0])
+    axes[1].set(xlabel="time [s]", ylabel="modal force [N/√kg]", title="modal force (its mean in the sliding mode)")
+    return figure
 
 
 def study(outcome, data=None):

@@ -9,12 +9,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from joblib import Parallel, delayed
+from matplotlib import colormaps
 
 from workbench import study as many
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import impulse_state
 from workbench.design.spillover.spillover import effort, spillover
-from workbench.draw.tables import plot_cases
+from workbench.draw.style import new_figure
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
 from workbench.study.runs.engines import packed, unpacked
@@ -71,6 +72,19 @@ def seconds(call) -> float:
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
+
+
+def plot_cases(rows, *, x, y, by):
+    """One quantity over another, a line for each value of a third; y is logarithmic where all of it is positive."""
+    values = sorted({row[by] for row in rows})
+    figure, ax = new_figure(width=9, height=4.5)
+    for value, colour in zip(values, colormaps["viridis"](np.linspace(0.0, 0.9, len(values)))):
+        line = sorted((row[x], row[y]) for row in rows if row[by] == value and row[y] is not None)
+        ax.plot(*np.array(line).T, color=colour, label=f"{by} {value:.3g}")
+    scale = "log" if all(row[y] is None or row[y] > 0 for row in rows) else "linear"
+    ax.set(xlabel=x, ylabel=y, yscale=scale)
+    ax.legend(ncols=1, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
 
 
 def study(outcome, data=None):

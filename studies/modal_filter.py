@@ -3,7 +3,7 @@
 import numpy as np
 
 from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
-from workbench.draw.design import plot_filter_errors
+from workbench.draw.style import COLOURS, new_figure
 from workbench.structure.member import Beam
 
 PRINTED = {
@@ -27,6 +27,20 @@ def pattern(x, derivative=0):
         np.sin(np.outer(x, i) * np.pi / 10) if derivative == 0 else np.cos(np.outer(x, i) * np.pi / 10) * i * np.pi / 10
     )
     return waves @ (1.0 / (2.0 * i) ** 2) / np.sqrt(5.0)
+
+
+def plot_filter_errors(counts, errors):
+    """Error of each modal coordinate against the number of sensors."""
+    figure, ax = new_figure(1, 1, width=9, height=4)
+    for r in range(errors.shape[1]):
+        ax.semilogy(counts, np.maximum(errors[:, r], 1e-7), "o-", label=f"mode {r + 1}", color=COLOURS[r % 7])
+    ax.set(
+        xlabel="number of sensors (displacement and slope each)",
+        ylabel="error of the modal coordinate, |q̂ - q| [m √kg]",
+    )
+    ax.set_title("error of modal filters against the number of sensors")
+    ax.legend(ncols=2)
+    return figure
 
 
 def study(outcome, data=None):

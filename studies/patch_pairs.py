@@ -3,7 +3,7 @@
 import numpy as np
 
 from workbench.design.placement.velocity_feedback import FeedbackTask, place_pairs
-from workbench.draw.design import plot_feedback_index
+from workbench.draw.style import COLOURS, new_figure
 from workbench.rig.actuators import piezo_patch
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
@@ -30,6 +30,19 @@ def task(gain):
     # actuator and sensor see the same slopes: their constants are shared between B and Bᵀ
     pair = piezo_patch("patch", 0.5 * LENGTH, length=PATCH, gain=float(np.sqrt(MOMENT_PER_VOLT * VOLT_PER_SLOPE)))
     return FeedbackTask(modes, pair, np.array(gain), np.r_[np.zeros(4), 0.2, 0.4, 0.6, 0.8], PATCH)
+
+
+def plot_feedback_index(places, index, found):
+    """Energy integral of one collocated pair by the place of its middle, and the best places of several pairs."""
+    figure, axes = new_figure(2, 1, width=9, height=5.5, sharex=True, height_ratios=[3, 1.3])
+    axes[0].plot(places, index, color=COLOURS[0], label="one pair")
+    axes[1].set(xlabel="middle of the patch, x [m]", ylabel="pairs", yticks=list(found), ylim=(0.4, max(found) + 0.6))
+    for (count, best), colour in zip(found.items(), COLOURS[1:], strict=False):
+        axes[0].axhline(best.index, color=colour, linestyle="--", label=f"best of {count}: E = {best.index:.4f}")
+        axes[1].plot(best.positions, np.full(best.positions.size, count), "s", color=colour, markersize=9)
+    axes[0].set(ylabel="energy integral E [J s]", title="direct velocity feedback by collocated piezo pairs")
+    axes[0].legend()
+    return figure
 
 
 def study(outcome, data=None):

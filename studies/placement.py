@@ -5,10 +5,29 @@ import numpy as np
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task, scan, symbolic_work
 from workbench.design.placement.sensor_placement import place_sensors
-from workbench.draw.design import plot_effort_front
+from workbench.draw.style import COLOURS, new_figure
 from workbench.structure.member import Beam
 
 SPACING = 0.5
+
+
+def plot_effort_front(placements, marked):
+    """Spillover against effort along the front of placements, with named ones marked; the places below."""
+    figure, axes = new_figure(2, 1, width=9, height=7, height_ratios=[3, 2])
+    effort = [p.effort for p in placements]
+    work = [p.residual_work for p in placements]
+    axes[0].plot(effort, work, "o-", color=COLOURS[0], label="least W_R at each effort")
+    for (name, p), colour in zip(marked.items(), COLOURS[1:], strict=False):
+        axes[0].plot(p.effort, p.residual_work, "s", color=colour, markersize=9, label=name)
+    axes[0].set(xscale="log", yscale="log", xlabel="effort ∫ FᵀF dt [N² s]", ylabel="spillover work W_R [J]")
+    axes[0].set_title("spillover against effort")
+    axes[0].legend()
+    for p in placements:
+        axes[1].plot(p.positions, np.full(p.positions.size, p.effort), "o", color=COLOURS[0], markersize=4)
+    for (_, p), colour in zip(marked.items(), COLOURS[1:], strict=False):
+        axes[1].plot(p.positions, np.full(p.positions.size, p.effort), "s", color=colour)
+    axes[1].set(yscale="log", xlabel="places of the actuators, x [m]", ylabel="effort [N² s]")
+    return figure
 
 
 def study(outcome, data=None):

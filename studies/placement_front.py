@@ -10,7 +10,7 @@ from workbench.design.placement.coupled_scan import scan_coupled
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task
 from workbench.design.spillover.spillover import quadratic_cost
-from workbench.draw.design import plot_placement_fronts
+from workbench.draw.style import COLOURS, new_figure
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
 
@@ -22,6 +22,32 @@ GAPS = {1: 0.01, 2: 0.01, 3: 0.01, 4: 0.05}
 TIGHT = {"forbidden": ((6.0, 6.6),), "peak_force": 0.32, "condition": 6.0}
 # places of the grid on which coupled LQR is tried with each number of actuators
 GRIDS = {2: 200, 3: 60, 4: 24}
+
+
+def plot_placement_fronts(fronts, rule):
+    """Least spillover against effort for each disturbance, the rule of the nodes beside it, and the places taken."""
+    figure, axes = new_figure(2, len(fronts), width=11, height=7, sharex=True, sharey="row", squeeze=False)
+    for (name, front), (above, below) in zip(fronts.items(), axes.T, strict=True):
+        effort = [p.effort for p in front]
+        above.plot(effort, [p.residual_work for p in front], "o-", color=COLOURS[0], label="optimum at each effort")
+        above.plot(
+            rule[name].effort,
+            rule[name].residual_work,
+            "s",
+            color=COLOURS[1],
+            markersize=9,
+            label="nodes of the next mode",
+        )
+        below.plot(effort, np.array([p.positions for p in front]), "o-", color=COLOURS[0], markersize=4)
+        below.plot(np.full(rule[name].positions.size, rule[name].effort), rule[name].positions, "s", color=COLOURS[1])
+        alone = np.ptp(effort) < 1e-3 * effort[0]
+        above.set_title(f"{name}: one placement is best at any effort" if alone else name)
+        above.set_ylim(bottom=0.0)
+        above.legend()
+        below.set(xlabel="effort ∫ FᵀF dt [N² s]")
+    axes[0, 0].set_ylabel("spillover work W_R [J]")
+    axes[1, 0].set_ylabel("places of the actuators [m]")
+    return figure
 
 
 def study(outcome, data=None):

@@ -11,7 +11,7 @@ from workbench.design.loop.closed_loop import close_loop, impulse_state, initial
 from workbench.design.loop.reidentify import open_loop, updated
 from workbench.design.spillover.robustness import draw_modes, robustness
 from workbench.design.spillover.spillover import distributed_cost, modal_cost
-from workbench.draw.design import plot_drift, plot_robustness
+from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
@@ -155,6 +155,44 @@ def drift(outcome):
         f" {last['cost_of_the_new_law']:.2e}"
     )
     outcome.figure("drift", plot_drift(rows), "Frequencies found in the running loop while the stiffness drifts.")
+
+
+def plot_robustness(scales, shares, spreads):
+    """Share of perturbed models that stay stable, and median W_R with its 90 % interval, by the size of the errors."""
+    figure, axes = new_figure(2, 1, width=9, height=7, sharex=True)
+    for (name, values), colour, mark in zip(shares.items(), COLOURS, "osD^", strict=False):
+        axes[0].semilogx(scales, values, mark + "-", color=colour, label=name)
+        low, middle, high = np.array(spreads[name]).T
+        axes[1].loglog(scales, middle, mark + "-", color=colour)
+        axes[1].fill_between(scales, low, high, color=colour, alpha=0.15)
+    axes[0].set(ylabel="share of perturbed models that stay stable", ylim=(-0.03, 1.05))
+    axes[0].set_title("robustness to the errors of identification, and to larger ones")
+    axes[0].legend(loc="lower left")
+    axes[1].set(
+        xlabel="errors, as multiples of the identified standard errors", ylabel="W_R [J], median and 90 % interval"
+    )
+    return figure
+
+
+def plot_drift(rows):
+    """Frequencies identified in the loop over the nominal, and excess cost of the old law, as the stiffness drifts."""
+    figure, axes = new_figure(1, 2, width=11, height=4.3)
+    drift = [100 * (row["stiffness"] - 1) for row in rows]
+    first = np.array(rows[0]["omega"])
+    for r in range(first.size):
+        axes[0].plot(drift, [row["omega"][r] / first[r] for row in rows], color=GREY, label="true" if r == 0 else None)
+        found = [row["found"][r] / first[r] for row in rows]
+        axes[0].plot(drift, found, "osD"[r % 3], color=COLOURS[r], label=f"mode {r + 1}, identified in the loop")
+    axes[0].set(xlabel="drift of the stiffness [%]", ylabel="frequency / nominal frequency [-]")
+    axes[0].legend()
+    for key, label, mark in (
+        ("cost_of_the_old_law", "nominal law", "o-"),
+        ("cost_of_the_new_law", "redesigned law", "s-"),
+    ):
+        axes[1].plot(drift, [1e6 * row[key] for row in rows], mark, label=label)
+    axes[1].set(xlabel="drift of the stiffness [%]", ylabel="cost above the least, parts per million")
+    axes[1].legend()
+    return figure
 
 
 def study(outcome, data=None):

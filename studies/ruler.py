@@ -14,7 +14,8 @@ from scipy.optimize import least_squares
 
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task
-from workbench.draw.identification import measured_modes, placement_on_shapes, stabilisation_diagram
+from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.draw.tables import stabilisation_diagram
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.identification.free_decay.refinement import modal_amplitudes
@@ -37,6 +38,63 @@ SEEN_HZ = (39.4, 108.8, 212.0, 352.6, 517.9, 729.0)
 OTHERS_HZ = (6.7, 551.0)
 DAMPING_WANTED = 0.05
 SHIFTING = ("point_mass", "local_stiffness_loss", "axial_load", "ground_spring")  # kinds that shift frequencies
+
+
+def measured_modes(bending, others, pairing, model):
+    """Measured shapes over the model's, one panel per mode; those that are not the model's last, in orange."""
+    n = bending.n_modes + others.n_modes
+    figure, axes = new_figure(int(np.ceil(n / 4)), 4, width=12, height=2.7 * np.ceil(n / 4), sharex=True, sharey=True)
+    x = np.linspace(0.0, model.length, 200)
+    at_sensors = model.phi(bending.positions)
+    for ax, r in zip(axes.ravel(), range(n), strict=False):
+        is_model = r < bending.n_modes
+        modes, k = (bending, r) if is_model else (others, r - bending.n_modes)
+        values = modes.shapes[:, k] * np.exp(-0.5j * np.angle((modes.shapes[:, k] ** 2).sum()))
+        values = values.real / np.abs(values).max()
+        if is_model:
+            shape = at_sensors[:, pairing.model[k]]
+            scale = (values @ shape) / (shape @ shape)
+            ax.plot(x, scale * model.phi(x)[:, pairing.model[k]], color=GREY, lw=3, alpha=0.5, label="beam model")
+        marker, colour, label = (
+            ("o", COLOURS[0], "measured") if is_model else ("s", COLOURS[1], "measured, not bending")
+        )
+        ax.plot(modes.positions, values, marker, color=colour, label=label)
+        what = f"beam {pairing.scaled_hz[k]:.1f} Hz, MAC {pairing.mac[k]:.3f}" if is_model else "not bending"
+        ax.set_title(f"{modes.frequencies_hz[k]:.1f} Hz: {what}", fontsize=9.5)
+    for ax in axes.ravel()[n:]:
+        ax.set_visible(False)
+    for ax in np.atleast_2d(axes)[-1]:
+        ax.set_xlabel("x / length")
+    for ax in np.atleast_2d(axes)[:, 0]:
+        ax.set_ylabel("mode shape, largest 1")
+    named = {label: line for ax in axes.ravel() for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named))
+    return figure
+
+
+def placement_on_shapes(modes, placements, *, n_controlled):
+    """Where actuators stand on the mode shapes, and what each placement leaves in the residual modes."""
+    figure, (left, right) = new_figure(1, 2, width=12, height=4.5, width_ratios=(3, 2))
+    x = np.linspace(0.0, modes.length, 300)
+    shapes = modes.phi(x)
+    for r in range(modes.n_modes):
+        controlled = r < n_controlled
+        label = {0: "controlled modes", n_controlled: "residual modes"}.get(r)
+        left.plot(x, shapes[:, r], color=COLOURS[0] if controlled else GREY, lw=2 if controlled else 0.9, label=label)
+    bottom, width = shapes.min(), 0.8 / len(placements)
+    for i, (name, placement) in enumerate(placements.items()):
+        colour = COLOURS[i + 1]
+        level = bottom - 0.35 * (i + 1)
+        left.plot(placement.positions, np.full(len(placement.positions), level), "^", color=colour, ms=9)
+        label = f"{name}: W_R = {placement.residual_work:.2e}, effort {placement.effort:.3g}"
+        number = np.arange(n_controlled + 1, modes.n_modes + 1)
+        work = np.maximum(placement.by_mode, 1e-12)
+        right.bar(number + (i - 1) * width, work, width, bottom=1e-12, color=colour, label=label)
+    left.set(xlabel="x / length", ylabel="mode shape; triangles: actuators")
+    left.legend(loc="upper center", ncols=2)
+    right.set(yscale="log", ylim=(1e-12, None), xticks=number, xlabel="residual mode", ylabel="spillover work W_r")
+    right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return figure
 
 
 def study(outcome, data: Path | None = None) -> None:

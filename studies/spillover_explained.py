@@ -10,7 +10,8 @@ from workbench.design.laws.law import Law
 from workbench.design.loop.closed_loop import close_loop, close_with
 from workbench.design.spillover.explain import explain_spillover
 from workbench.design.spillover.remedies import spillover_remedies, sufficient_sensors
-from workbench.draw.design import plot_sensor_counts, plot_spillover_paths
+from workbench.draw.design import plot_spillover_paths
+from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
@@ -25,6 +26,24 @@ BESIDE, ACROSS = 10.0 / 6.0, 50.0 / 6.0
 def margins_of_filter(modes, way, actuators, count=24):
     places = modes.length * np.arange(1, count + 1) / (count + 1)
     return close_with(modes, way(actuators, places)).margin
+
+
+def plot_sensor_counts(margins, counts):
+    """Stability margin of the full plant against the number of sensors, one line an estimator."""
+    figure, ax = new_figure(width=9, height=4.5)
+    for (name, values), colour, mark in zip(margins.items(), COLOURS, "osD", strict=False):
+        numbers = np.arange(1, len(values) + 1)
+        there = np.isfinite(values)
+        count = counts[name]
+        label = f"{name}: stable from {count} sensors on" if count else f"{name}: unstable up to {len(values)}"
+        ax.plot(numbers[there], values[there], mark + "-", color=colour, label=label, markersize=4)
+    ax.axhline(0.0, color=GREY, linewidth=1.0)
+    largest = max(v[np.isfinite(v)].max() for v in margins.values())
+    ax.set_yscale("symlog", linthresh=max(largest, 1e-6))
+    ax.set(xlabel="number of sensors, evenly spaced", ylabel="stability margin [1/s]; below zero unstable")
+    ax.set_title("observation spillover: stability margin against the number of sensors")
+    ax.legend()
+    return figure
 
 
 def study(outcome, data=None):

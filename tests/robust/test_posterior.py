@@ -33,7 +33,7 @@ def told(rig):
     rig = replace(rig, actuators=rig.actuators[:1], sensors=rig.sensors[:2])
     record = simulate(apply_all(rig, GAINS), np.random.default_rng(0).normal(size=(1, 600)), sample_time=0.01)
     noise = np.array([1e-3, 3e-2]) * record.outputs.std(axis=1)
-    found = with_intervals(rig, Fit(GAINS, 1.0, np.ones((1, 2)), 2, "given"), FitData((record,), noise))
+    found = with_intervals(rig, Fit(GAINS, 1.0, np.ones((1, 2)), 2), FitData((record,), noise))
     return rig, record, noise, found
 
 

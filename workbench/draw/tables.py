@@ -1,13 +1,19 @@
-"""Figures of many cases, and of what the command wrote as JSON."""
+"""Figures of what the command wrote as JSON."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.identification.free_decay.ibrahim import Stabilisation
+from workbench.structure.modes import SampledModes
+
+# the complex to real: seen on white and on black alike
+REAL = LinearSegmentedColormap.from_list("real", ["#8f979f", COLOURS[0]])
 
 
 def plot_poles(poles: Mapping[str, np.ndarray]) -> Figure:
@@ -60,14 +66,19 @@ def plot_places(places: Mapping[str, np.ndarray], length: float | None = None) -
     return figure
 
 
-def plot_cases(rows: Sequence[dict[str, Any]], *, x: str, y: str, by: str) -> Figure:
-    """One quantity over another, a line for each value of a third; y is logarithmic where all of it is positive."""
-    values = sorted({row[by] for row in rows})
+def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz: float) -> Figure:
+    """Frequencies at each order; blue dots have real shapes (phase collinearity near 1), grey ones complex shapes."""
     figure, ax = new_figure(width=9, height=4.5)
-    for value, colour in zip(values, colormaps["viridis"](np.linspace(0.0, 0.9, len(values)))):
-        line = sorted((row[x], row[y]) for row in rows if row[by] == value and row[y] is not None)
-        ax.plot(*np.array(line).T, color=colour, label=f"{by} {value:.3g}")
-    scale = "log" if all(row[y] is None or row[y] > 0 for row in rows) else "linear"
-    ax.set(xlabel=x, ylabel=y, yscale=scale)
-    ax.legend(ncols=1, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    look: Any = {"cmap": REAL, "vmin": 0, "vmax": 1, "s": 22, "edgecolors": GREY, "linewidths": 0.4, "zorder": 3}
+    for line, frequency in enumerate(stayed.frequencies_hz):
+        ax.axvline(frequency, color=COLOURS[1], alpha=0.5, lw=5, label=None if line else "stable")
+    for order, modes in zip(diagram.orders, diagram.found, strict=True):
+        keep = modes.frequencies_hz < band_hz
+        at, collinearity = np.full(keep.sum(), order), modes.phase_collinearity[keep]
+        dots = ax.scatter(modes.frequencies_hz[keep], at, c=collinearity, **look)
+    figure.colorbar(dots, ax=ax, label="phase collinearity of the shape")
+    ax.set(xlabel="frequency [Hz]", ylabel="model order (modes)")
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    if stayed.n_modes:
+        figure.legend(loc="outside upper right")
     return figure

@@ -36,7 +36,7 @@ from workbench.gap.report.verdict import Verdict
 from workbench.gap.report.wiring import check_kept_apart, wiring
 from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.gap.search.finish import with_equals
-from workbench.records.record import Record
+from workbench.records.record import Record, as_records
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 from workbench.threads import one_blas_thread
@@ -100,7 +100,7 @@ def diagnose(
         ValueError: arguments out of their ranges; records that do not fit the rig or cannot be of it, two of one name,
             a validation record that repeats one to be fitted; modes that are not those of the structure.
     """
-    records, validation = (_sequence_of(each) for each in (records, validation))
+    records, validation = (tuple(as_records(each)) for each in (records, validation))
     if not 0.0 <= tolerance < 1.0:
         raise ValueError(f"tolerance is a share of the signal's rms, from 0 to below 1; got {tolerance}")
     if not catalogue or not all(isinstance(kind, Kind) for kind in catalogue):
@@ -131,14 +131,15 @@ def diagnose(
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
     faults = wiring(rig, records, validation, settle=settle)
     report("looking for the unmodelled force", 0.02)
-    found = baseline(rig, records, settle=settle, guessed=silent, workers=sharing, deadline=deadline)
-    nominal = found.nominal
+    seen, nominal, evidence = baseline(rig, records, settle=settle, guessed=silent, workers=sharing, deadline=deadline)
     with (
-        sharing.in_background(lambda: locate_force(nominal.without(_faulty(found.seen)))) as place,
+        sharing.in_background(lambda: locate_force(nominal.without(_faulty(seen)))) as place,
         sharing.in_background(lambda: readiness(nominal, catalogue=catalogue)) as ready,
     ):
         attribution = attribute(
-            found,
+            seen,
+            nominal,
+            evidence,
             catalogue=catalogue,
             report=report,
             free_nominal=free_nominal,
@@ -147,7 +148,7 @@ def diagnose(
         )
         if attribution.outcome == "explained" and attribution.random is None:
             alike, search = ready().indistinguishable, attribution.search
-            rivals = with_equals(search, attribution.best, attribution.rivals, found.evidence, alike)
+            rivals = with_equals(search, attribution.best, attribution.rivals, evidence, alike)
             attribution = replace(attribution, rivals=rivals)
         attribution = _paid_for(rig, attribution, validation, settle)
         corrected = apply_all(rig, attribution.best.effects)
@@ -160,7 +161,7 @@ def diagnose(
         named = tuple(e for e in accounted if e is not errors)
         effects = named if outcome in ("none", "explained") else ()
         faulty = _faulty(attribution.best.effects)
-        as_seen = faulty == _faulty(found.seen)
+        as_seen = faulty == _faulty(seen)
         budget = budget_of(
             rig,
             effects,
@@ -208,10 +209,6 @@ def diagnose_case(case: Case, **options: Any) -> Verdict:
         options: of `diagnose`.
     """
     return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, units=case.units, **options)
-
-
-def _sequence_of(records: Record | Iterable[Record]) -> tuple[Record, ...]:
-    return (records,) if isinstance(records, Record) else tuple(records)
 
 
 def _faulty(effects: Sequence[Effect]) -> set[str]:

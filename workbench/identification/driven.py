@@ -252,8 +252,17 @@ def identify_driven(
         )
     most = min(max_modes, (rows - columns) // 6)
     how = {"max_modes": most, "false_alarm": false_alarm}
-    data, drift = beside_drift(data, lambda each: _strongest(each, **how, budget=budget.aside(DRIVEN.drifting)))
-    data, selected = _selected(data, budget, **how) if delays is not None else _with_delays(data, budget, **how)
+    looks: list[Budget] = []
+
+    def looked(each: KnownInputs) -> Selected:
+        looks.append(budget.aside(DRIVEN.drifting))
+        return _strongest(each, **how, budget=looks[-1])
+
+    data, strongest, drift = beside_drift(data, looked)
+    if any(look.unfinished for look in looks):
+        strongest = None
+    search = _with_delays if delays is None else _selected
+    data, selected = search(data, budget, strongest, **how)
     if selected.fit.poles.size == 0:
         raise ValueError(
             f"record {records[0].name!r}: no mode between inputs {', '.join(records[0].input_names)} and outputs"
@@ -296,7 +305,9 @@ def _sizes(data: KnownInputs, fit: Fit) -> Floats:
     )
 
 
-def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:
+def _with_delays(
+    data: KnownInputs, budget: Budget, strongest: Selected | None, **how: Any
+) -> tuple[KnownInputs, Selected]:
     """The modes, and how late each input acts.
 
     Lateness by a fraction of a sample is searched where the first response of an input is later than without delay, or
@@ -306,7 +317,7 @@ def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownIn
     whole = np.maximum(first - (0 if data.straight else 1), 0)
     in_time: tuple[KnownInputs, Selected] | None = None
     if not data.straight and not first.any():
-        return _selected(data, budget, **how)
+        return _selected(data, budget, strongest, **how)
     late = data.delayed_by(whole, any_fraction=True)
     strongest = _strongest(late, budget=budget, **how)
     if not whole.any():

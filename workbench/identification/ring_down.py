@@ -21,7 +21,7 @@ from workbench.identification.signal.modal_estimates import Identified, OfRefine
 from workbench.identification.signal.overtones import multiple_of
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import SECONDS, Budget, Progress
-from workbench.records.record import Record
+from workbench.records.record import Record, as_records
 from workbench.renamed import Renamed
 from workbench.structure.modes import SampledModes
 from workbench.threads import one_blas_thread
@@ -345,7 +345,7 @@ def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, 
     """
     modes, found = refined.modes, []
     size = np.abs(np.stack(refined.amplitudes) / refined.noise[:, :, None]).max(axis=(0, 1))
-    records = [records] if isinstance(records, Record) else records
+    records = as_records(records)
     span = max(record.n_samples * record.sample_time for record in records)
     for r in range(modes.n_modes):
         f, zeta, doubt = modes.frequencies_hz[r], modes.zeta[r], SURE * refined.zeta_std[r]

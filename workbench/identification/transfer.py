@@ -30,6 +30,7 @@ from workbench.renamed import Renamed, former_arguments
 from workbench.rig.sensors import MEASURED
 from workbench.structure.domain import place_array
 from workbench.structure.modes import SampledModes, frozen
+from workbench.structure.printed import mode_text
 from workbench.threads import one_blas_thread
 
 
@@ -323,7 +324,7 @@ def _of_stated_noise(misfit: Floats) -> tuple[str, ...]:
 def _uneven(whole: TransferModes) -> tuple[str, ...]:
     """A remark on the modes whose peaks are not those of one pole."""
     which = [
-        f"mode {r + 1} ({whole.modes.frequencies_hz[r]:.4g} Hz, by {scatter:.3g} Hz rms)"
+        mode_text(r, whole.modes.frequencies_hz[r], f", by {scatter:.3g} Hz rms")
         for r, scatter in enumerate(whole.scatter_hz)
         if scatter > 0
     ]

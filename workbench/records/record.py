@@ -1,6 +1,6 @@
 """A record: named, placed, uniformly sampled signals, going in and coming out."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -259,3 +259,8 @@ class Record(Printed):
             start_time=float(response.time[0]),
             name=name,
         )
+
+
+def as_records(records: Record | Iterable[Record]) -> list[Record]:
+    """The records, or the one, as a list."""
+    return [records] if isinstance(records, Record) else list(records)

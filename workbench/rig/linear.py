@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.linalg import expm
 
 from workbench.arrays import Complexes, Floats
 from workbench.structure.modes import modal_state_matrix
@@ -48,6 +49,21 @@ def modal_poles(omega: np.ndarray, damping: np.ndarray) -> ModalPoles:
     keep = values.imag >= 0
     twice = np.where(values.imag > 0, 2.0, 1.0)
     return ModalPoles(values[keep], inverse[keep][:, n:], (vectors[:n] * twice)[:, keep])
+
+
+def integrated(a: Floats, q: Floats, time: float, halvings: int) -> tuple[Floats, Floats]:
+    """e^(A t) and ∫ e^(A s) Q e^(Aᵀ s) ds from 0 to t, by one exponential of a block, doubled up from t / 2^halvings.
+
+    Van Loan, IEEE Trans. Automatic Control 23 (1978) 395.
+    """
+    size = len(a)
+    short = expm(np.block([[-a, q], [np.zeros_like(a), a.T]]) * time / 2**halvings)
+    transition: Floats = short[size:, size:].T
+    whole: Floats = transition @ short[:size, size:]
+    for _ in range(halvings):
+        whole = whole + transition @ whole @ transition.T
+        transition = transition @ transition
+    return transition, whole
 
 
 @njit(cache=True, nogil=True)

@@ -59,3 +59,8 @@ def place_text(place: object) -> str:
     if isinstance(place, tuple):
         return ", ".join(place_text(part) for part in place)
     return "" if place is None else f"{place:.4g}" if isinstance(place, int | float) else str(place)
+
+
+def mode_text(r: int, hz: float, more: str = "") -> str:
+    """A mode as a remark names it: mode 2 (4.1 Hz)."""
+    return f"mode {r + 1} ({hz:.4g} Hz{more})"

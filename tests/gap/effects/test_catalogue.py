@@ -227,23 +227,18 @@ def test_a_speed_too_small_to_tell_is_not_stated():
     assert "smoothing_speed" in effect_json(viscous, rig())["parameters"], "of a damper only the ratio is known"
 
 
-def _readings(series: np.ndarray) -> SimpleNamespace:
-    record = Record(0.01, series[None], (Channel("d", "displacement"),))
-    return SimpleNamespace(rig=SimpleNamespace(sensors=(Sensor("d", 0.0),)), data=SimpleNamespace(records=(record,)))
-
-
 def test_what_comes_to_rest_at_a_level_is_not_clipped_there():
     t = 0.01 * np.arange(1200)
-    assert clipped_level(_readings(np.clip(np.sin(2.0 * t), -0.8, 0.8)), "d") == 0.8
-    assert clipped_level(_readings(np.clip(np.sin(2.0 * t), -0.99, 0.99)), "d") == 0.99
+    assert clipped_level([np.clip(np.sin(2.0 * t), -0.8, 0.8)]) == 0.8
+    assert clipped_level([np.clip(np.sin(2.0 * t), -0.99, 0.99)]) == 0.99
     moving = np.clip(np.mod(t, 4.0) - 0.5, 0.0, 1.0)
     rest = np.where(np.mod(t, 8.0) < 4.0, 1.0, -1.0) * (0.5 - 0.5 * np.cos(np.pi * moving))
     there_and_back = np.where(np.mod(t, 8.0) < 4.0, rest, rest + 1.0)
-    assert clipped_level(_readings(there_and_back), "d") is None
+    assert clipped_level([there_and_back]) is None
     strokes = 0.25 * np.sin(np.pi * np.arange(3000) / 400) ** 3
-    assert clipped_level(_readings(strokes), "d") is None, "it turns round at one place every time"
+    assert clipped_level([strokes]) is None, "it turns round at one place every time"
     noisy = there_and_back + 0.01 * np.random.default_rng(0).standard_normal(t.size)
-    assert clipped_level(_readings(np.clip(noisy, -1.0, 1.0)), "d") == 1.0, "noise is cut off where the mass rests"
+    assert clipped_level([np.clip(noisy, -1.0, 1.0)]) == 1.0, "noise is cut off where the mass rests"
 
 
 @pytest.mark.parametrize("kind", [kind for kind in CATALOGUE if kind.force_laws], ids=lambda kind: kind.name)

@@ -93,7 +93,7 @@ def test_it_is_found_beside_small_errors_of_the_model(rig, records):
     data = FitData(tuple(made), np.array([s.noise_std for s in rig.sensors]))
     nominal = data.by_channel(data.residual(told))
     search = Search(told, data, data, data, CATALOGUE, lambda text, share: None, ALONE, nominal)
-    step = measured(search, Fit((nominal_errors(told, search.prior),), 0.0, nominal, 0, "nothing"))
+    step = measured(search, Fit((nominal_errors(told, search.prior),), 0.0, nominal, 0))
     assert not looks_random(evidence(told, made))
     assert random_beside_errors(search, step) is None
     found = random_beside_errors(search, step, surely=False)
@@ -141,4 +141,4 @@ def test_an_effect_of_a_coarse_sensor_keeps_it(rig, records):
     left = data.by_channel(data.residual(rig))
     search = Search(rig, data, data, data, CATALOGUE, lambda text, share: None, ALONE, left)
     assert coarse not in search.without_clipped().rig.sensors
-    assert random_beside(search, [Fit((swapped,), 1.0, left, 0, "")]) is None
+    assert random_beside(search, [Fit((swapped,), 1.0, left, 0)]) is None

@@ -14,7 +14,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.pairs import Pairs, _evidence
-from workbench.gap.search.screening import Screening, one_more, pairs_at_once
+from workbench.gap.search.screening import Screening, fitted_ahead, one_more
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import SELECTION
 from workbench.rig.elements import CubicSpring
@@ -67,7 +67,7 @@ def test_what_two_effects_come_to_is_least_squares_within_bounds():
 
 def test_both_halves_of_a_pair_are_found_at_once(rig, search):
     evidence = Evidence.of(rig, search.data)
-    best = pairs_at_once(search, Screening.of(search, (), evidence))[0]
+    best = fitted_ahead(search, Screening.of(search, (), evidence).likeliest_pairs(SELECTION.tried))[0]
     named = {effect.label: effect.values for effect in best.effects}
     assert set(named) == {"cubic_spring", "sensor_gain[d3]"} and best.cost < 1.05
     assert named["cubic_spring"]["at"] == pytest.approx(0.62, abs=1e-3)
@@ -105,7 +105,7 @@ def test_two_of_a_kind_beside_one_another_explain_nothing(search):
 
     def fitted(*places: float) -> Fit:
         contacts = (Effect(CLEARANCE, None, {"at": at, "stiffness": 1.0, "gap": 1e-3}) for at in places)
-        return Fit(tuple(contacts), 1.0, np.ones((2, 4)), 6, "settled")
+        return Fit(tuple(contacts), 1.0, np.ones((2, 4)), 6)
 
     assert search.explains(fitted(0.4, 1.2))
     assert not search.explains(fitted(0.4, 0.5))

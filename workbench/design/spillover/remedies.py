@@ -131,14 +131,11 @@ def sufficient_sensors(
     redesign: Redesign,
     actuators: Sequence[Actuator],
     *,
-    margin: float = 0.0,
     most: int = 60,
-    lasting: int = 3,
 ) -> tuple[int | None, np.ndarray]:
-    """The least number of evenly spaced sensors from which on the margin is met, and the margin with 1, 2, … sensors.
+    """The least number of evenly spaced sensors from which on the loop is stable, and the margin with 1, 2, … sensors.
 
-    Args:
-        lasting: further numbers of sensors that must meet it too, lest one count be lucky.
+    Three further numbers of sensors must do too, lest one count be lucky.
     """
     margins = np.full(most, -np.inf)
     for k in range(1, most + 1):
@@ -147,8 +144,8 @@ def sufficient_sensors(
             margins[k - 1] = close_with(modes, redesign(tuple(actuators), tuple(places), 1.0)).margin
         except (DesignError, ValueError):
             continue
-        if k > lasting and (margins[k - 1 - lasting : k] > margin).all():
-            return k - lasting, margins[:k]
+        if k > 3 and (margins[k - 4 : k] > 0.0).all():
+            return k - 3, margins[:k]
     return None, margins
 
 

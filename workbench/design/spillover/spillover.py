@@ -21,6 +21,7 @@ from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import motion, switchings
+from workbench.rig.linear import integrated
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import gauss_between
 from workbench.structure.modes import Modes, freeze
@@ -152,8 +153,7 @@ def check_final_time(final_time: float) -> None:
 def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> Spillover:
     """Work of the actuators in every mode up to a finite time, exactly, damping and filters included.
 
-    W_r = ∫ b_rᵀF q_r' dt is the integral of a quadratic form of the state, taken from one matrix exponential
-    (Van Loan, IEEE Trans. Automatic Control 23 (1978) 395).
+    W_r = ∫ b_rᵀF q_r' dt is the integral of a quadratic form of the state, taken from one matrix exponential.
     """
     check_final_time(final_time)
     n = loop.modes.n_modes
@@ -185,16 +185,8 @@ def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
     """
     a, (scale, _) = matrix_balance(a, permute=False, separate=True)
     state = state / scale
-    size = a.shape[0]
     halvings = max(0, int(np.ceil(np.log2(max(np.abs(a).sum(axis=1).max() * final_time, 1.0)))))
-    h = final_time / 2**halvings
-    block = np.block([[-a, np.outer(state, state)], [np.zeros_like(a), a.T]]) * h
-    exponential = expm(block)
-    transition = exponential[size:, size:].T
-    moments: Floats = transition @ exponential[:size, size:]
-    for _ in range(halvings):
-        moments = moments + transition @ moments @ transition.T
-        transition = transition @ transition
+    _, moments = integrated(a, np.outer(state, state), final_time, halvings)
     return np.asarray(scale[:, None] * moments * scale)
 
 

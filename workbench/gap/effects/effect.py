@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import combinations, permutations
 from typing import Any, ClassVar, Literal, Protocol
 from weakref import WeakValueDictionary
@@ -124,15 +124,21 @@ class Parameter:
         return float(np.hypot(value, self.scale)) if self.low < 0 else value
 
 
+def positive(
+    name: str, unit: str, size: float, low: float = 1e-12, high: float = 1e12, neutral: float | None = None
+) -> Parameter:
+    """A parameter above zero, fitted as its logarithm, within `low` and `high` times a size that the rig has itself."""
+    return Parameter(name, unit, low * size, high * size, logarithmic=True, neutral=neutral)
+
+
 def place_parameters(rig: Rig) -> tuple[Parameter, ...]:
     """The coordinates of a place, as parameters: x along an interval, x and y on a rectangle, none at named points."""
     domain = rig.modes.domain
-    lengths = {} if isinstance(domain, NamedPoints) else dict(zip(domain.coordinates, _lengths(domain), strict=True))
-    return tuple(Parameter(name, "m", 0.0, length, scale=0.01 * length) for name, length in lengths.items())
-
-
-def _lengths(domain: Domain) -> tuple[float, ...]:
-    return domain.length if isinstance(domain, Rectangle) else (domain.size,)
+    if isinstance(domain, NamedPoints):
+        return ()
+    lengths = domain.length if isinstance(domain, Rectangle) else (domain.size,)
+    named = zip(domain.coordinates, lengths, strict=True)
+    return tuple(Parameter(name, "m", 0.0, length, scale=0.01 * length) for name, length in named)
 
 
 def place_of(values: Mapping[str, Any]) -> Any:
@@ -147,20 +153,36 @@ def place_values(where: Where) -> dict[str, Any]:
     return {"at": where}
 
 
-class Moved(Protocol):
-    """The unmodelled force (N) at a place and the motion there, each (n_total,), the records joined end to end."""
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """The unmodelled force at a point and the motion there, one row per record joined end to end.
 
-    @property
-    def at(self) -> Where: ...
-    @property
-    def force(self) -> Floats: ...
-    @property
-    def displacement(self) -> Floats: ...
-    @property
-    def velocity(self) -> Floats: ...
-    @property
-    def acceleration(self) -> Floats: ...
-    def strength_along(self, basis: Floats) -> float: ...
+    Attributes:
+        at: on the structure.
+        force: (n_total,) N.
+        displacement, velocity, acceleration: (n_total,) there, of the real structure as far as the records tell.
+        bent: whether errors of the model may have taken linear parts of the force.
+    """
+
+    at: Where
+    force: Floats
+    displacement: Floats
+    velocity: Floats
+    acceleration: Floats
+    bent: bool = False
+
+    def strength_along(self, basis: Floats) -> float:
+        """The k for which -k basis (n_total,) is nearest to the force, beside any linear force where that is bent."""
+        force = self.force
+        if self.bent:
+            force, basis = (each - self._linear @ (self._linear.T @ each) for each in (force, basis))
+        return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
+
+    @cached_property
+    def _linear(self) -> Floats:
+        """Orthonormal columns (n_total, 3) that span what errors of stiffness, damping and mass do here."""
+        motion = np.column_stack([self.displacement, self.velocity, self.acceleration])
+        return np.asarray(np.linalg.qr(motion)[0])
 
 
 class Measured(Protocol):

@@ -14,6 +14,7 @@ from workbench.gap.effects.effect import (
     place_of,
     place_parameters,
     place_values,
+    positive,
 )
 from workbench.gap.effects.nonlinear import with_element
 from workbench.gap.effects.ports import ACTUATOR_BIAS
@@ -81,18 +82,13 @@ def _constant(tone: Effect, rig: Rig) -> Iterator[Effect]:
         yield from (Effect(ACTUATOR_BIAS, a.name, {"force": force}) for a in rig.actuators if not a.direct)
 
 
-def _force(name: str, rig: Rig) -> Parameter:
-    unit = Scales.of(rig).force
-    return Parameter(name, "N", 1e-15 * unit, 1e9 * unit, logarithmic=True)
-
-
 PERIODIC_DISTURBANCE = Kind(
     name="periodic_disturbance",
     path="environment",
     parameters=lambda rig, _: (
         *place_parameters(rig),
         Parameter("frequency", "Hz", 1e-6 / Scales.of(rig).time, 1e6 / Scales.of(rig).time, logarithmic=True),
-        _force("amplitude", rig),
+        positive("amplitude", "N", Scales.of(rig).force, 1e-15, 1e9),
         Parameter("phase", "rad", -20.0, 20.0),
     ),
     apply=lambda rig, _, v: with_element(rig, PeriodicForce(place_of(v), v["frequency"], v["amplitude"], v["phase"])),
@@ -106,7 +102,7 @@ PERIODIC_DISTURBANCE = Kind(
 RANDOM_DISTURBANCE = Kind(
     name="random_disturbance",
     path="environment",
-    parameters=lambda rig, _: (*place_parameters(rig), _force("rms", rig)),
+    parameters=lambda rig, _: (*place_parameters(rig), positive("rms", "N", Scales.of(rig).force, 1e-15, 1e9)),
     apply=lambda rig, _, v: with_element(rig, RandomForce(place_of(v), v["rms"])),
     starts=lambda *_: [],  # found by what it does to the statistics
     found_in="residual",

@@ -16,6 +16,7 @@ from workbench.gap.effects.effect import (
     place_of,
     place_parameters,
     place_values,
+    positive,
 )
 from workbench.gap.effects.ports import ACTUATOR_BIAS
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
@@ -38,33 +39,12 @@ from workbench.rig.stepping import hysteresis
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.member import Structure
 
-LEAST, MOST = 1e-12, 1e12  # bounds of a strength, in units of the rig's own
 AT_ONCE = 0.1  # of a smoothing speed that the records do not tell from none: friction that turns at once
 
 
 def with_element(rig: Rig, element: Element) -> Rig:
     """The rig with one more element."""
     return replace(rig, elements=(*rig.elements, element))
-
-
-def _stiffness(name: str, rig: Rig) -> Parameter:
-    unit = Scales.of(rig).stiffness
-    return Parameter(name, "N/m", LEAST * unit, MOST * unit, logarithmic=True, neutral=0.0)
-
-
-def _force(name: str, rig: Rig) -> Parameter:
-    unit = Scales.of(rig).force
-    return Parameter(name, "N", LEAST * unit, MOST * unit, logarithmic=True, neutral=0.0)
-
-
-def _speed(name: str, rig: Rig) -> Parameter:
-    unit = Scales.of(rig).speed
-    return Parameter(name, "m/s", LEAST * unit, MOST * unit, logarithmic=True)
-
-
-def _distance(name: str, rig: Rig) -> Parameter:
-    unit = Scales.of(rig).length
-    return Parameter(name, "m", LEAST * unit, MOST * unit, logarithmic=True)
 
 
 # --- cubic_spring
@@ -113,7 +93,7 @@ def _stretching_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
 
 def _stretching_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     unit = Scales.of(rig).stiffness  # tension over a squared slope times length
-    return (Parameter("coefficient", "N/m", LEAST * unit, 1e15 * unit, logarithmic=True, neutral=0.0),)
+    return (positive("coefficient", "N/m", unit, high=1e15, neutral=0.0),)
 
 
 MIDPLANE_STRETCHING = Kind(
@@ -144,7 +124,7 @@ def _drag_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
 def _drag_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     scales = Scales.of(rig)
     unit = scales.damping / scales.speed / scales.length
-    return (Parameter("coefficient", "N s^2/m^3", LEAST * unit, MOST * unit, logarithmic=True, neutral=0.0),)
+    return (positive("coefficient", "N s^2/m^3", unit, neutral=0.0),)
 
 
 AIR_DRAG = Kind(
@@ -163,11 +143,9 @@ AIR_DRAG = Kind(
 
 
 def _contact_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    return (
-        *place_parameters(rig),
-        _stiffness("stiffness", rig),
-        _distance("gap", rig),
-    )
+    scales = Scales.of(rig)
+    stiffness = positive("stiffness", "N/m", scales.stiffness, neutral=0.0)
+    return (*place_parameters(rig), stiffness, positive("gap", "m", scales.length))
 
 
 def _contact_starts(two_sided: bool) -> Callable[[Evidence, object], Iterator[dict[str, Any]]]:
@@ -281,8 +259,8 @@ COULOMB_FRICTION = Kind(
     path="structure",
     parameters=lambda rig, _: (
         *place_parameters(rig),
-        _force("force", rig),
-        _speed("smoothing_speed", rig),
+        positive("force", "N", Scales.of(rig).force, neutral=0.0),
+        positive("smoothing_speed", "m/s", Scales.of(rig).speed),
     ),
     apply=lambda rig, _, v: with_element(rig, CoulombFriction(place_of(v), v["force"], v["smoothing_speed"])),
     starts=_friction_starts,
@@ -325,8 +303,8 @@ BOUC_WEN = Kind(
     path="structure",
     parameters=lambda rig, _: (
         *place_parameters(rig),
-        _stiffness("stiffness", rig),
-        _distance("yield_displacement", rig),
+        positive("stiffness", "N/m", Scales.of(rig).stiffness, neutral=0.0),
+        positive("yield_displacement", "m", Scales.of(rig).length),
     ),
     apply=lambda rig, _, v: with_element(rig, BoucWen(place_of(v), v["stiffness"], v["yield_displacement"])),
     starts=_bouc_wen_starts,
@@ -408,9 +386,9 @@ TWO_WAY_FRICTION = Kind(
     path="structure",
     parameters=lambda rig, _: (
         *place_parameters(rig),
-        _force("force_forward", rig),
-        _force("force_backward", rig),
-        _speed("smoothing_speed", rig),
+        positive("force_forward", "N", Scales.of(rig).force, neutral=0.0),
+        positive("force_backward", "N", Scales.of(rig).force, neutral=0.0),
+        positive("smoothing_speed", "m/s", Scales.of(rig).speed),
     ),
     apply=lambda rig, _, v: with_element(rig, _two_way_element(v)),
     starts=_two_way_starts,
@@ -435,8 +413,7 @@ def _quadratic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]
 
 def _quadratic_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     unit = Scales.of(rig).damping / Scales.of(rig).speed
-    coefficient = Parameter("coefficient", "N s^2/m^2", 1e-12 * unit, 1e12 * unit, logarithmic=True, neutral=0.0)
-    return (*place_parameters(rig), coefficient)
+    return (*place_parameters(rig), positive("coefficient", "N s^2/m^2", unit, neutral=0.0))
 
 
 QUADRATIC_DAMPER = Kind(

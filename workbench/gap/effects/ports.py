@@ -99,11 +99,11 @@ def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     return tuple(ordered)
 
 
-def _commands(evidence: Evidence, target: str) -> np.ndarray:
-    """All commands to the target that are not at rest, joined."""
+def _commands(evidence: Evidence, target: str, *, changes: bool = False) -> np.ndarray:
+    """Sizes of all commands to the target, or of their changes from sample to sample, joined; zeros left out."""
     names = each_actuator(evidence.rig) if target == ALL else (target,)
     rows = [
-        row
+        np.diff(row) if changes else row
         for record in evidence.data.records
         for channel, row in zip(record.input_channels, record.inputs, strict=True)
         if channel.name in names
@@ -251,7 +251,7 @@ ACTUATOR_BIAS = Kind(
 
 def _rate_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
     """From slower than most changes of the command to as fast as its fastest."""
-    steps = _changes(evidence, target) / _sample_time(evidence)
+    steps = _commands(evidence, target, changes=True) / _sample_time(evidence)
     return [{"rate": float(q)} for q in np.quantile(steps, (0.1, 0.3, 0.5, 0.7, 0.9, 0.99))]
 
 
@@ -267,20 +267,6 @@ ACTUATOR_RATE_LIMIT = _actuator(
     nonlinear=True,
     starts=_rate_starts,
 )
-
-
-def _changes(evidence: Evidence, target: str) -> np.ndarray:
-    """All changes of commands to the target from sample to sample, joined, those of none left out."""
-    names = each_actuator(evidence.rig) if target == ALL else (target,)
-    changes = [
-        np.abs(np.diff(row))
-        for record in evidence.data.records
-        for channel, row in zip(record.input_channels, record.inputs, strict=True)
-        if channel.name in names
-    ]
-    values = np.concatenate(changes)
-    values = values[values > 0]
-    return values if values.size else np.ones(1)
 
 
 def _hysteresis_starts(evidence: Evidence, target: str) -> Iterator[dict[str, float]]:
@@ -383,8 +369,7 @@ SENSOR_MISPLACEMENT = Kind(
 
 def _size(evidence: Evidence, target: str) -> float:
     """Largest root mean square of an output among the records, in its unit."""
-    j = each_sensor(evidence.rig).index(target)
-    return float(max(np.sqrt(np.mean(record.outputs[j] ** 2)) for record in evidence.data.records))
+    return float(max(np.sqrt(np.mean(row**2)) for row in _read(evidence, target)))
 
 
 def _sensor(name: str, field: str, phrase: str, starts: Starts, unit: str = "", **options: Any) -> Kind:
@@ -427,8 +412,7 @@ SENSOR_GAIN = _sensor(
 
 
 def _mean_residual(evidence: Evidence, target: str) -> float:
-    j = each_sensor(evidence.rig).index(target)
-    return float(np.mean(np.concatenate([r[j] for r in evidence.residuals])))
+    return float(np.mean(_residual(evidence, target)))
 
 
 SENSOR_BIAS = _sensor(
@@ -540,10 +524,8 @@ SWAPPED_OUTPUTS = Kind(
 )
 
 
-def clipped_level(evidence: Evidence, target: str) -> float | None:
+def clipped_level(rows: list[np.ndarray]) -> float | None:
     """The level that a sensor's readings stop at: its largest magnitude, met again and again, where it is cut off."""
-    j = each_sensor(evidence.rig).index(target)
-    rows = [record.outputs[j] for record in evidence.data.records]
     top = max(float(np.abs(row).max()) for row in rows)
     at_top = [np.abs(row) >= top * (1 - 1e-6) for row in rows]
     if not top > 0 or sum(int(flags.sum()) for flags in at_top) < 3:
@@ -570,12 +552,6 @@ def _rests(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
     return bool(entering) and float(np.median(entering)) < SLOW * typical and float(np.mean(overstayed)) > 0.5
 
 
-def rounding_step(evidence: Evidence, target: str) -> float | None:
-    """The step that all of a sensor's readings are multiples of, or None."""
-    j = each_sensor(evidence.rig).index(target)
-    return step_of(np.concatenate([record.outputs[j] for record in evidence.data.records]))
-
-
 def step_of(readings: np.ndarray) -> float | None:
     """The step of which all readings are multiples, where there are far fewer levels than readings."""
     levels = np.unique(readings)
@@ -594,8 +570,14 @@ def step_of(readings: np.ndarray) -> float | None:
     return step if np.abs(inside - step * np.round(inside / step)).max() < 0.05 * step else None
 
 
+def _read(evidence: Evidence, target: str) -> list[np.ndarray]:
+    """The readings of a sensor, one row a record."""
+    j = each_sensor(evidence.rig).index(target)
+    return [record.outputs[j] for record in evidence.data.records]
+
+
 def _clipping_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    level = clipped_level(evidence, target)
+    level = clipped_level(_read(evidence, target))
     return [{"limit": level}] if level is not None else []
 
 
@@ -613,7 +595,7 @@ SENSOR_CLIPPING = _sensor(
 
 
 def _rounding_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    step = rounding_step(evidence, target)
+    step = step_of(np.concatenate(_read(evidence, target)))
     return [{"step": step}] if step is not None else []
 
 

@@ -17,6 +17,7 @@ from workbench.gap.effects.effect import (
     place_of,
     place_parameters,
     place_values,
+    positive,
 )
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping, ViscousDamping
@@ -209,10 +210,10 @@ def _regressed(place: Moved, series: str) -> float:
 
 
 def _point_starts(
-    name: str, series: str, typical: Callable[[Rig], float], *, between: bool = True, signed: bool = False
+    name: str, series: str, unit: str, *, between: bool = True, signed: bool = False
 ) -> Callable[[Evidence, object], Iterator[dict[str, Any]]]:
     def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-        size = typical(evidence.rig)
+        size = getattr(Scales.of(evidence.rig), unit)
         for place in evidence.at_peaks:
             if isinstance(place.at, Between) and not between:
                 continue
@@ -227,32 +228,15 @@ def _point_starts(
     return starts
 
 
-def _total_mass(rig: Rig) -> float:
-    return Scales.of(rig).mass
-
-
-def _typical_stiffness(rig: Rig) -> float:
-    return Scales.of(rig).stiffness
-
-
-def _typical_damping(rig: Rig) -> float:
-    return Scales.of(rig).damping
-
-
-def _positive(name: str, unit: str, typical: Callable[[Rig], float]) -> Callable[[Rig, object], tuple[Parameter, ...]]:
-    def parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-        size = typical(rig)
-        return (*place_parameters(rig), Parameter(name, unit, 1e-8 * size, 1e5 * size, logarithmic=True, neutral=0.0))
-
-    return parameters
-
-
 POINT_MASS = Kind(
     name="point_mass",
     path="structure",
-    parameters=_positive("mass", "kg", _total_mass),
+    parameters=lambda rig, _: (
+        *place_parameters(rig),
+        positive("mass", "kg", Scales.of(rig).mass, 1e-8, 1e5, neutral=0.0),
+    ),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointMass(place_of(v), v["mass"]))),
-    starts=_point_starts("mass", "acceleration", _total_mass, between=False),
+    starts=_point_starts("mass", "acceleration", "mass", between=False),
     phrase="an added mass",
 )
 
@@ -280,7 +264,7 @@ GROUND_SPRING = Kind(
     path="structure",
     parameters=_spring_parameters,
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointSpring(place_of(v), v["stiffness"]))),
-    starts=_point_starts("stiffness", "displacement", _typical_stiffness, signed=True),
+    starts=_point_starts("stiffness", "displacement", "stiffness", signed=True),
     phrase="a spring to ground",
     simpler=_turning_spring,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * w},
@@ -289,9 +273,12 @@ GROUND_SPRING = Kind(
 POINT_DAMPER = Kind(
     name="point_damper",
     path="structure",
-    parameters=_positive("coefficient", "N s/m", _typical_damping),
+    parameters=lambda rig, _: (
+        *place_parameters(rig),
+        positive("coefficient", "N s/m", Scales.of(rig).damping, 1e-8, 1e5, neutral=0.0),
+    ),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
-    starts=_point_starts("coefficient", "velocity", _typical_damping),
+    starts=_point_starts("coefficient", "velocity", "damping"),
     phrase="a viscous damper to ground",
     last=True,
     force_laws={"velocity": lambda v, u: -v["coefficient"] * u},
@@ -362,9 +349,7 @@ def _end_stiffness(rig: Rig) -> float:
 SUPPORT_ROTATION = Kind(
     name="support_rotation",
     path="structure",
-    parameters=lambda rig, _: (
-        Parameter("rotational_stiffness", "N m/rad", 1e-4 * _end_stiffness(rig), 1e5 * _end_stiffness(rig), True),
-    ),
+    parameters=lambda rig, _: (positive("rotational_stiffness", "N m/rad", _end_stiffness(rig), 1e-4, 1e5),),
     apply=solved_once(_rotated),
     starts=lambda evidence, _: [
         {"rotational_stiffness": _end_stiffness(evidence.rig) * s} for s in np.geomspace(0.01, 3000.0, 16)
@@ -394,41 +379,20 @@ def _pulled(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     return resolved(rig, replace(beam, tension=beam.tension + values["tension"]))
 
 
+def _load_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
+    load = buckling_load(rig)
+    return (Parameter("tension", "N", -4.0 * load, 200.0 * load, scale=0.05 * load, neutral=0.0),)
+
+
 AXIAL_LOAD = Kind(
     name="axial_load",
     path="structure",
-    parameters=lambda rig, _: (
-        Parameter(
-            "tension",
-            "N",
-            -4.0 * buckling_load(rig),
-            200.0 * buckling_load(rig),
-            scale=0.05 * buckling_load(rig),
-            neutral=0.0,
-        ),
-    ),
+    parameters=_load_parameters,
     apply=solved_once(_pulled),
     starts=lambda evidence, _: [
         {"tension": share * buckling_load(evidence.rig)}
-        for share in (
-            -0.9,
-            -0.6,
-            -0.4,
-            -0.25,
-            -0.15,
-            -0.08,
-            -0.03,
-            0.03,
-            0.08,
-            0.15,
-            0.25,
-            0.4,
-            0.6,
-            1.0,
-            1.5,
-            2.5,
-            4.0,
-        )
+        for share in (-0.9, -0.6, -0.4, -0.25, -0.15, -0.08, -0.03)
+        + (0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 1.0, 1.5, 2.5, 4.0)
     ],
     targets=lambda rig: (None,) if isinstance(rig.structure, Beam) else (),
     phrase="an axial load",
@@ -497,6 +461,8 @@ MODAL_DAMPING = Kind(
 
 # --- stiffness_drift
 
+DRIFTS = (0.02, 0.05, 0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # over a record, to start from either way
+
 
 def _duration(evidence: Evidence) -> float:
     return max(record.n_samples * record.sample_time for record in evidence.data.records)
@@ -510,25 +476,9 @@ STIFFNESS_DRIFT = Kind(
     ),
     apply=lambda rig, _, v: replace(rig, stiffness_rate=v["rate"]),
     starts=lambda evidence, _: [
-        {"rate": share / _duration(evidence)}
-        for share in (
-            -0.6,
-            -0.4,
-            -0.27,
-            -0.18,
-            -0.12,
-            -0.08,
-            -0.05,
-            -0.02,
-            0.02,
-            0.05,
-            0.08,
-            0.12,
-            0.18,
-            0.27,
-            0.4,
-            0.6,
-        )
+        {"rate": sign * share / _duration(evidence)}
+        for sign, shares in ((-1.0, DRIFTS[::-1]), (1.0, DRIFTS))
+        for share in shares
     ],
     phrase="a stiffness that drifts in time",
 )

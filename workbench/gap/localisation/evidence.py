@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from workbench.gap.effects.effect import Moved
 from workbench.gap.localisation.force_lines import Lines, lines_of, screened
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import (
@@ -46,38 +47,6 @@ class EvidenceSettings:
 
 EVIDENCE = EvidenceSettings()
 FEWER_PLACES = 20  # where a force is looked for beside what is given
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """The unmodelled force at a point and the motion there, one row per record joined end to end.
-
-    Attributes:
-        at: on the structure.
-        force: (n_total,) N.
-        displacement, velocity, acceleration: (n_total,) there, of the real structure as far as the records tell.
-        bent: whether errors of the model may have taken linear parts of the force.
-    """
-
-    at: Where
-    force: np.ndarray
-    displacement: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    bent: bool = False
-
-    def strength_along(self, basis: np.ndarray) -> float:
-        """The k for which -k basis (n_total,) is nearest to the force, beside any linear force where that is bent."""
-        force = self.force
-        if self.bent:
-            force, basis = (each - self._linear @ (self._linear.T @ each) for each in (force, basis))
-        return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
-
-    @cached_property
-    def _linear(self) -> np.ndarray:
-        """Orthonormal columns (n_total, 3) that span what errors of stiffness, damping and mass do here."""
-        motion = np.column_stack([self.displacement, self.velocity, self.acceleration])
-        return np.asarray(np.linalg.qr(motion)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,11 +172,12 @@ class Evidence:
     def _misfits(self, places: Sequence[Any]) -> np.ndarray:
         """What one force of any law at each of the places leaves, in units of the noise."""
         shapes = np.array([self.rig.modes.phi_at(where) for where in places])
-        misfits: np.ndarray = np.sum([screened(lines, shapes) for lines in self._lines], axis=0)
+        misfits: np.ndarray = np.sum([screened(lines, shapes) for lines in self.lines], axis=0)
         return misfits
 
     @cached_property
-    def _lines(self) -> list[Lines]:
+    def lines(self) -> list[Lines]:
+        """The lines of every record."""
         return lines_of(self.rig, self.model, self.residuals, self.data.counted[0].sample_time)
 
     @cached_property
@@ -260,7 +230,7 @@ class Evidence:
     def _misfit(self, where: Where) -> float:
         """What one force of any law there leaves, in units of the noise, the ends of records accounted for."""
         shape = self.rig.modes.phi_at(where)
-        return float(sum(lines.misfit(shape) for lines in self._lines))
+        return float(sum(lines.misfit(shape) for lines in self.lines))
 
     @cached_property
     def peaks(self) -> tuple[Any, ...]:
@@ -287,12 +257,12 @@ class Evidence:
         return float(found.x), -float(found.fun)
 
     @cached_property
-    def at_peaks(self) -> tuple[Place, ...]:
+    def at_peaks(self) -> tuple[Moved, ...]:
         """The unmodelled force and the motion at the likeliest places."""
         _ = self.size  # found once, before the work is shared
         return tuple(self.workers.map(self.place, self.peaks))
 
-    def place(self, where: Where) -> Place:
+    def place(self, where: Where) -> Moved:
         """The unmodelled force somewhere and the motion there, smoothed."""
         kalman = self.filter_at(where, *self.size)
         n, shape = self.rig.modes.n_modes, self.rig.modes.phi_at(where)
@@ -310,7 +280,7 @@ class Evidence:
                 )
             )
         force, w, v, a = (np.concatenate(series) for series in zip(*pieces, strict=True))
-        return Place(where, force, w, v, a, self.bent)
+        return Moved(where, force, w, v, a, self.bent)
 
 
 def _apart(

@@ -10,7 +10,7 @@ from scipy.optimize import minimize, minimize_scalar
 from workbench.arrays import Flags, Floats
 from workbench.gap.effects.effect import Effect
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.localisation.force_lines import Lines, lines_of, screened
+from workbench.gap.localisation.force_lines import Lines, screened
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
 from workbench.rig.linear import held_response, modal_motion, modal_poles, straight_response
@@ -78,8 +78,7 @@ def locate_force(evidence: Evidence) -> ForceLocation:
     if len(evidence.rig.sensors) < 2:
         unsure = 0.0 if isinstance(domain, NamedPoints) else domain.size / np.sqrt(12.0)
         return ForceLocation(places, np.zeros(len(places)), guess, unsure, 0.0, None)
-    lines = lines_of(evidence.rig, evidence.model, evidence.residuals, evidence.data.counted[0].sample_time)
-    search = _Search(evidence, lines)
+    search = _Search(evidence, evidence.lines)
     informative = search.informative(guess)
     at: Any
     if isinstance(domain, Interval):

@@ -12,6 +12,7 @@ from numba import njit
 from scipy.linalg import expm, solve_discrete_lyapunov, solve_triangular
 
 from workbench.arrays import Floats
+from workbench.rig.linear import integrated
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.stepping import FAST, LANES
 from workbench.structure.modes import Modes
@@ -147,8 +148,7 @@ def wandering_force_filter(
 ) -> ForceFilter:
     """The filter for one force that wanders within a sample too, as the forces of contact and friction do.
 
-    An Ornstein-Uhlenbeck process, integrated exactly by the exponential of Van Loan, IEEE Trans. Autom. Control 23
-    (1978) 395.
+    An Ornstein-Uhlenbeck process, integrated exactly.
 
     Args:
         modes, model: of the rig, and its sampled form.
@@ -167,16 +167,10 @@ def wandering_force_filter(
     # displacements as velocities, so that the matrix is no larger than the highest frequency
     scale = np.r_[np.maximum(modes.omega, 0.1 * modes.omega[-1]), np.ones(n + 1)]
     a = a * scale[:, None] / scale
-    pencil = np.zeros((2 * size, 2 * size))
-    pencil[:size, :size], pencil[size:, size:] = -a, a.T
-    pencil[size - 1, -1] = 2.0 * rms**2 / correlation_time
+    drive = np.zeros((size, size))
+    drive[-1, -1] = 2.0 * rms**2 / correlation_time
     halvings = max(0, int(np.ceil(np.log2(2.0 * np.abs(a).sum(axis=1).max() * sample_time))))
-    short = expm(pencil * sample_time / 2**halvings)
-    transition = short[size:, size:].T
-    noise = transition @ short[:size, size:]
-    for _ in range(halvings):
-        noise = noise + transition @ noise @ transition.T
-        transition = transition @ transition
+    transition, noise = integrated(a, drive, sample_time, halvings)
     transition = transition / scale[:, None] * scale
     noise = 0.5 * (noise + noise.T) / scale[:, None] / scale
     h = np.hstack([model.output, (model.feedthrough + model.before) @ shape[:, None]])

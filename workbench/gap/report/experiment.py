@@ -7,7 +7,7 @@ import numpy as np
 from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.prediction.residuals import FitData
-from workbench.gap.prediction.workers import ALONE, Workers
+from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.fit import Fit
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -50,7 +50,7 @@ class Experiment:
         )
 
 
-def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Workers = ALONE) -> Experiment:
+def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Workers) -> Experiment:
     """The experiment among variations of the records that separates two fits in the shortest time.
 
     For each variation both corrected rigs are simulated, and what small changes of either one's parameters could make

@@ -159,7 +159,11 @@ def _check_units(rig: Rig, record: Record, sizes: np.ndarray, what: str) -> None
         what: such records are called.
     """
     ratios_of = [column[np.isfinite(column)] for column in sizes.T]
-    off = [j for j, ratios in enumerate(ratios_of) if ratios.size and _always_far_off(ratios)]
+    off = [
+        j
+        for j, ratios in enumerate(ratios_of)
+        if ratios.size and ((ratios > FAR_OFF).all() or (ratios < 1.0 / FAR_OFF).all())
+    ]
     if not off:
         return
     if len(off) == sum(ratios.size > 0 for ratios in ratios_of) > 1:
@@ -172,10 +176,6 @@ def _check_units(rig: Rig, record: Record, sizes: np.ndarray, what: str) -> None
         f"output {name!r} reads about {_about(ratios_of[off[0]])} times what the model predicts in every {what}: is"
         f" it in {unit}?"
     )
-
-
-def _always_far_off(ratios: np.ndarray) -> bool:
-    return bool((ratios > FAR_OFF).all() or (ratios < 1.0 / FAR_OFF).all())
 
 
 def _about(ratios: np.ndarray) -> str:

@@ -6,18 +6,18 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.deadline import NEVER, Deadline
-from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.arrays import Floats
+from workbench.deadline import Deadline
 from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out, simpler_forms
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.nonlinear import BEYOND, any_beyond, in_catalogue
-from workbench.gap.effects.ports import clipped_level, exchanged_last, rounding_step
+from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION, clipped_level, exchanged_last, step_of
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
 from workbench.gap.prediction.noise import is_noise_alone, logging_noise, noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
-from workbench.gap.prediction.workers import ALONE, Workers
+from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.beside_random import decide_on_random, random_beside, random_beside_errors
 from workbench.gap.search.finish import best_of_each, finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Fit, cost_of, fit
@@ -99,31 +99,16 @@ class Attribution:
         return tuple(best_of_each(sorted((*self.tried, *fitted), key=lambda f: f.cost)))
 
 
-@dataclass(frozen=True, eq=False)
-class Baseline:
-    """Records laid beside a rig, before any effect is guessed.
-
-    Attributes:
-        seen: rounding and clipping, which show in the readings themselves.
-        nominal: evidence of the nominal rig.
-        evidence: of the rig with what is seen.
-    """
-
-    seen: tuple[Effect, ...]
-    nominal: Evidence
-    evidence: Evidence
-
-
 def baseline(
     rig: Rig,
     records: Sequence[Record],
     *,
-    settle: float = 0.0,
-    guessed: frozenset[str] = frozenset(),
-    workers: Workers = ALONE,
-    deadline: Deadline = NEVER,
-) -> Baseline:
-    """What a rig leaves of its fit records, where a force is missing and what it does there.
+    settle: float,
+    guessed: frozenset[str],
+    workers: Workers,
+    deadline: Deadline,
+) -> tuple[tuple[Effect, ...], Evidence, Evidence]:
+    """What shows in the readings themselves, and the evidence of the nominal rig and of the rig with that.
 
     Args:
         rig: nominal.
@@ -137,42 +122,43 @@ def baseline(
     if not (noise > 0).all():
         name = rig.sensors[int(np.argmin(noise))].name
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weights every residual by it")
-    whole = FitData(tuple(records), noise, settle=settle, guessed=guessed, deadline=deadline)
-    seen, data = _plain_to_see(rig, whole)
+    seen, heard = _plain_to_see(rig, records, noise)
+    data = FitData(tuple(records), heard, settle=settle, guessed=guessed, deadline=deadline)
     evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
     _ = evidence.at_peaks  # found once, before the work parts
     if not seen:
-        return Baseline(seen, evidence, evidence)
+        return seen, evidence, evidence
     nominal = replace(Evidence.of(rig, data, workers=workers), given_size=evidence.size)
     _ = nominal.at_peaks
-    return Baseline(seen, nominal, evidence)
+    return seen, nominal, evidence
 
 
-def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]:
+def _plain_to_see(rig: Rig, records: Sequence[Record], noise: Floats) -> tuple[tuple[Effect, ...], Floats]:
     """Rounding and clipping show in the readings themselves; rounding then adds its own noise to the channel's."""
-    evidence = Evidence.of(rig, data)
-    kinds = {kind.name: kind for kind in CATALOGUE}
-    seen, noise = [], data.noise.copy()
+    seen, noise = [], noise.copy()
     for j, sensor in enumerate(rig.sensors):
-        step = rounding_step(evidence, sensor.name)
+        readings = [record.outputs[j] for record in records]
+        step = step_of(np.concatenate(readings))
         if step is not None and step**2 / 12.0 > 0.02 * sensor.noise_std**2:
-            seen.append(Effect(kinds["sensor_quantisation"], sensor.name, {"step": step}, {"step": 0.0}))
+            seen.append(Effect(SENSOR_QUANTISATION, sensor.name, {"step": step}, {"step": 0.0}))
             noise[j] = np.hypot(noise[j], step / np.sqrt(12.0))
         elif step is None:
-            level = clipped_level(evidence, sensor.name)
+            level = clipped_level(readings)
             if level is not None:
-                seen.append(Effect(kinds["sensor_clipping"], sensor.name, {"limit": level}, {"limit": 0.0}))
-    return tuple(seen), replace(data, noise=noise)
+                seen.append(Effect(SENSOR_CLIPPING, sensor.name, {"limit": level}, {"limit": 0.0}))
+    return tuple(seen), noise
 
 
 def attribute(
-    found: Baseline,
+    seen: tuple[Effect, ...],
+    nominal: Evidence,
+    evidence: Evidence,
     *,
-    catalogue: tuple[Kind, ...] = CATALOGUE,
-    report: Callable[[str, float], None] = lambda text, share: None,
-    free_nominal: bool = False,
-    tolerance: float = 0.0,
-    identified: IdentifiedPrior | None = None,
+    catalogue: tuple[Kind, ...],
+    report: Callable[[str, float], None],
+    free_nominal: bool,
+    tolerance: float,
+    identified: IdentifiedPrior | None,
 ) -> Attribution:
     """Find the effects that turn the residual of a rig on its fit records into noise.
 
@@ -181,7 +167,7 @@ def attribute(
     "part" or "unknown".
 
     Args:
-        found: before any effect is guessed.
+        seen, nominal, evidence: of `baseline`.
         catalogue: kinds of effects to try.
         report: called with (what, share done) as the search proceeds.
         free_nominal: fit errors of the nominal model beside every effect from the first, for a model that is known to
@@ -189,15 +175,14 @@ def attribute(
         tolerance: of the signal's rms: a smaller gap beyond the noise is not searched for causes.
         identified: errors of a nominal rig that was itself identified.
     """
-    seen, evidence = found.seen, found.evidence
     rig, data, workers = evidence.rig, evidence.data, evidence.workers
-    nominal = data.by_channel(data.residual(found.nominal.rig))
-    start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0, "read off the records")
-    search = Search(rig, data, *most_informative(data, start.cost_by_channel), catalogue, report, workers, nominal)
+    of_nominal = data.by_channel(data.residual(nominal.rig))
+    start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0)
+    search = Search(rig, data, *most_informative(data, start.cost_by_channel), catalogue, report, workers, of_nominal)
     decision: Decision | None = None
     singles: list[Fit] = []
     ahead: list[Fit] = []
-    if not seen and _is_small(found.nominal, tolerance):
+    if not seen and _is_small(nominal, tolerance):
         decision = Decision("none", start)
     elif not search.explains(start) and is_noise_alone(evidence.residuals, data.counted):
         decision = Decision("none", start, noise=noise_found(evidence.residuals))
@@ -247,10 +232,10 @@ def attribute(
         best=best,
         random=random,
         rivals=rivals,
-        nominal_cost=float(nominal.mean()),
+        nominal_cost=float(of_nominal.mean()),
         tried=tuple(singles),
         ahead=tuple(ahead),
-        evidence=found.nominal,
+        evidence=nominal,
         search=search,
         weighed=within.data,
         noise=noise,

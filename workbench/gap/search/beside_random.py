@@ -150,7 +150,7 @@ def _matters(search: Search, single: Fit) -> bool:
 
 def _nothing(search: Search) -> Fit:
     left = search.data.by_channel(search.data.residual(search.rig))
-    return Fit((), float(left.mean()), left, 0, "nothing added")
+    return Fit((), float(left.mean()), left, 0)
 
 
 def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
@@ -231,5 +231,5 @@ def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit,
     deviations = {**spread, "rms": float(np.hypot(level * rms_std, off * rms))}
     effect = Effect(RANDOM_DISTURBANCE, None, {**place_values(found.at), "rms": rms}, deviations)
     fitted = given.n_parameters + 1 + len(spread)
-    combined = Fit((*given.effects, effect), found.cost, given.cost_by_channel, fitted, "maximum likelihood")
+    combined = Fit((*given.effects, effect), found.cost, given.cost_by_channel, fitted)
     return combined, found

@@ -29,7 +29,6 @@ class Fit:
         cost: what was minimised per measured value: 1 at the noise floor.
         cost_by_channel: (n_records, n_outputs) of the same, without the share of a random disturbance's statistics.
         n_parameters: numbers fitted.
-        status: why the fit stopped.
         falling: share of the cost that the last iteration took away; 0 where the fit came to rest.
         covariance: (n, n) of the free coordinates of all parameters, in the order of `parameters_of`; None before
             `with_intervals`.
@@ -41,7 +40,6 @@ class Fit:
     cost: float
     cost_by_channel: np.ndarray
     n_parameters: int
-    status: str
     falling: float = 0.0
     covariance: np.ndarray | None = None
     stepping: np.ndarray | float = 0.0
@@ -380,7 +378,7 @@ def fit(
     residual = problem.residual(problem.start)
     if residual is None:
         shape = (len(data.records), data.noise.size)
-        return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), problem.start.size, "no rig at the start")
+        return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), problem.start.size)
     with workers.standing(problem.done) as share:
         found = _descended(problem, share, residual, iterations, tolerance, damping)
     problem.end()
@@ -393,11 +391,11 @@ def _descended(
     """The fit from where the problem starts, with this residual."""
     free = problem.start.copy()
     cost = float(residual @ residual)
-    status, falling = "most iterations done", 0.0
+    falling = 0.0
     normal = np.zeros((free.size, free.size))
     for _ in range(iterations if free.size else 0):
         if problem.data.deadline.is_past:
-            status, falling = "no time left", 0.0
+            falling = 0.0
             break
         nearly, coarsely = problem.near(free, residual)
         jacobian = problem.jacobian(free, nearly, coarsely, share)
@@ -407,15 +405,15 @@ def _descended(
         attempts = (Attempt(free, coarsely, normal, gradient, each, worth) for each in dampings)
         found = _first_below(cost, attempts, share, problem.workers.at_once)
         if found is None:
-            status, falling = "no step lowers the cost", 0.0
+            falling = 0.0
             break
         (free, residual), damping = found
         falling = 1.0 - float(residual @ residual) / cost
         cost, damping = float(residual @ residual), max(damping / 8.0, 1e-9)
         if falling < tolerance:
-            status, falling = "settled", 0.0
+            falling = 0.0
             break
-    return _result(problem, free, residual, normal, status, falling)
+    return _result(problem, free, residual, normal, falling)
 
 
 def _first_below(
@@ -467,9 +465,7 @@ def _reach(problem: _Problem) -> np.ndarray:
     )
 
 
-def _result(
-    problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: np.ndarray, status: str, falling: float
-) -> Fit:
+def _result(problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: np.ndarray, falling: float) -> Fit:
     residual = residual[: problem.data.n_values]
     cost = float(residual @ residual) / residual.size
     deviations = np.zeros(free.size)
@@ -488,6 +484,5 @@ def _result(
         cost=cost,
         cost_by_channel=problem.data.by_channel(residual),
         n_parameters=free.size,
-        status=status,
         falling=falling,
     )

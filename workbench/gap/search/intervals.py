@@ -52,7 +52,8 @@ def with_intervals(
     jacobian, priors = jacobian / scale, priors / scale**2
     information = jacobian.T @ jacobian + level * np.diag(priors)
     inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
-    without = _without_each_block(residual, jacobian, data, information)
+    root = _root(information)
+    without = _without_each_block(residual, jacobian, data, root)
     spread = without.T @ without + level**2 * inverse @ np.diag(priors) @ inverse
     drawn = _by_noise_of_inputs(apply_all(rig, found.effects), data, residual, logged) @ jacobian @ inverse
     of_inputs = drawn.T @ drawn / INTERVALS.draws
@@ -62,7 +63,7 @@ def with_intervals(
         value = found.effects[i].values[parameter.name]
         deviations[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
     effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
-    joint = _joint(information, information @ spread @ information, level, len(without))
+    joint = _joint(root, information @ spread @ information, level, len(without))
     joint = _no_smaller(joint, of_inputs)
     return replace(found, effects=tuple(effects), covariance=joint / np.outer(scale, scale) + np.diag(least**2))
 
@@ -124,14 +125,18 @@ def _least(effect: Effect, parameter: Parameter) -> float:
     return INTERVALS.alike * size / parameter.scale
 
 
-def _joint(information: np.ndarray, scatter: np.ndarray, level: float, n_blocks: int) -> np.ndarray:
-    """The least covariance no smaller than A⁻¹ S A⁻¹ or s² A⁻¹ in any direction, with A `information`, S `scatter`.
+def _root(information: np.ndarray) -> np.ndarray:
+    """R of A⁻¹ = R Rᵀ, without directions of which nothing is known."""
+    values, vectors = np.linalg.eigh(information)
+    there = values > 1e-12 * values[-1]
+    return np.asarray(vectors[:, there] / np.sqrt(values[there]))
+
+
+def _joint(root: np.ndarray, scatter: np.ndarray, level: float, n_blocks: int) -> np.ndarray:
+    """The least covariance no smaller than A⁻¹ S A⁻¹ or s² A⁻¹ in any direction, of a root of A⁻¹, with S `scatter`.
 
     Few blocks tell little of many parameters, so S is drawn towards a multiple of s² A, the more the fewer they are.
     """
-    values, vectors = np.linalg.eigh(information)
-    there = values > 1e-12 * values[-1]
-    root = vectors[:, there] / np.sqrt(values[there])
     relative = root.T @ scatter @ root / level
     own = n_blocks / (n_blocks + len(relative))
     relative = own * relative + (1.0 - own) * np.trace(relative) / len(relative) * np.eye(len(relative))
@@ -166,13 +171,8 @@ def _by_noise_of_inputs(rig: Rig, data: FitData, residual: np.ndarray, logged: f
     return np.array([each.residual(rig) - residual for each in draws])
 
 
-def _without_each_block(
-    residual: np.ndarray, jacobian: np.ndarray, data: FitData, information: np.ndarray
-) -> np.ndarray:
+def _without_each_block(residual: np.ndarray, jacobian: np.ndarray, data: FitData, root: np.ndarray) -> np.ndarray:
     """What the parameters change by without each block: (n_blocks, n_parameters)."""
-    values, vectors = np.linalg.eigh(information)
-    there = values > 1e-12 * values[-1]
-    root = vectors[:, there] / np.sqrt(values[there])
     changes, start = [], 0
     for record in data.counted:
         n_outputs, n_samples = record.outputs.shape

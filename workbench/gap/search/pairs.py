@@ -9,9 +9,9 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
-from workbench.gap.search.screening import Screening, is_promising, on_whole_records, one_more, pairs_at_once
+from workbench.gap.search.screening import Screening, fitted_ahead, on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, in_one_valley, unexplained
-from workbench.gap.search.settings import PAIRS, RANDOM
+from workbench.gap.search.settings import PAIRS, RANDOM, SELECTION
 from workbench.structure.domain import Between
 
 
@@ -52,7 +52,7 @@ class Pairs:
         pairs = cls(search)
         if not search.is_over:
             search.report("all pairs at once", 0.4)
-            pairs.explain = pairs._explained_by(pairs_at_once(search, screened))
+            pairs.explain = pairs._explained_by(fitted_ahead(search, screened.likeliest_pairs(SELECTION.tried)))
         return pairs
 
     def further(self) -> "Pairs":
@@ -129,7 +129,8 @@ class Pairs:
     def _explained_by(self, ahead: Sequence[Fit]) -> bool:
         self.ahead = sorted((*self.ahead, *ahead), key=lambda f: f.cost)
         domain = self.search.rig.modes.domain
-        promising = [f for f in ahead if is_promising(self.search, f)]
+        enough = max(SELECTION.promising, SELECTION.promising_share * self.search.nominal_ahead)
+        promising = [f for f in ahead if f.cost < enough]
         fresh = [f for f in promising if not any(in_one_valley(f, other, domain) for other in self.followed)]
         most = PAIRS.more if self.found else PAIRS.finalists
         self.followed += fresh[:most]

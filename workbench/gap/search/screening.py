@@ -242,20 +242,6 @@ def _exchanged(found: Sequence[Fit], screened: Screening) -> list[Effect]:
     return [*there, *of_port]
 
 
-def pairs_at_once(search: Search, screened: Screening) -> list[Fit]:
-    """The likeliest fits, one sample ahead, of any two effects, best first.
-
-    Args:
-        screened: with nothing given.
-    """
-    return fitted_ahead(search, screened.likeliest_pairs(SELECTION.tried))
-
-
-def is_promising(search: Search, candidate: Fit) -> bool:
-    """Whether a fit one sample ahead may explain whole records."""
-    return candidate.cost < max(SELECTION.promising, SELECTION.promising_share * search.nominal_ahead)
-
-
 def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:
     """Fits of sets to predictions one sample ahead, best first: all to the most telling record, fewer to another too.
 

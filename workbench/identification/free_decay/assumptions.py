@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine
 from workbench.identification.signal.modal_estimates import Refined
-from workbench.records.record import Record
+from workbench.records.record import Record, as_records
 from workbench.structure.damping import ProportionalDamping
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
@@ -94,7 +94,7 @@ def amplitude_dependence(
     """
     if stretches < 2:
         raise ValueError(f"amplitudes are compared over two stretches or more; got {stretches}")
-    records = [records] if isinstance(records, Record) else records
+    records = as_records(records)
     each = zip(records, refined.amplitudes, refined.noise, strict=True)
     values = [_segments(record, refined, np.abs(a), noise, stretches) for record, a, noise in each]
     start = np.concatenate([each[0] for each in values])

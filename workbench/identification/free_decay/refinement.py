@@ -34,7 +34,7 @@ from workbench.identification.signal.projection import (
     variances,
 )
 from workbench.identification.signal.searches import FIT, Budget, minimise
-from workbench.records.record import Record
+from workbench.records.record import Record, as_records
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
@@ -73,7 +73,7 @@ def in_coloured_noise(
         records: that it was identified from.
         fits: of its poles, in any order, one per record; found anew unless given.
     """
-    records = [records] if isinstance(records, Record) else list(records)
+    records = as_records(records)
     fits = fits or [project(record, refined.modes.poles, True) for record in records]
     poles = fits[0].poles
     each = zip(records, fits, refined.noise, strict=True)
@@ -274,20 +274,18 @@ def cramer_rao_bound(modes: SampledModes, record: Record, *, noise_std: float | 
     return as_refined([clean], modes.poles, fits, noise, converged=True, steps=0)
 
 
-def modal_amplitudes(record: Record, modes: SampledModes, *, at: float = 0.0, offset: bool = False) -> SampledModes:
-    """The same modes with shapes of displacement that carry amplitude and phase at the time `at`, by least squares.
+def modal_amplitudes(record: Record, modes: SampledModes) -> SampledModes:
+    """The same modes with shapes of displacement that carry amplitude and phase at time 0, by least squares.
 
     Args:
         record: free decay.
         modes: poles are used.
-        at: s on the record's clock; after an impulse, the time it acted.
-        offset: whether each output may also hold a constant.
 
     Returns:
-        `SampledModes` with y = d^k/dt^k Re Σ s_r e^{λ_r (t - at)}, k the derivative each sensor measures.
+        `SampledModes` with y = d^k/dt^k Re Σ s_r e^{λ_r t}, k the derivative each sensor measures.
     """
-    fit = project(record, modes.poles, offset)
-    lag = np.exp(modes.poles * (at - record.start_time))
+    fit = project(record, modes.poles, False)
+    lag = np.exp(-modes.poles * record.start_time)
     derivative = time_derivatives(record.output_channels)
     return replace(modes, shapes=fit.complex_amplitudes * lag / modes.poles ** derivative[:, None])
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from workbench.arrays import Complexes
 from workbench.records.record import Record
+from workbench.structure.printed import mode_text
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,8 @@ def unexcited_remarks(records: Sequence[Record], poles: Complexes) -> tuple[str,
             about = power[first : int((pole.imag + half) / bin_width) + 2]
             amplitude[r] = max(amplitude[r], np.sqrt(about.mean() / mean)) if about.size else amplitude[r]
     words = [
-        f"mode {r + 1} ({abs(poles[r]) / (2.0 * np.pi):.4g} Hz, {100 * amplitude[r]:.1g} % of their mean amplitude)"
-        for r in np.flatnonzero(amplitude**2 < EXCITATION.hardly)
+        mode_text(r, abs(poles[r]) / (2.0 * np.pi), f", {100 * amplitude[r]:.1g} % of their mean amplitude")
+        for r in np.flatnonzero(amplitude**2 < EXCITATION.hardly).tolist()
     ]
     if not words:
         return ()

@@ -36,8 +36,12 @@ def may_drift(records: Sequence[Record]) -> bool:
     return False
 
 
-def beside_drift(data: KnownInputs, selected: Callable[[KnownInputs], Selected]) -> tuple[KnownInputs, tuple[str, ...]]:
+def beside_drift(
+    data: KnownInputs, selected: Callable[[KnownInputs], Selected]
+) -> tuple[KnownInputs, Selected | None, tuple[str, ...]]:
     """The records with polynomials of time beside the modes where these are likelier so, and a remark.
+
+    The strongest modes come with them, where they were searched to tell.
 
     A free body displaced drifts too: its rigid mode explains that by the inputs, and stays.
 
@@ -46,16 +50,17 @@ def beside_drift(data: KnownInputs, selected: Callable[[KnownInputs], Selected])
         selected: the strongest modes of records.
     """
     if not may_drift(data.records):
-        return data, ()
+        return data, None, ()
     other = data.with_drift(DRIFT.degree)
     plain, beside = selected(data), selected(other)
     n_outputs = data.values.shape[1]
     price = float(chi2.isf(FALSE_ALARM, n_outputs * (other.fixed.shape[1] - data.fixed.shape[1])))
     saved = plain.limit * (plain.fit.poles.size - beside.fit.poles.size)
     if other.cost(beside.fit) + price >= data.cost(plain.fit) + saved:
-        return data, ()
+        return data, plain, ()
     drift = other.drift_of(beside.fit)
     k, j = np.unravel_index(int(np.argmax(drift / beside.fit.noise)), drift.shape)
     record = data.records[int(k)]
     in_record = f" in record {record.name!r}" if len(data.records) > 1 else ""
-    return other, (f"outputs drift, {record.output_names[j]} by {drift[k, j]:.3g}{in_record}: fitted beside the modes",)
+    remark = f"outputs drift, {record.output_names[j]} by {drift[k, j]:.3g}{in_record}: fitted beside the modes"
+    return other, beside, (remark,)

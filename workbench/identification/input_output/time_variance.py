@@ -34,6 +34,7 @@ from workbench.identification.input_output.model_order import statistic_of, stat
 from workbench.identification.input_output.rivals import in_place_of_clusters, independent, of_unit_length
 from workbench.identification.signal.searches import SELECTION, Budget
 from workbench.structure.modes import mac
+from workbench.structure.printed import mode_text
 
 
 @dataclass(frozen=True)
@@ -244,7 +245,7 @@ def _pairs_alike(fit: Fit) -> list[tuple[int, int]]:
 def named_near(fit: Fit, poles: Iterable[complex]) -> dict[int, str]:
     """The modes of a fit nearest to some poles, in their order, by index: mode 2 (4.1 Hz)."""
     nearest = sorted({int(np.argmin(np.abs(fit.poles - pole))) for pole in poles})
-    return {r: f"mode {r + 1} ({np.abs(fit.poles[r]) / (2.0 * np.pi):.4g} Hz)" for r in nearest}
+    return {r: mode_text(r, abs(fit.poles[r]) / (2.0 * np.pi)) for r in nearest}
 
 
 def change_remarks(

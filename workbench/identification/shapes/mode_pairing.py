@@ -50,22 +50,21 @@ def repeated_modes(omega: np.ndarray, repeated: float = 1e-3) -> np.ndarray:
     return np.cumsum(np.r_[False, np.diff(omega) > repeated * np.maximum(omega[1:], 1e-300)])
 
 
-def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, repeated: float = 1e-3) -> np.ndarray:
+def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray) -> np.ndarray:
     """Modal assurance criterion in which repeated modes of the second set count as the subspace that they span.
 
     MAC_rs = |P_s φ_r|² / |φ_r|², P_s the projection on the span of all ψ_t with |ω_t / ω_s - 1| chained below
-    `repeated`: any basis of repeated modes agrees alike. Where ω_s stands alone it is the plain criterion.
+    a thousandth: any basis of repeated modes agrees alike. Where ω_s stands alone it is the plain criterion.
 
     Args:
         first: (n_points, n_first) shapes, real or complex.
         second: (n_points, n_second).
         omega: (n_second,) frequencies of the second set, not decreasing.
-        repeated: largest relative step of frequency from one mode to the next of a cluster.
 
     Returns:
         (n_first, n_second), between 0 and 1.
     """
-    return _cluster_mac(first, second, repeated_modes(omega, repeated))
+    return _cluster_mac(first, second, repeated_modes(omega))
 
 
 def _cluster_mac(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:

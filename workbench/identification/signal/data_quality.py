@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.records.record import Record
+from workbench.records.record import Record, as_records
 from workbench.rig.sensors import MEASURED
 
 
@@ -114,7 +114,7 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
     Raises:
         ValueError: no records, records that differ in outputs or sample time, and one that is given twice.
     """
-    records = [records] if isinstance(records, Record) else list(records)
+    records = as_records(records)
     if not records:
         raise ValueError("identification needs at least one record")
     first = records[0]

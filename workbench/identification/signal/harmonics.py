@@ -11,6 +11,7 @@ import numpy as np
 
 from workbench.arrays import Complexes, Floats
 from workbench.records.record import Record
+from workbench.structure.printed import mode_text
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def harmonic_remarks(records: Sequence[Record], poles: Complexes, among: Sequenc
         steady = [r for r in steady if _is_steady(lines, power, poles[r] / bin_width)]
     if not steady:
         return ()
-    modes = ", ".join(f"mode {r + 1} ({abs(poles[r]) / (2.0 * np.pi):.4g} Hz)" for r in steady)
+    modes = ", ".join(mode_text(r, abs(poles[r]) / (2.0 * np.pi)) for r in steady)
     return (
         f"harmonic excitation? the motion about {modes} has a constant amplitude, as mains hum and turning machines"
         " make it; then it is no mode, and its standard errors do not hold",

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.arrays import Floats
+from workbench.structure.printed import mode_text
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def overtone_remarks(poles: np.ndarray, size: Floats, scatter: Floats, deviation
             sums = _sums(poles, size, int(base), r)
             how = next((w for w, made, n in sums if _meets(poles[r], made, n * scatter[base], deviation[r])), None)
             if how is not None:
-                found.append(f"mode {r + 1} ({poles[r].imag / (2.0 * np.pi):.4g} Hz) lies at {how}")
+                found.append(f"{mode_text(r, poles[r].imag / (2.0 * np.pi))} lies at {how}")
                 of.add(int(base) + 1)
                 break
     if not found:

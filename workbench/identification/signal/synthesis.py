@@ -10,19 +10,16 @@ from workbench.structure.domain import Place, listed, place_array, same_place
 from workbench.structure.modes import Modes, SampledModes
 
 
-def impulse_response_modes(
-    modes: Modes, *, at: Place, positions: Sequence[Place], impulse: float = 1.0
-) -> SampledModes:
-    """The free decay after an impulse, as sampled modes whose shapes carry amplitude and phase.
+def impulse_response_modes(modes: Modes, *, at: Place, positions: Sequence[Place]) -> SampledModes:
+    """The free decay after a unit impulse, as sampled modes whose shapes carry amplitude and phase.
 
-    An impulse J at x0 gives q_r'(0) = J φ_r(x0), so w(x, t) = Re Σ_r s_r(x) e^{λ_r t} with
-    s_r(x) = -i J φ_r(x) φ_r(x0) / ω_dr.
+    An impulse of 1 N s at x0 gives q_r'(0) = φ_r(x0), so w(x, t) = Re Σ_r s_r(x) e^{λ_r t} with
+    s_r(x) = -i φ_r(x) φ_r(x0) / ω_dr.
 
     Args:
         modes: with proportional damping below critical.
         at: x0, m, or another place of the domain.
         positions: (n_outputs,) places of the sensors.
-        impulse: J, N s.
 
     Raises:
         ValueError: rigid-body, overdamped or coupled modes, which have no such form.
@@ -33,7 +30,7 @@ def impulse_response_modes(
             " select such modes, or simulate the rig"
         )
     omega_d = modes.omega * np.sqrt(1.0 - modes.zeta**2)
-    shapes = -1j * impulse * modes.phi(list(positions)) * modes.phi(at)[0] / omega_d
+    shapes = -1j * modes.phi(list(positions)) * modes.phi(at)[0] / omega_d
     return SampledModes(modes.omega, modes.zeta, shapes, place_array([same_place(x) for x in positions]))
 
 
