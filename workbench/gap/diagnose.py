@@ -226,11 +226,11 @@ def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: fl
     makes the gap of others larger corrects nothing.
     """
     effects = found.best.effects
-    if found.outcome in ("part", "unknown") and not _remainders(found):
+    if found.outcome in ("part", "unknown") and not _unpredictable(found):
         is_worse = _left_of(rig, effects, unseen, settle) > _left_of(rig, found.seen, unseen, settle)
         return found.without(*(e for e in effects if e not in found.seen)) if is_worse else found
     named = [e for e in effects if not e.kind.first and e not in found.seen]
-    if found.outcome != "explained" or len(named) < 2 or _remainders(found):
+    if found.outcome != "explained" or len(named) < 2 or _unpredictable(found):
         return found
     after = _left_of(rig, effects, unseen, settle)
     trifle = max(PAID * after, TRIFLE * _left_of(rig, (), unseen, settle))
@@ -320,7 +320,7 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float
     Args:
         beyond: (n_records,) of `_beyond_models`.
     """
-    if shrinkage is None or _remainders(found):
+    if shrinkage is None or _unpredictable(found):
         return False
     before, after, floor = _powers(shrinkage)
     floor = max(found.noise_ratio, 1.0) ** 2 * floor + beyond
@@ -330,9 +330,9 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float
     return bool((after > (1.0 + LEFT) * floor).any()) and closed < (BESIDE_ERRORS if beside else HELD_OUT)
 
 
-def _remainders(found: Attribution) -> list[str]:
+def _unpredictable(found: Attribution) -> list[str]:
     """What the effects leave that no model can predict."""
-    return list(dict.fromkeys(effect.kind.remainder for effect in found.best.effects if effect.kind.remainder))
+    return list(dict.fromkeys(effect.kind.unpredictable for effect in found.best.effects if effect.kind.unpredictable))
 
 
 def _check(rig: Rig, record: Record) -> None:
@@ -367,6 +367,6 @@ def _notes(
         *([taken] if silent else []),
         *([cut] if found.is_cut else []),
         budget.noise_remark if sound else "",  # else more than noise is left
-        *_remainders(found),
+        *_unpredictable(found),
     )
     return tuple(note for note in notes if note)

@@ -11,6 +11,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.records.record import Record
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion
 from workbench.structure.domain import Between, Domain, NamedPoints, Rectangle, Where
@@ -208,21 +209,22 @@ class Kind:
         nonlinear: whether it makes the response depend on level.
         phrase: how the sentence of the verdict calls it.
         simpler: effect, rig -> its limiting cases at bounds of its parameters, with values to start a fit from.
-        wider: effect -> what it is a limiting case of and records can mistake for it, with values to start a fit from.
+        more_general: effect -> what it is a limiting case of and records can mistake for it, with values to start a fit from.
         merged: effect, another -> the one effect that both together may be, with values to start a fit from; or None.
         signed: whether the change is linear in its one number, which may be of either sign; one start is then enough.
         found_in: "search", where its starts are tried; "readings", where it shows in them as they are; "residual",
             where only its statistics can be found.
-        alone: whether one rules out another of the kind, whatever its target.
-        remainder: what it leaves that no model can predict, in a sentence; empty where it leaves nothing.
+        exclusive: whether one rules out another of the kind, whatever its target.
+        unpredictable: the part of the response that no model can predict, in a sentence; empty where there is none.
         force_laws: "displacement" or "velocity" -> values, that motion (n,) -> force (n,), where it is a law of that
             alone.
         numbers: effect, rig -> the numbers that a verdict states, by name; None for its values, a place left out.
-        settled: effect -> the same with numbers as good as none that records may not tell from none; itself without.
+        without_negligible: effect -> the same less parameters so near zero that records may not show them; itself where
+            it has none.
         second_channel, joined: of a kind that acts on two inputs or two outputs: what the verdict calls the other one,
             and the word between the two in its sentence.
         remark: effect, rig -> what the sentence says in brackets; None for its numbers.
-        stands: effect, rig -> its place where no parameter holds it, and what the sentence calls it.
+        fixed_place: effect, rig -> its place where no parameter holds it, and what the sentence calls it.
         first: whether it changes the nominal model itself, before any other effect acts on it.
         last: whether it acts on modes as all other effects have made them: where modes keep their damping ratios, a
             damper there before a mass would be of another strength.
@@ -237,21 +239,23 @@ class Kind:
     nonlinear: bool = False
     phrase: str = ""
     simpler: Callable[["Effect", Rig], Iterable["Effect"]] = lambda effect, rig: ()
-    wider: Callable[["Effect"], Iterable["Effect"]] = lambda effect: ()
+    more_general: Callable[["Effect"], Iterable["Effect"]] = lambda effect: ()
     merged: "Callable[[Effect, Effect], Effect | None]" = lambda effect, other: None
     signed: bool = False
     found_in: Literal["search", "readings", "residual"] = "search"
-    alone: bool = False
-    remainder: str = ""
+    exclusive: bool = False
+    unpredictable: str = ""
     force_laws: Mapping[str, Callable[[Mapping[str, Any], np.ndarray], np.ndarray]] = field(default_factory=dict)
     numbers: Callable[["Effect", Rig], dict[str, float]] | None = None
-    settled: Callable[["Effect"], "Effect"] = lambda effect: effect
+    without_negligible: Callable[["Effect"], "Effect"] = lambda effect: effect
     remark: Callable[["Effect", Rig], str] | None = None
-    stands: Callable[["Effect", Rig], tuple[float, str]] | None = None
+    fixed_place: Callable[["Effect", Rig], tuple[float, str]] | None = None
     second_channel: str = "with"
     joined: str = " and "
     first: bool = False
     last: bool = False
+    wider, alone, remainder = Renamed("more_general"), Renamed("exclusive"), Renamed("unpredictable")
+    settled, stands = Renamed("without_negligible"), Renamed("fixed_place")
     known: ClassVar[WeakValueDictionary[int, "Kind"]] = WeakValueDictionary()  # by identity: none is equal to another
 
     def __post_init__(self) -> None:
@@ -260,6 +264,15 @@ class Kind:
     @property
     def words(self) -> str:
         return self.phrase or self.name.replace("_", " ")
+
+
+Kind.__init__ = former_arguments(  # type: ignore[method-assign]
+    wider="more_general",
+    alone="exclusive",
+    remainder="unpredictable",
+    settled="without_negligible",
+    stands="fixed_place",
+)(Kind.__init__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,8 +336,8 @@ def names_in(target: Any) -> tuple[str, ...]:
     return tuple(name for name in (target if isinstance(target, tuple) else (target,)) if isinstance(name, str))
 
 
-# of kinds whose names in words are no identifiers with spaces
-AS_WRITTEN = (
+# of kinds whose name in words is not their identifier with spaces for underscores
+SPELLINGS = (
     ("bouc wen", "Bouc-Wen"),
     ("coulomb", "Coulomb"),
     ("two way friction", "direction-dependent friction"),
@@ -335,8 +348,8 @@ AS_WRITTEN = (
 def label_in_words(label: str) -> str:
     """A label as a figure or a note shows it: actuator gain (F2), Bouc-Wen."""
     words = label.replace("[", " (").replace("]", ")").replace("_", " ")
-    for plain, written in AS_WRITTEN:
-        words = words.replace(plain, written)
+    for plain, spelt in SPELLINGS:
+        words = words.replace(plain, spelt)
     return words
 
 
@@ -392,11 +405,11 @@ def each_left_out(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
         yield tuple(other for other in effects if other is not effect)
 
 
-def wider_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
+def more_general_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect as what it is a limiting case of."""
     for i, effect in enumerate(effects):
-        for wider in effect.kind.wider(effect):
-            yield (*effects[:i], wider, *effects[i + 1 :])
+        for more_general in effect.kind.more_general(effect):
+            yield (*effects[:i], more_general, *effects[i + 1 :])
 
 
 def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:

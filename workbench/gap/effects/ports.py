@@ -627,7 +627,7 @@ SENSOR_QUANTISATION = _sensor(
     low=1e-300,
     nonlinear=True,
     found_in="readings",
-    remainder="Quantisation leaves an unpredictable error of step/√12 rms.",
+    unpredictable="Quantisation leaves an unpredictable error of step/√12 rms.",
 )
 
 KINDS = (

@@ -371,7 +371,7 @@ SUPPORT_ROTATION = Kind(
     ],
     targets=_ends,
     phrase="a support that is neither hinged nor clamped",
-    stands=lambda support, rig: (
+    fixed_place=lambda support, rig: (
         0.0 if support.target == "left" else _beam(rig).length,
         f"at the {support.target} end",
     ),
@@ -464,8 +464,8 @@ TRUNCATED_MODES = Kind(
     targets=lambda rig: () if rig.structure is None else tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)),
     phrase="modes left out of the model",
     simpler=_one_mode_fewer,
-    wider=_more_modes,
-    alone=True,
+    more_general=_more_modes,
+    exclusive=True,
     numbers=lambda truncation, rig: {"kept": rig.modes.n_modes, "needed": truncation.target},
     remark=lambda truncation, rig: f"{truncation.target} are needed, {rig.modes.n_modes} are kept",
 )

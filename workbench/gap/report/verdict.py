@@ -129,7 +129,7 @@ class Verdict:
             else:
                 each = joined_in_words([_percent(share) for share in shares])
                 text = f"{words} cause {_percent(sum(shares))} of the gap ({each})"
-            if any(effect.kind.remainder for effect in self.effects):
+            if any(effect.kind.unpredictable for effect in self.effects):
                 text += ", part of which is unpredictable"
             text += self._rest + self._not_excluded
         else:
@@ -309,8 +309,8 @@ def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
     if kind.path in ("actuator", "sensor"):
         side, target = "input" if kind.path == "actuator" else "output", effect.target
         entry |= {side: target[0], kind.second_channel: target[1]} if isinstance(target, tuple) else {side: target}
-    if kind.stands is not None:
-        entry["at"], entry["at_std"] = kind.stands(effect, nominal)[0], 0.0
+    if kind.fixed_place is not None:
+        entry["at"], entry["at_std"] = kind.fixed_place(effect, nominal)[0], 0.0
     elif effect.at is not None:
         entry |= _place_json(effect.at)
         spread = [_rounded(effect.deviations.get(name, 0.0)) for name in COORDINATES if name in effect.values]
@@ -371,8 +371,8 @@ def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
         inside = f"{target}: {inside}" if inside else str(target)
     if inside:
         text += f" ({inside})"
-    if kind.stands is not None:
-        text += f" {kind.stands(effect, nominal)[1]}"
+    if kind.fixed_place is not None:
+        text += f" {kind.fixed_place(effect, nominal)[1]}"
     elif effect.at is not None:
         text += f" {place_in_words(effect.at, effect.deviations)}"
     return text

@@ -290,7 +290,7 @@ def _settled(search: Search, best: Fit) -> Fit:
     """The fit with numbers as good as none that leave as much: no deviation at one point of a stiff law tells so."""
     data = search.data.finely(SELECTION.fine)
     for effect in best.effects:
-        settled = effect.kind.settled(effect)
+        settled = effect.kind.without_negligible(effect)
         if settled is effect:
             continue
         effects = tuple(settled if e is effect else e for e in best.effects)
