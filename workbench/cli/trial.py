@@ -36,7 +36,7 @@ def trial(
     say(f"  places   {held.tally.misplaced} of {held.tally.placed} more than 2 % of the length off")
     for name, one in held.scores.items():
         if not one["kinds"]:
-            say(f"  {name}: hidden {one['hidden']}, named {one['told']}")
+            say(f"  {name}: true {one['hidden']}, diagnosed {one['diagnosed']}")
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_confusion(held.tally).savefig(picture)
     write_json(json_path, {"labels": held.labels, "verdicts": held.verdicts, "scores": held.scores})

@@ -201,7 +201,7 @@ def diagnose(
 
 
 def diagnose_case(case: Case, **options: Any) -> Verdict:
-    """`diagnose` of what a case holds, told by its units.
+    """`diagnose` of what a case holds, stated in its units.
 
     Args:
         case: rig and records.

@@ -59,7 +59,7 @@ def score(
         inputs, outputs: names in order, needed where a label counts them from zero.
 
     Returns:
-        {"hidden", "told": sets of kinds in words; "family": single, pair, none or unknown; "kinds": right;
+        {"hidden", "diagnosed": sets of kinds in words; "family": single, pair, none or unknown; "kinds": right;
         "channels": inputs and outputs right, None without any; "position_errors": shares of the length or the
         diagonal, 1 for another name; "positions": right, None without any; "shrinkage": by validation record}.
     """
@@ -71,7 +71,7 @@ def score(
     errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
     return {
         "hidden": _words(hidden),
-        "told": _words(named),
+        "diagnosed": _words(named),
         "family": _family(hidden),
         "kinds": kinds,
         "channels": all(channels) if channels else None,
@@ -97,7 +97,7 @@ def score_dirty(
         inputs, outputs: names in order, needed where a label counts them from zero.
 
     Returns:
-        {"class", "size": of the small errors; "hidden", "told": sets of kinds in words;
+        {"class", "size": of the small errors; "hidden", "diagnosed": sets of kinds in words;
         "named": what hides is named, its channels and places right, and nothing else is; of three effects, two and an
         honest budget will do;
         "wrong": a kind, or a channel, is named that does not hide; "false_alarm": anything is, and nothing hides;
@@ -121,7 +121,7 @@ def score_dirty(
         "class": label.get("class", ""),
         "size": label.get("size", 1.0),
         "hidden": _words(hidden),
-        "told": _words(verdict["effects"]),
+        "diagnosed": _words(verdict["effects"]),
         "named": (complete or in_part) and placed and len(named) == len(verdict["effects"]),
         "wrong": len(pairs) < len(named),
         "false_alarm": not hidden and bool(named),
@@ -235,7 +235,7 @@ def tally(scores: Iterable[dict[str, Any]]) -> Tally:
     total: Counter[str] = Counter()
     misplaced = placed = 0
     for one in scores:
-        counts[one["hidden"], one["told"]] += 1
+        counts[one["hidden"], one["diagnosed"]] += 1
         total[one["family"]] += 1
         right[one["family"]] += one["kinds"]
         misplaced += sum(error > NEAR for error in one["position_errors"])

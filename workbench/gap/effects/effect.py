@@ -209,7 +209,8 @@ class Kind:
         nonlinear: whether it makes the response depend on level.
         phrase: how the sentence of the verdict calls it.
         simpler: effect, rig -> its limiting cases at bounds of its parameters, with values to start a fit from.
-        more_general: effect -> what it is a limiting case of and records can mistake for it, with values to start a fit from.
+        more_general: effect -> what it is a limiting case of and records can mistake for it, with values to start a
+            fit from.
         merged: effect, another -> the one effect that both together may be, with values to start a fit from; or None.
         signed: whether the change is linear in its one number, which may be of either sign; one start is then enough.
         found_in: "search", where its starts are tried; "readings", where it shows in them as they are; "residual",

@@ -12,9 +12,9 @@ from workbench.gap.effects.effect import (
     apply_all,
     each_left_out,
     key_of,
+    more_general_sets,
     place_values,
     simpler_sets,
-    more_general_sets,
     with_one_simpler,
 )
 from workbench.gap.localisation.evidence import Evidence

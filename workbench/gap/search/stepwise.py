@@ -15,8 +15,8 @@ from workbench.gap.effects.effect import (
     each_left_out,
     key_of,
     merged_sets,
-    simpler_sets,
     more_general_sets,
+    simpler_sets,
     with_one_simpler,
 )
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
