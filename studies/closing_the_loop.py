@@ -30,7 +30,7 @@ KINDS = (
     "modulus_error", "sensor_lag", "point_mass", "ground_spring", "cubic_spring", "coulomb_friction", "modal_damping",
     "actuator_misplacement", "sensor_bias",
 )  # fmt: skip
-DIRT = ("clean", "noise", "late", "clean", "offset")
+IMPERFECTIONS = ("clean", "noise", "late", "clean", "offset")
 LAWS = ("imsc", "coupled")
 CONTROLLED, DAMPING, DRAWS, PREDICTED = 2, 0.35, 40, 80
 OFF = (1.2, 1.02)  # factors by which the fit starts beside the truth; the better of both is kept
@@ -47,7 +47,9 @@ def plant(index, seed, searched=False):
     if index % 3 == 2:
         other = str(rng.choice([k for k in KINDS if k.split("_")[0] != kinds[0].split("_")[0]]))
         kinds.append(other)
-    case, label, real = find_trial_with_plant(rng, kinds=kinds, dirt=DIRT[index % len(DIRT)], size=0.5)
+    case, label, real = find_trial_with_plant(
+        rng, kinds=kinds, imperfections=IMPERFECTIONS[index % len(IMPERFECTIONS)], size=0.5
+    )
     true = tuple(_effect(told) for told in label["effects"])
     rig = case.rig
     level = np.max([np.abs(r.outputs).max(axis=1) for r in case.fit], axis=0)
@@ -97,7 +99,7 @@ def plant(index, seed, searched=False):
     told["inside the bands"] = _inside(possible, noise, found.controller, test, runs[found.controller])
     return {
         "kinds": [e.kind.name for e in true],
-        "dirt": label["class"],
+        "imperfections": label["class"],
         "found": [e.kind.name for e in possible.effects],
         "unexplained": possible.unexplained,
         "stable draws": found.proof.share_stable,

@@ -484,7 +484,7 @@ def test_more_gain_wins_back_nearly_all_that_a_limit_leaves_to_be_won(rig):
 
 @pytest.fixture(scope="module")
 def hidden_plant():
-    return find_trial_with_plant(np.random.default_rng([20301, 20]), dirt="clean", size=0.5)
+    return find_trial_with_plant(np.random.default_rng([20301, 20]), imperfections="clean", size=0.5)
 
 
 @pytest.mark.slow

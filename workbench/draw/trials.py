@@ -10,7 +10,7 @@ from matplotlib.patches import Rectangle
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.effect import label_in_words
 from workbench.structure.printed import counted
-from workbench.trials.dirt import CLEAN, TRIPLE
+from workbench.trials.imperfections import CLEAN, TRIPLE
 from workbench.trials.scoring import Reliability, Tally
 
 _FAMILY = {
@@ -72,8 +72,8 @@ def plot_times(seconds: Mapping[str, Sequence[float]], limits: Mapping[str, floa
     return figure
 
 
-def plot_dirt(scores: Sequence[Mapping[str, Any]]) -> Figure:
-    """How many trials of `score_dirty` were named correctly, by class and size of the small errors beside them."""
+def plot_imperfections(scores: Sequence[Mapping[str, Any]]) -> Figure:
+    """How many trials of `score_imperfect` were named correctly, by class and size of the small errors beside them."""
     classes, sizes = list(dict.fromkeys(s["class"] for s in scores)), sorted({s["size"] for s in scores})
     figure, ax = new_figure(width=9, height=1.6 + 0.45 * len(classes))
     for row, name in enumerate(classes):

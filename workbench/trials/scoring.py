@@ -12,7 +12,7 @@ from workbench.structure.domain import Domain, NamedPoints, as_domain
 from workbench.trials.hidden import NONE, UNKNOWN, stands
 
 NEAR = 0.02  # of the length: how far off a place may be
-NEAR_IN_DIRT = 0.03  # likewise beside the small errors of a real test
+NEAR_IF_IMPERFECT = 0.03  # likewise beside the small errors of a real test
 HONEST = 0.05  # of the nominal residual's mean square: how far off a budget's unexplained share may be
 NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
 BINS = 5  # of a reliability diagram, of equal width
@@ -81,7 +81,7 @@ def score(
     }
 
 
-def score_dirty(
+def score_imperfect(
     verdict: dict[str, Any],
     label: dict[str, Any],
     *,
@@ -115,7 +115,7 @@ def score_dirty(
     budget = verdict.get("budget", {}).get("unexplained")
     complete = len(pairs) == len(hidden) == len(named)
     off = None if budget is None or not complete else abs(budget - label["budget"]["unexplained"])
-    placed = all(error <= NEAR_IN_DIRT for error in errors)
+    placed = all(error <= NEAR_IF_IMPERFECT for error in errors)
     in_part = len(hidden) == 3 and len(pairs) == len(named) == 2 and budget is not None and budget > HONEST
     return {
         "class": label.get("class", ""),
@@ -154,8 +154,8 @@ def reliability(scores: Iterable[dict[str, Any]]) -> list[Reliability]:
     ]
 
 
-def tally_dirty(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
-    """Shares over many scores of `score_dirty`.
+def tally_imperfect(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
+    """Shares over many scores of `score_imperfect`.
 
     Returns:
         {"cases", "named", "wrong", "false_alarms" (a count), "placed" within 3 %, "covered" by 95 % intervals,
@@ -171,7 +171,7 @@ def tally_dirty(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
         "named": _share([s["named"] for s in hiding]),
         "wrong": _share([s["wrong"] for s in scores]),
         "false_alarms": float(sum(s["false_alarm"] for s in scores)),
-        "placed": _share([e <= NEAR_IN_DIRT for e in errors]),
+        "placed": _share([e <= NEAR_IF_IMPERFECT for e in errors]),
         "covered": float(inside / of) if of else float("nan"),
         "honest": _share([b <= HONEST for b in budgets]),
     }
