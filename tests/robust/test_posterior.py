@@ -63,7 +63,7 @@ def test_draws_keep_what_the_records_tell_of_the_product_of_two_numbers(told):
 def test_rivals_are_drawn_in_proportion_to_their_probability(told):
     rig, _, _, found = told
     rival = UncertainRig(rig, (Effect(kind_named("modal_damping"), None, {"factor": 2.0}),), np.zeros((1, 1)))
-    possible = UncertainRig(rig, found.effects, found.covariance, rivals=((rival, 0.25),))
+    possible = UncertainRig(rig, found.effects, found.covariance, alternatives=((rival, 0.25),))
     damped = [r.modes.zeta[0] > 1.5 * rig.modes.zeta[0] for r in possible.draws(2000, seed=2)]
     assert np.mean(damped) == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / 2000))
 
@@ -143,7 +143,7 @@ def test_what_cannot_be_is_named(told):
     with pytest.raises(ValueError, match=r"one row a parameter of the effects, shape \(2, 2\)"):
         UncertainRig(rig, GAINS, np.eye(3))
     with pytest.raises(ValueError, match="no effect is called 'gremlin'"):
-        UncertainRig.from_json(rig, {"effects": [{"kind": "gremlin"}], "covariance": [], "rivals": []})
+        UncertainRig.from_json(rig, {"effects": [{"kind": "gremlin"}], "covariance": [], "alternatives": []})
     buckled = Effect(kind_named("axial_load"), None, {"tension": -1e6})
     with pytest.raises(ValueError, match="measure more of them"):
         UncertainRig(rig, (buckled,), np.array([[1e-6]])).draws(1)

@@ -30,18 +30,18 @@ def possible_rig(
         ValueError: no verdict of this case, or channels that are certainly exchanged or turned.
     """
     from workbench.gap.diagnose import SECONDS, diagnose_case
-    from workbench.gap.report.wiring import check_kept_apart, wiring
+    from workbench.gap.report.setup_faults import check_disjoint, setup_faults
     from workbench.robust.posterior import UncertainRig
 
     if verdict is not None:
         return read_verdict(verdict, case.rig)
-    check_kept_apart(case.fit, case.validation)
+    check_disjoint(case.fit, case.validation)
     kept = Path("out") / f"{case.name}-verdict.json"
-    for fault in wiring(case.rig, case.fit, case.validation):
+    for fault in setup_faults(case.rig, case.fit, case.validation):
         if fault.certain:
             raise ValueError(
                 f"{fault.sentence.rstrip('.')}; correct the case, or go on as it is by `workbench diagnose CASE"
-                f" --as-wired --json {kept.name}`, and give that file as --verdict"
+                f" --uncorrected --json {kept.name}`, and give that file as --verdict"
             )
     errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
     found = diagnose_case(case, workers=workers, report=report)

@@ -743,9 +743,9 @@ def _notes(possible: UncertainRig, rig: Rig, aimed: bool) -> tuple[str, ...]:
         )
     if any(a.hysteresis_share for a in rig.actuators):
         notes.append("The hysteresis of an actuator is in the verification, but is not compensated.")
-    if possible.rivals:
-        share = sum(p for _, p in possible.rivals)
-        notes.append(f"{100 * share:.0f} % of the draws are rival sets of effects that the records do not exclude.")
+    if possible.alternatives:
+        share = sum(p for _, p in possible.alternatives)
+        notes.append(f"{100 * share:.0f} % of the draws are other sets of effects that the records do not exclude.")
     return tuple(notes)
 
 

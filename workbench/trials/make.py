@@ -372,7 +372,7 @@ def write_trials(
             give way to others.
         structure: of benches that are drawn: "members" (beams and rods), "plates" or "frames".
         kinds: what each case hides; None draws them, see `draw_kinds` and `draw_imperfect_kinds`.
-        imperfections: class of the small errors beside what hides, of `IMPERFECTIONS`, "all" for each in turn; None for none.
+        imperfections: class of the small errors beside what hides, of `IMPERFECTIONS`, or "all" in turn; None for none.
         size: of these errors; None for each of `SIZES` in turn.
         report: called with (what, share done).
 

@@ -13,6 +13,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_lines import Lines, lines_of, screened
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
+from workbench.renamed import Renamed
 from workbench.rig.linear import held_response, modal_motion, modal_poles, straight_response
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import participation_of
@@ -55,8 +56,8 @@ class ForceLocation:
         at_std: a quarter of the way between where the misfit is two deviations higher, m, more by what is left
             beyond the noise; on a rectangle along the longer axis of the region; 0 for named places.
         share: of the gap's power above the noise, what one force there accounts for.
-        holds: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing shows it:
-            no gap, one sensor, or records too short.
+        is_single_force: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing
+            shows it: no gap, one sensor, or records too short.
     """
 
     places: Sequence[Any]
@@ -64,7 +65,9 @@ class ForceLocation:
     at: Any
     at_std: float
     share: float
-    holds: bool | None
+    is_single_force: bool | None
+
+    holds = Renamed("is_single_force")
 
 
 @one_blas_thread

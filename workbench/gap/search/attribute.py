@@ -44,7 +44,7 @@ class Attribution:
         best: the chosen set of effects, fitted; empty for none; for "part" and "unknown" the nearest one, which may be
             a law beyond the catalogue.
         random: statistics of a random disturbance, where the set holds one.
-        rivals: other sets, best first, with their probabilities against the best.
+        alternatives: other sets, best first, with their probabilities against the best.
         nominal_cost: mean square of the nominal residual in noise units.
         tried: effects alone that were fitted to whole records; beside the random disturbance, where one holds.
         ahead: the likeliest of every kind alone, fitted to predictions one sample ahead.
@@ -60,7 +60,7 @@ class Attribution:
     outcome: str
     best: Fit
     random: RandomForceFit | None
-    rivals: tuple[tuple[Fit, float], ...]
+    alternatives: tuple[tuple[Fit, float], ...]
     nominal_cost: float
     tried: tuple[Fit, ...]
     ahead: tuple[Fit, ...]
@@ -167,7 +167,7 @@ def attribute(
     *,
     catalogue: tuple[Kind, ...] = CATALOGUE,
     report: Callable[[str, float], None] = lambda text, share: None,
-    free_nominal: bool = False,
+    uncertain_nominal: bool = False,
     tolerance: float = 0.0,
     identified: IdentifiedPrior | None = None,
 ) -> Attribution:
@@ -181,8 +181,8 @@ def attribute(
         found: before any effect is guessed.
         catalogue: kinds of effects to try.
         report: called with (what, share done) as the search proceeds.
-        free_nominal: fit errors of the nominal model beside every effect from the first, for a model that is known to
-            be a little off; otherwise where no single effect explains the records without.
+        uncertain_nominal: fit errors of the nominal model beside every effect from the first, for a model that is
+            known to be a little off; otherwise where no single effect explains the records without.
         tolerance: of the signal's rms: a smaller gap beyond the noise is not searched for causes.
         identified: errors of a nominal rig that was itself identified.
     """
@@ -198,7 +198,7 @@ def attribute(
         decision = Decision("none", start)
     elif not search.explains(start) and is_noise_alone(evidence.residuals, data.counted):
         decision = Decision("none", start, noise=noise_found(evidence.residuals))
-    elif free_nominal and not search.explains(start):
+    elif uncertain_nominal and not search.explains(start):
         decision = _beside_nominal_errors(search, tolerance)
     elif not search.explains(start) and not _of_one_sensor(start):
         decision, singles = decide_on_random(search, evidence)
@@ -243,7 +243,7 @@ def attribute(
         outcome=outcome,
         best=best,
         random=random,
-        rivals=rivals,
+        alternatives=rivals,
         nominal_cost=float(nominal.mean()),
         tried=tuple(singles),
         ahead=tuple(ahead),
