@@ -186,7 +186,10 @@ def study(outcome, data: Path) -> None:
     control = redesign(verdict, law, placement=False)
     outcome.say(f"a controller designed on the first test: {control.sentence}")
     outcome.table("control", control.to_json())
-    stable = {"designed before": control.present_proof.share_stable, "redesigned": control.proof.share_stable}
+    stable = {
+        "designed before": control.present_verification.share_stable,
+        "redesigned": control.verification.share_stable,
+    }
     for name, share in stable.items():
         outcome.check(f"controller {name}: share of possible arms on which it is stable", share, 1.0, at_least=True)
     outcome.figure("response", _plot_responses(before, after, rig, verdict.corrected), "Hub angle over drive.")

@@ -64,10 +64,10 @@ def plant(index, seed, searched=False):
     )
     if searched:
         verdict = diagnose(rig, case.fit, validation=case.validation, workers=1)
-        possible, noise = UncertainRig.of(verdict), verdict.budget.noise_found
+        uncertain, noise = UncertainRig.of(verdict), verdict.budget.noise_found
     else:
-        possible, noise = _fitted(case, true)
-    found = redesign(possible, law, test=test, draws=DRAWS, seed=index, placement=False)
+        uncertain, noise = _fitted(case, true)
+    found = redesign(uncertain, law, test=test, draws=DRAWS, seed=index, placement=False)
     sure = UncertainRig(rig, true, np.zeros((_size(rig, true),) * 2))
     best = redesign(sure, law, test=test, draws=1, seed=index, placement=False)
     weight = force_weight(best.after, best.controlled)
@@ -96,13 +96,13 @@ def plant(index, seed, searched=False):
             "peak force": run.peak_force,
             "settling": run.settling(),
         }
-    told["inside the bands"] = _inside(possible, noise, found.controller, test, runs[found.controller])
+    told["inside the bands"] = _inside(uncertain, noise, found.controller, test, runs[found.controller])
     return {
         "kinds": [e.kind.name for e in true],
         "imperfections": label["class"],
-        "found": [e.kind.name for e in possible.effects],
-        "unexplained": possible.unexplained,
-        "stable draws": found.proof.share_stable,
+        "found": [e.kind.name for e in uncertain.effects],
+        "unexplained": uncertain.unexplained,
+        "stable draws": found.verification.share_stable,
         "safe": found.safe,
         "pays": found.improves,
         "pays, no more work": bounded.improves,
@@ -112,11 +112,11 @@ def plant(index, seed, searched=False):
     }
 
 
-def _inside(possible, noise, controller, test, run):
+def _inside(uncertain, noise, controller, test, run):
     """Share of the readings of the hidden plant inside the bands that were predicted for them."""
     if not run.stable:
         return None
-    told = predict_loop(possible, controller, test, noise_std=noise, draws=PREDICTED, seed=1)
+    told = predict_loop(uncertain, controller, test, noise_std=noise, draws=PREDICTED, seed=1)
     return float(told.coverage(run.outputs)[:, 0].mean())
 
 

@@ -20,8 +20,8 @@ from workbench.gap.effects.effect import Effect
 from workbench.robust.on_rig import impulse_test
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import SETTLED
 from workbench.robust.redesign import redesign
+from workbench.robust.verification import SETTLED
 from workbench.trials.controlled import control_plant
 from workbench.trials.make import find_trial_with_plant
 
@@ -59,8 +59,8 @@ def plant(index, seed):
         return control_plant(hidden, controller, **given, rng=noise)
 
     def designed(*effects):
-        possible = UncertainRig(rig, effects, np.zeros((len(effects),) * 2))
-        return redesign(possible, law, test=test, draws=1, placement=False, more_cost=np.inf)
+        uncertain = UncertainRig(rig, effects, np.zeros((len(effects),) * 2))
+        return redesign(uncertain, law, test=test, draws=1, placement=False, more_cost=np.inf)
 
     nominal = designed()
     free = controlled(real, nominal.present)

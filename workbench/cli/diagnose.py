@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.possible import write_verdict
 from workbench.cli.terminal import as_typed, by_options, check_target, guarded, names_in, reporting, say, short
+from workbench.cli.uncertain import write_verdict
 
 SHOWN_ALTERNATIVES = 3
 

@@ -1,4 +1,4 @@
-"""A corrected rig with its uncertainty: rigs drawn from what a diagnosis leaves possible."""
+"""A corrected rig with its uncertainty: rigs drawn from what a diagnosis leaves uncertain."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -105,7 +105,7 @@ class UncertainRig:
         return parameters_of(self.nominal, self.effects)
 
     def draws(self, n: int, seed: int | np.random.Generator = 0) -> tuple[Rig, ...]:
-        """Rigs (n,) that the diagnosis leaves possible, alternatives in proportion to their probability.
+        """Rigs (n,) drawn from the uncertainty of the diagnosis, alternatives in proportion to their probability.
 
         Normal in the free coordinates of the fit, inside the bounds of each parameter; a rig that cannot be, such as a
         buckled beam, is drawn again.

@@ -1,4 +1,4 @@
-"""What the next test will show, with bands: readings of rigs drawn from what a diagnosis leaves possible."""
+"""What the next test will show, with bands: readings of rigs drawn from what a diagnosis leaves uncertain."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from workbench.rig.elements import RandomForce
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion, read, simulate
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
-from workbench.robust.proof import check_loop_kinds, drawn_with_errors
+from workbench.robust.verification import check_loop_kinds, drawn_with_errors
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.printed import Printed, counted
 from workbench.threads import one_blas_thread

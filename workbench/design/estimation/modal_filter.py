@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicHermiteSpline, RBFInterpolator, make_interp_spline
 
 from workbench.arrays import Floats
+from workbench.renamed import Renamed
 from workbench.structure.domain import NamedPoints, Place, Rectangle, gauss_between, same_place
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes, freeze
@@ -74,8 +75,10 @@ class ModalFilter(Printed):
             modal = modal + self.slope @ np.asarray(slope, float)
         return modal
 
-    def seen(self, modes: Modes) -> Floats:
-        """What the filter makes of each mode: (n_filtered, n_modes); the identity for a perfect filter.
+    seen = Renamed("response_to")
+
+    def response_to(self, modes: Modes) -> Floats:
+        """The filter's modal coordinates for a unit of each mode, (n_filtered, n_modes); the identity if it is perfect.
 
         Columns beyond the filtered modes are observation spillover.
         """

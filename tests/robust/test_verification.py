@@ -12,7 +12,7 @@ from workbench.design.loop.rig_loop import LoopTest
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import LinearSpring, PeriodicForce
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import verify
+from workbench.robust.verification import verify
 
 
 def test_what_no_loop_can_be_made_of_is_refused(rig):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from workbench.robust.prediction import Prediction
 
 
-def possible_rig(
+def uncertain_rig(
     case: "Case", verdict: Path | None, *, workers: int | None, report: Callable[[str, float], None]
 ) -> "tuple[UncertainRig, tuple[float, ...] | None]":
     """The uncertain rig of a case, and the noise (n_outputs,) that its diagnosis found; from a verdict where given.
@@ -75,9 +75,9 @@ def predicted(
     from workbench.robust.prediction import check_draws, predict
 
     check_draws(draws)  # before the diagnosis
-    possible, noise = possible_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))
+    uncertain, noise = uncertain_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))
     return predict(
-        possible, record, noise_std=noise, draws=draws, seed=seed,
+        uncertain, record, noise_std=noise, draws=draws, seed=seed,
         report=lambda what, done: report(what, 0.7 + 0.3 * done),
     )  # fmt: skip
 
