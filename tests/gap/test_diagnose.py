@@ -200,7 +200,7 @@ def test_a_clean_pair_is_found_before_errors_of_the_model_are_asked_for(hinged_r
     fitted, kept = pair_on(rig, record_of)
     catalogue = tuple(kind_named(n) for n in ("actuator_delay", "cubic_spring", "modal_damping", "point_mass"))
     report = lambda text, share: told.append(text)  # noqa: E731
-    verdict = diagnose(rig, [fitted], validation=[kept], catalogue=catalogue, report=report, workers=1)
+    verdict = diagnose(rig, [fitted], validation=[kept], catalogue=catalogue, progress=report, workers=1)
     assert verdict.outcome == "explained"
     assert {effect.kind.name for effect in verdict.effects} == {"actuator_delay", "cubic_spring"}
     assert "all pairs at once" in told and not any("small errors" in text for text in told)

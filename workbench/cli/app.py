@@ -21,7 +21,14 @@ from workbench.cli.terminal import errors
 from workbench.cli.trial import trial
 
 # Former names of options, which work for one version more.
-RENAMED = {"mend": "correct", "as-wired": "uncorrected", "free-nominal": "uncertain-nominal", "proof": "certify"}
+RENAMED = {
+    "mend": "correct",
+    "as-wired": "uncorrected",
+    "free-nominal": "uncertain-nominal",
+    "proof": "certify",
+    "picture": "figure",
+    "validate": "validation",
+}
 
 
 def current_option(name: str) -> str:

@@ -20,7 +20,7 @@ def diagnose(
         Path | None, typer.Option(help="In place of a case: a record at low level, whose linear model is the nominal.")
     ] = None,
     records: Annotated[list[Path] | None, typer.Option(help="With --nominal: a record to diagnose; repeat.")] = None,
-    validate: Annotated[
+    validation: Annotated[
         list[Path] | None, typer.Option(help="With --nominal: a record that only measures the gap; repeat.")
     ] = None,
     inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="With --nominal: channels that are inputs.")] = "",
@@ -79,7 +79,7 @@ def diagnose(
         found = measured_case(
             nominal,
             records,
-            validate or (),
+            validation or (),
             inputs=names_in(inputs),
             input_hold=input_hold,
             quantity=quantity,
@@ -102,7 +102,7 @@ def diagnose(
     corrected = [f"Corrected before the diagnosis: {fault.sentence}" for fault in faults if correct and fault.certain]
     with reporting("reading") as report:
         verdict = diagnose_case(
-            found, uncertain_nominal=uncertain_nominal, settle=settle, workers=workers, seconds=seconds, report=report
+            found, uncertain_nominal=uncertain_nominal, settle=settle, workers=workers, seconds=seconds, progress=report
         )
     say(verdict.sentence, bold=True)
     shown = verdict.to_json()

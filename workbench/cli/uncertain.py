@@ -44,7 +44,7 @@ def uncertain_rig(
                 f" --uncorrected --json {kept.name}`, and give that file as --verdict"
             )
     errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
-    found = diagnose_case(case, workers=workers, report=report)
+    found = diagnose_case(case, workers=workers, progress=report)
     write_verdict(found, kept)
     errors.print(f"  {found.sentence}")
     errors.print(f"  verdict    {short(kept)}: with --verdict {short(kept)} the next command need not diagnose")
@@ -78,7 +78,7 @@ def predicted(
     uncertain, noise = uncertain_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))
     return predict(
         uncertain, record, noise_std=noise, draws=draws, seed=seed,
-        report=lambda what, done: report(what, 0.7 + 0.3 * done),
+        progress=lambda what, done: report(what, 0.7 + 0.3 * done),
     )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ def plot_redesign(result: Redesign) -> Figure:
             time, middle, color=colour, linewidth=1.2, label=f"{name}: stable on {verification.share_stable:.0%}"
         )
     left.axhline(SETTLED, color=GREY, linewidth=0.8)
-    left.annotate("settled", (time[-1], SETTLED), (0, 3), textcoords="offset points", fontsize=8, ha="right")
+    left.annotate("settling threshold", (time[-1], SETTLED), (0, 3), textcoords="offset points", fontsize=8, ha="right")
     left.set(xlabel="time [s]", ylabel="modal energy over its peak", ylim=(1e-6, 3.0))
     left.set_title(f"{result.verification.n_draws} samples of the uncertain model: median and 95 % interval")
     left.legend(fontsize=8)

@@ -111,7 +111,9 @@ def plot_reliability(points: Sequence[Reliability]) -> Figure:
         beside = (8, 4) if point.probability < 0.7 else (-60, -12)
         count = counted(point.claims, "claim")
         ax.annotate(count, (point.probability, point.right), beside, textcoords="offset points")
-    ax.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="stated probability", ylabel="share right")
+    ax.set(
+        xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="stated probability", ylabel="observed frequency"
+    )
     ax.legend(loc="lower right", fontsize=8)
     return figure
 

@@ -57,7 +57,7 @@ BESIDE_ERRORS = 0.8  # likewise where the model itself is a little off: 4 % of t
 OVER_FITTING = "The nearest set explains the records it was fitted to, but not the validation records: over-fitting."
 
 
-@former_arguments(free_nominal="uncertain_nominal")
+@former_arguments(free_nominal="uncertain_nominal", report="progress")
 @one_blas_thread
 def diagnose(
     rig: Rig,
@@ -66,7 +66,7 @@ def diagnose(
     validation: Record | Iterable[Record] = (),
     catalogue: tuple[Kind, ...] = CATALOGUE,
     name: str = "case",
-    report: Callable[[str, float], None] = lambda text, share: None,
+    progress: Callable[[str, float], None] = lambda text, share: None,
     workers: int | None = None,
     seconds: float | None = SECONDS,
     settle: float = 0.0,
@@ -85,7 +85,7 @@ def diagnose(
         validation: kept out of every fit.
         catalogue: kinds of effects to try.
         name: of the case.
-        report: called with (what, share done) as the search proceeds.
+        progress: called with (what, share done) as the search proceeds.
         workers: processes that share the work, this one included; None for one per core.
         seconds: of processor time of this process, twice as many where it works alone, after which the search ends with
             the best that it has, and the verdict says so; None for no limit. What compiling takes is not counted.
@@ -132,7 +132,7 @@ def diagnose(
         each = zip(rig.sensors, noise_guessed(rig, records), strict=True)
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
     faults = setup_faults(rig, records, validation, settle=settle)
-    report("looking for the unmodelled force", 0.02)
+    progress("looking for the unmodelled force", 0.02)
     found = baseline(rig, records, settle=settle, workers=sharing, deadline=deadline)
     nominal = found.nominal
     with (
@@ -142,7 +142,7 @@ def diagnose(
         attribution = attribute(
             found,
             catalogue=catalogue,
-            report=report,
+            report=progress,
             uncertain_nominal=uncertain_nominal,
             tolerance=tolerance,
             identified=identified or IdentifiedPrior.of_modes(rig),
@@ -231,7 +231,7 @@ def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: fl
     if found.outcome in ("part", "unknown") and not _unpredictable(found):
         is_worse = _left_of(rig, effects, unseen, settle) > _left_of(rig, found.seen, unseen, settle)
         return found.without(*(e for e in effects if e not in found.seen)) if is_worse else found
-    named = [e for e in effects if not e.kind.first and e not in found.seen]
+    named = [e for e in effects if not e.kind.applied_first and e not in found.seen]
     if found.outcome != "explained" or len(named) < 2 or _unpredictable(found):
         return found
     after = _left_of(rig, effects, unseen, settle)

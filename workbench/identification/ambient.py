@@ -196,7 +196,7 @@ def _lags(record: Record, max_lag: float | None, references: Sequence[str] | Non
         strongest = np.argsort(-record.outputs.std(axis=1))[: AMBIENT.most_references]
         rows = sorted(int(j) for j in strongest)
     else:
-        rows = [record.output_names.index(name) for name in record.only(references).output_names]
+        rows = [record.output_names.index(name) for name in record.select_outputs(references).output_names]
     most, least = record.n_samples // (2 * AMBIENT.blocks), AMBIENT.least_lags // 4
     if most < least:
         raise ValueError(

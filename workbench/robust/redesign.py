@@ -399,7 +399,7 @@ class Redesign:
         }
 
 
-@former_arguments(aim="criterion")
+@former_arguments(aim="criterion", report="progress")
 @one_blas_thread
 def redesign(
     verdict: Verdict | UncertainRig,
@@ -414,7 +414,7 @@ def redesign(
     criterion: str | None = None,
     more_cost: float = MORE_COST,
     more_work: float = np.inf,
-    report: Report = lambda text, share: None,
+    progress: Report = lambda text, share: None,
 ) -> Redesign:
     """A controller of the same kind, redesigned for the corrected rig, and both verified on the same samples of it.
 
@@ -436,7 +436,7 @@ def redesign(
             minimises it, and "settling" for one by poles or on-off.
         more_cost: share by which the redesigned controller may cost more than the present one where it settles sooner.
         more_work: share by which it may do more work, W = Σ_r |W_r|: as much as it takes, unless given.
-        report: called with (what, share done).
+        progress: called with (what, share done).
 
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
@@ -463,13 +463,13 @@ def redesign(
             raise DesignError("how often does the controller run? give sample_time, in s")
         sample_time = verdict.attribution.search.data.records[0].sample_time
     check_rate(nominal.modes, controlled_by(design), sample_time)
-    report("the present controller", 0.05)
+    progress("the present controller", 0.05)
     level = _level(verdict)
     test = test or impulse_test(nominal, controlled_by(design), sample_time, impulse_at, level=level, seed=seed)
     loop = fitted(nominal, design, test)
     present = _present(nominal, loop, sample_time)
     before = run_loop(corrected, present, test)
-    report("designing for the corrected rig", 0.15)
+    progress("designing for the corrected rig", 0.15)
     quiet = _silent(present)
     modes = modes_in_motion(corrected, run_loop(corrected, quiet, test))
     steps: tuple[Step, ...]
@@ -481,14 +481,14 @@ def redesign(
         if not corrected.elements or not after.bounded:
             break
         modes = modes_in_motion(corrected, after)
-    report("verification on the samples", 0.4)
+    progress("verification on the samples", 0.4)
     rigs = drawn_with_errors(uncertain, draws, seed)
-    old = verify(rigs, present, test, controlled=anew.law.controlled, centre=corrected)
-    report("verification on the samples", 0.65)
-    new = verify(rigs, redesigned, test, controlled=anew.law.controlled, centre=corrected)
-    report("where actuators should stand", 0.9)
+    old = verify(rigs, present, test, controlled=anew.law.controlled, margin_rig=corrected)
+    progress("verification on the samples", 0.65)
+    new = verify(rigs, redesigned, test, controlled=anew.law.controlled, margin_rig=corrected)
+    progress("where actuators should stand", 0.9)
     moved = relocated(anew, test) if placement else None
-    report("done", 1.0)
+    progress("done", 1.0)
     return Redesign(
         uncertain, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight,
         judged, more_cost, more_work, moved, _notes(uncertain, corrected, judged == wanted),

@@ -128,7 +128,7 @@ def _plain(value: float) -> float | None:
     return float(f"{value:.6g}") if np.isfinite(value) else None
 
 
-@former_arguments(possible="rig")
+@former_arguments(possible="rig", centre="margin_rig")
 @one_blas_thread
 def verify(
     rig: UncertainRig | Sequence[Rig],
@@ -138,7 +138,7 @@ def verify(
     controlled: Sequence[int] = (),
     draws: int = 200,
     seed: int = 0,
-    centre: Rig | None = None,
+    margin_rig: Rig | None = None,
 ) -> Verification:
     """What a controller does on samples of an uncertain rig under a test, all nonlinear elements in.
 
@@ -151,20 +151,20 @@ def verify(
         controlled: zero-based modes whose work is W_C.
         draws: how many rigs, where they are not drawn yet.
         seed: of the draws.
-        centre: the rig whose small-gain margin is stated; the first where rigs are given.
+        margin_rig: the rig whose small-gain margin is stated; the first where rigs are given.
 
     Raises:
         TypeError: no uncertain rig, no sampled controller or no test, or no number where one is asked for.
         ValueError: a controller or a test that does not fit the rig, draws that are no whole number above zero, or a
             controlled mode that the rigs do not have.
     """
-    _check_kinds(rig, controller, test, centre)
+    _check_kinds(rig, controller, test, margin_rig)
     draws, seed = whole(draws, WHAT_DRAWS, least=1), whole(seed, "seed")
     if isinstance(rig, UncertainRig):
         rigs: Sequence[Rig] = drawn_with_errors(rig, draws, seed)
-        centre = centre or rig.rig
+        margin_rig = margin_rig or rig.rig
     else:
-        rigs, centre = rig, centre or rig[0]
+        rigs, margin_rig = rig, margin_rig or rig[0]
     index = _indices(controlled)
     n_modes = min(rig.modes.n_modes for rig in rigs)
     strange = [r for r in index if not 0 <= r < n_modes]
@@ -188,7 +188,7 @@ def verify(
 
     found = _Draw(*(list(values) for values in zip(*of_loops(rigs, controller, test, drawn))))
     margin, frequency = small_gain_margin(
-        centre, controller, modes_in_motion(centre, run_loop(centre, controller, test))
+        margin_rig, controller, modes_in_motion(margin_rig, run_loop(margin_rig, controller, test))
     )
     dt = test.sample_time
     with np.errstate(over="ignore", invalid="ignore"):
@@ -216,7 +216,7 @@ def _indices(controlled: Sequence[int]) -> list[int]:
     return [whole(r, "each of controlled, a mode counted from zero,") for r in controlled]
 
 
-def _check_kinds(uncertain: object, controller: object, test: object, centre: object) -> None:
+def _check_kinds(uncertain: object, controller: object, test: object, margin_rig: object) -> None:
     """Refuse what no loop can be made of."""
     drawn = isinstance(uncertain, Sequence) and len(uncertain) > 0 and all(isinstance(rig, Rig) for rig in uncertain)
     if not (isinstance(uncertain, UncertainRig) or drawn):
@@ -225,8 +225,8 @@ def _check_kinds(uncertain: object, controller: object, test: object, centre: ob
             " UncertainRig.of(verdict) is what a diagnosis leaves"
         )
     check_loop_kinds(controller, test)
-    if not isinstance(centre, Rig | None):
-        raise TypeError(f"centre is the rig whose small-gain margin is stated; got {type(centre).__name__}")
+    if not isinstance(margin_rig, Rig | None):
+        raise TypeError(f"margin_rig is the rig whose small-gain margin is stated; got {type(margin_rig).__name__}")
 
 
 def check_loop_kinds(controller: object, test: object) -> None:

@@ -160,7 +160,7 @@ def test_a_sensor_that_lags_misleads_no_place(rig, measured):
 
 def test_one_sensor_tells_no_place(rig, measured):
     real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
-    records = [measured(real, str(seed), 0.3, seed).only(("d2",)) for seed in (2, 3)]
+    records = [measured(real, str(seed), 0.3, seed).select_outputs(("d2",)) for seed in (2, 3)]
     place = placed_by(replace(rig, sensors=rig.sensors[1:2]), records)
     assert place.is_single_force is None and place.at_std > 0.2 * rig.modes.length
 

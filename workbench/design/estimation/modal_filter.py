@@ -281,6 +281,6 @@ def _held(modes: Modes, domain: Rectangle, at: np.ndarray) -> Floats:
     x, y = (np.linspace(0.0, side, max(round(side / spacing), 4) + 1) for side in (a, b))
     along = [(each, edge) for edge in (0.0, b) for each in x] + [(edge, each) for edge in (0.0, a) for each in y[1:-1]]
     rim = np.array(along)
-    rim = rim[modes.are_still(rim)]
+    rim = rim[modes.are_held(rim)]
     distance = np.linalg.norm(rim[:, None] - at, axis=2).min(axis=1, initial=np.inf)
     return np.asarray(rim[distance > SAME * domain.size])

@@ -222,13 +222,13 @@ class Kind:
         numbers: effect, rig -> the numbers that a verdict states, by name; None for its values, a place left out.
         without_negligible: effect -> the same less parameters so near zero that records may not show them; itself where
             it has none.
-        second_channel, joined: of a kind that acts on two inputs or two outputs: what the verdict calls the other one,
+        second_channel, conjunction: of a kind that acts on two inputs or two outputs: what the verdict calls the other,
             and the word between the two in its sentence.
         remark: effect, rig -> what the sentence says in brackets; None for its numbers.
         fixed_place: effect, rig -> its place where no parameter holds it, and what the sentence calls it.
-        first: whether it changes the nominal model itself, before any other effect acts on it.
-        last: whether it acts on modes as all other effects have made them: where modes keep their damping ratios, a
-            damper there before a mass would be of another strength.
+        applied_first: whether it changes the nominal model itself, before any other effect acts on it.
+        applied_last: whether it acts on modes as all other effects have made them: where modes keep their damping
+            ratios, a damper there before a mass would be of another strength.
     """
 
     name: str
@@ -252,11 +252,12 @@ class Kind:
     remark: Callable[["Effect", Rig], str] | None = None
     fixed_place: Callable[["Effect", Rig], tuple[float, str]] | None = None
     second_channel: str = "with"
-    joined: str = " and "
-    first: bool = False
-    last: bool = False
+    conjunction: str = " and "
+    applied_first: bool = False
+    applied_last: bool = False
     wider, alone, remainder = Renamed("more_general"), Renamed("exclusive"), Renamed("unpredictable")
     settled, stands = Renamed("without_negligible"), Renamed("fixed_place")
+    first, last, joined = Renamed("applied_first"), Renamed("applied_last"), Renamed("conjunction")
     known: ClassVar[WeakValueDictionary[int, "Kind"]] = WeakValueDictionary()  # by identity: none is equal to another
 
     def __post_init__(self) -> None:
@@ -273,6 +274,9 @@ Kind.__init__ = former_arguments(  # type: ignore[method-assign]
     remainder="unpredictable",
     settled="without_negligible",
     stands="fixed_place",
+    first="applied_first",
+    last="applied_last",
+    joined="conjunction",
 )(Kind.__init__)
 
 
@@ -311,7 +315,7 @@ class Effect:
         """
         tested = [p for p in self.parameters(rig) if p.neutral is not None and self.deviations.get(p.name, 0.0) > 0]
         off = any(abs(self.values[p.name] - p.neutral) > self.deviations[p.name] for p in tested)
-        return off or not tested or self.kind.first
+        return off or not tested or self.kind.applied_first
 
     def stated(self, rig: Rig) -> dict[str, Any]:
         """The numbers that a verdict states, by name."""
@@ -361,7 +365,7 @@ def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
 
 def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
     """The rig with every effect in it, in order, errors of the nominal model before all others and dampers after."""
-    for effect in sorted(effects, key=lambda e: (e.kind.last, not e.kind.first)):
+    for effect in sorted(effects, key=lambda e: (e.kind.applied_last, not e.kind.applied_first)):
         rig = effect.apply(rig)
     return rig
 

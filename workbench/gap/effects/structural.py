@@ -70,7 +70,7 @@ def _modes_of_surface(surface: Plate | Membrane, n_modes: int, solved_for: int =
     if not isinstance(damping, ViscousDamping):
         bare = replace(bare, damping=damping.matrix(bare.omega))
     residual = _residual_flexibility(surface, float(bare.omega[-1]))
-    return attach(bare, _attachments(surface), kept=n_modes, residual=residual)
+    return attach(bare, _attachments(surface), n_modes=n_modes, residual_flexibility=residual)
 
 
 def _residual_flexibility(surface: Plate | Membrane, omega: float) -> float:
@@ -293,7 +293,7 @@ POINT_DAMPER = Kind(
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
     starts=_point_starts("coefficient", "velocity", _typical_damping),
     phrase="a viscous damper to ground",
-    last=True,
+    applied_last=True,
     force_laws={"velocity": lambda v, u: -v["coefficient"] * u},
 )
 

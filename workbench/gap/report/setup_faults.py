@@ -607,7 +607,7 @@ def _without_record(name: str, rig: Rig, records: Sequence[Record]) -> Corrected
 
 def _without_output(name: str, rig: Rig, records: Sequence[Record]) -> Corrected:
     sensors = tuple(sensor for sensor in rig.sensors if sensor.name != name)
-    return replace(rig, sensors=sensors), tuple(r.only([s.name for s in sensors]) for r in records)
+    return replace(rig, sensors=sensors), tuple(r.select_outputs([s.name for s in sensors]) for r in records)
 
 
 def _outputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Corrected:

@@ -185,7 +185,7 @@ class Verdict:
 
     def _share_of(self, effect: Effect) -> float:
         """Share of the gap that an effect causes; of all sensors together where it stands for all of them."""
-        shares, named = self.budget.effects, [e for e in self.effects if not e.kind.first]
+        shares, named = self.budget.effects, [e for e in self.effects if not e.kind.applied_first]
         labels = dict(zip(named, labels_of(named, self.nominal.modes.domain), strict=True))
         label = labels.get(effect, effect.label)
         if label in shares:
@@ -371,7 +371,7 @@ def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
     kind, text = effect.kind, effect.kind.words
     inside = kind.remark(effect, nominal) if kind.remark is not None else ", ".join(n.strip() for n in numbers)
     if kind.path in ("actuator", "sensor"):
-        target = effect.target if effect.target == ALL else kind.joined.join(names_in(effect.target))
+        target = effect.target if effect.target == ALL else kind.conjunction.join(names_in(effect.target))
         inside = f"{target}: {inside}" if inside else str(target)
     if inside:
         text += f" ({inside})"

@@ -222,7 +222,7 @@ def attribute(
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
     best = replace(best, effects=exchanged_last(best.effects))
-    beside = identified if random is None and not any(effect.kind.first for effect in best.effects) else None
+    beside = identified if random is None and not any(effect.kind.applied_first for effect in best.effects) else None
     if beside is not None:
         best = beside_identified(within, best, beside, seen)
     logged = within.logged
@@ -232,7 +232,7 @@ def attribute(
         best = _settled(search, best)
         if outcome == "explained":
             best = _as_it_stands(within, best, seen, logged)
-            named = [e for e in best.effects if not e.kind.first]
+            named = [e for e in best.effects if not e.kind.applied_first]
             # no number of it is known: something is there, and that is all
             vague = any(not e.stands_out(search.rig) for e in named if e not in seen)
             outcome = "none" if not named else "unknown" if vague else outcome

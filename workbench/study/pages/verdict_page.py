@@ -127,7 +127,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     tables = [
         ("Effects", ("effect", "parameter", "value", "standard error", f"x [{length}]", "input or output"), effects),
         ("Gap (rms error / rms signal)", ("record", "before", "after", "floor", "share closed"), gaps),
-        ("Other explanations", ("set of effects", "probability"), rivals),
+        ("Alternatives that the records do not exclude", ("set of effects", "probability"), rivals),
     ]
     return [table for table in tables if table[2]]
 
