@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.signal import butter, csd, sosfilt, welch
 
-from workbench.draw.gap import plot_rivals
+from workbench.draw.gap import plot_single_effects
 from workbench.draw.robust import plot_redesign
 from workbench.draw.style import COLOURS, new_figure
 from workbench.gap.diagnose import diagnose
@@ -144,7 +144,7 @@ def study(outcome, data: Path) -> None:
             more = left(fit.effects[0].apply(rig), after) ** 2 - best**2
             low, _ = resampled(more, lambda mean: mean)
             rivals[fit.labels[0]] = {"more_left": float(more.mean() / np.mean(best**2)), "excluded": bool(low > 0)}
-    outcome.table("rivals", rivals)
+    outcome.table("single_effects", rivals)
 
     # the mass with the rig's own figures free on both tests at once, so that their doubt is in its interval
     joint = identified((before, after), (*figures, 0.01), at=LENGTH)
@@ -186,11 +186,14 @@ def study(outcome, data: Path) -> None:
     control = redesign(verdict, law, placement=False)
     outcome.say(f"a controller designed on the first test: {control.sentence}")
     outcome.table("control", control.to_json())
-    stable = {"designed before": control.present_proof.share_stable, "redesigned": control.proof.share_stable}
+    stable = {
+        "designed before": control.present_verification.share_stable,
+        "redesigned": control.verification.share_stable,
+    }
     for name, share in stable.items():
         outcome.check(f"controller {name}: share of possible arms on which it is stable", share, 1.0, at_least=True)
     outcome.figure("response", _plot_responses(before, after, rig, verdict.corrected), "Hub angle over drive.")
-    outcome.figure("rivals", plot_rivals(verdict), "Each linear effect alone on the second test.")
+    outcome.figure("single_effects", plot_single_effects(verdict), "Each linear effect alone on the second test.")
     shares = [1.0 + excess.mean() / np.mean(joint.fun**2) for excess in more]
     outcome.figure("place", _plot_place(places, shares, lowest), "Where on the link the mass may stand.")
     outcome.figure(

@@ -32,7 +32,7 @@ def study(outcome, data: Path | None = None) -> None:
         if result.error is not None:
             outcome.say(f"{where}: {result.error}")
         elif not result["score"]["kinds"]:
-            outcome.say(f"{where}: true {result['score']['hidden']}, diagnosed {result['score']['told']}")
+            outcome.say(f"{where}: true {result['score']['hidden']}, diagnosed {result['score']['diagnosed']}")
     outcome.table("scores", {f"{r['structure']} {r['seed']}": r["score"] for r in held})
     for structure in ("plates", "frames"):
         outcome.table(f"shares on {structure}", tally(r["score"] for r in held if r["structure"] == structure).shares)

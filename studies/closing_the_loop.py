@@ -30,7 +30,7 @@ KINDS = (
     "modulus_error", "sensor_lag", "point_mass", "ground_spring", "cubic_spring", "coulomb_friction", "modal_damping",
     "actuator_misplacement", "sensor_bias",
 )  # fmt: skip
-DIRT = ("clean", "noise", "late", "clean", "offset")
+IMPERFECTIONS = ("clean", "noise", "late", "clean", "offset")
 LAWS = ("imsc", "coupled")
 CONTROLLED, DAMPING, DRAWS, PREDICTED = 2, 0.35, 40, 80
 OFF = (1.2, 1.02)  # factors by which the fit starts beside the truth; the better of both is kept
@@ -47,7 +47,9 @@ def plant(index, seed, searched=False):
     if index % 3 == 2:
         other = str(rng.choice([k for k in KINDS if k.split("_")[0] != kinds[0].split("_")[0]]))
         kinds.append(other)
-    case, label, real = find_trial_with_plant(rng, kinds=kinds, dirt=DIRT[index % len(DIRT)], size=0.5)
+    case, label, real = find_trial_with_plant(
+        rng, kinds=kinds, imperfections=IMPERFECTIONS[index % len(IMPERFECTIONS)], size=0.5
+    )
     true = tuple(_effect(told) for told in label["effects"])
     rig = case.rig
     level = np.max([np.abs(r.outputs).max(axis=1) for r in case.fit], axis=0)
@@ -62,10 +64,10 @@ def plant(index, seed, searched=False):
     )
     if searched:
         verdict = diagnose_case(case, workers=1)
-        possible, noise = UncertainRig.of(verdict), verdict.budget.noise_found
+        uncertain, noise = UncertainRig.of(verdict), verdict.budget.noise_found
     else:
-        possible, noise = _fitted(case, true)
-    found = redesign(possible, law, test=test, draws=DRAWS, seed=index, placement=False)
+        uncertain, noise = _fitted(case, true)
+    found = redesign(uncertain, law, test=test, draws=DRAWS, seed=index, placement=False)
     sure = UncertainRig(rig, true, np.zeros((_size(rig, true),) * 2))
     best = redesign(sure, law, test=test, draws=1, seed=index, placement=False)
     weight = force_weight(best.after, best.controlled)
@@ -94,13 +96,13 @@ def plant(index, seed, searched=False):
             "peak force": run.peak_force,
             "settling": run.settling(),
         }
-    told["inside the bands"] = _inside(possible, noise, found.controller, test, runs[found.controller])
+    told["inside the bands"] = _inside(uncertain, noise, found.controller, test, runs[found.controller])
     return {
         "kinds": [e.kind.name for e in true],
-        "dirt": label["class"],
-        "found": [e.kind.name for e in possible.effects],
-        "unexplained": possible.unexplained,
-        "stable draws": found.proof.share_stable,
+        "imperfections": label["class"],
+        "found": [e.kind.name for e in uncertain.effects],
+        "unexplained": uncertain.unexplained,
+        "stable draws": found.verification.share_stable,
         "safe": found.safe,
         "pays": found.improves,
         "pays, no more work": bounded.improves,
@@ -110,11 +112,11 @@ def plant(index, seed, searched=False):
     }
 
 
-def _inside(possible, noise, controller, test, run):
+def _inside(uncertain, noise, controller, test, run):
     """Share of the readings of the hidden plant inside the bands that were predicted for them."""
     if not run.stable:
         return None
-    told = predict_loop(possible, controller, test, noise_std=noise, draws=PREDICTED, seed=1)
+    told = predict_loop(uncertain, controller, test, noise_std=noise, draws=PREDICTED, seed=1)
     return float(told.coverage(run.outputs)[:, 0].mean())
 
 

@@ -20,13 +20,13 @@ from workbench.gap.effects.effect import Effect
 from workbench.robust.on_rig import impulse_test
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import SETTLED
 from workbench.robust.redesign import redesign
+from workbench.robust.verification import SETTLED
 from workbench.trials.controlled import control_plant
 from workbench.trials.make import find_trial_with_plant
 
 PLANTS, SEED = 30, 20305
-DIRT = ("clean", "offset")
+IMPERFECTIONS = ("clean", "offset")
 LAWS = ("imsc", "coupled")
 CONTROLLED, DAMPING = 2, 0.35
 LATE, STICKS, LIMIT = 1.5, 0.3, 0.5  # samples; of the rms of the low level; of the peak force without a limit
@@ -43,7 +43,9 @@ NEARLY_ALL = 0.9  # of the plants
 def plant(index, seed):
     """One hidden plant without any effect, and with each in turn under the present and the redesigned controller."""
     rng = np.random.default_rng([seed, index])
-    case, _, real = find_trial_with_plant(rng, dirt=DIRT[index // len(LAWS) % len(DIRT)], size=0.5)
+    case, _, real = find_trial_with_plant(
+        rng, imperfections=IMPERFECTIONS[index // len(LAWS) % len(IMPERFECTIONS)], size=0.5
+    )
     rig = case.rig
     level = np.max([np.abs(r.outputs).max(axis=1) for r in case.fit], axis=0)
     test = impulse_test(rig, range(CONTROLLED), case.fit[0].sample_time, level=level, seed=index)
@@ -57,8 +59,8 @@ def plant(index, seed):
         return control_plant(hidden, controller, **given, rng=noise)
 
     def designed(*effects):
-        possible = UncertainRig(rig, effects, np.zeros((len(effects),) * 2))
-        return redesign(possible, law, test=test, draws=1, placement=False, more_cost=np.inf)
+        uncertain = UncertainRig(rig, effects, np.zeros((len(effects),) * 2))
+        return redesign(uncertain, law, test=test, draws=1, placement=False, more_cost=np.inf)
 
     nominal = designed()
     free = controlled(real, nominal.present)

@@ -97,7 +97,7 @@ def study(outcome, data: Path) -> None:
             record_of(force, velocity if quantity == "velocity" else position - position[0], quantity, name)
             for name, (force, position, velocity) in signals.items()
         )
-        verdict = diagnose(nominal(quantity), (fitted,), validation=(held_out,), name="emps", free_nominal=True)
+        verdict = diagnose(nominal(quantity), (fitted,), validation=(held_out,), name="emps", uncertain_nominal=True)
         verdicts[quantity], records[quantity] = verdict, (fitted, held_out)
         outcome.say(f"{quantity} measured: {verdict.sentence}")
         outcome.table(f"verdict_{quantity}", verdict.to_json())

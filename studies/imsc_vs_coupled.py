@@ -44,7 +44,7 @@ ERRORS, DRAWS = 0.05, 60
 FIGURES = {
     "cost": "cost J",
     "effort": "effort [N² s]",
-    "spilled": "spillover W_R [J]",
+    "spillover": "spillover W_R [J]",
     "stable_share": f"share of models stable,\nperturbed by {ERRORS:.0%}",
     "design_time": "time to design\n/ that of the first",
 }

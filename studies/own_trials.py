@@ -19,8 +19,8 @@ def study(outcome, data: Path | None = None) -> None:
         if result.error is not None:
             outcome.say(f"seed {result['seed']}: {result.error}")
         elif not result["score"]["kinds"]:
-            told, hid = result["score"]["told"], result["score"]["hidden"]
-            outcome.say(f"seed {result['seed']}: true {hid}, diagnosed {told}")
+            score = result["score"]
+            outcome.say(f"seed {result['seed']}: true {score['hidden']}, diagnosed {score['diagnosed']}")
     outcome.table("scores", {result["seed"]: result["score"] for result in found if result.error is None})
     outcome.table("shares", held.shares)
     for family in held.shares:

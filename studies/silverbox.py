@@ -86,7 +86,7 @@ def study(outcome, data: Path) -> None:
         validation=(held_out,),
         name="silverbox",
         settle=SETTLE,
-        free_nominal=True,
+        uncertain_nominal=True,
         units=Units(length="V", mass="s^2", time="s", force="V"),  # of a circuit
     )
     errors = {

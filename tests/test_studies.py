@@ -17,7 +17,15 @@ DATA["identification_peers"] = DATA["ruler"]
 DATA["silverbox"] = SHARED / "measured/silverbox/SNLS80mV.mat"
 DATA["emps"] = SHARED / "measured/emps"
 DATA["f16"] = SHARED / "measured/f16"
-LONG = {"blind_trials", "dirty_trials", "own_trials", "false_alarms", "many_cases", "design_scaling", "placement_front"}
+LONG = {
+    "blind_trials",
+    "imperfect_trials",
+    "own_trials",
+    "false_alarms",
+    "many_cases",
+    "design_scaling",
+    "placement_front",
+}
 LONG |= {"local_loss", "identification_order", "identification_peers", "identification_coverage", "identification_size"}
 LONG |= {"identification_records", "diagnosis_speed", "silverbox", "patch_pairs", "emps", "f16", "frame_gap"}
 LONG |= {"placement", "ruler", "robustness_to_identification", "arm_change", "identification_ambient_peers"}

@@ -56,8 +56,8 @@ from .rig.simulate import simulate as simulate
 from .rig.statespace import state_space as state_space
 from .robust.posterior import UncertainRig as UncertainRig
 from .robust.prediction import predict as predict
-from .robust.proof import verify as verify
 from .robust.redesign import redesign as redesign
+from .robust.verification import verify as verify
 from .structure.damping import ModalDamping as ModalDamping
 from .structure.damping import ProportionalDamping as ProportionalDamping
 from .structure.damping import ViscousDamping as ViscousDamping

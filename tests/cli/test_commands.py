@@ -201,7 +201,7 @@ def test_place_does_better_than_even_places(rig, tmp_path):
 @pytest.mark.slow
 def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
     found = tmp_path / "places.json"
-    limits = ("--peak-force", 0.5, "--condition", 3, "--forbid", "4.9:5.6", "--proof", 0.05)
+    limits = ("--peak-force", 0.5, "--condition", 3, "--forbid", "4.9:5.6", "--certify", 0.05)
     result = run("place", rig, "--control", 2, "--weight", 20, *limits, "--json", found)
     assert result.exit_code == 0, result.output
     assert "no placement under the limits has less than 95.0%" in result.output
@@ -213,7 +213,7 @@ def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
 
 def test_places_are_chosen_from_those_there_are(rig, tmp_path):
     found = tmp_path / "places.json"
-    given = ("--at", "1.5,3,4.5,6.5,7,8.5", "--effort", 3, "--proof", 0.05)
+    given = ("--at", "1.5,3,4.5,6.5,7,8.5", "--effort", 3, "--certify", 0.05)
     result = run("place", rig, "--control", 3, "--weight", 20, *given, "--json", found)
     assert result.exit_code == 0, result.output
     assert "no placement under the limits has less than 100.0%" in result.output
@@ -293,7 +293,7 @@ def test_a_plate_is_placed_outside_a_zone_and_drawn(plate, tmp_path):
 
 def test_candidates_of_a_plate_are_proven(plate, tmp_path):
     found = tmp_path / "places.json"
-    given = ("--at", "0.3,0.24; 0.4,0.4; 0.8,0.4; 0.84,0.52; 1.0,0.4", "--effort", 3, "--proof", 0.05)
+    given = ("--at", "0.3,0.24; 0.4,0.4; 0.8,0.4; 0.84,0.52; 1.0,0.4", "--effort", 3, "--certify", 0.05)
     result = run("place", plate, "--control", 2, "--weight", 0.01, *given, "--json", found)
     assert result.exit_code == 0, result.output
     # modes (1, 1) and (2, 1) from a third and two thirds of the length on the midline: nothing reaches (1, 2) or (3, 1)
@@ -303,7 +303,7 @@ def test_candidates_of_a_plate_are_proven(plate, tmp_path):
 def test_a_grid_over_a_plate_is_proven(plate, tmp_path):
     """Nodes of a grid that keep out of the zone; its best choice is within the proof of all of them."""
     found = tmp_path / "places.json"
-    given = ("--control", 2, "--weight", 0.01, "--forbid", "0.3,0.2:0.6,0.5", "--effort", 3, "--proof", 0.05)
+    given = ("--control", 2, "--weight", 0.01, "--forbid", "0.3,0.2:0.6,0.5", "--effort", 3, "--certify", 0.05)
     result = run("place", plate, *given, "--grid", 0.1, "--json", found)
     assert result.exit_code == 0, result.output
     best, written = json.loads(found.read_text())["placements"][0], json.loads(found.read_text())
@@ -314,7 +314,7 @@ def test_a_grid_over_a_plate_is_proven(plate, tmp_path):
     for more, words in (
         (("--grid", 0.9), "--grid lies between 0 and half the shorter side, 0.4 m; got 0.9"),
         (("--grid", 0.1, "--at", "0.3,0.2"), "--grid is for a plate, in place of --at; leave one of them out"),
-        ((), "--proof on a plate is among candidate places; give --grid M, so far apart, or --at PLACES"),
+        ((), "--certify on a plate is among candidate places; give --grid M, so far apart, or --at PLACES"),
     ):
         refused = run("place", plate, *given, *more)
         assert refused.exit_code == 2 and words in refused.output

@@ -1,4 +1,4 @@
-"""`workbench diagnose`: faults of wiring are said before any search, and mended where that is asked for."""
+"""`workbench diagnose`: faults of wiring are said before any search, and corrected where that is asked for."""
 
 import json
 from dataclasses import replace
@@ -35,11 +35,11 @@ def write_exchanged(case, folder):
 
 
 @pytest.mark.slow
-def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_path, monkeypatch, nothing_hidden):
+def test_exchanged_inputs_stop_a_diagnosis_and_are_corrected_on_request(run, tmp_path, monkeypatch, nothing_hidden):
     write_exchanged(nothing_hidden, tmp_path / "crossed")
     stopped = run("diagnose", tmp_path / "crossed", "--page", tmp_path / "p.html")
     assert stopped.exit_code == 2 and "The inputs F1 and F2 are exchanged: swap them." in stopped.output
-    assert "--mend" in stopped.output and not (tmp_path / "p.html").exists()
+    assert "--correct" in stopped.output and not (tmp_path / "p.html").exists()
     seen, real = [], nothing_hidden
 
     def search(rig, records, *, validation, **options):
@@ -47,15 +47,19 @@ def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_pa
         raise ValueError("the search has begun")
 
     monkeypatch.setattr("workbench.gap.diagnose.diagnose", search)
-    for option, order in (("--mend", [0, 1]), ("--as-wired", [1, 0])):
+    for option, order in (("--correct", [0, 1]), ("--uncorrected", [1, 0])):
         seen.clear()
         assert "the search has begun" in run("diagnose", tmp_path / "crossed", option).output
         for record, exact in zip(seen, (*real.fit[:2], *real.validation[:1]), strict=True):
             np.testing.assert_array_equal(record.inputs[:2], exact.inputs[order])
 
 
-def test_what_was_mended_is_told_in_the_verdict_and_on_the_page(run, tmp_path):
-    """Two outputs of records that begin in motion are exchanged; with --settle that is seen and mended too."""
+def test_a_former_name_of_an_option_is_taken_for_the_new_one(run):
+    assert "--mend is now --correct" in run("diagnose", "no-case", "--mend").output
+
+
+def test_what_was_corrected_is_stated_in_the_verdict_and_on_the_page(run, tmp_path):
+    """Two outputs of records that begin in motion are exchanged; with --settle that is seen and corrected too."""
     beam = Beam(
         length=2.0, mass_per_length=1.0, bending_stiffness=20.0, left="hinged", right="hinged",
         damping=ModalDamping(0.3),
@@ -72,7 +76,7 @@ def test_what_was_mended_is_told_in_the_verdict_and_on_the_page(run, tmp_path):
     options = ("--settle", "6", "--workers", "1", "--json", verdict, "--page", page)
     assert "The outputs y1 and y2 are exchanged" in run("diagnose", tmp_path / "crossed", *options).output
     assert not page.exists()
-    told = run("diagnose", tmp_path / "crossed", *options, "--mend")
+    told = run("diagnose", tmp_path / "crossed", *options, "--correct")
     note = "Corrected before the diagnosis: The outputs y1 and y2 are exchanged: swap them."
     assert told.exit_code == 0 and note in json.loads(verdict.read_text())["notes"]
     assert note in page.read_text()
@@ -122,7 +126,7 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
         file.parent.mkdir()
         copy(tmp_path / "high.csv", file)
     seen.clear()
-    options = ("--nominal", tmp_path / "low.csv", "--inputs", "F1", "--quantity", "displacement", "--as-wired")
+    options = ("--nominal", tmp_path / "low.csv", "--inputs", "F1", "--quantity", "displacement", "--uncorrected")
     run("diagnose", *options, *(part for file in days for part in ("--records", file)))
     assert [record.name for record in seen[1:]] == ["monday/sweep", "tuesday/sweep"]
     assert "give it once" in run("diagnose", *options, "--records", days[0], "--records", days[0]).output

@@ -10,7 +10,7 @@ from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, Kind, Parameter, place_parameters
 from workbench.gap.effects.nonlinear import with_element
 from workbench.gap.prediction.residuals import FitData
-from workbench.gap.report.readiness import RecordsError
+from workbench.gap.report.record_checks import RecordsError
 from workbench.gap.search.fit import fit
 from workbench.rig.elements import OneSidedStop, UserLaw
 from workbench.rig.rig import Rig
@@ -43,9 +43,9 @@ def test_a_hidden_contact_is_named_placed_and_closed():
     assert verdict.shrinkage.overall > 0.95 and shown["where"]["path"] == "structure"
     assert verdict.shrinkage.ci95[0] <= verdict.shrinkage.overall <= verdict.shrinkage.ci95[1]
     assert shown["where"]["amplitude_dependent"]
-    for shift, stands in ((0.0, True), (0.1, False)):
+    for shift, located in ((0.0, True), (0.1, False)):
         place = replace(verdict.where.place, at=told["at"] - shift * case.rig.modes.length)
-        assert replace(verdict, where=replace(verdict.where, place=place)).place_stands == stands
+        assert replace(verdict, where=replace(verdict.where, place=place)).is_located == located
 
 
 @pytest.mark.slow
@@ -124,7 +124,7 @@ def test_a_rival_of_the_users_own_is_told_by_its_phrase(quiet_verdict):
         verdict,
         outcome="explained",
         alternatives=(("own_law", 0.2),),
-        attribution=replace(verdict.attribution, rivals=rivals),
+        attribution=replace(verdict.attribution, alternatives=rivals),
     )
     assert "a quadratic spring cannot be excluded" in told.sentence
     (shown,) = told.to_json()["alternatives"]
@@ -200,7 +200,7 @@ def test_a_clean_pair_is_found_before_errors_of_the_model_are_asked_for(hinged_r
     fitted, kept = pair_on(rig, record_of)
     catalogue = tuple(kind_named(n) for n in ("actuator_delay", "cubic_spring", "modal_damping", "point_mass"))
     report = lambda text, share: told.append(text)  # noqa: E731
-    verdict = diagnose(rig, [fitted], validation=[kept], catalogue=catalogue, report=report, workers=1)
+    verdict = diagnose(rig, [fitted], validation=[kept], catalogue=catalogue, progress=report, workers=1)
     assert verdict.outcome == "explained"
     assert {effect.kind.name for effect in verdict.effects} == {"actuator_delay", "cubic_spring"}
     assert "all pairs at once" in told and not any("small errors" in text for text in told)

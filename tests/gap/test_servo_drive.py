@@ -53,9 +53,9 @@ def test_dry_friction_and_a_constant_force_are_named_in_one_form_and_the_other_n
     """Friction that differs between the directions is friction and a constant force, number for number."""
     rng = np.random.default_rng(1)
     fitted, held_out = (stroke(quantity, size, f"{size:g} N", rng) for size in (60.0, 75.0))
-    verdict = diagnose(nominal(quantity), (fitted,), validation=(held_out,), free_nominal=True)
+    verdict = diagnose(nominal(quantity), (fitted,), validation=(held_out,), uncertain_nominal=True)
     assert verdict.outcome == "explained"
-    told = {effect.kind.name: effect.values for effect in verdict.effects if not effect.kind.first}
+    told = {effect.kind.name: effect.values for effect in verdict.effects if not effect.kind.applied_first}
     assert set(told) in ({"coulomb_friction", "actuator_bias"}, {"two_way_friction"})
     if "two_way_friction" in told:
         one, other = (told["two_way_friction"][f"force_{way}"] for way in ("forward", "backward"))

@@ -51,7 +51,7 @@ def test_correlations_are_those_of_the_closed_form():
     """R(τ) = C e^{A^T τ} with A C + C A^T + B B^T = 0; white noise of the sensors is in lag 0 alone."""
     covariance = solve_continuous_lyapunov(A, -np.diag(np.r_[np.zeros(N), np.ones(N)]))
     record = driven(1, n_samples=60_000, noise=0.3)
-    [decay] = correlation_functions(record, longest=4.0, references=["y2"])
+    [decay] = correlation_functions(record, max_lag=4.0, references=["y2"])
     exact = np.array([(expm(A * tau) @ covariance)[N:, N + 1] for tau in decay.time]).T / record.outputs[1].std()
     assert decay.time[0] == record.sample_time
     assert np.abs(decay.outputs - exact).max() < 0.08 * np.abs(exact).max()
@@ -110,7 +110,7 @@ def test_noise_alone_holds_no_mode():
 
 def test_too_short_a_record_is_refused():
     with pytest.raises(ValueError, match="measure longer"):
-        correlation_functions(driven(2, n_samples=1000), longest=5.0)
+        correlation_functions(driven(2, n_samples=1000), max_lag=5.0)
     with pytest.raises(ValueError, match="no output 'y9'"):
         correlation_functions(driven(2, n_samples=4000), references=["y9"])
 

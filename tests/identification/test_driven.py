@@ -515,7 +515,7 @@ def is_seen_to_stiffen(found):
 @pytest.mark.parametrize("n_outputs", [1, 2])
 def test_a_mode_that_changes_with_amplitude_is_one_mode_with_a_remark(n_outputs):
     record = stiffening(0, n=1200)
-    assert is_seen_to_stiffen(identify_driven(record.only(record.output_names[:n_outputs])))
+    assert is_seen_to_stiffen(identify_driven(record.select_outputs(record.output_names[:n_outputs])))
 
 
 @pytest.mark.slow

@@ -137,7 +137,7 @@ def test_what_was_changed_is_remarked(tmp_path):
     assert record.remarks[0] == "a: g taken as 9.80665 m/s^2"
     assert record.remarks[1].startswith("c: in counts") and len(record.remarks) == 2
     assert record.output_names == ("a", "b", "c", "d (left)")
-    assert record.only(["a"]).remarks == record.remarks
+    assert record.select_outputs(["a"]).remarks == record.remarks
 
 
 def test_an_input_is_named_with_its_unit_or_without(tmp_path):
@@ -270,7 +270,7 @@ def test_units_of_universal_transfer_functions(tmp_path, labels):
     np.testing.assert_allclose(found.values[0, 0], G / 1e3 * spectrum)
     np.testing.assert_allclose(found.frequencies_hz, 500.0 * np.arange(4))
     said = "node 1 direction 3: g taken as 9.80665 m/s^2", "node 2 direction 3: kN taken as 1000 N"
-    assert found.remarks == found.only(("node 1 direction 3",)).remarks == said
+    assert found.remarks == found.select_outputs(("node 1 direction 3",)).remarks == said
 
 
 @pytest.mark.parametrize(

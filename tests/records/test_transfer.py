@@ -86,7 +86,7 @@ def test_arrays_of_transfer_functions_are_read_whichever_way_they_lie(tmp_path, 
     np.testing.assert_allclose(found.values, values, rtol=1e-15)
     np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-14)
     assert found.output_names == names
-    np.testing.assert_array_equal(found.only(names[1:2]).values, found.values[1:2])
+    np.testing.assert_array_equal(found.select_outputs(names[1:2]).values, found.values[1:2])
 
 
 def test_lines_up_to_half_the_sample_rate(tmp_path):

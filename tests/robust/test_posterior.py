@@ -63,8 +63,8 @@ def test_draws_keep_what_the_records_tell_of_the_product_of_two_numbers(told):
 def test_rivals_are_drawn_in_proportion_to_their_probability(told):
     rig, _, _, found = told
     rival = UncertainRig(rig, (Effect(kind_named("modal_damping"), None, {"factor": 2.0}),), np.zeros((1, 1)))
-    possible = UncertainRig(rig, found.effects, found.covariance, rivals=((rival, 0.25),))
-    damped = [r.modes.zeta[0] > 1.5 * rig.modes.zeta[0] for r in possible.draws(2000, seed=2)]
+    uncertain = UncertainRig(rig, found.effects, found.covariance, alternatives=((rival, 0.25),))
+    damped = [r.modes.zeta[0] > 1.5 * rig.modes.zeta[0] for r in uncertain.draws(2000, seed=2)]
     assert np.mean(damped) == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / 2000))
 
 
@@ -81,10 +81,10 @@ def test_errors_of_the_nominal_model_and_places_go_through_json(told):
     errors = nominal_errors(rig, NominalPrior(frequency=0.01, damping=0.1), {"frequency_2": 0.5})
     spring = Effect(kind_named("ground_spring"), None, {"at": 0.6, "stiffness": 3.0}, {"at": 0.01, "stiffness": 0.1})
     n = len(errors.values) + 2
-    possible = UncertainRig(rig, (errors, spring), 1e-4 * np.eye(n), 0.02, "explained")
-    again = UncertainRig.from_json(rig, json.loads(json.dumps(possible.to_json())))
+    uncertain = UncertainRig(rig, (errors, spring), 1e-4 * np.eye(n), 0.02, "explained")
+    again = UncertainRig.from_json(rig, json.loads(json.dumps(uncertain.to_json())))
     assert again.unexplained == 0.02 and again.outcome == "explained"
-    for one, other in zip(possible.draws(3, seed=5), again.draws(3, seed=5), strict=True):
+    for one, other in zip(uncertain.draws(3, seed=5), again.draws(3, seed=5), strict=True):
         assert np.array_equal(one.modes.omega, other.modes.omega)
     assert np.ptp([r.modes.omega[0] for r in again.draws(20)]) > 0
 
@@ -128,14 +128,14 @@ def test_errors_of_an_identified_rig_go_through_json():
     errors = nominal_errors(rig, IdentifiedPrior.of_modes(rig), {"identified_1": 0.5, "identified_3": -1.0})
     spring = Effect(kind_named("cubic_spring"), None, {"at": "F", "stiffness": 3.0})
     n = len(errors.values) + 1
-    possible = UncertainRig(rig, (spring, errors), 1e-2 * np.eye(n))
-    again = UncertainRig.from_json(rig, json.loads(json.dumps(possible.to_json())))
-    for one, other in zip(possible.draws(3, seed=5), again.draws(3, seed=5), strict=True):
+    uncertain = UncertainRig(rig, (spring, errors), 1e-2 * np.eye(n))
+    again = UncertainRig.from_json(rig, json.loads(json.dumps(uncertain.to_json())))
+    for one, other in zip(uncertain.draws(3, seed=5), again.draws(3, seed=5), strict=True):
         assert np.array_equal(one.modes.omega, other.modes.omega)
         assert np.array_equal(one.modes.phi("y"), other.modes.phi("y"))
     assert np.ptp([r.modes.omega[0] for r in again.draws(20)]) > 0
     with pytest.raises(ValueError, match="modes know their covariance"):
-        UncertainRig.from_json(identified_rig(), possible.to_json())
+        UncertainRig.from_json(identified_rig(), uncertain.to_json())
 
 
 def test_what_cannot_be_is_named(told):
@@ -143,7 +143,7 @@ def test_what_cannot_be_is_named(told):
     with pytest.raises(ValueError, match=r"one row a parameter of the effects, shape \(2, 2\)"):
         UncertainRig(rig, GAINS, np.eye(3))
     with pytest.raises(ValueError, match="no effect is called 'gremlin'"):
-        UncertainRig.from_json(rig, {"effects": [{"kind": "gremlin"}], "covariance": [], "rivals": []})
+        UncertainRig.from_json(rig, {"effects": [{"kind": "gremlin"}], "covariance": [], "alternatives": []})
     buckled = Effect(kind_named("axial_load"), None, {"tension": -1e6})
     with pytest.raises(ValueError, match="measure more of them"):
         UncertainRig(rig, (buckled,), np.array([[1e-6]])).draws(1)

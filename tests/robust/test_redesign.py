@@ -20,8 +20,8 @@ from workbench.rig.sensors import Sensor
 from workbench.robust.on_rig import fitted, impulse_test, tuned
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import Verification, verify
 from workbench.robust.redesign import redesign
+from workbench.robust.verification import Verification, verify
 from workbench.structure.domain import Patch
 from workbench.trials.controlled import control_plant
 from workbench.trials.make import find_trial_with_plant
@@ -30,7 +30,7 @@ from workbench.trials.plant import Plant
 DT = 0.01
 
 
-def possible(rig, *effects: Effect, spread: float = 1e-2, **more) -> UncertainRig:
+def uncertain(rig, *effects: Effect, spread: float = 1e-2, **more) -> UncertainRig:
     n = sum(len(e.parameters(rig)) for e in effects)
     return UncertainRig(rig, effects, spread**2 * np.eye(n), **more)
 
@@ -57,7 +57,9 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_at_least_half_of_what_a_fault_costs_is_won_back(rig, controller, fault):
-    found = redesign(possible(rig, FAULTS[fault]), controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False)
+    found = redesign(
+        uncertain(rig, FAULTS[fault]), controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False
+    )
     kept = [step for step in found.steps if step.kept]
     assert found.steps[0].loss > 0.03
     assert kept[-1].loss < 0.5 * found.steps[0].loss
@@ -69,8 +71,8 @@ def test_a_dead_zone_is_made_up_for_though_it_spills_less(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
     spilling = kalman(rig.modes, law, rig.sensors[:2], disturbance=1.0, noise=1e-5)
     told = {"sample_time": DT, "impulse_at": 0.8, "draws": 1, "placement": False}
-    free = redesign(possible(rig), spilling, **told).after.response.energy
-    found = redesign(possible(rig, FAULTS["dead zone"]), spilling, **told)
+    free = redesign(uncertain(rig), spilling, **told).after.response.energy
+    found = redesign(uncertain(rig, FAULTS["dead zone"]), spilling, **told)
     before, after = (run.response.energy for run in (found.before, found.after))
     assert before.sum() < 0.97 * free.sum() and before[:2].sum() > 1.2 * free[:2].sum()
     assert [s.name for s in found.steps if s.kept][2:] == ["dead zone"]
@@ -78,27 +80,33 @@ def test_a_dead_zone_is_made_up_for_though_it_spills_less(rig):
 
 
 def test_a_residual_mode_that_control_leaves_undamped_is_named(rig, controller):
-    found = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    found = redesign(uncertain(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
     own = found.loop.modes.zeta
-    damping = np.maximum(found.proof.damping, own)
+    damping = np.maximum(found.verification.damping, own)
     damping[:, 3] = 0.2 * own[3]
     alike = {
-        name: replace(proof, damping=damping)
-        for name, proof in (("proof", found.proof), ("present_proof", found.present_proof))
+        name: replace(verification, damping=damping)
+        for name, verification in (
+            ("verification", found.verification),
+            ("present_verification", found.present_verification),
+        )
     }
     assert "Mode 4, which is not controlled, keeps" in replace(found, **alike).sentence
     damping[:, 3] = 0.6 * own[3]
     alike = {
-        name: replace(proof, damping=damping)
-        for name, proof in (("proof", found.proof), ("present_proof", found.present_proof))
+        name: replace(verification, damping=damping)
+        for name, verification in (
+            ("verification", found.verification),
+            ("present_verification", found.present_verification),
+        )
     }
     assert not replace(found, **alike).left_undamped
 
 
 def test_a_loop_that_a_long_delay_destabilises_is_made_stable(rig, controller):
-    late = possible(rig, effect("actuator_delay", "all", delay=6.0 * DT))
+    late = uncertain(rig, effect("actuator_delay", "all", delay=6.0 * DT))
     found = redesign(late, controller, sample_time=DT, impulse_at=0.8, draws=8, placement=False)
-    assert found.present_proof.share_stable == 0.0 and found.proof.share_stable == 1.0
+    assert found.present_verification.share_stable == 0.0 and found.verification.share_stable == 1.0
     assert "the present controller is unstable on 8 of 8 samples" in found.sentence
 
 
@@ -109,7 +117,7 @@ def test_a_filter_through_which_residual_modes_diverge_is_made_slower(rig):
     plant = Plant(rig, rig.actuators, rig.sensors, rig.modes.n_modes).solved()
     for noise in (1e-7, 1e-9):
         fast = kalman(rig.modes, law, rig.sensors[:2], disturbance=1.0, noise=noise)
-        found = redesign(possible(rig), fast, sample_time=DT, impulse_at=0.8, draws=2, placement=False)
+        found = redesign(uncertain(rig), fast, sample_time=DT, impulse_at=0.8, draws=2, placement=False)
         assert found.improves and found.safe and "the present one on 0" in found.advice
         assert "otherwise unstable" in found.steps[1].what and found.steps[0].lost == "diverges"
         assert not control_plant(plant, found.present, n_samples=1500, impulse_input="F1").stable
@@ -119,16 +127,16 @@ def test_a_filter_through_which_residual_modes_diverge_is_made_slower(rig):
 
 
 def test_where_neither_controller_is_stable_neither_is_advised(rig, controller):
-    sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    sure = redesign(uncertain(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
     lost, some = (told([False, False, one], np.ones(3), -np.ones(3)) for one in (False, True))
-    for present, proof in ((lost, lost), (lost, some), (some, lost)):
-        found = replace(sure, present_proof=present, proof=proof)
+    for present, verification in ((lost, lost), (lost, some), (some, lost)):
+        found = replace(sure, present_verification=present, verification=verification)
         assert found.advice.startswith("Use neither controller: the present one is stable on") and not found.safe
         assert "Use neither controller" in found.sentence and "Keep" not in found.sentence
 
 
 def told(stable, vibration, work, **figures):
-    """A proof with these figures of each draw, and nothing else of interest."""
+    """A verification with these figures of each draw, and nothing else of interest."""
     n = len(stable)
     others = ("peak_force", "stroke", "settling", "controlled_settling", "effort")
     none = {name: np.ones(n) for name in others} | figures
@@ -152,9 +160,11 @@ def told(stable, vibration, work, **figures):
 def test_the_present_controller_is_kept_where_the_redesigned_does_no_better(
     rig, controller, stable, vibration, work, pays
 ):
-    sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    sure = redesign(uncertain(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
     present = told([True, True], [1.0, 1.0], [-1.0, -1.0])  # damping takes energy out
-    found = replace(sure, present_proof=present, proof=told(stable, vibration, np.negative(work)), weight=0.5)
+    found = replace(
+        sure, present_verification=present, verification=told(stable, vibration, np.negative(work)), weight=0.5
+    )
     assert replace(found, more_work=np.inf).improves or max(vibration) > 0.99
     found = replace(found, more_work=0.05)
     assert found.improves is pays
@@ -164,22 +174,22 @@ def test_the_present_controller_is_kept_where_the_redesigned_does_no_better(
     if max(vibration) < 1.0 and not pays:  # it is better, for more work: the sentence says how much to allow
         allowed = float(re.search(r"more_work = (\S+) allows it", found.sentence)[1])
         assert replace(found, more_work=allowed).improves and not replace(found, more_work=allowed - 0.02).improves
-    back = replace(sure, present_proof=found.proof, proof=present, weight=0.5)
+    back = replace(sure, present_verification=found.verification, verification=present, weight=0.5)
     assert back.improves or pays or stable == [True, True], "more stable draws come first"
 
 
 def test_a_law_is_judged_by_what_it_is_for(rig, controller):
     """Less vibration is no merit of a law by poles whose modes settle later, nor sooner settling at any effort."""
     law = plain_law("poles", rig, 2, damping=0.2)
-    found = redesign(possible(rig), law, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
-    by_weight = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    found = redesign(uncertain(rig), law, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    by_weight = redesign(uncertain(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
     assert (found.criterion, by_weight.criterion) == ("settling", "cost")
     one = np.ones(2)
     present = told([True, True], one, -one)
 
     def judged(result, vibration, time, effort):
-        proof = told([True, True], vibration * one, -one, controlled_settling=time * one, effort=effort * one)
-        return replace(result, present_proof=present, proof=proof, weight=1.0)
+        verification = told([True, True], vibration * one, -one, controlled_settling=time * one, effort=effort * one)
+        return replace(result, present_verification=present, verification=verification, weight=1.0)
 
     later = judged(found, 0.5, 1.2, 1.0)
     assert not later.improves and judged(by_weight, 0.5, 1.2, 1.0).improves
@@ -190,13 +200,13 @@ def test_a_law_is_judged_by_what_it_is_for(rig, controller):
     dear = judged(found, 1.0, 0.9, 1.5)
     assert not dear.improves and "costs 20 % more, time and effort taken together: more_cost = 0.2" in dear.advice
     asked = redesign(
-        possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False, criterion="settling"
+        uncertain(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False, criterion="settling"
     )
     assert asked.criterion == "settling" and not judged(asked, 0.5, 1.2, 1.0).improves
     with pytest.raises(ValueError, match="cost or settling; got 'speed'"):
-        redesign(possible(rig), controller, sample_time=DT, criterion="speed")
+        redesign(uncertain(rig), controller, sample_time=DT, criterion="speed")
     short = LoopTest(100, DT, 0.8)
-    cut = redesign(possible(rig), law, test=short, draws=1, placement=False)
+    cut = redesign(uncertain(rig), law, test=short, draws=1, placement=False)
     assert cut.criterion == "cost" and "give a longer test" in cut.notes[0]
 
 
@@ -207,7 +217,7 @@ def test_settling_and_effort_cost_least_where_the_poles_are_asked_for(rig):
     one = replace(one, sensors=(Sensor("v", 1.0, "velocity"),))
     law = imsc_poles(one.modes, 1, one.actuators, poles=modes.omega[:1] * (-0.05 + 1j))
     speedy = kalman(one.modes, law, one.sensors, disturbance=1.0, noise=1e-9)
-    asked = redesign(possible(one), speedy, sample_time=DT, impulse_at=1.0, draws=1, placement=False)
+    asked = redesign(uncertain(one), speedy, sample_time=DT, impulse_at=1.0, draws=1, placement=False)
     cost = {}
     for gain in (0.7, 1.0, 1.4):
         off = replace(one, actuators=(Actuator("F", 1.0, gain=gain),))
@@ -228,26 +238,29 @@ def test_the_gain_of_a_law_by_poles_is_tuned_as_that_of_a_weight(rig):
 
 
 def test_a_gain_of_nothing_is_no_reason_to_change_the_controller(rig, controller):
-    sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
-    present, proofs = told([True, True], [1.0, 1.0], [-1.0, -1.0]), {}
+    sure = redesign(uncertain(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    present, verifications = told([True, True], [1.0, 1.0], [-1.0, -1.0]), {}
     for less in (0.001, 0.02):
-        proofs[less] = told([True, True], [1.0 - less] * 2, [-1.0, -1.0])
-    found = [replace(sure, present_proof=present, proof=proof, weight=0.0) for proof in proofs.values()]
+        verifications[less] = told([True, True], [1.0 - less] * 2, [-1.0, -1.0])
+    found = [
+        replace(sure, present_verification=present, verification=verification, weight=0.0)
+        for verification in verifications.values()
+    ]
     assert [one.advice.split(":")[0] for one in found] == ["Either controller does", "Use the redesigned controller"]
     # of a settling time that is shorter by a part in a thousand nobody is told where the cost falls by more
     for less, said in ((0.02, "it takes 2 % less vibration and effort"), (0.0, "Either controller does")):
-        proof = told([True, True], [1.0 - less] * 2, [-1.0, -1.0], settling=np.full(2, 0.998))
-        assert said in replace(sure, present_proof=present, proof=proof, weight=0.0).advice
+        verification = told([True, True], [1.0 - less] * 2, [-1.0, -1.0], settling=np.full(2, 0.998))
+        assert said in replace(sure, present_verification=present, verification=verification, weight=0.0).advice
 
 
 def test_poles_ask_for_damping_and_not_for_the_frequency_of_another_rig(rig):
     """On a heavier structure they are those of the same damping ratio, as a law designed for it has them."""
-    heavier = possible(rig, effect("point_mass", at=0.8, mass=0.2))
+    heavier = uncertain(rig, effect("point_mass", at=0.8, mass=0.2))
     assert heavier.rig.modes.omega[0] < 0.96 * rig.modes.omega[0]
     found = redesign(heavier, plain_law("poles", rig, 2, damping=0.05), sample_time=DT, impulse_at=0.8, draws=2)
     own = plain_law("poles", heavier.rig, 2, damping=0.05)
     np.testing.assert_allclose(found.loop.law.gain, own.gain, rtol=1e-9, atol=1e-9 * np.abs(own.gain).max())
-    assert np.median(found.proof.effort) < 1.2 * np.median(found.present_proof.effort)
+    assert np.median(found.verification.effort) < 1.2 * np.median(found.present_verification.effort)
 
 
 def test_a_controller_for_other_places_does_not_fit_the_rig(rig, controller):
@@ -255,11 +268,11 @@ def test_a_controller_for_other_places_does_not_fit_the_rig(rig, controller):
     moved = [replace(rig.actuators[0], at=0.8), rig.actuators[1]]
     law = imsc(rig.modes, 2, moved, weight=0.02)
     with pytest.raises(DesignError, match=r"drives F1 \(force\) at x = 0.8, .*: it has F1 \(force\) at x = 0.45"):
-        redesign(possible(rig), law, sample_time=DT)
+        redesign(uncertain(rig), law, sample_time=DT)
     sensors = [replace(rig.sensors[0], at=0.5), *rig.sensors[1:4]]
     estimator = kalman(rig.modes, controller.law, sensors, disturbance=1.0, noise=1e-6)
     with pytest.raises(DesignError, match=r"at x = 0.5, .*: it has d1 \(displacement at x = 0.3\)"):
-        redesign(possible(rig), estimator, sample_time=DT)
+        redesign(uncertain(rig), estimator, sample_time=DT)
     between = wb.Between(0.3, 0.7)
     stretched = replace(rig, sensors=[*rig.sensors, Sensor("d9", between)])
     reads = kalman(
@@ -274,7 +287,7 @@ def test_a_controller_for_other_places_does_not_fit_the_rig(rig, controller):
 
 
 def test_a_gain_near_one_is_said_by_what_it_is_off(rig, controller):
-    wrong = possible(rig, effect("sensor_gain", "d2", gain=1.0002))
+    wrong = uncertain(rig, effect("sensor_gain", "d2", gain=1.0002))
     found = redesign(wrong, controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
     step = next(s for s in found.steps if s.name == "sensors")
     assert step.what == "d2: gain off by 0.02 %"
@@ -287,45 +300,46 @@ def test_a_gain_near_one_is_said_by_what_it_is_off(rig, controller):
 
 
 def test_the_ends_of_an_interval_are_told_apart(rig, controller):
-    sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
+    sure = redesign(uncertain(rig), controller, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
     near, far = (
-        replace(sure.proof, damping=np.outer(v, np.ones(6))) for v in ((0.1041, 0.1043, 0.1045), (0.2, 0.25, 0.3))
+        replace(sure.verification, damping=np.outer(v, np.ones(6)))
+        for v in ((0.1041, 0.1043, 0.1045), (0.2, 0.25, 0.3))
     )
-    found = replace(sure, present_proof=near, proof=far)
+    found = replace(sure, present_verification=near, verification=far)
     assert "at 10.43 % (95 %: 10.41 to 10.45) damping" in found.sentence
     assert "25 % (20 to 30), as much effort" in found.sentence
-    alike = replace(sure.proof, damping=np.full((3, 6), 0.05))
-    assert "redesigned: 5.00 % (the same in all samples)," in replace(found, proof=alike).sentence
+    alike = replace(sure.verification, damping=np.full((3, 6), 0.05))
+    assert "redesigned: 5.00 % (the same in all samples)," in replace(found, verification=alike).sentence
 
 
 def test_every_draw_is_judged_by_its_own_simulation(rig, controller):
-    """The figures of a proof are those of single loops, run one by one."""
-    spring = possible(rig, effect("cubic_spring", at=0.9, stiffness=400.0), spread=0.1)
+    """The figures of a verification are those of single loops, run one by one."""
+    spring = uncertain(rig, effect("cubic_spring", at=0.9, stiffness=400.0), spread=0.1)
     found = redesign(spring, controller, sample_time=DT, impulse_at=0.8, draws=3, seed=4, placement=False)
     again = redesign(spring, controller, sample_time=DT, impulse_at=0.8, draws=3, seed=4, placement=False)
-    assert np.array_equal(found.proof.work, again.proof.work)
+    assert np.array_equal(found.verification.work, again.verification.work)
     for i, drawn in enumerate(spring.draws(3, np.random.default_rng(4))):
         run = run_loop(drawn, found.redesigned, replace(found.test, seed=found.test.seed + i))
-        assert found.proof.work[i] == pytest.approx(run.work, rel=1e-12)
-        assert found.proof.peak_force[i] == np.abs(run.response.forces).max()
+        assert found.verification.work[i] == pytest.approx(run.work, rel=1e-12)
+        assert found.verification.peak_force[i] == np.abs(run.response.forces).max()
         energy = run.response.energy.sum(axis=0)
-        after = run.response.time >= found.proof.settling[i]
+        after = run.response.time >= found.verification.settling[i]
         assert energy[after].max() <= 0.01 * energy.max() < energy[~after][-1]
 
 
 def test_on_off_control_is_told_by_its_settling(rig):
     relays = on_off(rig.modes, 2, rig.actuators, force=0.5, dead_band=0.05)
-    stuck = possible(rig, effect("actuator_dead_zone", "all", width=0.3))
+    stuck = uncertain(rig, effect("actuator_dead_zone", "all", width=0.3))
     found = redesign(stuck, relays, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
     assert "settles in" in found.sentence and found.steps[-1].loss < 0.1 * found.steps[0].loss
-    alike = replace(found.proof, controlled_settling=np.full(3, 2.29), settling=np.full(3, 2.29))
-    assert "redesigned: 2.29 s (the same in all samples)" in replace(found, proof=alike).sentence
+    alike = replace(found.verification, controlled_settling=np.full(3, 2.29), settling=np.full(3, 2.29))
+    assert "redesigned: 2.29 s (the same in all samples)" in replace(found, verification=alike).sentence
 
 
 def test_relays_that_a_dead_zone_silences_are_made_to_act_again(rig):
     """Each of them pushes with a given force, so that the less effort of one that does nothing is no merit."""
     law = plain_law("on-off", rig, 2, impulse_at=0.8, impulse=0.5)
-    sticking = possible(rig, effect("actuator_dead_zone", "all", width=0.9 * max(r.force for r in law.relays)))
+    sticking = uncertain(rig, effect("actuator_dead_zone", "all", width=0.9 * max(r.force for r in law.relays)))
     found = redesign(sticking, law, test=LoopTest(2500, DT, 0.8, 0.5, seed=0), draws=2, placement=False)
     assert found.after.effort > 1.5 * found.before.effort and found.weight == 0.0
     assert found.improves
@@ -335,7 +349,7 @@ def test_relays_that_a_dead_zone_silences_are_made_to_act_again(rig):
 
 def test_moving_the_actuators_is_offered_where_it_pays(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.5)
-    found = redesign(possible(rig, effect("modulus_error", factor=0.8)), law, sample_time=DT, impulse_at=0.8, draws=2)
+    found = redesign(uncertain(rig, effect("modulus_error", factor=0.8)), law, sample_time=DT, impulse_at=0.8, draws=2)
     moved = found.relocation
     assert moved is not None and 0.0 < moved.gain < 1.0
     assert moved.moved.effort <= 1.001 * moved.present.effort
@@ -343,12 +357,15 @@ def test_moving_the_actuators_is_offered_where_it_pays(rig):
 
 
 def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, controller):
-    sure = possible(rig, unexplained=0.01, outcome="unknown")
+    sure = uncertain(rig, unexplained=0.01, outcome="unknown")
     found = redesign(sure, controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False)
-    assert found.proof.small_gain_margin > 0.01 and found.safe
+    assert found.verification.small_gain_margin > 0.01 and found.safe
     assert found.sentence.endswith("so stability is guaranteed if the share exceeds that at no frequency.")
-    proofs = {name: replace(getattr(found, name), small_gain_margin=1.004) for name in ("present_proof", "proof")}
-    certain = replace(found, **proofs)  # whichever controller is the one to use
+    verifications = {
+        name: replace(getattr(found, name), small_gain_margin=1.004)
+        for name in ("present_verification", "verification")
+    }
+    certain = replace(found, **verifications)  # whichever controller is the one to use
     assert (
         "the small-gain margin is 100 %" in certain.sentence and "1 % of the output is unexplained" in certain.sentence
     )
@@ -398,7 +415,7 @@ def test_a_motor_at_a_support_is_tested_by_an_impulse_that_moves_the_modes():
 
 
 def test_what_cannot_be_redesigned_is_named(rig, controller):
-    plain = possible(rig)
+    plain = uncertain(rig)
     with pytest.raises(
         DesignError, match=r"10 samples per second are too slow for mode 2 at 3.142 Hz: sample at 12.57 Hz"
     ):
@@ -409,7 +426,7 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
         redesign(plain, controller, sample_time=DT, impulse_at=7.0)
     with pytest.raises(DesignError, match="moves none of the controlled modes"):
         redesign(plain, controller, sample_time=DT, impulse_at=0.0)
-    late = possible(rig, effect("actuator_delay", "all", delay=0.04))
+    late = uncertain(rig, effect("actuator_delay", "all", delay=0.04))
     with pytest.raises(DesignError, match=r"delay of F1, 40 ms, is 40,000 samples .* sample at 1.25e\+04 Hz or slower"):
         redesign(late, controller, sample_time=1e-6, test=LoopTest(2, 1e-6, 0.8))
     with pytest.raises(DesignError, match="how often"):
@@ -437,13 +454,13 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
         with pytest.raises(TypeError, match=match):
             redesign(plain, controller, **{"sample_time": DT, **given})
     with pytest.raises(DesignError, match="where the rig has no actuator"):
-        redesign(possible(replace(rig, actuators=rig.actuators[:1])), controller, sample_time=DT)
+        redesign(uncertain(replace(rig, actuators=rig.actuators[:1])), controller, sample_time=DT)
     with pytest.raises(ValueError, match="2 samples or more"):
         LoopTest(1, DT)
 
 
 def test_a_sensor_that_drifts_is_left_out(rig, controller):
-    drifting = possible(rig, effect("sensor_drift", "d2", drift_over_record=2.0))
+    drifting = uncertain(rig, effect("sensor_drift", "d2", drift_over_record=2.0))
     found = redesign(drifting, controller, sample_time=DT, impulse_at=0.8, draws=2, placement=False)
     assert found.steps[-1].name == "without d2" and found.steps[-1].kept
     assert "d2" not in found.redesigned.sensors
@@ -451,13 +468,13 @@ def test_a_sensor_that_drifts_is_left_out(rig, controller):
 
 
 def test_an_estimator_that_is_too_slow_for_a_late_loop_is_made_faster(rig, controller):
-    late = possible(rig, effect("actuator_delay", "all", delay=2.0 * DT))
+    late = uncertain(rig, effect("actuator_delay", "all", delay=2.0 * DT))
     found = redesign(late, controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False)
     compensated = next(step for step in found.steps if step.name == "delay")
     faster = next(step for step in found.steps if step.name == "estimator")
     assert faster.kept and compensated.cost > 0.1 and faster.cost < 0.2 * compensated.cost
     assert np.all(np.array(faster.excess) < found.steps[0].excess)
-    assert found.proof.stable.all()
+    assert found.verification.stable.all()
     assert found.after.effort == faster.effort
 
 
@@ -469,9 +486,9 @@ def test_more_gain_wins_back_nearly_all_that_a_limit_leaves_to_be_won(rig):
     """
     one = replace(rig, modes=rig.modes.select(slice(1)), actuators=rig.actuators[:1])
     quick = kalman(one.modes, imsc(one.modes, 1, one.actuators, weight=2.0), one.sensors, disturbance=1.0, noise=1e-9)
-    free = redesign(possible(one), quick, sample_time=DT, impulse_at=0.45, draws=1, placement=False)
+    free = redesign(uncertain(one), quick, sample_time=DT, impulse_at=0.45, draws=1, placement=False)
     peak = float(np.abs(free.after.response.forces).max())
-    held = possible(one, effect("actuator_saturation", "all", limit=0.5 * peak))
+    held = uncertain(one, effect("actuator_saturation", "all", limit=0.5 * peak))
     found = redesign(held, quick, sample_time=DT, impulse_at=0.45, draws=4, placement=False)
     present, last = found.steps[0].vibration, [s for s in found.steps if s.kept][-1]
     ideal = free.after.response.energy.sum() * DT
@@ -479,12 +496,12 @@ def test_more_gain_wins_back_nearly_all_that_a_limit_leaves_to_be_won(rig):
     assert present / ideal > 1.1
     won = (present - last.vibration) / (present - ideal)
     assert 0.40 < won < 0.55
-    assert found.proof.stable.all()
+    assert found.verification.stable.all()
 
 
 @pytest.fixture(scope="module")
 def hidden_plant():
-    return find_trial_with_plant(np.random.default_rng([20301, 20]), dirt="clean", size=0.5)
+    return find_trial_with_plant(np.random.default_rng([20301, 20]), imperfections="clean", size=0.5)
 
 
 @pytest.mark.slow
@@ -501,7 +518,7 @@ def test_a_limit_is_made_up_for_where_residual_modes_fill_the_readings(hidden_pl
     impulse_input = next(a.name for a in rig.actuators if a.direct or a.at == test.impulse_at)
 
     def designed(*effects):
-        return redesign(possible(rig, *effects), law, test=test, draws=1, placement=False)
+        return redesign(uncertain(rig, *effects), law, test=test, draws=1, placement=False)
 
     def run(plant, controller):
         rng = np.random.default_rng(7)

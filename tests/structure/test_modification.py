@@ -38,7 +38,7 @@ def beam(*attachments):
 def test_the_static_answer_of_modes_left_out_makes_the_few_that_are_kept_exact(parts):
     exact = beam(*parts).modes(5)
     many = beam().modes(60)
-    with_rest, without = attach(many, parts, kept=5), attach(beam().modes(20), parts).select(slice(5))
+    with_rest, without = attach(many, parts, n_modes=5), attach(beam().modes(20), parts).select(slice(5))
     error, worse = np.abs(with_rest.omega / exact.omega - 1), np.abs(without.omega / exact.omega - 1)
     assert error.max() < 2e-5 and error.max() < 0.2 * worse.max()
     places = np.linspace(0.1, 2.0, 12)

@@ -293,6 +293,6 @@ def test_the_places_that_no_mode_moves_are_those_of_its_held_edges():
     edges = {"left": "clamped", "bottom": "simply supported", "right": "free", "top": "free"}
     modes = square(edges, length=(1.2, 0.8)).modes(4)
     rim = np.array([(0.0, 0.0), (0.0, 0.5), (0.7, 0.0), (1.2, 0.0), (1.2, 0.4), (0.7, 0.8), (0.6, 0.4)])
-    still = modes.are_still(rim)
+    still = modes.are_held(rim)
     assert still.tolist() == [True, True, True, True, False, False, False]
     assert still.tolist() == [modes.is_held(tuple(place)) for place in rim]

@@ -8,7 +8,7 @@ SI_NAME = re.compile(r"\b(m|kg|s|N|Hz)\b")
 
 @dataclass(frozen=True)
 class Units:
-    """Names of a consistent set of units, by which results are told; numbers are never converted.
+    """Names of a consistent set of units, in which results are stated; numbers are never converted.
 
     Attributes:
         length, mass, time, force: such as "mm", "t", "s", "N"; force is that of mass · length / time².

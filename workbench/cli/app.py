@@ -17,12 +17,32 @@ from workbench.cli.predict import predict
 from workbench.cli.redesign import redesign
 from workbench.cli.report import report
 from workbench.cli.study import study
+from workbench.cli.terminal import errors
 from workbench.cli.trial import trial
+
+# Former names of options, which work for one version more.
+RENAMED = {
+    "mend": "correct",
+    "as-wired": "uncorrected",
+    "free-nominal": "uncertain-nominal",
+    "proof": "certify",
+    "picture": "figure",
+    "validate": "validation",
+}
+
+
+def current_option(name: str) -> str:
+    """The name of an option now; a former one is said on standard error."""
+    if name not in RENAMED:
+        return name
+    errors.print(f"  --{name} is now --{RENAMED[name]}; the old name goes with the next version")
+    return RENAMED[name]
+
 
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["--help", "-h"]},
+    context_settings={"help_option_names": ["--help", "-h"], "token_normalize_func": current_option},
     help="Modal identification, vibration control and diagnosis of the gap between simulation and test, for flexible"
     " structures.",
 )

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.possible import predicted, record_of
 from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, tell, write_json
+from workbench.cli.uncertain import predicted, record_of
 
 LOG = "tests.csv"
 

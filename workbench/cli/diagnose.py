@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.possible import write_verdict
 from workbench.cli.terminal import as_typed, by_options, check_target, guarded, names_in, reporting, say, short
+from workbench.cli.uncertain import write_verdict
 
-SHOWN_RIVALS = 3
+SHOWN_ALTERNATIVES = 3
 
 
 @guarded
@@ -20,7 +20,7 @@ def diagnose(
         Path | None, typer.Option(help="In place of a case: a record at low level, whose linear model is the nominal.")
     ] = None,
     records: Annotated[list[Path] | None, typer.Option(help="With --nominal: a record to diagnose; repeat.")] = None,
-    validate: Annotated[
+    validation: Annotated[
         list[Path] | None, typer.Option(help="With --nominal: a record that only measures the gap; repeat.")
     ] = None,
     inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="With --nominal: channels that are inputs.")] = "",
@@ -34,14 +34,16 @@ def diagnose(
     ] = "",
     json_path: options.JsonPath = None,
     page: options.PagePath = None,
-    free_nominal: Annotated[
-        bool, typer.Option("--free-nominal", help="Re-estimate the nominal frequencies and damping with every effect.")
+    uncertain_nominal: Annotated[
+        bool,
+        typer.Option("--uncertain-nominal", help="Re-estimate the nominal frequencies and damping with every effect."),
     ] = False,
-    mend: Annotated[
-        bool, typer.Option("--mend", help="Correct faults of wiring and units that are found, and go on.")
+    correct: Annotated[
+        bool, typer.Option("--correct", help="Correct the faults of wiring and units that are found, and go on.")
     ] = False,
-    as_wired: Annotated[
-        bool, typer.Option("--as-wired", help="Go on in spite of faults of wiring and units, without correcting them.")
+    uncorrected: Annotated[
+        bool,
+        typer.Option("--uncorrected", help="Go on in spite of faults of wiring and units, without correcting them."),
     ] = False,
     settle: Annotated[
         float, typer.Option(help="Time at the start of each record that is not counted, where it starts in motion, s.")
@@ -58,9 +60,9 @@ def diagnose(
     from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose_case
     from workbench.gap.effects.effect import COORDINATES
-    from workbench.gap.report.readiness import check_alive
+    from workbench.gap.report.record_checks import check_alive
+    from workbench.gap.report.setup_faults import check_disjoint, setup_faults, without_faults
     from workbench.gap.report.verdict import place_in_words
-    from workbench.gap.report.wiring import check_kept_apart, mended, wiring
     from workbench.study.measured_case import measured_case
     from workbench.study.pages.verdict_page import verdict_page
 
@@ -77,7 +79,7 @@ def diagnose(
         found = measured_case(
             nominal,
             records,
-            validate or (),
+            validation or (),
             inputs=names_in(inputs),
             input_hold=input_hold,
             quantity=quantity,
@@ -86,19 +88,21 @@ def diagnose(
     elif case is not None:
         found = read_case(case)
     check_alive(found.rig, found.fit, found.validation, settle=settle)
-    check_kept_apart(found.fit, found.validation)
-    faults = wiring(found.rig, found.fit, found.validation, settle=settle)
+    check_disjoint(found.fit, found.validation)
+    faults = setup_faults(found.rig, found.fit, found.validation, settle=settle)
     for fault in faults:
-        say(f"  {'corrected' if mend and fault.certain else 'wiring'}     {fault.sentence}")
-    if any(fault.certain for fault in faults) and not (mend or as_wired):
-        raise ValueError("diagnose again with --mend to correct this and go on, or with --as-wired to go on as it is")
-    if mend:
-        rig, fit = mended(faults, found.rig, found.fit)
-        found = replace(found, rig=rig, fit=fit, validation=mended(faults, found.rig, found.validation)[1])
-    corrected = [f"Corrected before the diagnosis: {fault.sentence}" for fault in faults if mend and fault.certain]
+        say(f"  {'corrected' if correct and fault.certain else 'set-up'}     {fault.sentence}")
+    if any(fault.certain for fault in faults) and not (correct or uncorrected):
+        raise ValueError(
+            "diagnose again with --correct to correct this and go on, or with --uncorrected to go on as it is"
+        )
+    if correct:
+        rig, fit = without_faults(faults, found.rig, found.fit)
+        found = replace(found, rig=rig, fit=fit, validation=without_faults(faults, found.rig, found.validation)[1])
+    corrected = [f"Corrected before the diagnosis: {fault.sentence}" for fault in faults if correct and fault.certain]
     with reporting("reading") as report:
         verdict = diagnose_case(
-            found, free_nominal=free_nominal, settle=settle, workers=workers, seconds=seconds, report=report
+            found, uncertain_nominal=uncertain_nominal, settle=settle, workers=workers, seconds=seconds, progress=report
         )
     say(verdict.sentence, bold=True)
     shown = verdict.to_json()
@@ -107,16 +111,16 @@ def diagnose(
         say(f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on amplitude")
         say(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
     if verdict.shows_gap and where.path in ("structure", "environment"):
-        if verdict.place_stands:
+        if verdict.is_located:
             spread = dict.fromkeys(COORDINATES, where.at_std)
             say(f"  place      {place_in_words(where.at, spread)}, of the unmodelled point force, no law assumed")
-        elif where.place.holds is False:
+        elif where.place.is_single_force is False:
             say("  place      no single point force explains the gap")
     after, floor = shown["gap"]["after"], shown["gap"]["floor"]
     for name, before in shown["gap"]["before"].items():
         say(f"  {name:<10} gap {before:.4g} → {after[name]:.4g}, noise floor {floor[name]:.4g}")
-    for words, probability in verdict.rivals[:SHOWN_RIVALS]:
-        say(f"  rival      {words} ({probability:.2g})")
+    for words, probability in verdict.alternatives_in_words[:SHOWN_ALTERNATIVES]:
+        say(f"  alternative {words} ({probability:.2g})")
     for note in verdict.notes:
         say(f"  {by_options(note)}")
     verdict = replace(verdict, notes=(*corrected, *verdict.notes))

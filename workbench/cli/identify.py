@@ -70,7 +70,7 @@ def identify(
             for path in records
         ]
         if outputs:
-            read = [measured.only(names_in(outputs)) for measured in read]
+            read = [measured.select_outputs(names_in(outputs)) for measured in read]
         found = identification_report(
             read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz, seconds=seconds, progress=report
         )

@@ -47,8 +47,11 @@ def place(
     grid: Annotated[
         float | None, typer.Option(metavar="M", help="Spacing of a grid of candidates over a plate, m.")
     ] = None,
-    proof: Annotated[
-        float | None, typer.Option(help="Prove global optimality to within this share, such as 0.05.")
+    certified_gap: Annotated[
+        float | None,
+        typer.Option(
+            "--certify", metavar="GAP", help="Certify global optimality within this gap, a share such as 0.05."
+        ),
     ] = None,
     picture: Annotated[
         Path | None, typer.Option("--figure", help="Draw the placement to this file (.png, .svg, .pdf).")
@@ -57,7 +60,7 @@ def place(
 ) -> None:
     """Place actuators for the least spillover work, within the limits of a rig; its piezo patches, where it has some.
 
-    Example: workbench place case.toml --control 3 --weight 20 --effort 1.2 --forbid 0.2:0.3 --proof 0.05
+    Example: workbench place case.toml --control 3 --weight 20 --effort 1.2 --forbid 0.2:0.3 --certify 0.05
     """
     import numpy as np
 
@@ -69,14 +72,14 @@ def place(
     from workbench.rig.actuators import command_unit
 
     check_target(json_path, picture)
-    if proof is not None and not 0 < proof < 1:
-        raise ValueError(f"--proof is a share between 0 and 1; got {proof:g}")
+    if certified_gap is not None and not 0 < certified_gap < 1:
+        raise ValueError(f"--certify is a share between 0 and 1; got {certified_gap:g}")
     found = read_structure_rig(rig)
     modes, struck = found.modes, impulse_place(found, impulse_at)
     domain = modes.domain
     candidates = _candidates(domain, at, grid)
-    if proof is not None and isinstance(domain, Rectangle) and candidates is None:
-        raise ValueError("--proof on a plate is among candidate places; give --grid M, so far apart, or --at PLACES")
+    if certified_gap is not None and isinstance(domain, Rectangle) and candidates is None:
+        raise ValueError("--certify on a plate is among candidate places; give --grid M, so far apart, or --at PLACES")
     with reporting("placing actuators") as report:
         task = placement_task(modes, control, impulse_at=struck, weight=weight, actuator=patch_of(found))
         if isinstance(domain, Interval):
@@ -99,14 +102,14 @@ def place(
         )
         best = least_work(task, limits)
         certificate = None
-        if proof is not None:
-            wanted = 1.0 - proof
+        if certified_gap is not None:
+            wanted = 1.0 - certified_gap
 
             def proving(bound: float, work: float, cells: int) -> None:
                 share = bound / work
                 report(f"proving: at least {share:.1%} of W_R, {cells:,} cells", 0.5 + 0.5 * min(share / wanted, 1.0))
 
-            certificate = certify(task, limits, placement=best, gap=proof, progress=proving)
+            certificate = certify(task, limits, placement=best, gap=certified_gap, progress=proving)
     rows = [best, usual]
     nodes = nodes_of_mode(modes, control) if isinstance(domain, Interval) else None
     if nodes is not None and nodes.size == control:

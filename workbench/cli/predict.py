@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from workbench.cli import options
-from workbench.cli.possible import predicted, record_of
 from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, tell, write_json
+from workbench.cli.uncertain import predicted, record_of
 
 
 @guarded

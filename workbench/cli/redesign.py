@@ -7,9 +7,9 @@ import typer
 
 from workbench.cli import options
 from workbench.cli.control import check_rate, count_of, damping_by, law_from, observed
-from workbench.cli.possible import possible_rig
 from workbench.cli.rig_file import impulse_place
 from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, show_table, write_json
+from workbench.cli.uncertain import uncertain_rig
 
 
 @guarded
@@ -95,11 +95,11 @@ def redesign(
     if estimator is not None:
         in_use = observed(rig, own, estimator, disturbance=disturbance, sample_time=sample_time)
     with reporting("reading") as report:
-        possible, _ = possible_rig(
+        uncertain, _ = uncertain_rig(
             found, verdict, workers=workers, report=lambda what, share: report(what, 0.7 * share)
         )
         result = run(
-            possible,
+            uncertain,
             in_use,
             test=test,
             draws=draws,
@@ -107,7 +107,7 @@ def redesign(
             criterion=criterion,
             more_cost=more_cost,
             more_work=more_work,
-            report=lambda what, share: report(what, 0.7 + 0.3 * share),
+            progress=lambda what, share: report(what, 0.7 + 0.3 * share),
         )
     say(f"{result.advice} {result.guarantee}".rstrip(), bold=True)
     say(result.comparison)

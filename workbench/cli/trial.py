@@ -15,7 +15,7 @@ def trial(
     cases: Annotated[int, typer.Option(help="Number of blind cases to make, diagnose and score.")] = 30,
     seed: Annotated[int, typer.Option(help="Seed of the random cases.")] = 0,
     json_path: options.JsonPath = None,
-    picture: Annotated[Path, typer.Option(help="File of the confusion matrix.")] = Path("out/trial.png"),
+    picture: Annotated[Path, typer.Option("--figure", help="File of the confusion matrix.")] = Path("out/trial.png"),
 ) -> None:
     """Score the diagnosis on blind cases of your own rig: made, diagnosed, and only then compared with the truth.
 
@@ -36,8 +36,8 @@ def trial(
     say(f"  places   {held.tally.misplaced} of {held.tally.placed} more than 2 % of the length off")
     for name, one in held.scores.items():
         if not one["kinds"]:
-            say(f"  {name}: hidden {one['hidden']}, named {one['told']}")
+            say(f"  {name}: true {one['hidden']}, diagnosed {one['diagnosed']}")
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_confusion(held.tally).savefig(picture)
     write_json(json_path, {"labels": held.labels, "verdicts": held.verdicts, "scores": held.scores})
-    say(f"  picture  {short(picture)}")
+    say(f"  figure   {short(picture)}")

@@ -118,11 +118,11 @@ def plot_controlled_mode_count(found: dict[str, ControlledModeCount], share: flo
         ax.bar(result.counts, uncontrolled, color=COLOURS[0], label="in residual modes")
         ax.bar(result.counts, spilled, bottom=uncontrolled, color=COLOURS[1], label="spillover")
         if share is not None:
-            ax.axhline(share, color=GREY, linestyle="--", label=f"{share:.0%} may be left")
+            ax.axhline(share, color=GREY, linestyle="--", label=f"{share:.0%} limit")
         if result.recommended:
             label = f"recommended: {result.recommended} modes"
             ax.axvline(result.recommended, color=COLOURS[2], linewidth=6, alpha=0.35, label=label)
         ax.set(xlabel="controlled modes, n", xticks=result.counts, title=name)
         ax.legend()
-    axes[0, 0].set_ylabel("share of the disturbance's energy left")
+    axes[0, 0].set_ylabel("remaining share of the disturbance's energy")
     return figure

@@ -120,7 +120,7 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
         False: "no single point force: where one fits best",
         None: "no place of a force can be identified",
     }
-    ax.set(title=title[place.holds], ylabel="log-likelihood below its maximum")
+    ax.set(title=title[place.is_single_force], ylabel="log-likelihood below its maximum")
     domain = verdict.nominal.modes.domain
     if isinstance(domain, Rectangle):
         _map(ax, verdict, domain)
@@ -205,7 +205,7 @@ def _law(chosen: Sequence[Effect], series: Floats, name: str) -> tuple[Floats, F
     return None if law is None else (grid, law(chosen[0].values, grid))
 
 
-def plot_rivals(verdict: Verdict) -> Figure:
+def plot_single_effects(verdict: Verdict) -> Figure:
     """What each effect alone would leave of the gap, and a law beyond the catalogue where one explains it."""
     best = verdict.attribution.best
     beyond = [best] if any_beyond(best.effects) else []

@@ -83,14 +83,14 @@ def mode_motion(
         ValueError: modes at named points without positions.
     """
     first = next(iter(modes.values()))
-    if isinstance(first, SampledModes) and first.is_over:
+    if isinstance(first, SampledModes) and first.on_plate:
         return _net_motion(scattered_net(first.positions), modes, actuators, sensors)
     if isinstance(first, Modes) and not isinstance(first.domain, Interval):
         return _net_motion(_net(first.domain), modes, actuators, sensors)
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
         if isinstance(found, SampledModes):
-            x = found.positions if found.is_along else np.arange(1.0, found.n_outputs + 1)
+            x = found.positions if found.on_interval else np.arange(1.0, found.n_outputs + 1)
             shapes = found.shapes
         else:
             x = np.linspace(0.0, found.length, N_PLACES)
@@ -113,7 +113,7 @@ def mode_motion(
                 "damping": _numbers(found.zeta),
             }
         )
-    label = "sensor" if isinstance(first, SampledModes) and not first.is_along else ALONG
+    label = "sensor" if isinstance(first, SampledModes) and not first.on_interval else ALONG
     return {"kind": "modes", "x": tracks[0]["x"], "label": label, "tracks": tracks, **_places(actuators, sensors)}
 
 

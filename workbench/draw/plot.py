@@ -90,11 +90,11 @@ def _(result: Modes) -> Figure:
 
 @plot.register
 def _(result: SampledModes) -> Figure:
-    if result.is_over:
+    if result.on_plate:
         return plot_scattered_modes(result, count=MOST_PANELS)
     shapes = result.shapes[:, :MOST_PANELS]
     figure, axes = _panels(shapes.shape[1])
-    placed = result.is_along
+    placed = result.on_interval
     x = result.positions if placed else np.arange(1, result.n_outputs + 1)
     for r, ax in enumerate(axes):
         ax.axhline(0.0, color=GREY, linewidth=0.6)

@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from workbench.draw.style import COLOURS, GREY, in_units, new_figure, plain_ticks
 from workbench.records.record import Record
 from workbench.robust.prediction import LEVEL, Prediction, amplitudes
-from workbench.robust.proof import SETTLED, interval
 from workbench.robust.redesign import Redesign
+from workbench.robust.verification import SETTLED, interval
 
 OLD, NEW = COLOURS[1], COLOURS[0]
 MOST_SENSORS = 8
@@ -18,21 +18,23 @@ def plot_redesign(result: Redesign) -> Figure:
     """Energy of the structure under test with its 95 % band over the draws, and the damping of each controlled mode."""
     figure, (left, right) = new_figure(1, 2, width=10, height=4.2, width_ratios=(2, 1))
     time = result.test.time
-    both = (("present", result.present_proof, OLD), ("redesigned", result.proof, NEW))
+    both = (("present", result.present_verification, OLD), ("redesigned", result.verification, NEW))
     # after an impulse both begin at the same energy; one that diverges leaves the figure at its top
     top = min(float(p.energy[0].max()) for _, p, _ in both)
-    for name, proof, colour in both:
-        middle, low, high = np.clip(proof.energy / max(top, 1e-300), 1e-9, 1e3)
+    for name, verification, colour in both:
+        middle, low, high = np.clip(verification.energy / max(top, 1e-300), 1e-9, 1e3)
         left.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0)
-        left.semilogy(time, middle, color=colour, linewidth=1.2, label=f"{name}: stable on {proof.share_stable:.0%}")
+        left.semilogy(
+            time, middle, color=colour, linewidth=1.2, label=f"{name}: stable on {verification.share_stable:.0%}"
+        )
     left.axhline(SETTLED, color=GREY, linewidth=0.8)
-    left.annotate("settled", (time[-1], SETTLED), (0, 3), textcoords="offset points", fontsize=8, ha="right")
+    left.annotate("settling threshold", (time[-1], SETTLED), (0, 3), textcoords="offset points", fontsize=8, ha="right")
     left.set(xlabel="time [s]", ylabel="modal energy over its peak", ylim=(1e-6, 3.0))
-    left.set_title(f"{result.proof.n_draws} samples of the uncertain model: median and 95 % interval")
+    left.set_title(f"{result.verification.n_draws} samples of the uncertain model: median and 95 % interval")
     left.legend(fontsize=8)
     rows = np.arange(len(result.controlled))
-    for shift, (name, proof, colour) in zip((-0.12, 0.12), both, strict=True):
-        ratios = 100.0 * np.array([interval(proof.damping[:, r]) for r in result.controlled])
+    for shift, (name, verification, colour) in zip((-0.12, 0.12), both, strict=True):
+        ratios = 100.0 * np.array([interval(verification.damping[:, r]) for r in result.controlled])
         right.plot(ratios[:, 0], rows + shift, "o", color=colour, label=name)
         for y, (_, low, high) in zip(rows + shift, ratios, strict=True):
             right.plot([low, high], [y, y], color=colour, linewidth=2)

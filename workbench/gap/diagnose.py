@@ -31,17 +31,18 @@ from workbench.gap.report.budget import (
 )
 from workbench.gap.report.data_faults import data_faults
 from workbench.gap.report.experiment import Experiment, next_experiment
-from workbench.gap.report.readiness import check_modes, check_records, readiness
+from workbench.gap.report.record_checks import check_modes, check_records, detectability
+from workbench.gap.report.setup_faults import check_disjoint, setup_faults
 from workbench.gap.report.verdict import Verdict
-from workbench.gap.report.wiring import check_kept_apart, wiring
 from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.gap.search.finish import with_equals
 from workbench.records.record import Record, as_records
+from workbench.renamed import former_arguments
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 from workbench.threads import one_blas_thread
 
-RIVAL = 0.01  # probability from which a rival is worth an experiment
+LIKELY = 0.01  # probability from which an alternative is worth an experiment
 TOLERANCE = 0.01  # of the signal: a gap that is worth no cause
 PAID = 0.02  # of what is left of records held out: what an effect that acts there must take away, to be named
 TRIFLE = 0.0005  # of the gap there: likewise
@@ -56,6 +57,7 @@ BESIDE_ERRORS = 0.8  # likewise where the model itself is a little off: 4 % of t
 OVER_FITTING = "The nearest set explains the records it was fitted to, but not the validation records: over-fitting."
 
 
+@former_arguments(free_nominal="uncertain_nominal", report="progress")
 @one_blas_thread
 def diagnose(
     rig: Rig,
@@ -64,11 +66,11 @@ def diagnose(
     validation: Record | Iterable[Record] = (),
     catalogue: tuple[Kind, ...] = CATALOGUE,
     name: str = "case",
-    report: Callable[[str, float], None] = lambda text, share: None,
+    progress: Callable[[str, float], None] = lambda text, share: None,
     workers: int | None = None,
     seconds: float | None = SECONDS,
     settle: float = 0.0,
-    free_nominal: bool = False,
+    uncertain_nominal: bool = False,
     tolerance: float = TOLERANCE,
     identified: IdentifiedPrior | None = None,
     units: Units = SI,
@@ -83,18 +85,18 @@ def diagnose(
         validation: kept out of every fit.
         catalogue: kinds of effects to try.
         name: of the case.
-        report: called with (what, share done) as the search proceeds.
+        progress: called with (what, share done) as the search proceeds.
         workers: processes that share the work, this one included; None for one per core.
         seconds: of processor time of this process, twice as many where it works alone, after which the search ends with
             the best that it has, and the verdict says so; None for no limit. What compiling takes is not counted.
         settle: seconds at the start of each record that are simulated but not counted, where a record does not start
             at rest.
-        free_nominal: fit errors of the nominal model beside every effect from the first.
+        uncertain_nominal: fit errors of the nominal model beside every effect from the first.
         tolerance: of the signal's rms: a gap beyond the noise that is smaller in every record is reported, and not
             explained; nor is one below a tenth of the noise.
         identified: errors that the nominal rig has because it was itself identified: they are fitted beside the effects
             in the end, so that intervals allow for them. Those of a rig's modes where their covariance is known.
-        units: names of the units of the rig and the records, by which the verdict tells its numbers.
+        units: names of the units of the rig and the records, in which the verdict states its numbers.
 
     Raises:
         ValueError: arguments out of their ranges; records that do not fit the rig or cannot be of it, two of one name,
@@ -124,32 +126,32 @@ def diagnose(
         )
     check_modes(rig)
     check_records(rig, records, validation, settle=settle)
-    check_kept_apart(records, validation)
+    check_disjoint(records, validation)
     silent = frozenset(sensor.name for sensor in rig.sensors if not sensor.noise_std)
     if silent:
         each = zip(rig.sensors, noise_guessed(rig, records), strict=True)
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
-    faults = wiring(rig, records, validation, settle=settle)
-    report("looking for the unmodelled force", 0.02)
+    faults = setup_faults(rig, records, validation, settle=settle)
+    progress("looking for the unmodelled force", 0.02)
     seen, nominal, evidence = baseline(rig, records, settle=settle, guessed=silent, workers=sharing, deadline=deadline)
     with (
         sharing.in_background(lambda: locate_force(nominal.without(_faulty(seen)))) as place,
-        sharing.in_background(lambda: readiness(nominal, catalogue=catalogue)) as ready,
+        sharing.in_background(lambda: detectability(nominal, catalogue=catalogue)) as ready,
     ):
         attribution = attribute(
             seen,
             nominal,
             evidence,
             catalogue=catalogue,
-            report=report,
-            free_nominal=free_nominal,
+            report=progress,
+            uncertain_nominal=uncertain_nominal,
             tolerance=tolerance,
             identified=identified or IdentifiedPrior.of_modes(rig),
         )
         if attribution.outcome == "explained" and attribution.random is None:
             alike, search = ready().indistinguishable, attribution.search
-            rivals = with_equals(search, attribution.best, attribution.rivals, evidence, alike)
-            attribution = replace(attribution, rivals=rivals)
+            rivals = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
+            attribution = replace(attribution, alternatives=rivals)
         attribution = _paid_for(rig, attribution, validation, settle)
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)
@@ -174,19 +176,19 @@ def diagnose(
         sound = outcome in ("none", "explained")
         in_records = () if sound else data_faults(rig, records, settle=settle)
         in_unseen = () if sound else data_faults(rig, validation, settle=settle)
-        miswired = any(record.name in fault.records for fault in faults for record in validation)
+        of_setup = any(record.name in fault.records for fault in faults for record in validation)
         return Verdict(
             case=name,
             outcome=outcome,
             disagreeing=disagreeing,
             effects=attribution.best.effects,
-            alternatives=tuple((fit.named, probability) for fit, probability in attribution.rivals),
+            alternatives=tuple((fit.named, probability) for fit, probability in attribution.alternatives),
             where=locate(nominal, effects, place() if as_seen else locate_force(nominal.without(faulty))),
             shrinkage=shrinkage,
             corrected=corrected,
             nominal=rig,
             attribution=attribution,
-            readiness=ready(),
+            detectability=ready(),
             budget=budget,
             experiment=_next(rig, attribution, sharing, units),
             tolerance=tolerance,
@@ -195,14 +197,14 @@ def diagnose(
                 *(fault.sentence for fault in faults),
                 *in_records,
                 *in_unseen,
-                *([OVER_FITTING] if outcome == "part" != attribution.outcome and not (in_unseen or miswired) else []),
+                *([OVER_FITTING] if outcome == "part" != attribution.outcome and not (in_unseen or of_setup) else []),
                 *_notes(attribution, budget, seconds, silent, sound),
             ),
         )
 
 
 def diagnose_case(case: Case, **options: Any) -> Verdict:
-    """`diagnose` of what a case holds, told by its units.
+    """`diagnose` of what a case holds, stated in its units.
 
     Args:
         case: rig and records.
@@ -223,11 +225,11 @@ def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: fl
     makes the gap of others larger corrects nothing.
     """
     effects = found.best.effects
-    if found.outcome in ("part", "unknown") and not _remainders(found):
+    if found.outcome in ("part", "unknown") and not _unpredictable(found):
         is_worse = _left_of(rig, effects, unseen, settle) > _left_of(rig, found.seen, unseen, settle)
         return found.without(*(e for e in effects if e not in found.seen)) if is_worse else found
-    named = [e for e in effects if not e.kind.first and e not in found.seen]
-    if found.outcome != "explained" or len(named) < 2 or _remainders(found):
+    named = [e for e in effects if not e.kind.applied_first and e not in found.seen]
+    if found.outcome != "explained" or len(named) < 2 or _unpredictable(found):
         return found
     after = _left_of(rig, effects, unseen, settle)
     trifle = max(PAID * after, TRIFLE * _left_of(rig, (), unseen, settle))
@@ -317,7 +319,7 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float
     Args:
         beyond: (n_records,) of `_beyond_models`.
     """
-    if shrinkage is None or _remainders(found):
+    if shrinkage is None or _unpredictable(found):
         return False
     before, after, floor = _powers(shrinkage)
     floor = max(found.noise_ratio, 1.0) ** 2 * floor + beyond
@@ -327,9 +329,9 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float
     return bool((after > (1.0 + LEFT) * floor).any()) and closed < (BESIDE_ERRORS if beside else HELD_OUT)
 
 
-def _remainders(found: Attribution) -> list[str]:
+def _unpredictable(found: Attribution) -> list[str]:
     """What the effects leave that no model can predict."""
-    return list(dict.fromkeys(effect.kind.remainder for effect in found.best.effects if effect.kind.remainder))
+    return list(dict.fromkeys(effect.kind.unpredictable for effect in found.best.effects if effect.kind.unpredictable))
 
 
 def _check(rig: Rig, record: Record) -> None:
@@ -346,11 +348,11 @@ def _check(rig: Rig, record: Record) -> None:
 
 
 def _next(rig: Rig, found: Attribution, workers: Workers, units: Units) -> Experiment | None:
-    """The experiment that would separate the best set from its likeliest rival."""
+    """The experiment that would separate the best set from its likeliest alternative."""
     explained = found.outcome == "explained" or any_beyond(found.best.effects)
-    for rival, probability in found.rivals:
-        if explained and probability > RIVAL:
-            return replace(next_experiment(rig, found.best, rival, found.search.data, workers), time=units.time)
+    for other, probability in found.alternatives:
+        if explained and probability > LIKELY:
+            return replace(next_experiment(rig, found.best, other, found.search.data, workers), time=units.time)
     return None
 
 
@@ -365,6 +367,6 @@ def _notes(
         *([taken] if silent else []),
         *([cut] if found.is_cut else []),
         budget.noise_remark if sound and not silent else "",  # else more than noise is left
-        *_remainders(found),
+        *_unpredictable(found),
     )
     return tuple(note for note in notes if note)

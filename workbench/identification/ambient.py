@@ -24,7 +24,7 @@ from workbench.identification.signal.modal_estimates import (
 from workbench.identification.signal.projection import project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress, check_count
 from workbench.records.record import Channel, Record
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
@@ -73,7 +73,7 @@ class AmbientModes(ModalEstimates):
 
 
 def correlation_functions(
-    record: Record, *, longest: float | None = None, references: Sequence[str] | None = None
+    record: Record, *, max_lag: float | None = None, references: Sequence[str] | None = None
 ) -> tuple[Record, ...]:
     """Correlation functions of the outputs with each reference, as free decays.
 
@@ -81,7 +81,7 @@ def correlation_functions(
 
     Args:
         record: driven by broadband forces all along.
-        longest: lag, s; by default as long as the functions stand out of their errors.
+        max_lag: longest lag, s; by default as long as the functions stand out of their errors.
         references: names of outputs; all unless given, or the four that move most.
 
     Returns:
@@ -89,19 +89,20 @@ def correlation_functions(
         standard errors are not those of white noise: take `identify_ambient`.
 
     Raises:
-        ValueError: an unknown reference; a record shorter than forty times the longest lag.
+        ValueError: an unknown reference; a record shorter than forty times `max_lag`.
     """
-    lags, rows = _lags(record, longest, references)
+    lags, rows = _lags(record, max_lag, references)
     blocks = _correlations(record, lags, rows, 1)
     return _as_records(record, blocks.sum(axis=0) / record.n_samples, rows)
 
 
+@former_arguments(longest="max_lag")
 @one_blas_thread
 def identify_ambient(
     record: Record,
     *,
     n_modes: int | None = None,
-    longest: float | None = None,
+    max_lag: float | None = None,
     references: Sequence[str] | None = None,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
@@ -113,7 +114,7 @@ def identify_ambient(
         record: long: each twelfth of it is to be longer than a mode takes to decay.
         n_modes: that many, those of the highest test statistic; unless given, those that rise above the noise and whose
             frequency is as sure as that of a mode.
-        longest: lag, s, as in `correlation_functions`.
+        max_lag: longest lag, s, as in `correlation_functions`.
         references: names of outputs, as in `correlation_functions`.
         false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which standard errors come from fewer parts of the record,
@@ -125,7 +126,7 @@ def identify_ambient(
     """
     check_count("n_modes", n_modes)
     budget = Budget(seconds, progress)
-    lags, rows = _lags(record, longest, references)
+    lags, rows = _lags(record, max_lag, references)
     decays = _as_records(record, _correlations(record, lags, rows, 1)[0] / record.n_samples, rows)
     subspace = Subspace(_directions(record), record.sample_time)
     stable = subspace.stable()
@@ -189,27 +190,27 @@ def _shapes(decays: Sequence[Record], poles: np.ndarray) -> np.ndarray:
     return normalised_shapes(shapes / poles ** time_derivatives(decays[0].output_channels)[:, None])
 
 
-def _lags(record: Record, longest: float | None, references: Sequence[str] | None) -> tuple[int, list[int]]:
+def _lags(record: Record, max_lag: float | None, references: Sequence[str] | None) -> tuple[int, list[int]]:
     """How many lags, and the rows of the references."""
     if references is None:
         strongest = np.argsort(-record.outputs.std(axis=1))[: AMBIENT.most_references]
         rows = sorted(int(j) for j in strongest)
     else:
-        rows = [record.output_names.index(name) for name in record.only(references).output_names]
+        rows = [record.output_names.index(name) for name in record.select_outputs(references).output_names]
     most, least = record.n_samples // (2 * AMBIENT.blocks), AMBIENT.least_lags // 4
     if most < least:
         raise ValueError(
             f"record {record.name!r} has {record.n_samples} samples; modes of random vibration take at least"
             f" {2 * AMBIENT.blocks * least}: measure longer"
         )
-    lags = most if longest is None else round(longest / record.sample_time)
+    lags = most if max_lag is None else round(max_lag / record.sample_time)
     if not least <= lags <= most:
         raise ValueError(
             f"record {record.name!r} has {record.n_samples} samples, enough for lags from"
             f" {least * record.sample_time:g} to {most * record.sample_time:g} s;"
             f" {lags * record.sample_time:g} s were asked for: measure longer, or ask for others"
         )
-    if longest is None:
+    if max_lag is None:
         found = _correlations(record, 4 * lags, rows, 1)[0]
         energy = (found / found.std(axis=2, keepdims=True)) ** 2
         windows = (

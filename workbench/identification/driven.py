@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from workbench.arrays import Floats
-from workbench.identification.input_output.after_blows import after_blows
+from workbench.identification.input_output.after_impacts import after_impacts
 from workbench.identification.input_output.excitation import check_inputs, unexcited_remarks
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.force_window import force_window
@@ -197,7 +197,7 @@ def identify_driven(
     """The modes between inputs and outputs, their number selected, with participation factors and standard errors.
 
     Any excitation serves that moves the modes: noise, multisine, PRBS, an impulse. Each mode enters if it raises the
-    likelihood by more than noise would in one record of a thousand. Inputs that are blows count as zero between them,
+    likelihood by more than noise would in one record of a thousand. Inputs that are impacts count as zero between them,
     with a remark: what their channels read there is noise.
 
     Args:
@@ -235,7 +235,7 @@ def identify_driven(
     check_inputs(records)
     clipped = dict.fromkeys(fault.message for record in records for fault in input_faults(record))
     records, windowed = force_window(records)
-    by_amplitude = after_blows(records, budget)
+    by_amplitude = after_impacts(records, budget)
     data = KnownInputs(
         records,
         at_rest=at_rest,

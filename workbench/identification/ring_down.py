@@ -38,7 +38,7 @@ class RingDownSettings:
     as_strong: float = 0.5  # energy of the second half over that of the first, either way, of what does not decay
     correlated: float = 0.5  # least correlation of a free decay as strong at its end, after a third of it
     uncorrelated: float = 3.0  # correlation of noise, times the root of its samples, is 1; more is an oscillation
-    left_over: float = 0.1  # share of the energy about the modes that the residual may have
+    residual_share: float = 0.1  # share of the energy about the modes that the residual may have
     most_left: float = 0.25  # likewise of all, if it is not white
     stands_out: float = 5.0  # times the residual beside them that it may stand out by
     band: int = 6  # bins about a mode
@@ -289,7 +289,7 @@ def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined
         beside &= ~inside
         share, whole = (float(power[k].sum() / motion[k].sum()) for k in (inside, slice(None)))
         level = np.median(power[beside]) if beside.any() else 0.0
-        about = share > RING_DOWN.left_over and power[inside].mean() > RING_DOWN.stands_out * level
+        about = share > RING_DOWN.residual_share and power[inside].mean() > RING_DOWN.stands_out * level
         if about or (whole > RING_DOWN.most_left and coloured):
             return (
                 f"in record {record.name!r} the residual is {100 * np.sqrt(share):.0f} % of the motion about the"

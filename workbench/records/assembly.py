@@ -243,7 +243,7 @@ def _sampling(
         return Sampling(0.0, 1.0 / sample_rate_hz)
     if not np.isfinite(time).all():
         raise RecordFileError(f"{path}, time, row {int(np.argmax(~np.isfinite(time))) + 1}: not a number")
-    sampling = _of_times(path, time, mend=described.sampling is None)
+    sampling = _of_times(path, time, correct=described.sampling is None)
     if sample_rate_hz is not None and abs(sample_rate_hz * sampling.step - 1.0) > UNIFORM:
         raise RecordFileError(f"{path} is sampled at {1 / sampling.step:g} Hz, not at {sample_rate_hz:g} Hz")
     if described.sampling is None:
@@ -258,8 +258,8 @@ def _sampling(
     return replace(sampling, start=start, step=said)
 
 
-def _of_times(path: Path, time: np.ndarray, *, mend: bool) -> Sampling:
-    """Start and step of sample instants; unequal ones are rounded, or to be resampled, where they may be mended."""
+def _of_times(path: Path, time: np.ndarray, *, correct: bool) -> Sampling:
+    """Start and step of sample instants; unequal ones are rounded, or to be resampled, where they may be corrected."""
     start, n_samples = float(time[0]), time.size
     with np.errstate(over="ignore", invalid="ignore"):
         mean = float((time[-1] - time[0]) / (n_samples - 1))
@@ -271,7 +271,7 @@ def _of_times(path: Path, time: np.ndarray, *, mend: bool) -> Sampling:
     if 0 < median < np.inf and even.all():
         return Sampling(start, mean)
     shortest, longest = float(steps.min()), float(steps.max())
-    if mend and 0 < mean < np.inf and shortest >= 0:
+    if correct and 0 < mean < np.inf and shortest >= 0:
         rounded = _rounded(time, steps)
         if rounded is not None:
             return rounded

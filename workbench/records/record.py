@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from workbench.renamed import Renamed
 from workbench.structure.domain import Where, place_array, same_place
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed, counted, place_text
@@ -203,7 +204,9 @@ class Record(Printed):
     def _instant(self, sample: int) -> float:
         return float(self.start_time + self.sample_time * sample)
 
-    def only(self, outputs: Sequence[str]) -> "Record":
+    only = Renamed("select_outputs")
+
+    def select_outputs(self, outputs: Sequence[str]) -> "Record":
         """The record with only the named outputs, in that order."""
         if tuple(outputs) == self.output_names:
             return self

@@ -15,6 +15,7 @@ from workbench.records.confined import load_confined
 from workbench.records.limits import RecordFileError, check_file
 from workbench.records.record import Channel, Record
 from workbench.records.units import split_unit, unit_named
+from workbench.renamed import Renamed
 from workbench.structure.modes import freeze
 from workbench.structure.printed import Printed, counted, place_text
 
@@ -87,7 +88,9 @@ class TransferFunctions(Printed):
     def output_names(self) -> tuple[str, ...]:
         return tuple(channel.name for channel in self.output_channels)
 
-    def only(self, outputs: tuple[str, ...]) -> "TransferFunctions":
+    only = Renamed("select_outputs")
+
+    def select_outputs(self, outputs: tuple[str, ...]) -> "TransferFunctions":
         """These outputs alone, in this order.
 
         Raises:

@@ -1,4 +1,4 @@
-"""A corrected rig with its uncertainty: rigs drawn from what a diagnosis leaves possible."""
+"""A corrected rig with its uncertainty: rigs drawn from what a diagnosis leaves uncertain."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -15,6 +15,7 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, Nomin
 from workbench.gap.effects.nonlinear import BEYOND
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.search.fit import Fit, parameters_of
+from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between
 from workbench.structure.modes import frozen
@@ -23,7 +24,7 @@ from workbench.threads import one_blas_thread
 # Free coordinates within which a fit is taken for linear: a factor e, a tenth of the extent. A number that the records
 # hardly tell has a wider deviation, which says no more than that.
 WIDEST, WIDEST_PLACE = 1.0, 10.0
-LIKELY = 0.01  # probability from which on a rival set is drawn too
+LIKELY = 0.01  # probability from which on an alternative set is drawn too
 MOST_TRIES = 20  # draws for each rig that can be
 SAYABLE = ("none", "explained")
 LATER = ("places_of_inputs", "places_of_outputs", "quantities_of_outputs", "damping_rates")  # not in early verdicts
@@ -41,7 +42,7 @@ class UncertainRig:
         unexplained: root mean square of what the effects leave unexplained, noise apart, over that of the readings: a
             relative error |Δ| of the model's output, y_real = (1 + Δ) y.
         outcome: of the diagnosis.
-        rivals: other sets that the records do not exclude, each with its probability.
+        alternatives: other sets that the records do not exclude, each with its probability.
     """
 
     nominal: Rig
@@ -49,7 +50,9 @@ class UncertainRig:
     covariance: np.ndarray
     unexplained: float = 0.0
     outcome: str = "explained"
-    rivals: tuple[tuple["UncertainRig", float], ...] = ()
+    alternatives: tuple[tuple["UncertainRig", float], ...] = ()
+
+    rivals = Renamed("alternatives")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "effects", tuple(self.effects))
@@ -65,7 +68,7 @@ class UncertainRig:
 
     @classmethod
     def of(cls, verdict: Verdict) -> "UncertainRig":
-        """The corrected rig of a verdict, with the covariance of its effects and rivals that are not excluded.
+        """The corrected rig of a verdict, with the covariance of its effects and alternatives that are not excluded.
 
         Raises:
             TypeError: no verdict.
@@ -76,10 +79,15 @@ class UncertainRig:
                 " is known for certain is UncertainRig(rig, (), np.zeros((0, 0))), from workbench.robust.posterior"
             )
         nominal, best = verdict.nominal, verdict.attribution.best
-        likely = [(fit, p) for fit, p in verdict.attribution.rivals if p > LIKELY]
-        rivals = [(cls(nominal, fit.effects, _covariance(nominal, fit)), p) for fit, p in likely]
+        likely = [(fit, p) for fit, p in verdict.attribution.alternatives if p > LIKELY]
+        alternatives = [(cls(nominal, fit.effects, _covariance(nominal, fit)), p) for fit, p in likely]
         return cls(
-            nominal, best.effects, _covariance(nominal, best), _unexplained(verdict), verdict.outcome, tuple(rivals)
+            nominal,
+            best.effects,
+            _covariance(nominal, best),
+            _unexplained(verdict),
+            verdict.outcome,
+            tuple(alternatives),
         )
 
     @cached_property
@@ -97,7 +105,7 @@ class UncertainRig:
         return parameters_of(self.nominal, self.effects)
 
     def draws(self, n: int, seed: int | np.random.Generator = 0) -> tuple[Rig, ...]:
-        """Rigs (n,) that the diagnosis leaves possible, rivals in proportion to their probability.
+        """Rigs (n,) drawn from the uncertainty of the diagnosis, alternatives in proportion to their probability.
 
         Normal in the free coordinates of the fit, inside the bounds of each parameter; a rig that cannot be, such as a
         buckled beam, is drawn again.
@@ -119,8 +127,8 @@ class UncertainRig:
         """The same, each with the effects that make it."""
         n = whole(n, WHAT_DRAWS, least=1)
         rng = np.random.default_rng(seed)
-        sets = [self, *(rival for rival, _ in self.rivals)]
-        shares = np.array([p for _, p in self.rivals])
+        sets = [self, *(alternative for alternative, _ in self.alternatives)]
+        shares = np.array([p for _, p in self.alternatives])
         shares = np.r_[max(1.0 - shares.sum(), 0.0), shares]
         chosen = rng.choice(len(sets), n, p=shares / shares.sum())
         return tuple(sets[i]._drawn(rng) for i in chosen)
@@ -162,7 +170,7 @@ class UncertainRig:
             "covariance": self.covariance.tolist(),
             "unexplained": self.unexplained,
             "outcome": self.outcome,
-            "rivals": [[rival.to_json(), probability] for rival, probability in self.rivals],
+            "alternatives": [[each.to_json(), probability] for each, probability in self.alternatives],
         }
 
     @classmethod
@@ -196,8 +204,9 @@ class UncertainRig:
         effects = tuple(_effect(nominal, kinds[entry["kind"]], entry) for entry in written["effects"])
         n = len(parameters_of(nominal, effects))
         covariance = _covariance_read(written["covariance"], n)
-        rivals = tuple((cls.from_json(nominal, rival, catalogue=catalogue), p) for rival, p in written["rivals"])
-        return cls(nominal, effects, covariance, written["unexplained"], written["outcome"], rivals)
+        sets = written["alternatives"]
+        alternatives = tuple((cls.from_json(nominal, each, catalogue=catalogue), p) for each, p in sets)
+        return cls(nominal, effects, covariance, written["unexplained"], written["outcome"], alternatives)
 
 
 def _nominal_json(rig: Rig) -> dict[str, list[Any]]:

@@ -1,4 +1,4 @@
-"""What the next test will show, with bands: readings of rigs drawn from what a diagnosis leaves possible."""
+"""What the next test will show, with bands: readings of rigs drawn from what a diagnosis leaves uncertain."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,12 +12,13 @@ from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, named, run_loops
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Channel, Record
+from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import RandomForce
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion, read, simulate
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
-from workbench.robust.proof import check_loop_kinds, drawn_with_errors
+from workbench.robust.verification import check_loop_kinds, drawn_with_errors
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.printed import Printed, counted
 from workbench.threads import one_blas_thread
@@ -99,6 +100,7 @@ class Prediction(Printed):
         return line, ("sensor", "unit", "root mean square", "half width of the band [%]"), rows, self.notes
 
 
+@former_arguments(report="progress")
 @one_blas_thread
 def predict(
     rig: Verdict | UncertainRig,
@@ -108,7 +110,7 @@ def predict(
     noise_std: Sequence[float] | Floats | None = None,
     draws: int = DRAWS,
     seed: int = 0,
-    report: Callable[[str, float], None] | None = None,
+    progress: Callable[[str, float], None] | None = None,
 ) -> Prediction:
     """Predicted sensor outputs of a test, from rest, with 95 % bands over time and frequency.
 
@@ -123,7 +125,7 @@ def predict(
         noise_std: (n_outputs,) of the readings; as the verdict found it, or as the sensors state it.
         draws: of the rig.
         seed: of the draws and of the noise.
-        report: called with what is done and the share done.
+        progress: called with what is done and the share done.
 
     Raises:
         TypeError: no verdict, inputs that are neither numbers nor a record, or no number where one is asked for.
@@ -137,8 +139,8 @@ def predict(
     truths = []
     rigs = found.draws(_draws(draws, n_outputs, n_samples), rng)
     for i, drawn in enumerate(rigs):
-        if report is not None:
-            report("predicting", i / len(rigs))
+        if progress is not None:
+            progress("predicting", i / len(rigs))
         quiet, forces = _with_disturbances(drawn, sent, rng)
         with np.errstate(over="ignore", invalid="ignore"):
             try:

@@ -23,9 +23,9 @@ from workbench.rig.rig import Rig
 from workbench.robust.compensation import STEPS, Loop, check_rate, compensated, without
 from workbench.robust.on_rig import Design, controlled_by, designed_anew, fitted, impulse_test, tuned
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
-from workbench.robust.proof import Verification, check_test, drawn_with_errors, interval, settling, verify
 from workbench.robust.relocation import Relocation, relocated
 from workbench.robust.small_motion import loop_poles, modes_in_motion
+from workbench.robust.verification import Verification, check_test, drawn_with_errors, interval, settling, verify
 from workbench.structure.domain import Where
 from workbench.threads import one_blas_thread
 
@@ -89,14 +89,14 @@ class Redesign:
     """A controller redesigned for the structure that a diagnosis found.
 
     Attributes:
-        possible: the corrected rig with its uncertainty.
+        uncertain_rig: the corrected rig with its uncertainty.
         present, redesigned: the controllers, once a sample.
         loop: law and estimator of the redesigned one, on the corrected rig in the motion under test.
         controlled: zero-based modes of the corrected rig.
         steps: from one to the other.
         test: what the loops were put through.
         before, after: the present and the redesigned controller on the corrected rig under test.
-        present_proof, proof: both on the same draws.
+        present_verification, verification: both on the same draws.
         weight: ρ of the cost J; 0 for on-off control.
         criterion: what the law is for. "cost": J = 2 ∫ energy dt + ρ ∫ FᵀF dt, with ρ such that both terms are equal
             over the controlled modes where actuators and sensors are perfect; "settling": J = t + ρ ∫ FᵀF dt with t the
@@ -107,7 +107,7 @@ class Redesign:
         notes: what else a reader should know.
     """
 
-    possible: UncertainRig
+    uncertain_rig: UncertainRig
     present: DigitalController
     redesigned: DigitalController
     loop: Loop
@@ -116,8 +116,8 @@ class Redesign:
     test: LoopTest
     before: LoopRun
     after: LoopRun
-    present_proof: Verification
-    proof: Verification
+    present_verification: Verification
+    verification: Verification
     weight: float
     criterion: str = "cost"
     more_cost: float = MORE_COST
@@ -127,6 +127,8 @@ class Redesign:
 
     pays, aim = Renamed("improves"), Renamed("criterion")
     promise, figures = Renamed("guarantee"), Renamed("comparison")
+    proof, present_proof = Renamed("verification"), Renamed("present_verification")
+    possible = Renamed("uncertain_rig")
 
     @cached_property
     def improves(self) -> bool:
@@ -135,7 +137,7 @@ class Redesign:
         It is stable on more of the draws; or on as many, and on those that both keep stable it costs less or settles
         sooner, and neither costs nor works more than is allowed: by the means of log J and log W, W = Σ_r |W_r|.
         """
-        old, new = self.present_proof, self.proof
+        old, new = self.present_verification, self.verification
         if new.stable.sum() != old.stable.sum():
             return bool(new.stable.sum() > old.stable.sum())
         return self._better and not self._more
@@ -149,24 +151,26 @@ class Redesign:
     def _better_on(self) -> int:
         """Draws that both keep stable on which it does better, by what `_better` finds in the mean."""
         of_draw = self._cost if self._over[0] < 1.0 else self._settling
-        new, old = (of_draw(p)[self._both] for p in (self.proof, self.present_proof))
+        new, old = (of_draw(p)[self._both] for p in (self.verification, self.present_verification))
         return int((new < old).sum())
 
     @property
     def _sooner(self) -> bool:
-        return interval(self._settling(self.proof))[0] < interval(self._settling(self.present_proof))[0]
+        return interval(self._settling(self.verification))[0] < interval(self._settling(self.present_verification))[0]
 
     @property
     def _sooner_by(self) -> float:
         """Share of the settling time that the redesigned controller saves, in the median of the draws."""
-        new, old = (interval(self._settling(proof))[0] for proof in (self.proof, self.present_proof))
+        new, old = (
+            interval(self._settling(verification))[0] for verification in (self.verification, self.present_verification)
+        )
         if not np.isfinite(old):
             return float(np.isfinite(new))
         return 1.0 - new / old if old else 0.0
 
-    def _settling(self, proof: Verification) -> np.ndarray:
+    def _settling(self, verification: Verification) -> np.ndarray:
         """Settling time of each draw (n_draws,), s: of the controlled modes where the law is for it."""
-        return proof.settling if self.criterion == "cost" else proof.controlled_settling
+        return verification.settling if self.criterion == "cost" else verification.controlled_settling
 
     @property
     def _more(self) -> str:
@@ -183,7 +187,7 @@ class Redesign:
     @cached_property
     def _over(self) -> tuple[float, float]:
         """J and W over those of the present controller: means of the draws that both keep stable; inf for none."""
-        old, new, both = self.present_proof, self.proof, self._both
+        old, new, both = self.present_verification, self.verification, self._both
         if not both.any():
             return np.inf, np.inf
         costs = (self._cost(p)[both] for p in (new, old))
@@ -192,17 +196,17 @@ class Redesign:
             cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
         return cost, work
 
-    def _cost(self, proof: Verification) -> np.ndarray:
+    def _cost(self, verification: Verification) -> np.ndarray:
         """J of each draw (n_draws,); inf where it is not stable."""
-        settles = np.minimum(proof.controlled_settling, self.test.time[-1])
-        cost = 2.0 * proof.vibration if self.criterion == "cost" else np.array(settles)
+        settles = np.minimum(verification.controlled_settling, self.test.time[-1])
+        cost = 2.0 * verification.vibration if self.criterion == "cost" else np.array(settles)
         if self.weight:  # relays have none, and an effort may be infinite
-            cost = cost + self.weight * proof.effort
-        return np.asarray(np.where(proof.stable, cost, np.inf))
+            cost = cost + self.weight * verification.effort
+        return np.asarray(np.where(verification.stable, cost, np.inf))
 
     @property
     def _both(self) -> np.ndarray:
-        return np.asarray(self.present_proof.stable & self.proof.stable)
+        return np.asarray(self.present_verification.stable & self.verification.stable)
 
     @property
     def controller(self) -> DigitalController:
@@ -211,12 +215,15 @@ class Redesign:
 
     @property
     def _used(self) -> Verification:
-        return self.proof if self.improves else self.present_proof
+        return self.verification if self.improves else self.present_verification
 
     @property
     def mode(self) -> int:
         """The controlled mode (zero-based) whose damping is changed most."""
-        old, new = (np.median(p.damping[:, list(self.controlled)], axis=0) for p in (self.present_proof, self.proof))
+        old, new = (
+            np.median(p.damping[:, list(self.controlled)], axis=0)
+            for p in (self.present_verification, self.verification)
+        )
         return self.controlled[int(np.argmax(np.abs(new - old)))]
 
     @property
@@ -228,7 +235,7 @@ class Redesign:
     @property
     def comparison(self) -> str:
         """What both controllers do on the real structure, in one sentence."""
-        old, new = self.present_proof, self.proof
+        old, new = self.present_verification, self.verification
         unstable = old.n_draws - int(old.stable.sum())
         effort, work = _times(new.effort, old.effort), _times(new.all_work, old.all_work)
         if old.share_stable < 0.5:
@@ -247,7 +254,7 @@ class Redesign:
     @property
     def _kept(self) -> str:
         """Why the present controller stays."""
-        old, new = self.present_proof, self.proof
+        old, new = self.present_verification, self.verification
         if self._neither:
             return self._neither
         if new.stable.sum() < old.stable.sum():
@@ -261,7 +268,7 @@ class Redesign:
     @property
     def _neither(self) -> str:
         """That no controller is to be used, and what can be done; empty where one is stable on most of the draws."""
-        old, new = self.present_proof, self.proof
+        old, new = self.present_verification, self.verification
         if max(old.share_stable, new.share_stable) >= 0.5:
             return ""
         return (
@@ -270,15 +277,15 @@ class Redesign:
             " fewer modes, or read more sensors."
         )
 
-    def _does(self, proof: Verification, lead: str, *, named: bool = True) -> str:
+    def _does(self, verification: Verification, lead: str, *, named: bool = True) -> str:
         """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
         if self.redesigned.relays is not None:
-            middle, low, high = interval(self._settling(proof))
+            middle, low, high = interval(self._settling(verification))
             if not np.isfinite(high):
-                return self._settles(proof)
+                return self._settles(verification)
             ends = "the same in all samples" if f"{low:.3g}" == f"{high:.3g}" else f"{lead}{low:.3g} to {high:.3g}"
             return f"{'settles in ' * named}{middle:.3g} s ({ends})"
-        ratios = _ratios(proof.damping[:, self.mode], lead)
+        ratios = _ratios(verification.damping[:, self.mode], lead)
         return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
 
     @property
@@ -287,20 +294,22 @@ class Redesign:
         if not self.improves or self._neither:
             return self._kept
         difference = self._difference
-        if self.present_proof.stable.sum() != self.proof.stable.sum():
+        if self.present_verification.stable.sum() != self.verification.stable.sum():
             return f"Use the redesigned controller: it {difference}."
         if max(1.0 - self._over[0], self._sooner_by) < GAINED:
             return f"Either controller does: the redesigned {difference} (medians of the samples of the model)."
-        forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
+        forces = [
+            interval(verification.peak_force)[0] for verification in (self.verification, self.present_verification)
+        ]
         after, before = (f"{force:.3g} N" for force in forces)
         forced = f", with at most {after} instead of {before}" if np.isfinite(forces).all() and after != before else ""
-        sure = f"it does better on {_of(self._better_on, self.proof.n_draws)} samples"
+        sure = f"it does better on {_of(self._better_on, self.verification.n_draws)} samples"
         return f"Use the redesigned controller: it {difference}{forced} (medians); {sure}."
 
     @property
     def _difference(self) -> str:
         """What the redesigned controller does better than the present one, in words."""
-        old, new = self.present_proof, self.proof
+        old, new = self.present_verification, self.verification
         if new.stable.sum() != old.stable.sum():
             stable = _of(int(new.stable.sum()), new.n_draws)
             return f"is stable on {stable} samples, the present one on {int(old.stable.sum()):,}"
@@ -313,9 +322,9 @@ class Redesign:
             return f"{self._settles(new)} where the present one {self._settles(old)}"
         return f"takes {_percent(abs(less))} {'less' if less > 0 else 'more'} vibration and effort than the present one"
 
-    def _settles(self, proof: Verification, what: str = "") -> str:
+    def _settles(self, verification: Verification, what: str = "") -> str:
         """How soon it settles, in the median of the draws, in words."""
-        time = interval(self._settling(proof))[0]
+        time = interval(self._settling(verification))[0]
         return f"settles{what} in {time:.3g} s" if np.isfinite(time) else f"does not settle{what} within the test"
 
     @property
@@ -335,15 +344,15 @@ class Redesign:
     def safe(self) -> bool:
         """Whether the controller to use is stable on every draw, and bears an error as large as is unexplained."""
         margin = self._used.small_gain_margin
-        holds = margin > self.possible.unexplained or np.isnan(margin)
-        return bool(self._used.stable.all() and (self.possible.explained or holds))
+        holds = margin > self.uncertain_rig.unexplained or np.isnan(margin)
+        return bool(self._used.stable.all() and (self.uncertain_rig.explained or holds))
 
     @property
     def guarantee(self) -> str:
         """What stability is guaranteed where the gap is not explained; empty where it is."""
-        if self.possible.explained:
+        if self.uncertain_rig.explained:
             return ""
-        share, margin = self.possible.unexplained, self._used.small_gain_margin
+        share, margin = self.uncertain_rig.unexplained, self._used.small_gain_margin
         error = f"{_percent(share)} of the output is unexplained in the mean over frequencies"
         if np.isnan(margin):
             return f"No stability guarantee: {error}, and on-off control has no small-gain margin."
@@ -364,7 +373,7 @@ class Redesign:
         Raises:
             ValueError: an ending of another kind, or a name that C or Python cannot have.
         """
-        rig, used = self.possible.rig, self.controller
+        rig, used = self.uncertain_rig.rig, self.controller
         return write_controller(
             used,
             path,
@@ -382,15 +391,15 @@ class Redesign:
             "criterion": self.criterion,
             "controlled": [r + 1 for r in self.controlled],
             "steps": [asdict(s) for s in self.steps],
-            "present": self.present_proof.to_json(),
-            "redesigned": self.proof.to_json(),
-            "unexplained": self.possible.unexplained,
+            "present": self.present_verification.to_json(),
+            "redesigned": self.verification.to_json(),
+            "unexplained": self.uncertain_rig.unexplained,
             "placement": None if moved is None else moved.to_json(),
             "notes": list(self.notes),
         }
 
 
-@former_arguments(aim="criterion")
+@former_arguments(aim="criterion", report="progress")
 @one_blas_thread
 def redesign(
     verdict: Verdict | UncertainRig,
@@ -405,7 +414,7 @@ def redesign(
     criterion: str | None = None,
     more_cost: float = MORE_COST,
     more_work: float = np.inf,
-    report: Report = lambda text, share: None,
+    progress: Report = lambda text, share: None,
 ) -> Redesign:
     """A controller of the same kind, redesigned for the corrected rig, and both verified on the same samples of it.
 
@@ -420,14 +429,14 @@ def redesign(
         sample_time: s, of the controller; that of the records unless given.
         impulse_at: where the test strikes; at the hammer, or the first actuator, unless given.
         test: in place of the impulse.
-        draws: possible rigs on which both are proved.
+        draws: samples of the uncertain rig on which both are verified.
         seed: of the draws and of the sensors' noise.
         placement: whether to look where the actuators should stand instead.
         criterion: what it is judged by, "cost" or "settling", see `Redesign`; unless given "cost" for a law that
             minimises it, and "settling" for one by poles or on-off.
         more_cost: share by which the redesigned controller may cost more than the present one where it settles sooner.
         more_work: share by which it may do more work, W = Σ_r |W_r|: as much as it takes, unless given.
-        report: called with (what, share done).
+        progress: called with (what, share done).
 
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
@@ -443,8 +452,8 @@ def redesign(
     draws, seed = whole(draws, WHAT_DRAWS, least=1), whole(seed, "seed")
     if test is not None:
         check_test(test)
-    possible = verdict if isinstance(verdict, UncertainRig) else UncertainRig.of(verdict)
-    nominal, corrected = possible.nominal, possible.rig
+    uncertain = verdict if isinstance(verdict, UncertainRig) else UncertainRig.of(verdict)
+    nominal, corrected = uncertain.nominal, uncertain.rig
     if test is not None:
         sample_time = test.sample_time if sample_time is None else sample_time
     if sample_time is not None:
@@ -454,13 +463,13 @@ def redesign(
             raise DesignError("how often does the controller run? give sample_time, in s")
         sample_time = verdict.attribution.search.data.records[0].sample_time
     check_rate(nominal.modes, controlled_by(design), sample_time)
-    report("the present controller", 0.05)
+    progress("the present controller", 0.05)
     level = _level(verdict)
     test = test or impulse_test(nominal, controlled_by(design), sample_time, impulse_at, level=level, seed=seed)
     loop = fitted(nominal, design, test)
     present = _present(nominal, loop, sample_time)
     before = run_loop(corrected, present, test)
-    report("designing for the corrected rig", 0.15)
+    progress("designing for the corrected rig", 0.15)
     quiet = _silent(present)
     modes = modes_in_motion(corrected, run_loop(corrected, quiet, test))
     steps: tuple[Step, ...]
@@ -472,17 +481,17 @@ def redesign(
         if not corrected.elements or not after.bounded:
             break
         modes = modes_in_motion(corrected, after)
-    report("verification on the samples", 0.4)
-    rigs = drawn_with_errors(possible, draws, seed)
-    old = verify(rigs, present, test, controlled=anew.law.controlled, centre=corrected)
-    report("verification on the samples", 0.65)
-    new = verify(rigs, redesigned, test, controlled=anew.law.controlled, centre=corrected)
-    report("where actuators should stand", 0.9)
+    progress("verification on the samples", 0.4)
+    rigs = drawn_with_errors(uncertain, draws, seed)
+    old = verify(rigs, present, test, controlled=anew.law.controlled, margin_rig=corrected)
+    progress("verification on the samples", 0.65)
+    new = verify(rigs, redesigned, test, controlled=anew.law.controlled, margin_rig=corrected)
+    progress("where actuators should stand", 0.9)
     moved = relocated(anew, test) if placement else None
-    report("done", 1.0)
+    progress("done", 1.0)
     return Redesign(
-        possible, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight,
-        judged, more_cost, more_work, moved, _notes(possible, corrected, judged == wanted),
+        uncertain, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight,
+        judged, more_cost, more_work, moved, _notes(uncertain, corrected, judged == wanted),
     )  # fmt: skip
 
 
@@ -734,7 +743,7 @@ def _gain(gain: float) -> str:
     return f"gain {gain:.3g}" if abs(gain - 1.0) >= 0.005 else f"gain off by {_percent(abs(gain - 1.0))}"
 
 
-def _notes(possible: UncertainRig, rig: Rig, aimed: bool) -> tuple[str, ...]:
+def _notes(uncertain: UncertainRig, rig: Rig, aimed: bool) -> tuple[str, ...]:
     notes = []
     if not aimed:
         notes.append(
@@ -743,9 +752,9 @@ def _notes(possible: UncertainRig, rig: Rig, aimed: bool) -> tuple[str, ...]:
         )
     if any(a.hysteresis_share for a in rig.actuators):
         notes.append("The hysteresis of an actuator is in the verification, but is not compensated.")
-    if possible.rivals:
-        share = sum(p for _, p in possible.rivals)
-        notes.append(f"{100 * share:.0f} % of the draws are rival sets of effects that the records do not exclude.")
+    if uncertain.alternatives:
+        share = sum(p for _, p in uncertain.alternatives)
+        notes.append(f"{100 * share:.0f} % of the draws are other sets of effects that the records do not exclude.")
     return tuple(notes)
 
 

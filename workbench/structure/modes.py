@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.arrays import Complexes, Flags, Floats, Integers
-from workbench.renamed import former_arguments
+from workbench.renamed import Renamed, former_arguments
 from workbench.structure.domain import (
     Between,
     Derivative,
@@ -227,8 +227,10 @@ class Modes(Printed):
             return False
         return bool(self._hardly_move(self.phi_at(where, derivative, direction=direction)))
 
-    def are_still(self, places: ArrayLike) -> Flags:
-        """Whether no mode moves each of some places of the domain, (n_places,)."""
+    are_still = Renamed("are_held")
+
+    def are_held(self, places: ArrayLike) -> Flags:
+        """`is_held` of displacements at several places: whether no mode moves them, (n_places,)."""
         return self._hardly_move(self.phi(places))
 
     def _hardly_move(self, phi: Floats) -> Flags:
@@ -330,22 +332,24 @@ class SampledModes(Printed):
     def n_outputs(self) -> int:
         return len(self.shapes)
 
+    unplaced, is_along, is_over = Renamed("without_position"), Renamed("on_interval"), Renamed("on_plate")
+
     @property
-    def unplaced(self) -> Flags:
-        """Which sensors have no known place, (n_outputs,)."""
+    def without_position(self) -> Flags:
+        """Which sensors have no known position, (n_outputs,)."""
         if self.positions.dtype == object:
             return np.array([place is None for place in self.positions])
         return np.asarray(~np.isfinite(self.positions.reshape(self.n_outputs, -1)).all(axis=1))
 
     @property
-    def is_along(self) -> bool:
+    def on_interval(self) -> bool:
         """Whether every sensor has a known place along an interval."""
-        return self.positions.ndim == 1 and self.positions.dtype != object and not self.unplaced.any()
+        return self.positions.ndim == 1 and self.positions.dtype != object and not self.without_position.any()
 
     @property
-    def is_over(self) -> bool:
+    def on_plate(self) -> bool:
         """Whether every sensor has a known place on a plate."""
-        return self.positions.ndim == 2 and not self.unplaced.any()
+        return self.positions.ndim == 2 and not self.without_position.any()
 
     @property
     def poles(self) -> Complexes:

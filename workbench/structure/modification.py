@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
+from workbench.renamed import former_arguments
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
 from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
@@ -14,8 +15,9 @@ DIVERGES = 0.9  # of that ratio: from here on the flexibility at a point has no 
 ROUNDING = 1e-9  # of the largest eigenvalue: what a rigid-body mode may be off by
 
 
+@former_arguments(kept="n_modes", residual="residual_flexibility")
 def attach(
-    modes: Modes, attachments: tuple[Attachment, ...], *, kept: int | None = None, residual: float = 0.0
+    modes: Modes, attachments: tuple[Attachment, ...], *, n_modes: int | None = None, residual_flexibility: float = 0.0
 ) -> Modes:
     """The modes with masses, springs and dampers attached, by Rayleigh-Ritz in the modes at hand.
 
@@ -26,15 +28,15 @@ def attach(
     Args:
         modes: as many as the changed shapes take.
         attachments: what is attached.
-        kept: how many modes come out, and how many of those at hand move on their own, four times as many; the others
-            go with the force of each attachment as they do at rest: an error of the order of (ω / ω_kept)⁴. All of
+        n_modes: how many modes come out, and how many of those at hand move on their own, four times as many; the
+            others go with the force of each attachment as they do at rest: an error of the order of (ω / ω_n)⁴. All of
             them where not given.
-        residual: flexibility at a point of all modes that are not at hand, m/N.
+        residual_flexibility: flexibility at a point of all modes that are not at hand, m/N.
 
     MacNeal, Computers & Structures 1 (1971) 581, on residual flexibility.
     """
-    if kept is not None:
-        return _with_residual(modes, attachments, kept, residual)
+    if n_modes is not None:
+        return _with_residual(modes, attachments, n_modes, residual_flexibility)
     n = modes.n_modes
     mass, stiffness, extra_damping = np.eye(n), np.diag(modes.omega**2), []
     for part in attachments:

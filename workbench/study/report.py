@@ -159,7 +159,7 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
     blocks = [block(damping, "Damping ratio of each mode, ± 2 standard errors.")]
     if len(shapes) > 1:  # one sensor knows no shape
         moving = mode_motion({"identified": modes})
-        numbered = "" if modes.is_along or modes.is_over else ", numbered as in the record"
+        numbered = "" if modes.on_interval or modes.on_plate else ", numbered as in the record"
         blocks.insert(0, block(moving, f"The shapes identified, at the sensors{numbered}, with the phase of each."))
     if len(shapes) > 1 and hertz.size > 1:
         blocks.append(

@@ -6,7 +6,7 @@ import numpy as np
 
 from workbench.design.estimation.digital import DigitalController
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.robust.proof import settling
+from workbench.robust.verification import settling
 from workbench.trials import motion
 from workbench.trials.plant import FINEST, SolvedPlant, sensor_noise
 

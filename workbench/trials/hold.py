@@ -13,7 +13,7 @@ import numpy as np
 from workbench.cases.case import read_case
 from workbench.gap.diagnose import diagnose_case
 from workbench.trials.make import write_trials
-from workbench.trials.scoring import Tally, score, score_dirty, tally
+from workbench.trials.scoring import Tally, score, score_imperfect, tally
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,14 +24,14 @@ class Trials:
         verdicts: by case, as JSON.
         labels: by case.
         scores: by case.
-        dirty_scores: by case, see `score_dirty`; empty without dirt.
+        imperfect_scores: by case, see `score_imperfect`; empty without imperfections.
         tally: of all scores.
     """
 
     verdicts: dict[str, dict[str, Any]]
     labels: dict[str, dict[str, Any]]
     scores: dict[str, dict[str, Any]]
-    dirty_scores: dict[str, dict[str, Any]]
+    imperfect_scores: dict[str, dict[str, Any]]
     tally: Tally
 
 
@@ -51,14 +51,15 @@ def hold_trials(
     Args:
         diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
         report: called with (what, share done).
-        hidden: `like`, `structure`, `kinds`, `dirt` and `size` of `write_trials`: what the cases are, and hide.
+        hidden: `like`, `structure`, `kinds`, `imperfections` and `size` of `write_trials`: what the cases are,
+            and hide.
     """
     with TemporaryDirectory() as cases, TemporaryDirectory() as vault:
         sealed = Path(vault) / "labels.json"
         write_trials(cases, sealed, n, seed, report=lambda text, share: report(f"making {text}", 0.1 * share), **hidden)
         labels = json.loads(sealed.read_text(encoding="utf-8"))
         sealed.unlink()
-        verdicts, scores, dirty = {}, {}, {}
+        verdicts, scores, imperfect = {}, {}, {}
         folders = sorted(Path(cases).iterdir())
         for i, folder in enumerate(folders):
             verdicts[folder.name] = (diagnose_case or verdict_on)(folder)
@@ -67,16 +68,16 @@ def hold_trials(
             domain = read_case(folder).rig.modes.domain
             verdict, label = verdicts[folder.name], labels[folder.name]
             scores[folder.name] = score(verdict, label, domain=domain)
-            if hidden.get("dirt") is not None:
-                dirty[folder.name] = score_dirty(verdict, label, domain=domain)
-    return Trials(verdicts, labels, scores, dirty, tally(scores.values()))
+            if hidden.get("imperfections") is not None:
+                imperfect[folder.name] = score_imperfect(verdict, label, domain=domain)
+    return Trials(verdicts, labels, scores, imperfect, tally(scores.values()))
 
 
 def hold_one(seed: int, kinds: Sequence[str], **hidden: Any) -> dict[str, Any]:
     """One blind trial: {"score", "sentence" of its verdict, "processor": time that it took, s}."""
     begun = process_time()
     held = hold_trials(1, seed, kinds=[kinds], **hidden)
-    (found,), (verdict,) = (held.dirty_scores or held.scores).values(), held.verdicts.values()
+    (found,), (verdict,) = (held.imperfect_scores or held.scores).values(), held.verdicts.values()
     return {"score": found, "sentence": verdict["sentence"], "processor": process_time() - begun}
 
 

@@ -13,9 +13,17 @@ from workbench.cases.case import Case
 from workbench.cases.writing import write_case
 from workbench.records.record import Record
 from workbench.trials.benches import Bench, bench_of, draw_bench, experiments, tested
-from workbench.trials.dirt import CLEAN, DIRT_CLASSES, MIMICS, SIZES, TRIPLE, Dirt, draw_dirt
 from workbench.trials.draws import draw_effect
 from workbench.trials.hidden import HIDE, NONE, OUTSIDE, UNKNOWN, hide
+from workbench.trials.imperfections import (
+    CLEAN,
+    IMPERFECTIONS,
+    MIMICS,
+    SIZES,
+    TRIPLE,
+    Imperfections,
+    draw_imperfections,
+)
 from workbench.trials.laws import POINT_LAWS
 from workbench.trials.plant import Plant, SolvedPlant
 from workbench.trials.rigs import FRAMES, MEMBERS, PLATES
@@ -27,7 +35,7 @@ MOST_BENCHES, MOST_DRAWS, MOST_SEEDS = 40, 8, 100
 VISIBLE = 0.02
 SEEN = 0.03  # each effect of several must alter the response by this much beside the others
 DISTINCT = 0.1  # of the noise: what tells an effect from its limiting case must alter the readings by this much
-STRONG = 0.7  # of the gap that dirt makes: what an effect beside it must make at least
+STRONG = 0.7  # of the gap that imperfections make: what an effect beside it must make at least
 
 # Kinds that a structure cannot show.
 OF_MEMBERS = frozenset({"local_stiffness_loss", "support_rotation", "axial_load", "air_drag", "midplane_stretching"})
@@ -45,10 +53,10 @@ TWINS = (
 )
 
 
-class DirtyDraw(NamedTuple):
-    """What a dirty trial is made of: class and size of its dirt, kinds of its effects."""
+class ImperfectDraw(NamedTuple):
+    """What an imperfect trial is made of: class and size of its imperfections, kinds of its effects."""
 
-    dirt: str
+    imperfections: str
     size: float
     kinds: tuple[str, ...]
 
@@ -66,7 +74,7 @@ def make_trial_with_plant(
     like: Case | None = None,
     structure: str = MEMBERS,
     name: str = "case",
-    dirt: str = CLEAN,
+    imperfections: str = CLEAN,
     size: float = 1.0,
 ) -> tuple[Case, dict[str, Any], SolvedPlant]:
     """A case that hides effects of the given kinds, its label in the words of the case format, and the real structure.
@@ -77,7 +85,7 @@ def make_trial_with_plant(
         like: a case whose nominal rig, levels, band, noise and records are taken; None draws a bench.
         structure: of a bench that is drawn: "members" (beams and rods), "plates" or "frames".
         name: of the case.
-        dirt: class of the small errors beside them, of `DIRT_CLASSES`.
+        imperfections: class of the small errors beside them, of `IMPERFECTIONS`.
         size: of these errors, 1 for those of a careful laboratory.
 
     Returns:
@@ -88,8 +96,8 @@ def make_trial_with_plant(
     Raises:
         ValueError: an unknown kind or class, or kinds that the bench cannot show.
     """
-    if dirt not in DIRT_CLASSES:
-        raise ValueError(f"dirt {dirt!r} is none of {', '.join(DIRT_CLASSES)}")
+    if imperfections not in IMPERFECTIONS:
+        raise ValueError(f"imperfections {imperfections!r} are none of {', '.join(IMPERFECTIONS)}")
     unknown = [kind for kind in kinds if kind not in (*KINDS, *OUTSIDE_KINDS)]
     if unknown:
         raise ValueError(f"kind {unknown[0]!r} is neither in the vocabulary nor among {', '.join(OUTSIDE_KINDS)}")
@@ -100,9 +108,13 @@ def make_trial_with_plant(
             bench = draw_bench(rng, structure) if like is None else bench_of(like)
             tests = experiments(bench, rng)
             bench, effects = _draw_effects(bench, tests["mid"], kinds, rng)
-            errors = draw_dirt(dirt, size, bench, rng) if dirt not in (CLEAN, TRIPLE) else Dirt()
+            errors = (
+                draw_imperfections(imperfections, size, bench, rng)
+                if imperfections not in (CLEAN, TRIPLE)
+                else Imperfections()
+            )
             case, label, real = _case(bench, tests, effects, errors, rng, name)
-            return case, {**label, "class": dirt, "size": size}, real
+            return case, {**label, "class": imperfections, "size": size}, real
         except Unsuitable as error:
             reason = str(error)
     raise ValueError(f"no case with {' and '.join(kinds)} could be generated on this bench; the last draw: {reason}")
@@ -150,16 +162,16 @@ def _case(
     bench: Bench,
     tests: dict[str, np.ndarray],
     effects: list[dict[str, Any]],
-    dirt: Dirt,
+    imperfections: Imperfections,
     rng: np.random.Generator,
     name: str,
 ) -> tuple[Case, dict[str, Any], SolvedPlant]:
-    dirty = dirt.on(bench.plant(), bench.sample_time)
+    imperfect = imperfections.on(bench.plant(), bench.sample_time)
     nominal = bench.plant().solved()
-    real = hide(dirty, effects).solved()
-    if dirt != Dirt() and effects:
-        _check_strong(bench, tests, effects, nominal, dirty.solved(), real, rng)
-    _check_distinct(bench, tests, effects, dirty, real)
+    real = hide(imperfect, effects).solved()
+    if imperfections != Imperfections() and effects:
+        _check_strong(bench, tests, effects, nominal, imperfect.solved(), real, rng)
+    _check_distinct(bench, tests, effects, imperfect, real)
     fit: list[Record] = []
     validation: list[Record] = []
     figures = {}
@@ -200,11 +212,11 @@ def _check_strong(
     tests: dict[str, np.ndarray],
     effects: list[dict[str, Any]],
     nominal: SolvedPlant,
-    dirty: SolvedPlant,
+    imperfect: SolvedPlant,
     real: SolvedPlant,
     rng: np.random.Generator,
 ) -> None:
-    """Some record to fit must show the effects well, and at least nearly as strongly as the dirt.
+    """Some record to fit must show the effects well, and at least nearly as strongly as the imperfections.
 
     Else nothing strong hides: what alters the readings by less than a diagnosis explains has no right name.
     """
@@ -214,7 +226,7 @@ def _check_strong(
         if test == "validate":
             continue
         y = []
-        for plant in (nominal, dirty, real):
+        for plant in (nominal, imperfect, real):
             moved, _ = tested(plant, bench, test, commands, np.random.default_rng(rng.integers(2**31)))
             y.append(plant.readings(moved, bench.sample_time))
         if not np.isfinite(y).all():
@@ -224,11 +236,11 @@ def _check_strong(
     if not rounded and max(gaps) < VISIBLE:
         raise Unsuitable(f"the effects alone alter the readings by {max(gaps):.2g}, at most")
     if max(ratios) < STRONG:
-        raise Unsuitable(f"the effects make {max(ratios):.2g} times the gap that the dirt makes, at most")
+        raise Unsuitable(f"the effects make {max(ratios):.2g} times the gap that the imperfections make, at most")
 
 
 def _check_distinct(
-    bench: Bench, tests: dict[str, np.ndarray], effects: list[dict[str, Any]], dirty: Plant, real: SolvedPlant
+    bench: Bench, tests: dict[str, np.ndarray], effects: list[dict[str, Any]], imperfect: Plant, real: SolvedPlant
 ) -> None:
     """The records to fit must tell an effect from its limiting case, else the simpler one is meant, and right.
 
@@ -238,7 +250,7 @@ def _check_distinct(
         law = POINT_LAWS.get(one["kind"])
         if law is None or law.limit is None:
             continue
-        simpler = hide(dirty, [law.limit(e) if e is one else e for e in effects]).solved()
+        simpler = hide(imperfect, [law.limit(e) if e is one else e for e in effects]).solved()
         noise = np.array([[sensor.noise_std] for sensor in real.plant.sensors])
         squares = []
         for test in (name for name in tests if name != "validate"):
@@ -306,18 +318,20 @@ def draw_kinds(n: int, seed: int, *, like: Case | None = None, structure: str = 
     return drawn
 
 
-def draw_dirty_kinds(n: int, seed: int, *, dirt: str = "all", size: float | None = None) -> list[DirtyDraw]:
-    """What n dirty trials hide: the class and size of the dirt, and the kinds; every third hides nothing.
+def draw_imperfect_kinds(
+    n: int, seed: int, *, imperfections: str = "all", size: float | None = None
+) -> list[ImperfectDraw]:
+    """What n imperfect trials hide: the class and size of the imperfections, and the kinds; every third hides nothing.
 
     Args:
-        dirt: a class, or "all" for each in turn.
-        size: of the dirt; None for each of `SIZES` in turn.
+        imperfections: a class, or "all" for each in turn.
+        size: of the imperfections; None for each of `SIZES` in turn.
     """
     rng = np.random.default_rng(seed)
-    drawn: list[DirtyDraw] = []
+    drawn: list[ImperfectDraw] = []
     for i in range(n):
-        name = DIRT_CLASSES[i % len(DIRT_CLASSES)] if dirt == "all" else dirt
-        turn = i // len(DIRT_CLASSES) if dirt == "all" else i
+        name = IMPERFECTIONS[i % len(IMPERFECTIONS)] if imperfections == "all" else imperfections
+        turn = i // len(IMPERFECTIONS) if imperfections == "all" else i
         how_large = SIZES[turn % len(SIZES)] if size is None else size
         pool = [k for k in KINDS if k not in MIMICS[name]]
         if name == TRIPLE:
@@ -326,7 +340,7 @@ def draw_dirty_kinds(n: int, seed: int, *, dirt: str = "all", size: float | None
             kinds = ()
         else:
             kinds = (str(rng.choice(pool)),)
-        drawn.append(DirtyDraw(name, how_large, kinds))
+        drawn.append(ImperfectDraw(name, how_large, kinds))
     return drawn
 
 
@@ -347,7 +361,7 @@ def write_trials(
     like: Case | None = None,
     structure: str = MEMBERS,
     kinds: Sequence[Sequence[str]] | None = None,
-    dirt: str | None = None,
+    imperfections: str | None = None,
     size: float | None = None,
     report: Callable[[str, float], None] = lambda text, share: None,
 ) -> None:
@@ -357,8 +371,8 @@ def write_trials(
         like: a case whose rig and records all are like; None draws a bench a case. Kinds that a bench cannot show
             give way to others.
         structure: of benches that are drawn: "members" (beams and rods), "plates" or "frames".
-        kinds: what each case hides; None draws them, see `draw_kinds` and `draw_dirty_kinds`.
-        dirt: class of the small errors beside what hides, of `DIRT_CLASSES`, or "all" for each in turn; None for none.
+        kinds: what each case hides; None draws them, see `draw_kinds` and `draw_imperfect_kinds`.
+        imperfections: class of the small errors beside what hides, of `IMPERFECTIONS`, or "all" in turn; None for none.
         size: of these errors; None for each of `SIZES` in turn.
         report: called with (what, share done).
 
@@ -368,17 +382,23 @@ def write_trials(
     folder, labels = Path(folder), Path(labels)
     if labels.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"labels {labels} would lie among the cases in {folder}; seal them elsewhere")
-    if dirt is None:
-        draws = [DirtyDraw(CLEAN, 1.0, k) for k in draw_kinds(n, seed, like=like, structure=structure)]
+    if imperfections is None:
+        draws = [ImperfectDraw(CLEAN, 1.0, k) for k in draw_kinds(n, seed, like=like, structure=structure)]
     else:
-        draws = draw_dirty_kinds(n, seed, dirt=dirt, size=size)
+        draws = draw_imperfect_kinds(n, seed, imperfections=imperfections, size=size)
     if kinds is not None:
         draws = [draw._replace(kinds=tuple(hidden)) for draw, hidden in zip(draws, kinds, strict=True)]
     labelled = {}
     for i, draw in enumerate(draws):
         name = f"case-{i + 1:03d}"
-        pool = [k for k in KINDS if k not in MIMICS[draw.dirt] | NOT_ON[structure] | {"truncated_modes"}]
-        how = {"like": like, "structure": structure, "name": name, "dirt": draw.dirt, "size": draw.size}
+        pool = [k for k in KINDS if k not in MIMICS[draw.imperfections] | NOT_ON[structure] | {"truncated_modes"}]
+        how = {
+            "like": like,
+            "structure": structure,
+            "name": name,
+            "imperfections": draw.imperfections,
+            "size": draw.size,
+        }
         case, labelled[name], _ = find_trial_with_plant(
             np.random.default_rng([seed, i]), kinds=draw.kinds, others=pool, tries=MOST_SEEDS, **how
         )

@@ -12,7 +12,7 @@ from workbench.structure.domain import Domain, NamedPoints, as_domain
 from workbench.trials.hidden import NONE, UNKNOWN, stands
 
 NEAR = 0.02  # of the length: how far off a place may be
-NEAR_IN_DIRT = 0.03  # likewise beside the small errors of a real test
+NEAR_IF_IMPERFECT = 0.03  # likewise beside the small errors of a real test
 HONEST = 0.05  # of the nominal residual's mean square: how far off a budget's unexplained share may be
 NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
 BINS = 5  # of a reliability diagram, of equal width
@@ -59,7 +59,7 @@ def score(
         inputs, outputs: names in order, needed where a label counts them from zero.
 
     Returns:
-        {"hidden", "told": sets of kinds in words; "family": single, pair, none or unknown; "kinds": right;
+        {"hidden", "diagnosed": sets of kinds in words; "family": single, pair, none or unknown; "kinds": right;
         "channels": inputs and outputs right, None without any; "position_errors": shares of the length or the
         diagonal, 1 for another name; "positions": right, None without any; "shrinkage": by validation record}.
     """
@@ -71,7 +71,7 @@ def score(
     errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
     return {
         "hidden": _words(hidden),
-        "told": _words(named),
+        "diagnosed": _words(named),
         "family": _family(hidden),
         "kinds": kinds,
         "channels": all(channels) if channels else None,
@@ -81,7 +81,7 @@ def score(
     }
 
 
-def score_dirty(
+def score_imperfect(
     verdict: dict[str, Any],
     label: dict[str, Any],
     *,
@@ -97,7 +97,7 @@ def score_dirty(
         inputs, outputs: names in order, needed where a label counts them from zero.
 
     Returns:
-        {"class", "size": of the small errors; "hidden", "told": sets of kinds in words;
+        {"class", "size": of the small errors; "hidden", "diagnosed": sets of kinds in words;
         "named": what hides is named, its channels and places right, and nothing else is; of three effects, two and an
         honest budget will do;
         "wrong": a kind, or a channel, is named that does not hide; "false_alarm": anything is, and nothing hides;
@@ -115,13 +115,13 @@ def score_dirty(
     budget = verdict.get("budget", {}).get("unexplained")
     complete = len(pairs) == len(hidden) == len(named)
     off = None if budget is None or not complete else abs(budget - label["budget"]["unexplained"])
-    placed = all(error <= NEAR_IN_DIRT for error in errors)
+    placed = all(error <= NEAR_IF_IMPERFECT for error in errors)
     in_part = len(hidden) == 3 and len(pairs) == len(named) == 2 and budget is not None and budget > HONEST
     return {
         "class": label.get("class", ""),
         "size": label.get("size", 1.0),
         "hidden": _words(hidden),
-        "told": _words(verdict["effects"]),
+        "diagnosed": _words(verdict["effects"]),
         "named": (complete or in_part) and placed and len(named) == len(verdict["effects"]),
         "wrong": len(pairs) < len(named),
         "false_alarm": not hidden and bool(named),
@@ -154,8 +154,8 @@ def reliability(scores: Iterable[dict[str, Any]]) -> list[Reliability]:
     ]
 
 
-def tally_dirty(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
-    """Shares over many scores of `score_dirty`.
+def tally_imperfect(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
+    """Shares over many scores of `score_imperfect`.
 
     Returns:
         {"cases", "named", "wrong", "false_alarms" (a count), "placed" within 3 %, "covered" by 95 % intervals,
@@ -171,7 +171,7 @@ def tally_dirty(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
         "named": _share([s["named"] for s in hiding]),
         "wrong": _share([s["wrong"] for s in scores]),
         "false_alarms": float(sum(s["false_alarm"] for s in scores)),
-        "placed": _share([e <= NEAR_IN_DIRT for e in errors]),
+        "placed": _share([e <= NEAR_IF_IMPERFECT for e in errors]),
         "covered": float(inside / of) if of else float("nan"),
         "honest": _share([b <= HONEST for b in budgets]),
     }
@@ -235,7 +235,7 @@ def tally(scores: Iterable[dict[str, Any]]) -> Tally:
     total: Counter[str] = Counter()
     misplaced = placed = 0
     for one in scores:
-        counts[one["hidden"], one["told"]] += 1
+        counts[one["hidden"], one["diagnosed"]] += 1
         total[one["family"]] += 1
         right[one["family"]] += one["kinds"]
         misplaced += sum(error > NEAR for error in one["position_errors"])

@@ -55,7 +55,7 @@ def test_rigid_motions_are_seen_exactly():
     shapes = np.column_stack([np.ones(5), x, x**2 - 0.5, x**4 - x**2])
     names = [f"P{i}" for i in range(5)]
     free = Modes([0.0, 0.0, 3.0, 9.0], np.zeros(4), lambda index, _: shapes[index], NamedPoints(tuple(names)))
-    seen = point_filter(free, ["P0", "P2", "P3"], [0, 1, 2]).seen(free)
+    seen = point_filter(free, ["P0", "P2", "P3"], [0, 1, 2]).response_to(free)
     np.testing.assert_allclose(seen[:, :2], np.eye(3, 2), atol=1e-6)
 
 

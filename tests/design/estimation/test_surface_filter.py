@@ -32,7 +32,7 @@ def scattered(n):
 def test_motions_of_a_rigid_plate_are_seen_exactly_from_any_sensors():
     free = plate("free", mass_per_area=lambda x, y: 8.0 + 3.0 * x * y).modes(6)
     assert (free.omega[:3] == 0).all()
-    found = surface_filter(free, scattered(10), lambda x, y: 8.0 + 3.0 * x * y).seen(free)
+    found = surface_filter(free, scattered(10), lambda x, y: 8.0 + 3.0 * x * y).response_to(free)
     np.testing.assert_allclose(found[:, :3], np.eye(6, 3), atol=1e-6)
 
 
@@ -43,7 +43,8 @@ def test_more_sensors_see_the_modes_better(edges):
     structure = plate(edges)
     modes = structure.modes(6)
     off = [
-        np.abs(filter_on(structure, modes, range(6), scattered(n)).seen(modes) - np.eye(6)).max() for n in (12, 48, 192)
+        np.abs(filter_on(structure, modes, range(6), scattered(n)).response_to(modes) - np.eye(6)).max()
+        for n in (12, 48, 192)
     ]
     assert off[1] < 0.35 * off[0] and off[2] < 0.35 * off[1] and off[2] < 0.02, off
 

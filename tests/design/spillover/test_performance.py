@@ -50,7 +50,9 @@ def test_figures_of_a_loop_with_an_observer_are_those_of_its_motion():
     spent = simpson((forces**2).sum(axis=0), x=time)
     assert told.effort == pytest.approx(spent, rel=1e-6)
     assert told.cost == pytest.approx(simpson(energy.sum(axis=0), x=time) + 3.0 * spent, rel=1e-6)
-    assert told.spilled == pytest.approx(simpson(((shapes @ forces)[2:] * motion[8:12]).sum(axis=0), x=time), rel=1e-5)
+    assert told.spillover == pytest.approx(
+        simpson(((shapes @ forces)[2:] * motion[8:12]).sum(axis=0), x=time), rel=1e-5
+    )
     assert told.margin == pytest.approx(-np.linalg.eigvals(loop).real.max())
 
 
@@ -68,7 +70,7 @@ def test_a_loop_that_is_unstable_has_no_figures():
         weight=1.0,
         final_time=10.0,
     )
-    assert told.margin < 0 and np.isinf([told.cost, told.effort, told.spilled]).all()
+    assert told.margin < 0 and np.isinf([told.cost, told.effort, told.spillover]).all()
     with pytest.raises(DesignError, match="final time must be positive and finite; got inf"):
         performance(close_loop(MODES, LAW), STATE, weight=1.0, final_time=np.inf)
 
@@ -81,4 +83,4 @@ def test_an_idle_relay_leaves_the_energy_of_free_decay():
     motion = control.initial_response(control.ss(plant, np.zeros((12, 1)), np.eye(12), 0), time, STATE).outputs
     energy = ((MODES.omega[:2, None] * motion[:2]) ** 2 + motion[6:8] ** 2).sum(axis=0)
     assert told.cost == pytest.approx(simpson(energy, x=time), rel=1e-6)
-    assert told.effort == 0.0 and told.spilled == 0.0
+    assert told.effort == 0.0 and told.spillover == 0.0

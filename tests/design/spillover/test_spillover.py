@@ -94,7 +94,7 @@ def test_lqr_is_cheapest_on_its_own_yardstick():
 def test_filter_weights_converge_with_the_fourth_power():
     errors = []
     for k in (9, 17, 33):
-        seen = hermite_filter(modes(4), np.linspace(0, 10, k), 1.0).seen(modes(4))
+        seen = hermite_filter(modes(4), np.linspace(0, 10, k), 1.0).response_to(modes(4))
         errors.append(np.abs(seen - np.eye(4)).max())
     slopes = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert (slopes > 3.7).all() and errors[-1] < 1e-4
@@ -104,9 +104,9 @@ def test_filter_with_uneven_sensors_and_uneven_mass():
     beam = Beam(length=4.0, mass_per_length=lambda x: 2 - 0.3 * x, bending_stiffness=1.0, left="clamped", right="free")
     found = beam.modes(3)
     uneven = 4 * np.sort(np.r_[0, 1, np.random.default_rng(0).uniform(0, 1, 30)])
-    seen = hermite_filter(found, uneven, lambda x: 2 - 0.3 * x).seen(found)
+    seen = hermite_filter(found, uneven, lambda x: 2 - 0.3 * x).response_to(found)
     assert np.abs(seen - np.eye(3)).max() < 1e-3
-    alone = displacement_filter(found, np.linspace(0.1, 4.0, 16), lambda x: 2 - 0.3 * x).seen(found)
+    alone = displacement_filter(found, np.linspace(0.1, 4.0, 16), lambda x: 2 - 0.3 * x).response_to(found)
     assert np.abs(alone - np.eye(3)).max() < 1e-3
 
 
@@ -118,7 +118,7 @@ def test_filter_refuses_sensors_out_of_order():
 def test_a_loop_through_sensors_that_cannot_see_a_mode_names_it():
     found = modes(2)
     filter_ = displacement_filter(found, [5.0], 1.0)
-    assert abs(filter_.seen(found)[1, 1]) < 1e-12
+    assert abs(filter_.response_to(found)[1, 1]) < 1e-12
     law = imsc(found, 2, [Actuator("a", 2.0), Actuator("b", 3.0)], weight=1.0)
     with pytest.raises(ValueError, match="mode 2 is unobservable"):
         close_loop(found, law, filter_)

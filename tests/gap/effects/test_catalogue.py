@@ -218,11 +218,11 @@ def test_a_speed_too_small_to_tell_is_not_stated():
     told = Effect(kind_named("coulomb_friction"), None, sudden, {"force": 0.1, "smoothing_speed": 1e-4})
     assert effect_json(told, rig())["parameters"] == {"force": 1.0}
     assert "smoothing" not in _described(told, rig())
-    at_once = told.kind.settled(told).values
+    at_once = told.kind.without_negligible(told).values
     assert at_once == {**sudden, "smoothing_speed": at_once["smoothing_speed"]} and at_once["smoothing_speed"] < 2e-10
     sure = Effect(kind_named("coulomb_friction"), None, sudden, {"force": 0.1, "smoothing_speed": 1e-10})
     assert effect_json(sure, rig())["parameters"] == {"force": 1.0, "smoothing_speed": 1e-9}
-    assert effect_json(sure.kind.settled(sure), rig())["parameters"] == {"force": 1.0}
+    assert effect_json(sure.kind.without_negligible(sure), rig())["parameters"] == {"force": 1.0}
     viscous = Effect(kind_named("coulomb_friction"), None, sudden, {"force": 2.0, "smoothing_speed": 2e-9})
     assert "smoothing_speed" in effect_json(viscous, rig())["parameters"], "of a damper only the ratio is known"
 

@@ -66,7 +66,7 @@ def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig
     found = where(rig, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
     assert abs(found.at - 1.37) < min(0.005 * rig.modes.length, 4.0 * found.at_std)
     assert found.at_std < 0.005 * rig.modes.length
-    assert 2 in found.modes and found.place.holds and found.place.share > 0.999
+    assert 2 in found.modes and found.place.is_single_force and found.place.share > 0.999
     assert found.path == "structure" and found.linear_share < 0.1
 
 
@@ -79,7 +79,11 @@ def test_a_force_is_placed_without_the_sensor_that_is_at_fault(rig, measured):
     misled, found = where(rig, records), where(rig, records, faulty=[faulty.name])
     assert abs(misled.at - 1.37) > 0.02 * rig.modes.length
     assert abs(found.at - 1.37) < min(0.005 * rig.modes.length, 4.0 * found.at_std)
-    assert found.place.holds and not misled.place.holds and found.sensor_shares[1] == misled.sensor_shares[1]
+    assert (
+        found.place.is_single_force
+        and not misled.place.is_single_force
+        and found.sensor_shares[1] == misled.sensor_shares[1]
+    )
 
 
 @pytest.mark.slow  # that single places lie within four deviations is tried by others here
@@ -97,7 +101,7 @@ def test_the_deviation_of_a_place_is_true(rig, measured, law):
     real = replace(rig, elements=(law,))
     places = [placed_by(rig, [measured(real, str(s), 0.3, s) for s in (seed, seed + 100)]) for seed in range(10)]
     z = np.array([(place.at - 1.37) / place.at_std for place in places])
-    assert all(place.holds for place in places)
+    assert all(place.is_single_force for place in places)
     assert 0.4 < np.sqrt(np.mean(z**2)) < 2.0 and np.abs(z).max() < 4.0
 
 
@@ -105,7 +109,7 @@ def test_the_deviation_of_a_place_is_true(rig, measured, law):
 def test_a_gap_that_is_not_of_one_force_is_not_placed(rig, measured, elsewhere):
     real = replace(rig, elements=(CubicSpring(1.37, 300.0), elsewhere))
     place = placed_by(rig, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
-    assert not place.holds
+    assert not place.is_single_force
 
 
 @pytest.mark.slow
@@ -115,7 +119,7 @@ def test_a_long_record_is_placed_by_some_of_its_lines(rig, measured, monkeypatch
     every = placed_by(rig, records)
     monkeypatch.setattr(force_lines, "LINES", replace(force_lines.LINES, most_lines=300))
     fewer = placed_by(rig, records)
-    assert fewer.holds and every.at_std < fewer.at_std < 8.0 * every.at_std
+    assert fewer.is_single_force and every.at_std < fewer.at_std < 8.0 * every.at_std
     assert abs(fewer.at - 1.37) < 4.0 * fewer.at_std
 
 
@@ -129,14 +133,14 @@ def test_a_force_far_above_the_noise_has_all_of_its_lines(rig, measured):
 
 def test_no_gap_tells_no_place(rig, measured):
     place = placed_by(rig, [measured(rig, str(seed), 0.3, seed) for seed in (2, 3)])
-    assert place.holds is None and place.share == 0.0
+    assert place.is_single_force is None and place.share == 0.0
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 4, 6, 8))])
 def test_short_records_of_one_force_are_of_one_force(rig, measured, seed):
     real = replace(rig, elements=(CubicSpring(1.37, 3000.0),))
     records = [measured(real, str(s), 1.0, s) for s in (seed, seed + 1)]
-    assert placed_by(rig, [record.between(0.0, 4.0) for record in records]).holds
+    assert placed_by(rig, [record.between(0.0, 4.0) for record in records]).is_single_force
 
 
 def test_an_undamped_mode_on_a_line_is_no_obstacle(rig):
@@ -151,14 +155,14 @@ def test_a_sensor_that_lags_misleads_no_place(rig, measured):
     sensors = (replace(rig.sensors[0], time_constant=0.01), *rig.sensors[1:])
     known, real = replace(rig, sensors=sensors), replace(rig, sensors=sensors, elements=(CubicSpring(1.37, 3000.0),))
     place = placed_by(known, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
-    assert place.holds and abs(place.at - 1.37) < 4.0 * place.at_std
+    assert place.is_single_force and abs(place.at - 1.37) < 4.0 * place.at_std
 
 
 def test_one_sensor_tells_no_place(rig, measured):
     real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
-    records = [measured(real, str(seed), 0.3, seed).only(("d2",)) for seed in (2, 3)]
+    records = [measured(real, str(seed), 0.3, seed).select_outputs(("d2",)) for seed in (2, 3)]
     place = placed_by(replace(rig, sensors=rig.sensors[1:2]), records)
-    assert place.holds is None and place.at_std > 0.2 * rig.modes.length
+    assert place.is_single_force is None and place.at_std > 0.2 * rig.modes.length
 
 
 def test_no_gap_has_no_path(rig, measured):

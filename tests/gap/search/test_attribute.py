@@ -53,7 +53,7 @@ def test_a_mass_that_stood_for_an_error_of_the_identified_frequency_is_left_out(
     alone = fit(nominal, (GAIN, replace(mass, values={"at": "y", "mass": added + 0.01})), data)
     assert alone.effects[1].values["mass"] > 0.008, "without the doubt it stands for the error"
     found = beside_identified(search, alone, IdentifiedPrior.of_modes(nominal), ())
-    assert sorted(e.kind.name for e in found.effects if not e.kind.first) == kinds
+    assert sorted(e.kind.name for e in found.effects if not e.kind.applied_first) == kinds
 
 
 def test_friction_far_below_its_smoothing_speed_is_a_damper():

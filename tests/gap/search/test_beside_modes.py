@@ -62,7 +62,7 @@ def test_nothing_is_named_where_nothing_hides(rig, measured):
 def test_a_law_is_named_beside_them_and_its_interval_holds(rig, measured):
     *fitted, kept = measured(CubicSpring(AT, STIFFNESS))
     verdict = diagnose(rig, fitted, validation=[kept])
-    (effect,) = (e for e in verdict.effects if not e.kind.first)
+    (effect,) = (e for e in verdict.effects if not e.kind.applied_first)
     assert effect.kind.name == "cubic_spring" and effect.at == pytest.approx(AT, abs=0.03 * rig.modes.length)
     assert abs(effect.values["stiffness"] - STIFFNESS) < 2.5 * effect.deviations["stiffness"]
 
@@ -88,7 +88,7 @@ def test_a_gain_far_from_the_others_is_an_effect(rig, measured):
 def test_a_gain_off_by_more_than_any_calibration_is_named(rig, measured):
     *fitted, kept = measured(gain=0.8)
     verdict = diagnose(rig, fitted, validation=[kept])
-    (effect,) = (e for e in verdict.effects if not e.kind.first)
+    (effect,) = (e for e in verdict.effects if not e.kind.applied_first)
     assert (effect.kind.name, effect.target) == ("sensor_gain", rig.sensors[1].name)
     assert effect.values["gain"] == pytest.approx(0.993 * 0.8, rel=0.02)
 

@@ -24,7 +24,7 @@ from workbench.gap.search.plain import (
 )
 from workbench.gap.search.search import Search
 from workbench.trials.make import make_trial
-from workbench.trials.scoring import score_dirty
+from workbench.trials.scoring import score_imperfect
 
 DAMPER = Effect(kind_named("point_damper"), None, {"at": 1.2, "coefficient": 0.06})
 MODULUS = Effect(kind_named("modulus_error"), None, {"factor": 1.008})
@@ -144,7 +144,7 @@ def test_one_of_them_alone_is_an_effect(search, common):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seed", "kinds", "dirt", "size"),
+    ("seed", "kinds", "imperfections", "size"),
     [
         (34017, ("sensor_bias", "sensor_drift", "support_rotation"), "triple", 1.0),
         (35026, ("one_sided_stop", "point_damper", "sensor_drift"), "triple", 2.0),
@@ -153,11 +153,11 @@ def test_one_of_them_alone_is_an_effect(search, common):
         (35006, ("random_disturbance",), "late", 0.5),
     ],
 )
-def test_hidden_effects_that_errors_could_stand_in_for_are_named(seed, kinds, dirt, size):
+def test_hidden_effects_that_errors_could_stand_in_for_are_named(seed, kinds, imperfections, size):
     """Plants by another numerical route: an effect that a support, a damper or a load hides among errors of modes."""
-    case, label = make_trial(seed, kinds=kinds, dirt=dirt, size=size)
+    case, label = make_trial(seed, kinds=kinds, imperfections=imperfections, size=size)
     verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1)
-    assert score_dirty(verdict.to_json(), label, domain=case.rig.modes.domain)["named"]
+    assert score_imperfect(verdict.to_json(), label, domain=case.rig.modes.domain)["named"]
 
 
 @pytest.mark.parametrize(

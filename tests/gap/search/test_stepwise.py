@@ -22,7 +22,7 @@ from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
 from workbench.trials.hold import hold_trials
 from workbench.trials.make import make_trial
-from workbench.trials.scoring import score_dirty
+from workbench.trials.scoring import score_imperfect
 
 NOISE = 1e-5
 DT = 0.01  # of the records
@@ -105,7 +105,7 @@ def test_friction_beside_small_errors(rig, measured, records):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seed", "kinds", "dirt", "size"),
+    ("seed", "kinds", "imperfections", "size"),
     [
         (866047253, ("point_mass",), "input", 0.5),  # 6 % of the response, beside noise of the inputs
         (1848887362, ("truncated_modes",), "input", 1.0),
@@ -118,11 +118,11 @@ def test_friction_beside_small_errors(rig, measured, records):
         (20299141, ("midplane_stretching",), "mixed", 0.5),
     ],
 )
-def test_effects_beside_small_errors_are_named(seed, kinds, dirt, size):
+def test_effects_beside_small_errors_are_named(seed, kinds, imperfections, size):
     """Plants by another numerical route, with an effect among small errors that would hide it from a mean square."""
-    case, label = make_trial(seed, kinds=[*kinds], dirt=dirt, size=size)
+    case, label = make_trial(seed, kinds=[*kinds], imperfections=imperfections, size=size)
     verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1).to_json()
-    score = score_dirty(verdict, label, domain=case.rig.modes.domain)
+    score = score_imperfect(verdict, label, domain=case.rig.modes.domain)
     assert score["named"] and not (score["wrong"] or score["false_alarm"])
 
 
@@ -178,7 +178,7 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seed", "dirt", "size", "kinds"),
+    ("seed", "imperfections", "size", "kinds"),
     [
         (880002, "offset", 0.5, ()),  # sides of accelerometers told beside a wrong stiffness
         (20261502, "shape", 0.5, ("actuator_bias",)),  # a constant force passed for a random one
@@ -211,8 +211,8 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (881003, "triple", 0.5, ("actuator_dead_zone", "clearance", "ground_spring")),  # told as a cubic spring
     ],
 )
-def test_trials_that_were_told_wrongly_once(seed, dirt, size, kinds):
-    (told,) = hold_trials(1, seed, kinds=[kinds], dirt=dirt, size=size).dirty_scores.values()
+def test_trials_that_were_told_wrongly_once(seed, imperfections, size, kinds):
+    (told,) = hold_trials(1, seed, kinds=[kinds], imperfections=imperfections, size=size).imperfect_scores.values()
     assert told["named"] and not told["wrong"]
 
 

@@ -120,7 +120,7 @@ def test_refusals(bar_modes):
     with pytest.raises(ValueError, match="Measure longer or ask for fewer"):
         stacked_delays(record, n_modes=20)
     with pytest.raises(ValueError, match="same outputs"):
-        stacked_delays([record, record.only(["y1"])], n_modes=1)
+        stacked_delays([record, record.select_outputs(["y1"])], n_modes=1)
 
 
 def test_a_mode_beyond_half_the_sample_rate_is_named():

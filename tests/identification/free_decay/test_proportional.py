@@ -29,7 +29,7 @@ def test_constants_found_within_their_errors():
 def test_other_damping_is_recognised():
     fit = proportional_fit(identified(np.array([0.01, 0.03, 0.005, 0.02])))
     assert fit.probability < 1e-6
-    assert np.abs(fit.left_over).max() > 10
+    assert np.abs(fit.standardised_residuals).max() > 10
 
 
 def test_one_mode_is_not_enough():

@@ -115,7 +115,7 @@ def test_noisy_sensor_is_weighted_down(truth):
     spoilt[0] += 30 * std * np.random.default_rng(0).standard_normal(N)
     spoilt = replace(record, outputs=spoilt)
     start = stacked_delays(record, n_modes=4, delays=60)
-    with_it, without = refine(spoilt, start), refine(record.only(record.output_names[1:]), start)
+    with_it, without = refine(spoilt, start), refine(record.select_outputs(record.output_names[1:]), start)
     assert with_it.noise_std[0] == pytest.approx(30 * std, rel=0.15)
     assert np.allclose(with_it.omega_std, without.omega_std, rtol=0.1)
 

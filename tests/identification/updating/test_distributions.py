@@ -64,7 +64,7 @@ def test_scale_of_the_modes_does_not_matter(case):
 
 
 def test_prior_estimate_is_corrected(case):
-    """A right prior needs no series; a wrong one is mended by it (4.20-4.24)."""
+    """A right prior needs no series; a wrong one is corrected by it (4.20-4.24)."""
     ends, modes = case
     options = {"kind": ends["kind"], "known_mass": [(1.0, 1.3)]}
     right = mass_and_stiffness(
@@ -77,7 +77,7 @@ def test_prior_estimate_is_corrected(case):
     )
     assert np.abs(right.mass.coefficients).max() < 1e-9
     assert np.abs(right.stiffness.coefficients).max() < 1e-8
-    mended = mass_and_stiffness(
+    corrected = mass_and_stiffness(
         modes,
         mass_basis=Basis.polynomial(2),
         stiffness_basis=Basis.polynomial(3),
@@ -85,8 +85,8 @@ def test_prior_estimate_is_corrected(case):
         prior_stiffness=lambda x: 1.0 + x,
         **options,
     )
-    assert np.allclose(mended.mass(X), mass(X), rtol=1e-9)
-    assert np.allclose(mended.stiffness(X), stiffness(X), rtol=1e-9)
+    assert np.allclose(corrected.mass(X), mass(X), rtol=1e-9)
+    assert np.allclose(corrected.stiffness(X), stiffness(X), rtol=1e-9)
 
 
 def test_local_functions(case):

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicHermiteSpline, RBFInterpolator, make_interp_spline
 
 from workbench.arrays import Floats
+from workbench.renamed import Renamed
 from workbench.structure.domain import NamedPoints, Place, Rectangle, gauss_between, same_place
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes, freeze
@@ -74,8 +75,10 @@ class ModalFilter(Printed):
             modal = modal + self.slope @ np.asarray(slope, float)
         return modal
 
-    def seen(self, modes: Modes) -> Floats:
-        """What the filter makes of each mode: (n_filtered, n_modes); the identity for a perfect filter.
+    seen = Renamed("response_to")
+
+    def response_to(self, modes: Modes) -> Floats:
+        """The filter's modal coordinates for a unit of each mode, (n_filtered, n_modes); the identity if it is perfect.
 
         Columns beyond the filtered modes are observation spillover.
         """
@@ -278,6 +281,6 @@ def _held(modes: Modes, domain: Rectangle, at: np.ndarray) -> Floats:
     x, y = (np.linspace(0.0, side, max(round(side / spacing), 4) + 1) for side in (a, b))
     along = [(each, edge) for edge in (0.0, b) for each in x] + [(edge, each) for edge in (0.0, a) for each in y[1:-1]]
     rim = np.array(along)
-    rim = rim[modes.are_still(rim)]
+    rim = rim[modes.are_held(rim)]
     distance = np.linalg.norm(rim[:, None] - at, axis=2).min(axis=1, initial=np.inf)
     return np.asarray(rim[distance > SAME * domain.size])

@@ -17,7 +17,7 @@ from workbench.structure.domain import Domain
 HERE = Path(__file__).parent
 TEMPLATES = {"c": ("h", "c"), "python": ("py",)}
 WIDTH = 108
-DIGITS = 6  # of a place: channels are told apart by it
+DIGITS = 6  # of a place: channels are distinguished by it
 
 
 def source(

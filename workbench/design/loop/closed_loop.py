@@ -125,7 +125,7 @@ def close_loop(modes: Modes, law: Law | Controller, filter_: ModalFilter | None 
         seen = np.zeros((law.n_controlled, n))
         seen[np.arange(law.n_controlled), list(law.controlled)] = 1.0
     else:
-        seen = filter_.seen(modes)
+        seen = filter_.response_to(modes)
         if seen.shape[0] != law.n_controlled:
             raise ValueError(f"the filter gives {seen.shape[0]} modes; the law controls {law.n_controlled}")
         strength = np.abs(seen[np.arange(law.n_controlled), list(law.controlled)])

@@ -79,7 +79,7 @@ def _error_by_mode(
 ) -> np.ndarray:
     """(n_modes,) what each mode has of the squared relative error."""
     index, e = list(controlled), np.asarray(mean_squares, float)
-    seen = filter_of_mass(mass, modes, index, positions).seen(modes)
+    seen = filter_of_mass(mass, modes, index, positions).response_to(modes)
     seen[np.arange(len(index)), index] -= 1.0
     return np.asarray((seen**2).sum(axis=0) * e / e[index].sum())
 

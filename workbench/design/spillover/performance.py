@@ -9,6 +9,7 @@ from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import respond_on_off
 from workbench.design.spillover.spillover import check_final_time, on_off_work, second_moments
+from workbench.renamed import Renamed
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
 
@@ -22,14 +23,16 @@ class Performance:
     Attributes:
         cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt, Σ over the controlled modes as they are, not as they are estimated.
         effort: ∫ FᵀF dt.
-        spilled: W_R, work in the residual modes.
+        spillover: W_R, work in the residual modes.
         margin: distance of the rightmost pole from the axis, 1/s; nan where a loop has no poles.
     """
 
     cost: float
     effort: float
-    spilled: float
+    spillover: float
     margin: float
+
+    spilled = Renamed("spillover")
 
 
 def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: float) -> Performance:
@@ -54,8 +57,8 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
     effort = float(np.trace(loop.feedback @ moments @ loop.feedback.T))
     rest = [r for r in range(n) if r not in own]
     push = input_matrix(modes, loop.law.actuators)[rest] @ loop.feedback
-    spilled = float(sum(row @ moments[:, n + r] for row, r in zip(push, rest)))
-    return Performance(float(energy) + weight * effort, effort, spilled, margin)
+    spillover = float(sum(row @ moments[:, n + r] for row, r in zip(push, rest)))
+    return Performance(float(energy) + weight * effort, effort, spillover, margin)
 
 
 def on_off_performance(
@@ -69,8 +72,8 @@ def on_off_performance(
     own = list(law.controlled)
     effort = float(np.trapezoid((response.forces**2).sum(axis=0), time))
     energy = float(np.trapezoid(2.0 * response.energy[own].sum(axis=0), time))
-    spilled = on_off_work(modes, law, state, final_time).residual_total
-    return Performance(energy + weight * effort, effort, spilled, np.nan)
+    spillover = on_off_work(modes, law, state, final_time).residual_total
+    return Performance(energy + weight * effort, effort, spillover, np.nan)
 
 
 def _check_weight(weight: float) -> None:

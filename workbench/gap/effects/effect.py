@@ -11,6 +11,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.records.record import Record
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion
 from workbench.structure.domain import Between, Domain, NamedPoints, Rectangle, Where
@@ -230,24 +231,26 @@ class Kind:
         nonlinear: whether it makes the response depend on level.
         phrase: how the sentence of the verdict calls it.
         simpler: effect, rig -> its limiting cases at bounds of its parameters, with values to start a fit from.
-        wider: effect -> what it is a limiting case of and records can mistake for it, with values to start a fit from.
+        more_general: effect -> what it is a limiting case of and records can mistake for it, with values to start a
+            fit from.
         merged: effect, another -> the one effect that both together may be, with values to start a fit from; or None.
         signed: whether the change is linear in its one number, which may be of either sign; one start is then enough.
         found_in: "search", where its starts are tried; "readings", where it shows in them as they are; "residual",
             where only its statistics can be found.
-        alone: whether one rules out another of the kind, whatever its target.
-        remainder: what it leaves that no model can predict, in a sentence; empty where it leaves nothing.
+        exclusive: whether one rules out another of the kind, whatever its target.
+        unpredictable: the part of the response that no model can predict, in a sentence; empty where there is none.
         force_laws: "displacement" or "velocity" -> values, that motion (n,) -> force (n,), where it is a law of that
             alone.
         numbers: effect, rig -> the numbers that a verdict states, by name; None for its values, a place left out.
-        settled: effect -> the same with numbers as good as none that records may not tell from none; itself without.
-        second_channel, joined: of a kind that acts on two inputs or two outputs: what the verdict calls the other one,
+        without_negligible: effect -> the same less parameters so near zero that records may not show them; itself where
+            it has none.
+        second_channel, conjunction: of a kind that acts on two inputs or two outputs: what the verdict calls the other,
             and the word between the two in its sentence.
         remark: effect, rig -> what the sentence says in brackets; None for its numbers.
-        stands: effect, rig -> its place where no parameter holds it, and what the sentence calls it.
-        first: whether it changes the nominal model itself, before any other effect acts on it.
-        last: whether it acts on modes as all other effects have made them: where modes keep their damping ratios, a
-            damper there before a mass would be of another strength.
+        fixed_place: effect, rig -> its place where no parameter holds it, and what the sentence calls it.
+        applied_first: whether it changes the nominal model itself, before any other effect acts on it.
+        applied_last: whether it acts on modes as all other effects have made them: where modes keep their damping
+            ratios, a damper there before a mass would be of another strength.
     """
 
     name: str
@@ -259,21 +262,24 @@ class Kind:
     nonlinear: bool = False
     phrase: str = ""
     simpler: Callable[["Effect", Rig], Iterable["Effect"]] = lambda effect, rig: ()
-    wider: Callable[["Effect"], Iterable["Effect"]] = lambda effect: ()
+    more_general: Callable[["Effect"], Iterable["Effect"]] = lambda effect: ()
     merged: "Callable[[Effect, Effect], Effect | None]" = lambda effect, other: None
     signed: bool = False
     found_in: Literal["search", "readings", "residual"] = "search"
-    alone: bool = False
-    remainder: str = ""
+    exclusive: bool = False
+    unpredictable: str = ""
     force_laws: Mapping[str, Callable[[Mapping[str, Any], np.ndarray], np.ndarray]] = field(default_factory=dict)
     numbers: Callable[["Effect", Rig], dict[str, float]] | None = None
-    settled: Callable[["Effect"], "Effect"] = lambda effect: effect
+    without_negligible: Callable[["Effect"], "Effect"] = lambda effect: effect
     remark: Callable[["Effect", Rig], str] | None = None
-    stands: Callable[["Effect", Rig], tuple[float, str]] | None = None
+    fixed_place: Callable[["Effect", Rig], tuple[float, str]] | None = None
     second_channel: str = "with"
-    joined: str = " and "
-    first: bool = False
-    last: bool = False
+    conjunction: str = " and "
+    applied_first: bool = False
+    applied_last: bool = False
+    wider, alone, remainder = Renamed("more_general"), Renamed("exclusive"), Renamed("unpredictable")
+    settled, stands = Renamed("without_negligible"), Renamed("fixed_place")
+    first, last, joined = Renamed("applied_first"), Renamed("applied_last"), Renamed("conjunction")
     known: ClassVar[WeakValueDictionary[int, "Kind"]] = WeakValueDictionary()  # by identity: none is equal to another
 
     def __post_init__(self) -> None:
@@ -282,6 +288,18 @@ class Kind:
     @property
     def words(self) -> str:
         return self.phrase or self.name.replace("_", " ")
+
+
+Kind.__init__ = former_arguments(  # type: ignore[method-assign]
+    wider="more_general",
+    alone="exclusive",
+    remainder="unpredictable",
+    settled="without_negligible",
+    stands="fixed_place",
+    first="applied_first",
+    last="applied_last",
+    joined="conjunction",
+)(Kind.__init__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,7 +337,7 @@ class Effect:
         """
         tested = [p for p in self.parameters(rig) if p.neutral is not None and self.deviations.get(p.name, 0.0) > 0]
         off = any(abs(self.values[p.name] - p.neutral) > self.deviations[p.name] for p in tested)
-        return off or not tested or self.kind.first
+        return off or not tested or self.kind.applied_first
 
     def stated(self, rig: Rig) -> dict[str, Any]:
         """The numbers that a verdict states, by name."""
@@ -345,8 +363,8 @@ def names_in(target: Any) -> tuple[str, ...]:
     return tuple(name for name in (target if isinstance(target, tuple) else (target,)) if isinstance(name, str))
 
 
-# of kinds whose names in words are no identifiers with spaces
-AS_WRITTEN = (
+# of kinds whose name in words is not their identifier with spaces for underscores
+SPELLINGS = (
     ("bouc wen", "Bouc-Wen"),
     ("coulomb", "Coulomb"),
     ("two way friction", "direction-dependent friction"),
@@ -357,8 +375,8 @@ AS_WRITTEN = (
 def label_in_words(label: str) -> str:
     """A label as a figure or a note shows it: actuator gain (F2), Bouc-Wen."""
     words = label.replace("[", " (").replace("]", ")").replace("_", " ")
-    for plain, written in AS_WRITTEN:
-        words = words.replace(plain, written)
+    for plain, spelt in SPELLINGS:
+        words = words.replace(plain, spelt)
     return words
 
 
@@ -369,7 +387,7 @@ def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
 
 def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
     """The rig with every effect in it, in order, errors of the nominal model before all others and dampers after."""
-    for effect in sorted(effects, key=lambda e: (e.kind.last, not e.kind.first)):
+    for effect in sorted(effects, key=lambda e: (e.kind.applied_last, not e.kind.applied_first)):
         rig = effect.apply(rig)
     return rig
 
@@ -414,11 +432,11 @@ def each_left_out(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
         yield tuple(other for other in effects if other is not effect)
 
 
-def wider_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
+def more_general_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect as what it is a limiting case of."""
     for i, effect in enumerate(effects):
-        for wider in effect.kind.wider(effect):
-            yield (*effects[:i], wider, *effects[i + 1 :])
+        for more_general in effect.kind.more_general(effect):
+            yield (*effects[:i], more_general, *effects[i + 1 :])
 
 
 def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:

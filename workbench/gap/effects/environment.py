@@ -106,7 +106,7 @@ RANDOM_DISTURBANCE = Kind(
     apply=lambda rig, _, v: with_element(rig, RandomForce(place_of(v), v["rms"])),
     starts=lambda *_: [],  # found by what it does to the statistics
     found_in="residual",
-    remainder="A random disturbance leaves an unpredictable residual; only its statistics were estimated.",
+    unpredictable="A random disturbance leaves an unpredictable residual; only its statistics were estimated.",
     phrase="a random disturbance",
 )
 

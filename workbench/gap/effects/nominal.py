@@ -384,7 +384,7 @@ NOMINAL_ERRORS = Kind(
     apply=_off,
     starts=lambda evidence, _: [],
     phrase="small errors of the nominal model",
-    first=True,
+    applied_first=True,
 )
 
 

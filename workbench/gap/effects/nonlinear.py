@@ -265,12 +265,12 @@ COULOMB_FRICTION = Kind(
     apply=lambda rig, _, v: with_element(rig, CoulombFriction(place_of(v), v["force"], v["smoothing_speed"])),
     starts=_friction_starts,
     nonlinear=True,
-    wider=_either_way,
+    more_general=_either_way,
     merged=_with_a_constant_force,
     simpler=_viscous,
     force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
     numbers=_without_sudden,
-    settled=_sudden,
+    without_negligible=_sudden,
     phrase="a friction force",
 )
 
@@ -396,7 +396,7 @@ TWO_WAY_FRICTION = Kind(
     simpler=_same_both_ways,
     force_laws={"velocity": _two_way_law},
     numbers=_without_sudden,
-    settled=_sudden,
+    without_negligible=_sudden,
     phrase="a friction force that differs between the two directions",
 )
 

@@ -87,14 +87,14 @@ def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     for exchange in [e for e in effects if e.kind in (SWAPPED_INPUTS, SWAPPED_OUTPUTS)]:
         at, (one, other) = ordered.index(exchange), exchange.target
         names = {one: other, other: one}
-        later = [e for e in ordered[at + 1 :] if e.kind.path == exchange.kind.path and not e.kind.first]
+        later = [e for e in ordered[at + 1 :] if e.kind.path == exchange.kind.path and not e.kind.applied_first]
         if any(isinstance(e.target, tuple) for e in later):  # each of two channels may be a part of what they do
             continue
         moved = [
             replace(e, target=names.get(e.target, e.target)) if e in later and e.kind.name != OF_THE_CHANNEL else e
             for e in ordered[at + 1 :]
         ]
-        errors = sum(e.kind.first for e in moved)
+        errors = sum(e.kind.applied_first for e in moved)
         ordered[at:] = [*moved[: len(moved) - errors], exchange, *moved[len(moved) - errors :]]
     return tuple(ordered)
 
@@ -496,7 +496,7 @@ SENSOR_CROSSTALK = Kind(
     targets=lambda rig: tuple(permutations(each_sensor(rig), 2)),
     signed=True,
     second_channel="from",
-    joined=" from ",
+    conjunction=" from ",
     phrase="cross-talk between sensors",
 )
 
@@ -609,7 +609,7 @@ SENSOR_QUANTISATION = _sensor(
     low=1e-300,
     nonlinear=True,
     found_in="readings",
-    remainder="Quantisation leaves an unpredictable error of step/√12 rms.",
+    unpredictable="Quantisation leaves an unpredictable error of step/√12 rms.",
 )
 
 KINDS = (

@@ -71,7 +71,7 @@ def _modes_of_surface(surface: Plate | Membrane, n_modes: int, solved_for: int =
     if not isinstance(damping, ViscousDamping):
         bare = replace(bare, damping=damping.matrix(bare.omega))
     residual = _residual_flexibility(surface, float(bare.omega[-1]))
-    return attach(bare, _attachments(surface), kept=n_modes, residual=residual)
+    return attach(bare, _attachments(surface), n_modes=n_modes, residual_flexibility=residual)
 
 
 def _residual_flexibility(surface: Plate | Membrane, omega: float) -> float:
@@ -280,7 +280,7 @@ POINT_DAMPER = Kind(
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
     starts=_point_starts("coefficient", "velocity", "damping"),
     phrase="a viscous damper to ground",
-    last=True,
+    applied_last=True,
     force_laws={"velocity": lambda v, u: -v["coefficient"] * u},
 )
 
@@ -356,7 +356,7 @@ SUPPORT_ROTATION = Kind(
     ],
     targets=_ends,
     phrase="a support that is neither hinged nor clamped",
-    stands=lambda support, rig: (
+    fixed_place=lambda support, rig: (
         0.0 if support.target == "left" else _beam(rig).length,
         f"at the {support.target} end",
     ),
@@ -428,8 +428,8 @@ TRUNCATED_MODES = Kind(
     targets=lambda rig: () if rig.structure is None else tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)),
     phrase="modes left out of the model",
     simpler=_one_mode_fewer,
-    wider=_more_modes,
-    alone=True,
+    more_general=_more_modes,
+    exclusive=True,
     numbers=lambda truncation, rig: {"kept": rig.modes.n_modes, "needed": truncation.target},
     remark=lambda truncation, rig: f"{truncation.target} are needed, {rig.modes.n_modes} are kept",
 )

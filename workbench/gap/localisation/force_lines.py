@@ -223,7 +223,7 @@ class Lines:
         return self.receptances.products(self.left, self.weights)
 
     @property
-    def freedom(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """Values that stay noise once a force, of any law, and the ends are accounted for."""
         n_lines, n_sensors = self.left.shape
         return int(max(2 * n_lines * (n_sensors - 1 - len(self.folded)) - self._products[1].size, 0))

@@ -13,6 +13,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_lines import Lines, screened
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
+from workbench.renamed import Renamed
 from workbench.rig.linear import held_response, modal_motion, modal_poles, straight_response
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import participation_of
@@ -55,8 +56,8 @@ class ForceLocation:
         at_std: a quarter of the way between where the misfit is two deviations higher, m, more by what is left
             beyond the noise; on a rectangle along the longer axis of the region; 0 for named places.
         share: of the gap's power above the noise, what one force there accounts for.
-        holds: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing shows it:
-            no gap, one sensor, or records too short.
+        is_single_force: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing
+            shows it: no gap, one sensor, or records too short.
     """
 
     places: Sequence[Any]
@@ -64,7 +65,9 @@ class ForceLocation:
     at: Any
     at_std: float
     share: float
-    holds: bool | None
+    is_single_force: bool | None
+
+    holds = Renamed("is_single_force")
 
 
 @one_blas_thread
@@ -133,21 +136,21 @@ class _Search:
         return sum(each.misfit(shape) for each in lines)
 
     @property
-    def freedom(self) -> int:
-        return sum(each.freedom for each in self.lines)
+    def degrees_of_freedom(self) -> int:
+        return sum(each.degrees_of_freedom for each in self.lines)
 
     def left(self, at: Any) -> float:
         """What a force there leaves beyond the noise, per value, in units of the noise."""
-        return self.misfit(self.lines, at) / max(self.freedom, 1) - 1.0
+        return self.misfit(self.lines, at) / max(self.degrees_of_freedom, 1) - 1.0
 
     def of_one_force(self, at: Any) -> tuple[float, bool | None]:
         """Share of the gap's power that a force there accounts for, and whether it is all of it."""
         values = 2 * sum(each.left.size for each in self.lines)
         gap = sum(each.power for each in self.lines) - values
-        if self.freedom == 0 or gap < LOCALISATION.chance * np.sqrt(2.0 * values):
+        if self.degrees_of_freedom == 0 or gap < LOCALISATION.chance * np.sqrt(2.0 * values):
             return 0.0, None
-        left, chance = self.left(at), LOCALISATION.chance * np.sqrt(2.0 / self.freedom)
-        share = float(np.clip(1.0 - left * self.freedom / gap, 0.0, 1.0))
+        left, chance = self.left(at), LOCALISATION.chance * np.sqrt(2.0 / self.degrees_of_freedom)
+        share = float(np.clip(1.0 - left * self.degrees_of_freedom / gap, 0.0, 1.0))
         return share, bool(left < LOCALISATION.noise + chance or share > 1.0 - LOCALISATION.all_but)
 
     def along(self, lines: list[Lines], places: Sequence[Any]) -> np.ndarray:

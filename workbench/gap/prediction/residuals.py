@@ -73,7 +73,7 @@ class FitData:
     def of_outputs(self, names: tuple[str, ...]) -> "FitData":
         """The same residual on some of the outputs."""
         kept = [self.records[0].output_names.index(name) for name in names]
-        return replace(self, records=tuple(r.only(names) for r in self.records), noise=self.noise[kept])
+        return replace(self, records=tuple(r.select_outputs(names) for r in self.records), noise=self.noise[kept])
 
     def stepped(self, substeps: int) -> "FitData":
         """The same residual with other substeps."""

@@ -236,7 +236,7 @@ def budget_of(
         by_inputs = np.minimum(logged**2 * power_of_inputs(rig, records, settle), rest)
     rows[-1], rest = rows[-1] + by_inputs, rest - by_inputs
     for row, i in enumerate(by_size):  # what no model can predict is theirs
-        if causes[i].kind.remainder:
+        if causes[i].kind.unpredictable:
             rows[row], rest = rows[row] + rest, np.zeros_like(rest)
     shares = np.array([*rows, rest, noise])
     whole = shares.sum(axis=1).clip(0.0) / max(nominal.sum(), 1e-300)

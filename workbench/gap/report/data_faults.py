@@ -16,7 +16,7 @@ MOVES = 0.1  # of its own deviation: what a sensor moves by meanwhile that is al
 
 
 def data_faults(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> tuple[str, ...]:
-    """Records that begin in motion, and channels that are stuck for a while: a sentence each, with the mend.
+    """Records that begin in motion, and channels that are stuck for a while: a sentence each, with the correction.
 
     Args:
         rig: nominal.

@@ -105,7 +105,9 @@ def _response(rig: Rig, effects: tuple[Effect, ...], trial: FitData) -> tuple[np
     centre = trial.residual(apply_all(rig, effects))
     slopes = []
     for i, effect in enumerate(effects):
-        for parameter in () if effect.kind.first else effect.parameters(rig):  # errors of the model stay as they are
+        for parameter in (
+            () if effect.kind.applied_first else effect.parameters(rig)
+        ):  # errors of the model stay as they are
             step = 1e-4 * max(abs(effect.values[parameter.name]), 1e-6)
             moved = dict(effect.values)
             moved[parameter.name] += step

@@ -14,8 +14,9 @@ from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.where import Where
 from workbench.gap.report.budget import REMARKED, Budget, RecordToRecord, Shrinkage, labels_of
 from workbench.gap.report.experiment import Experiment
-from workbench.gap.report.readiness import Readiness
+from workbench.gap.report.record_checks import Detectability
 from workbench.gap.search.attribute import Attribution
+from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.printed import joined_in_words
@@ -35,14 +36,14 @@ class Verdict:
         effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown"; errors of
             the nominal model among it, where they were fitted beside.
         budget: of the gap: shares of each effect, of errors of the nominal model, of noise and of what is unexplained.
-        alternatives: (label of a rival set, probability), best first.
+        alternatives: (label of another set that the records do not exclude, probability), likeliest first.
         where: the gap taken apart.
         shrinkage: on validation records; None without any.
         corrected: the rig with the effects in it.
         nominal: the rig as it was handed in.
         attribution: the whole search.
-        readiness: what the records could show before anything was fitted.
-        experiment: what to measure next, where rivals remain.
+        detectability: what the records could show before anything was fitted.
+        experiment: what to measure next, where alternatives remain.
         tolerance: of the signal's rms, below which a gap beyond the noise was not explained.
         disagreeing: names of validation records that have a gap, where the fitted ones have none; the outcome is then
             "unknown".
@@ -59,13 +60,16 @@ class Verdict:
     corrected: Rig
     nominal: Rig
     attribution: Attribution
-    readiness: Readiness
+    detectability: Detectability
     budget: Budget
     experiment: Experiment | None = None
     tolerance: float = 0.0
     disagreeing: tuple[str, ...] = ()
     units: Units = SI
     notes: tuple[str, ...] = ()
+
+    rivals, place_stands = Renamed("alternatives_in_words"), Renamed("is_located")
+    readiness = Renamed("detectability")
 
     @property
     def shows_gap(self) -> bool:
@@ -85,9 +89,9 @@ class Verdict:
         return tuple(shown)
 
     @property
-    def place_stands(self) -> bool:
-        """Whether one force, of any law, makes the gap, and effects that explain it do not contradict its place."""
-        if not self.where.place.holds:
+    def is_located(self) -> bool:
+        """Whether a single point force, no law assumed, makes the gap, at a place that no effect named contradicts."""
+        if not self.where.place.is_single_force:
             return False
         if self.outcome != "explained":
             return True
@@ -129,7 +133,7 @@ class Verdict:
             else:
                 each = joined_in_words([_percent(share) for share in shares])
                 text = f"{words} cause {_percent(sum(shares))} of the gap ({each})"
-            if any(effect.kind.remainder for effect in self.effects):
+            if any(effect.kind.unpredictable for effect in self.effects):
                 text += ", part of which is unpredictable"
             text += self._rest + self._not_excluded
         else:
@@ -181,7 +185,7 @@ class Verdict:
 
     def _share_of(self, effect: Effect) -> float:
         """Share of the gap that an effect causes; of all sensors together where it stands for all of them."""
-        shares, named = self.budget.effects, [e for e in self.effects if not e.kind.first]
+        shares, named = self.budget.effects, [e for e in self.effects if not e.kind.applied_first]
         labels = dict(zip(named, labels_of(named, self.nominal.modes.domain), strict=True))
         label = labels.get(effect, effect.label)
         if label in shares:
@@ -236,17 +240,17 @@ class Verdict:
         return f"{thousandths:.2g} ms" if time == "s" else f"{1e-3 * thousandths:.2g} {time}"
 
     @property
-    def rivals(self) -> tuple[tuple[str, float], ...]:
-        """The alternatives in words, by the phrases of their kinds: (set, probability), best first."""
+    def alternatives_in_words(self) -> tuple[tuple[str, float], ...]:
+        """The alternatives in words, by the phrases of their kinds: (set, probability), likeliest first."""
         return tuple(
             (in_words(fit.named, [effect.kind for effect in fit.effects]), probability)
-            for fit, probability in self.attribution.rivals
+            for fit, probability in self.attribution.alternatives
         )
 
     @property
     def _not_excluded(self) -> str:
-        """The end of the sentence: rivals that remain."""
-        near = [words for words, probability in self.rivals if probability > 0.01]
+        """The end of the sentence: alternatives that remain."""
+        near = [words for words, probability in self.alternatives_in_words if probability > 0.01]
         return f"; {', or '.join(near)} cannot be excluded." if near else "."
 
     def __repr__(self) -> str:
@@ -257,7 +261,6 @@ class Verdict:
         known = self.outcome in ("none", "explained")
         effects = [effect_json(effect, self.nominal) for effect in self._named]
         shrink = self.shrinkage
-        rivals = zip(self.alternatives, self.rivals, strict=True)
         return {
             "case": self.case,
             "units": asdict(self.units),
@@ -266,7 +269,8 @@ class Verdict:
             "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
             "nearest": [] if known else effects,
             "alternatives": [
-                {"kind": label, "words": words, "probability": _rounded(p)} for (label, p), (words, _) in rivals
+                {"kind": label, "words": words, "probability": _rounded(p)}
+                for (label, p), (words, _) in zip(self.alternatives, self.alternatives_in_words, strict=True)
             ],
             "where": where_json(self.where),
             "gap": {
@@ -283,8 +287,8 @@ class Verdict:
                 "corrected": _rounded(self.attribution.best.cost),
             },
             "check": {
-                "undetectable": list(self.readiness.undetectable),
-                "indistinguishable": [list(pair[:2]) for pair in self.readiness.indistinguishable],
+                "undetectable": list(self.detectability.undetectable),
+                "indistinguishable": [list(pair[:2]) for pair in self.detectability.indistinguishable],
             },
             "next_experiment": None if self.experiment is None else self.experiment.sentence,
             "budget": self.budget.to_json(),
@@ -309,8 +313,8 @@ def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
     if kind.path in ("actuator", "sensor"):
         side, target = "input" if kind.path == "actuator" else "output", effect.target
         entry |= {side: target[0], kind.second_channel: target[1]} if isinstance(target, tuple) else {side: target}
-    if kind.stands is not None:
-        entry["at"], entry["at_std"] = kind.stands(effect, nominal)[0], 0.0
+    if kind.fixed_place is not None:
+        entry["at"], entry["at_std"] = kind.fixed_place(effect, nominal)[0], 0.0
     elif effect.at is not None:
         entry |= _place_json(effect.at)
         spread = [_rounded(effect.deviations.get(name, 0.0)) for name in COORDINATES if name in effect.values]
@@ -338,7 +342,7 @@ def where_json(where: Where) -> dict[str, Any]:
             **_place_json(where.at),
             "at_std": _rounded(where.at_std),
             "share": _rounded(where.place.share),
-            "one_force": where.place.holds,
+            "single_force": where.place.is_single_force,
         },
         "by_mode": [_rounded(s) for s in where.mode_shares],
         "by_band": {
@@ -367,12 +371,12 @@ def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
     kind, text = effect.kind, effect.kind.words
     inside = kind.remark(effect, nominal) if kind.remark is not None else ", ".join(n.strip() for n in numbers)
     if kind.path in ("actuator", "sensor"):
-        target = effect.target if effect.target == ALL else kind.joined.join(names_in(effect.target))
+        target = effect.target if effect.target == ALL else kind.conjunction.join(names_in(effect.target))
         inside = f"{target}: {inside}" if inside else str(target)
     if inside:
         text += f" ({inside})"
-    if kind.stands is not None:
-        text += f" {kind.stands(effect, nominal)[1]}"
+    if kind.fixed_place is not None:
+        text += f" {kind.fixed_place(effect, nominal)[1]}"
     elif effect.at is not None:
         text += f" {place_in_words(effect.at, effect.deviations)}"
     return text

@@ -44,7 +44,7 @@ class Attribution:
         best: the chosen set of effects, fitted; empty for none; for "part" and "unknown" the nearest one, which may be
             a law beyond the catalogue.
         random: statistics of a random disturbance, where the set holds one.
-        rivals: other sets, best first, with their probabilities against the best.
+        alternatives: other sets, best first, with their probabilities against the best.
         nominal_cost: mean square of the nominal residual in noise units.
         tried: effects alone that were fitted to whole records; beside the random disturbance, where one holds.
         ahead: the likeliest of every kind alone, fitted to predictions one sample ahead.
@@ -60,7 +60,7 @@ class Attribution:
     outcome: str
     best: Fit
     random: RandomForceFit | None
-    rivals: tuple[tuple[Fit, float], ...]
+    alternatives: tuple[tuple[Fit, float], ...]
     nominal_cost: float
     tried: tuple[Fit, ...]
     ahead: tuple[Fit, ...]
@@ -156,7 +156,7 @@ def attribute(
     *,
     catalogue: tuple[Kind, ...],
     report: Callable[[str, float], None],
-    free_nominal: bool,
+    uncertain_nominal: bool,
     tolerance: float,
     identified: IdentifiedPrior | None,
 ) -> Attribution:
@@ -170,8 +170,8 @@ def attribute(
         seen, nominal, evidence: of `baseline`.
         catalogue: kinds of effects to try.
         report: called with (what, share done) as the search proceeds.
-        free_nominal: fit errors of the nominal model beside every effect from the first, for a model that is known to
-            be a little off; otherwise where no single effect explains the records without.
+        uncertain_nominal: fit errors of the nominal model beside every effect from the first, for a model that is
+            known to be a little off; otherwise where no single effect explains the records without.
         tolerance: of the signal's rms: a smaller gap beyond the noise is not searched for causes.
         identified: errors of a nominal rig that was itself identified.
     """
@@ -186,7 +186,7 @@ def attribute(
         decision = Decision("none", start)
     elif not search.explains(start) and is_noise_alone(evidence.residuals, data.counted):
         decision = Decision("none", start, noise=noise_found(evidence.residuals))
-    elif free_nominal and not search.explains(start):
+    elif uncertain_nominal and not search.explains(start):
         decision = _beside_nominal_errors(search, tolerance)
     elif not search.explains(start) and not _of_one_sensor(start):
         decision, singles = decide_on_random(search, evidence)
@@ -210,7 +210,7 @@ def attribute(
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
     best = replace(best, effects=exchanged_last(best.effects))
-    beside = identified if random is None and not any(effect.kind.first for effect in best.effects) else None
+    beside = identified if random is None and not any(effect.kind.applied_first for effect in best.effects) else None
     if beside is not None:
         best = beside_identified(within, best, beside, seen)
     logged = within.logged
@@ -220,7 +220,7 @@ def attribute(
         best = _settled(search, best)
         if outcome == "explained":
             best = _as_it_stands(within, best, seen, logged)
-            named = [e for e in best.effects if not e.kind.first]
+            named = [e for e in best.effects if not e.kind.applied_first]
             # no number of it is known: something is there, and that is all
             vague = any(not e.stands_out(search.rig) for e in named if e not in seen)
             outcome = "none" if not named else "unknown" if vague else outcome
@@ -231,7 +231,7 @@ def attribute(
         outcome=outcome,
         best=best,
         random=random,
-        rivals=rivals,
+        alternatives=rivals,
         nominal_cost=float(of_nominal.mean()),
         tried=tuple(singles),
         ahead=tuple(ahead),
@@ -278,7 +278,7 @@ def _settled(search: Search, best: Fit) -> Fit:
     """The fit with numbers as good as none that leave as much: no deviation at one point of a stiff law tells so."""
     data = search.data.finely(SELECTION.fine)
     for effect in best.effects:
-        settled = effect.kind.settled(effect)
+        settled = effect.kind.without_negligible(effect)
         if settled is effect:
             continue
         effects = tuple(settled if e is effect else e for e in best.effects)

@@ -12,9 +12,9 @@ from workbench.gap.effects.effect import (
     apply_all,
     each_left_out,
     key_of,
+    more_general_sets,
     place_values,
     simpler_sets,
-    wider_sets,
     with_one_simpler,
 )
 from workbench.gap.localisation.evidence import Evidence
@@ -68,7 +68,7 @@ def widened(search: Search, found: Fit) -> Fit:
     The wider law may make another effect needless: a constant force beside friction stood in for friction that differs
     between the two directions. That is no richer a set, so any sure gain is one.
     """
-    sets, kinds = list(wider_sets(found.effects)), {effect.kind for effect in found.effects}
+    sets, kinds = list(more_general_sets(found.effects)), {effect.kind for effect in found.effects}
     if not sets:
         return found
     data = search.data.finely(SELECTION.fine)

@@ -52,7 +52,7 @@ class Fit:
     @property
     def named(self) -> str:
         """Labels of the effects, without errors of the nominal model, in one string."""
-        return " + ".join(effect.label for effect in self.effects if not effect.kind.first)
+        return " + ".join(effect.label for effect in self.effects if not effect.kind.applied_first)
 
     @property
     def key(self) -> tuple[str, ...]:

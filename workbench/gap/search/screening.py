@@ -201,7 +201,7 @@ def _repeats(one: Effect, other: Effect) -> bool:
     kind = one.kind
     if other.kind is not kind or not (kind.path in ("actuator", "sensor") or other.at is None):
         return False
-    return one.target == other.target or ALL in (one.target, other.target) or kind.alone
+    return one.target == other.target or ALL in (one.target, other.target) or kind.exclusive
 
 
 def one_more(

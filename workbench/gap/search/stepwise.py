@@ -15,8 +15,8 @@ from workbench.gap.effects.effect import (
     each_left_out,
     key_of,
     merged_sets,
+    more_general_sets,
     simpler_sets,
-    wider_sets,
     with_one_simpler,
 )
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
@@ -478,7 +478,7 @@ class Stepwise:
             alike = sum(candidate.effects[-1].kind is others[-1].kind for others in chosen)
             if candidate.cost <= promising and alike < (2 if candidate.cost <= as_good else 1):
                 chosen.append(candidate.effects)
-        chosen = [*chosen[: STEPWISE.candidates], *wider_sets(step.effects)]
+        chosen = [*chosen[: STEPWISE.candidates], *more_general_sets(step.effects)]
         return self._fitted(chosen, step, self._slopes(step))
 
     def _in_place_of_inputs(self, step: Step) -> Step | None:

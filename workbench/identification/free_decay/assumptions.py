@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine
 from workbench.identification.signal.modal_estimates import Refined
 from workbench.records.record import Record, as_records
+from workbench.renamed import Renamed
 from workbench.structure.damping import ProportionalDamping
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
@@ -168,14 +169,16 @@ class ProportionalFit:
     Attributes:
         damping: g1 in s and g2 in 1/s.
         standard_errors: (2,) of g1 and g2.
-        left_over: (n_modes,) ζ_r minus the fit, in standard errors of ζ_r.
+        standardised_residuals: (n_modes,) ζ_r minus the fit, in standard errors of ζ_r.
         probability: of so bad a fit if the damping is proportional; below 0.01 it hardly is.
     """
 
     damping: ProportionalDamping
     standard_errors: np.ndarray
-    left_over: np.ndarray
+    standardised_residuals: np.ndarray
     probability: float
+
+    left_over = Renamed("standardised_residuals")
 
 
 def proportional_fit(refined: Refined, only: Sequence[int] | slice = slice(None)) -> ProportionalFit:
@@ -202,6 +205,6 @@ def proportional_fit(refined: Refined, only: Sequence[int] | slice = slice(None)
     return ProportionalFit(
         damping=ProportionalDamping(float(g[0]), float(g[1])),
         standard_errors=frozen(np.sqrt(np.diag(np.linalg.inv(a.T @ a)))),
-        left_over=frozen((modes.zeta - columns @ g) / np.sqrt(np.diag(covariance))),
+        standardised_residuals=frozen((modes.zeta - columns @ g) / np.sqrt(np.diag(covariance))),
         probability=float(chi2.sf(misfit, n - 2)) if n > 2 else 1.0,
     )

@@ -298,7 +298,7 @@ def check_along(sampled: SampledModes) -> None:
         ValueError: a sensor without a place, or with one of another kind.
     """
     check_placed(sampled)
-    if not sampled.is_along:
+    if not sampled.on_interval:
         raise ValueError(
             "the sensors have no places along a bar or beam; on a plate take `surface_eigenfunctions`, at named points"
             " `rig_from`"

@@ -274,8 +274,8 @@ def check_placed(sampled: SampledModes) -> None:
     Raises:
         ValueError: naming it, from 1.
     """
-    if sampled.unplaced.any():
-        raise ValueError(f"sensor {int(np.argmax(sampled.unplaced)) + 1} has no place; give its channel `at`")
+    if sampled.without_position.any():
+        raise ValueError(f"sensor {int(np.argmax(sampled.without_position)) + 1} has no place; give its channel `at`")
 
 
 def check_finite(shapes: np.ndarray) -> None:

@@ -76,6 +76,6 @@ def free_decay(
         outputs = outputs + noise_std * np.random.default_rng(seed).standard_normal(outputs.shape)
     channels = tuple(
         Channel(f"y{j + 1}", quantity, at=None if unknown else at)
-        for j, (at, unknown) in enumerate(zip(listed(modes.positions), modes.unplaced))
+        for j, (at, unknown) in enumerate(zip(listed(modes.positions), modes.without_position))
     )
     return Record(sample_time, outputs, channels, start_time=start_time, name="free decay")

@@ -56,8 +56,8 @@ class LocatedDamage:
     Attributes:
         undamaged: the best explanation without one, or, where no number of terms comes near, that of most terms.
         damaged: the best with one, whether or not it is significant.
-        statistic: of the test: what the loss lowers χ² + n_terms ln n_data by; in units of χ² / freedom where `damaged`
-            does not explain the modes either.
+        statistic: of the test: what the loss lowers χ² + n_terms ln n_data by; in units of χ² / degrees of freedom
+            where `damaged` does not explain the modes either.
         threshold: what noise lowers it by with the probability of a false alarm.
     """
 
@@ -145,7 +145,10 @@ def locate_damage(
             statistic = _statistic(task, undamaged, damaged)
     # modes that not even a loss explains err by more than their standard errors, and count for less
     return LocatedDamage(
-        undamaged, damaged, statistic if damaged.explains else statistic * damaged.freedom / damaged.chi2, limit
+        undamaged,
+        damaged,
+        statistic if damaged.explains else statistic * damaged.degrees_of_freedom / damaged.chi2,
+        limit,
     )
 
 

@@ -132,5 +132,5 @@ def with_spare_terms(chosen: FittedStructure, task: Task, basis: Callable[[int],
         return chosen
     if wide.chi2 > chosen.chi2 + 1.0:  # a basis that does not hold the smaller one
         return chosen
-    kept = ("n_terms", "chi2", "freedom", "criterion")
+    kept = ("n_terms", "chi2", "degrees_of_freedom", "criterion")
     return replace(wide, **{name: getattr(chosen, name) for name in kept})

@@ -180,13 +180,13 @@ class Problem:
             z = np.r_[z[: self.n_free], astuple(LocalLoss(*z[self.n_free :]).within(task.nominal.length))]
         rows = self.misses(z)[0]
         chi2 = float(rows @ rows)
-        freedom = rows.size - z.size
+        degrees_of_freedom = rows.size - z.size
         d, e, loss = self.parts(z)
         parameters = np.r_[d, e, z[self.n_free :]]
         carry = self.carry(z)
         covariance = carry @ self._covariance(z) @ carry.T
-        if freedom > 0 and chi2 > chi2_distribution.isf(TASK.unlikely, freedom):
-            covariance = covariance * chi2 / freedom
+        if degrees_of_freedom > 0 and chi2 > chi2_distribution.isf(TASK.unlikely, degrees_of_freedom):
+            covariance = covariance * chi2 / degrees_of_freedom
         size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         root = symmetric_root(covariance / np.outer(size, size))
         normal = np.random.default_rng(0).standard_normal((PROBLEM.draws, parameters.size))
@@ -219,7 +219,7 @@ class Problem:
             n_terms=(n, e.size),
             loss=loss,
             chi2=chi2,
-            freedom=freedom,
+            degrees_of_freedom=degrees_of_freedom,
             criterion=chi2 + z.size * float(np.log(task.n_data)),
             parameters=frozen(parameters),
             covariance=frozen(covariance),

@@ -12,6 +12,7 @@ from workbench.identification.signal.modal_estimates import Refined, normalised_
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
+from workbench.renamed import Renamed
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import mac
 from workbench.structure.profile import Profile
@@ -190,11 +191,11 @@ class FittedStructure:
         n_terms: of mass, of stiffness.
         loss: of stiffness over a part of the structure, where one was fitted.
         chi2: squares of what its modes miss of the measured, in standard errors; those of the prior with them.
-        freedom: data less parameters; `chi2` is about as large where the structure explains its modes.
+        degrees_of_freedom: data less parameters; `chi2` is about as large where the structure explains its modes.
         criterion: χ² + n_parameters ln n_data; the least among numbers of terms is the one to take.
         parameters: d, e and, with a loss, its share, centre and width.
-        covariance: of the parameters, the Cramér-Rao bound at the estimate; larger by χ² / freedom where the structure
-            does not explain its modes.
+        covariance: of the parameters, the Cramér-Rao bound at the estimate; larger by χ² / `degrees_of_freedom` where
+            the structure does not explain its modes.
         numbers: (n_modes,) of the structure's elastic modes, from 1, that the measured ones are.
         check: frequencies and shapes of the structure beside the measured.
     """
@@ -205,14 +206,16 @@ class FittedStructure:
     n_terms: tuple[int, int]
     loss: LocalLoss | None
     chi2: float
-    freedom: int
+    degrees_of_freedom: int
     criterion: float
     parameters: np.ndarray
     covariance: np.ndarray = field(repr=False)
     numbers: np.ndarray
     check: SelfCheck
 
+    freedom = Renamed("degrees_of_freedom")
+
     @property
     def explains(self) -> bool:
         """Whether noise alone would miss the measured modes by as much, in one measurement of a hundred or more."""
-        return bool(self.chi2 <= chi2_distribution.isf(TASK.unlikely, self.freedom))
+        return bool(self.chi2 <= chi2_distribution.isf(TASK.unlikely, self.degrees_of_freedom))

@@ -121,7 +121,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
             "g1": damping.damping.g1,
             "g2": damping.damping.g2,
             "standard_errors": damping.standard_errors,
-            "left_over": damping.left_over,
+            "standardised_residuals": damping.standardised_residuals,
             "probability": damping.probability,
         },
         "noise_modes_hz": decay.noise_modes.frequencies_hz,
@@ -249,10 +249,10 @@ def _content(channels: Sequence[Channel], found: ModalEstimates) -> dict[str, An
 
 
 def _proportional(fit: ProportionalFit | None) -> list[str]:
-    if fit is None or fit.left_over.size < 3:
+    if fit is None or fit.standardised_residuals.size < 3:
         return []
     if fit.probability < UNLIKELY:
-        worst = float(np.abs(fit.left_over).max())
+        worst = float(np.abs(fit.standardised_residuals).max())
         return [f"damping is not proportional: ζ deviates from (g1 ω + g2/ω)/2 by up to {worst:.0f} standard errors"]
     (g1, g1_std), (g2, g2_std) = (
         rounded(value, error)

@@ -84,14 +84,18 @@ def _record(record: Record, path: Path) -> Look:
     if forces:
         remarks.append(f"{', '.join(forces)}: an input by its name or unit; leave --inputs out if it is not")
     if not options:
-        decays = _decays(record.only(kept)) if kept else False
-        start = decay_start(record.only(kept)) if decays else record.start_time
+        decays = _decays(record.select_outputs(kept)) if kept else False
+        start = decay_start(record.select_outputs(kept)) if decays else record.start_time
         if decays and start > record.start_time:
             remarks.append(f"the free decay begins at {start:.6g} s")
         options += [] if decays else ["--ambient"]
     if faulty and kept:
         options += ["--outputs", ",".join(kept)]
-    moving = record.only([name for name in record.output_names if name not in faulty]) if kept or forces else record
+    moving = (
+        record.select_outputs([name for name in record.output_names if name not in faulty])
+        if kept or forces
+        else record
+    )
     driven = moving.n_inputs == 1 and bool(np.ptp(moving.inputs)) and moving.n_samples >= 16 * SEGMENTS
     page_content = PageContent(
         title=f"What {path.name} holds",
@@ -112,7 +116,7 @@ def _with_inputs(record: Record, names: Sequence[str]) -> Record:
     """The record with these outputs as its inputs."""
     at = [record.output_names.index(name) for name in names]
     applied = tuple(record.output_channels[i] for i in at)
-    rest = record.only([name for name in record.output_names if name not in names])
+    rest = record.select_outputs([name for name in record.output_names if name not in names])
     return replace(rest, inputs=record.outputs[at], input_channels=applied)
 
 

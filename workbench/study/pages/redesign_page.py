@@ -13,8 +13,8 @@ from workbench.draw.robust import NEW, OLD, plot_redesign, plot_steps
 from workbench.draw.style import COLOURS, new_figure
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
-from workbench.robust.proof import Verification, interval
 from workbench.robust.redesign import Redesign
+from workbench.robust.verification import Verification, interval
 from workbench.structure.domain import NamedPoints, Where
 from workbench.study.pages.page import PageContent, Table, block, write_page
 from workbench.study.pages.verdict_page import case_inputs
@@ -73,7 +73,7 @@ def redesign_page(
             [(s.name, s.what, s.lost, "yes" if s.kept else "no") for s in found.steps],
         ),
     ]
-    used = found.proof if found.improves else found.present_proof
+    used = found.verification if found.improves else found.present_verification
     moved = [] if found.relocation is None else [found.relocation.sentence]
     page_content = PageContent(
         title=f"Redesign for {name}",
@@ -89,7 +89,7 @@ def redesign_page(
 
 
 def _figures(found: Redesign) -> list[tuple[str, ...]]:
-    old, new = found.present_proof, found.proof
+    old, new = found.present_verification, found.verification
     rows: list[tuple[str, ...]] = [("stable samples", *(f"{int(p.stable.sum())} of {p.n_draws}" for p in (old, new)))]
     for r in found.controlled:
         rows.append((f"damping ratio of mode {r + 1} [%]", *(_rounded(100.0 * p.damping[:, r]) for p in (old, new))))
@@ -119,13 +119,17 @@ def _rounded(values: np.ndarray) -> str:
     return f"{middle:.3g} ({low:.3g} to {high:.3g})"
 
 
-def _margin(proof: Verification) -> str:
-    return "no linear bound" if np.isnan(proof.small_gain_margin) else f"{100.0 * proof.small_gain_margin:.3g}"
+def _margin(verification: Verification) -> str:
+    return (
+        "no linear bound"
+        if np.isnan(verification.small_gain_margin)
+        else f"{100.0 * verification.small_gain_margin:.3g}"
+    )
 
 
 def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
     """Both loops on the corrected rig under the inputs of a measured record, as forces at the same places."""
-    rig = found.possible.rig
+    rig = found.uncertain_rig.rig
     step = found.test.sample_time
     if abs(record.sample_time / step - 1.0) > 1e-6:
         return []
@@ -148,7 +152,7 @@ def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
 
 def _drawn(found: Redesign) -> bool:
     """Whether it is known where the structure stands."""
-    domain = found.possible.rig.modes.domain
+    domain = found.uncertain_rig.rig.modes.domain
     return not (isinstance(domain, NamedPoints) and domain.positions is None)
 
 
@@ -156,8 +160,8 @@ def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict
     scale = np.abs(new.modal[: new.modes.n_modes]).max()
     limit = RUNS_AWAY * scale
     limited = replace(old, modal=np.clip(np.nan_to_num(old.modal), -limit, limit))
-    actuators = [a for a in found.possible.rig.actuators if a.name in found.redesigned.actuators]
-    sensors = [s for s in found.possible.rig.sensors if s.name in found.redesigned.sensors]
+    actuators = [a for a in found.uncertain_rig.rig.actuators if a.name in found.redesigned.actuators]
+    sensors = [s for s in found.uncertain_rig.rig.sensors if s.name in found.redesigned.sensors]
     both, colours = {"present": limited, "redesigned": new}, {"present": OLD, "redesigned": NEW}
     motion = response_motion(both, actuators=actuators, sensors=sensors, colours=colours)
     grown = np.abs(old.modal[: old.modes.n_modes]).max() > limit
@@ -166,7 +170,7 @@ def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict
 
 
 def _readings(found: Redesign, record: Record, responses: dict[str, Response]) -> Shown:
-    rig = found.possible.rig
+    rig = found.uncertain_rig.rig
     seen = [(i, s) for i, s in enumerate(rig.sensors) if s.quantity == "displacement"]
     figure, ax = new_figure(width=9, height=3.6)
     n = next(iter(responses.values())).time.size

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from workbench.cases.case import Case
-from workbench.draw.gap import plot_budget, plot_responses, plot_rivals, plot_unmodelled_force, plot_where
+from workbench.draw.gap import plot_budget, plot_responses, plot_single_effects, plot_unmodelled_force, plot_where
 from workbench.draw.motion import ALONG, mode_motion
 from workbench.draw.spectra import plot_distortion
 from workbench.gap.effects.catalogue import in_words
@@ -72,7 +72,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         ]
         if verdict.attribution.singles:  # none were tried where errors of the model were fitted from the first
             each = "Residual with each effect alone, without errors of the model: at the noise floor, it explains all."
-            figures.append((plot_rivals(verdict), each))
+            figures.append((plot_single_effects(verdict), each))
     distortions = _of_lowest_and_highest(records)
     if distortions:
         seen = (
@@ -127,7 +127,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     tables = [
         ("Effects", ("effect", "parameter", "value", "standard error", f"x [{length}]", "input or output"), effects),
         ("Gap (rms error / rms signal)", ("record", "before", "after", "floor", "share closed"), gaps),
-        ("Other explanations", ("set of effects", "probability"), rivals),
+        ("Alternatives that the records do not exclude", ("set of effects", "probability"), rivals),
     ]
     return [table for table in tables if table[2]]
 
@@ -169,8 +169,8 @@ def case_inputs(folder: Path) -> dict[str, str]:
 
 def _could_show(verdict: Verdict) -> str:
     """What the records can and cannot show, in a line."""
-    hidden, alike = verdict.readiness.undetectable, verdict.readiness.indistinguishable
-    count = len(verdict.readiness.strengths)
+    hidden, alike = verdict.detectability.undetectable, verdict.detectability.indistinguishable
+    count = len(verdict.detectability.strengths)
     text = f"Before any fit: these records can show {f'all but {len(hidden)} of' if hidden else 'all'} {count} effects"
     if hidden:
         named = ", ".join(map(label_in_words, hidden[:6]))

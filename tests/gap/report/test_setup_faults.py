@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.gap.diagnose import diagnose
-from workbench.gap.report.wiring import WiringFault, check_kept_apart, mended, wiring
+from workbench.gap.report.setup_faults import SetupFault, check_disjoint, setup_faults, without_faults
 from workbench.structure.damping import ModalDamping
 from workbench.trials.make import make_trial
 
@@ -45,22 +45,22 @@ def exchanged(n, i, j):
 
 
 def expect(case, records, sentence, rig=None):
-    """One fault, with that sentence, whose mend leaves none."""
+    """One fault, with that sentence, whose correction leaves none."""
     rig = case.rig if rig is None else rig
-    faults = wiring(rig, records)
+    faults = setup_faults(rig, records)
     assert [fault.sentence for fault in faults] == [sentence]
-    assert wiring(*mended(faults, rig, records)) == ()
+    assert setup_faults(*without_faults(faults, rig, records)) == ()
     return faults[0]
 
 
 def test_nothing_is_wrong_with_a_case_wired_rightly(case):
-    assert wiring(case.rig, case.fit) == ()
+    assert setup_faults(case.rig, case.fit) == ()
 
 
-def test_exchanged_inputs_are_named_and_mended_to_the_last_bit(case):
+def test_exchanged_inputs_are_named_and_corrected_to_the_last_bit(case):
     records = change(case.fit, inputs=exchanged(4, 0, 2))
     fault = expect(case, records, "The inputs F1 and F3 are exchanged: swap them.")
-    _, again = fault.mend(case.rig, records)
+    _, again = fault.correction(case.rig, records)
     assert all(np.array_equal(a.inputs, b.inputs) for a, b in zip(again, case.fit, strict=True))
 
 
@@ -126,7 +126,7 @@ def test_damping_in_per_cent_is_named(case):
     rig = replace(rig, structure=structure, modes=replace(rig.modes, damping=100.0 * rig.modes.damping))
     words = "The damping looks like per cent where a ratio is meant: divide it by 100"
     fault = expect(case, case.fit, f"{words} (the largest would be {zeta:.4g}, not {100 * zeta:.4g}).", rig=rig)
-    assert fault.mend(rig, case.fit)[0].structure.damping.zeta == pytest.approx(zeta)
+    assert fault.correction(rig, case.fit)[0].structure.damping.zeta == pytest.approx(zeta)
 
 
 def test_the_same_data_under_two_names_are_named(case):
@@ -138,7 +138,7 @@ def test_the_same_data_under_two_names_are_named(case):
         "The outputs a5 and a6 hold the same samples, and the model agrees better with a5: measure a6 again, or leave"
         " it out.",
     )
-    rig, records = found.mend(case.rig, case.fit)
+    rig, records = found.correction(case.rig, case.fit)
     assert [s.name for s in rig.sensors] == list(records[0].output_names) == ["a1", "a2", "a3", "a4", "a5", "v1"]
 
 
@@ -148,16 +148,16 @@ def test_one_record_twice_is_named_and_a_validation_record_that_repeats_one_is_r
     expect(case, twice, f"The records {first} and again hold the same samples: leave again out.")
     part = replace(case.fit[1], outputs=case.fit[1].outputs[:, :900], inputs=case.fit[1].inputs[:, :900], name="part")
     with pytest.raises(ValueError, match=f"validation record 'part' repeats the fit record '{first}'"):
-        check_kept_apart(case.fit, [part])
+        check_disjoint(case.fit, [part])
     with pytest.raises(ValueError, match="repeats the fit record"):
         diagnose(case.rig, case.fit, validation=[part], workers=1)
 
 
 def test_faults_that_hide_one_another_are_found_one_after_the_other(case):
     records = change(case.fit, inputs=exchanged(4, 0, 1), outputs=diagonal(7, 0, -1.0))
-    faults = wiring(case.rig, records)
+    faults = setup_faults(case.rig, records)
     assert {fault.kind for fault in faults} == {"exchanged inputs", "sign"}
-    assert wiring(*mended(faults, case.rig, records)) == ()
+    assert setup_faults(*without_faults(faults, case.rig, records)) == ()
 
 
 @pytest.mark.parametrize(
@@ -170,56 +170,56 @@ def test_faults_that_hide_one_another_are_found_one_after_the_other(case):
 )
 def test_an_effect_is_not_taken_for_a_fault_of_wiring(kinds):
     case, _ = make_trial(3, kinds=kinds)
-    assert wiring(case.rig, case.fit) == ()
+    assert setup_faults(case.rig, case.fit) == ()
 
 
 def test_a_fault_says_how_much_it_closes(case):
-    [fault] = wiring(case.rig, change(case.fit, inputs=exchanged(4, 0, 2)))
-    assert isinstance(fault, WiringFault) and 0.99 < fault.closes <= 1.0
+    [fault] = setup_faults(case.rig, change(case.fit, inputs=exchanged(4, 0, 2)))
+    assert isinstance(fault, SetupFault) and 0.99 < fault.closes <= 1.0
 
 
-def test_a_gain_that_is_near_a_unit_and_differs_beyond_its_error_is_said_and_not_mended(case):
+def test_a_gain_that_is_near_a_unit_and_differs_beyond_its_error_is_said_and_not_corrected(case):
     records = change(case.fit, outputs=diagonal(7, 2, 1.01 / 9.80665))
-    [fault] = wiring(case.rig, records)
+    [fault] = setup_faults(case.rig, records)
     assert not fault.certain
     assert fault.sentence == (
         "The output a3 may look like g where m/s² is meant; but the gain differs from that by +1 %, more than its"
         " error: taken for an error of calibration."
     )
-    rig, kept = mended([fault], case.rig, records)
+    rig, kept = without_faults([fault], case.rig, records)
     assert rig is case.rig and all(np.array_equal(a.outputs, b.outputs) for a, b in zip(kept, records, strict=True))
 
 
-def test_an_input_with_a_gain_near_a_unit_is_not_mended_beside_a_turned_sign_that_is(case):
+def test_an_input_with_a_gain_near_a_unit_is_not_corrected_beside_a_turned_sign_that_is(case):
     matrix = diagonal(4, 0, 9.80665 * 1.02) @ diagonal(4, 1, -1.0)
-    faults = wiring(case.rig, change(case.fit, inputs=np.linalg.inv(matrix)))
+    faults = setup_faults(case.rig, change(case.fit, inputs=np.linalg.inv(matrix)))
     assert [(fault.kind, fault.certain) for fault in faults] == [("sign", True), ("unit", False)]
     assert "the gain differs from that by +2 %" in faults[1].sentence
 
 
 @pytest.mark.parametrize("factor", [1 / 9.81, 1.0005 / 9.80665])
 def test_a_factor_rounded_or_within_calibration_is_a_fault_of_units(case, factor):
-    [fault] = wiring(case.rig, change(case.fit, outputs=diagonal(7, 2, factor)))
+    [fault] = setup_faults(case.rig, change(case.fit, outputs=diagonal(7, 2, factor)))
     assert fault.certain
 
 
-def test_a_validation_record_is_mended_by_what_it_shows_itself(case):
+def test_a_validation_record_is_corrected_by_what_it_shows_itself(case):
     """The fit records state twice their sample time, or have two outputs exchanged; the validation record is right."""
     held = case.validation
     (kept,) = held
     slow = change(case.fit, sample_time=2.0)
-    faults = wiring(case.rig, slow, held)
-    assert all(a is b for a, b in zip(mended(faults, case.rig, held)[1], held, strict=True))
-    mended_fit = mended(faults, case.rig, slow)[1]
-    assert [r.sample_time for r in mended_fit] == pytest.approx([r.sample_time for r in case.fit])
+    faults = setup_faults(case.rig, slow, held)
+    assert all(a is b for a, b in zip(without_faults(faults, case.rig, held)[1], held, strict=True))
+    corrected_fit = without_faults(faults, case.rig, slow)[1]
+    assert [r.sample_time for r in corrected_fit] == pytest.approx([r.sample_time for r in case.fit])
     crossed = exchanged(7, 1, 4)
     fit = change(case.fit, outputs=crossed)
-    (fault,) = wiring(case.rig, fit, held)
+    (fault,) = setup_faults(case.rig, fit, held)
     assert fault.sentence == f"The outputs a2 and a5 are exchanged: swap them; not in {kept.name}."
-    assert mended([fault], case.rig, held)[1] == held
-    (fault,) = wiring(case.rig, fit, change(held, outputs=crossed))
+    assert without_faults([fault], case.rig, held)[1] == held
+    (fault,) = setup_faults(case.rig, fit, change(held, outputs=crossed))
     assert fault.sentence == "The outputs a2 and a5 are exchanged: swap them."
-    (again,) = mended([fault], case.rig, change(held, outputs=crossed))[1]
+    (again,) = without_faults([fault], case.rig, change(held, outputs=crossed))[1]
     assert np.array_equal(again.outputs, kept.outputs)
 
 
@@ -233,35 +233,35 @@ def test_faults_that_a_validation_record_alone_has_are_named_with_it(case):
         ({"inputs": exchanged(4, 0, 2)}, "the inputs F1 and F3 are exchanged: swap them"),
     ):
         spoilt = change([kept], **change_of)
-        (fault,) = wiring(case.rig, case.fit, spoilt)
+        (fault,) = setup_faults(case.rig, case.fit, spoilt)
         assert fault.sentence == f"In validation record {kept.name}, {words}."
-        rig, (again,) = mended([fault], case.rig, spoilt)
+        rig, (again,) = without_faults([fault], case.rig, spoilt)
         assert (
             rig is case.rig and np.allclose(again.outputs, kept.outputs) and np.array_equal(again.inputs, kept.inputs)
         )
-        assert mended([fault], case.rig, case.fit)[1] == case.fit
-    (fault,) = wiring(case.rig, case.fit, change([kept], sample_time=0.5))
+        assert without_faults([fault], case.rig, case.fit)[1] == case.fit
+    (fault,) = setup_faults(case.rig, case.fit, change([kept], sample_time=0.5))
     assert fault.sentence.startswith(f"The record {kept.name} is sampled at half the stated rate")
 
 
-def test_wiring_is_compared_once_the_rig_has_settled(case):
+def test_the_set_up_is_compared_once_the_rig_has_settled(case):
     """Records that begin in motion look like no wiring at first."""
     crossed = change(case.fit, outputs=exchanged(7, 1, 4))
     begun = [r.between(0.2 * r.n_samples * r.sample_time) for r in crossed]
     settle = 0.5 * begun[0].n_samples * begun[0].sample_time
-    assert [fault.sentence for fault in wiring(case.rig, begun, settle=settle)] == [
+    assert [fault.sentence for fault in setup_faults(case.rig, begun, settle=settle)] == [
         "The outputs a2 and a5 are exchanged: swap them."
     ]
 
 
 def test_a_dead_channel_is_no_other_quantity(case):
     dead = change(case.fit, outputs=diagonal(7, 2, 0.0))
-    assert wiring(case.rig, dead) == ()
+    assert setup_faults(case.rig, dead) == ()
 
 
 def test_records_of_one_name_are_refused(case):
     first, other = case.fit[0], replace(case.fit[1], name=case.fit[0].name)
     with pytest.raises(ValueError, match=f"2 records are called '{first.name}'"):
-        wiring(case.rig, [first, other])
+        setup_faults(case.rig, [first, other])
     with pytest.raises(ValueError, match=f"2 records are called '{first.name}'"):
         diagnose(case.rig, [first], validation=[other], workers=1)

@@ -41,7 +41,7 @@ class RecordsError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Readiness:
+class Detectability:
     """Which effects the records can show, and which they can tell apart, before anything is fitted.
 
     Attributes:
@@ -259,7 +259,7 @@ def _check_not_stuck(rig: Rig, records: Sequence[Record]) -> None:
             )
 
 
-def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Readiness:
+def detectability(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Detectability:
     """Simulate each effect at a strength that the records show, and compare the responses."""
     rig, data = evidence.rig, evidence.data.stepped(COARSELY)
     base = data.residual(rig)
@@ -280,7 +280,7 @@ def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) ->
         for j in range(i + 1, len(labels))
         if correlation[i, j] > ALIKE and labels[i].split("[")[0] != labels[j].split("[")[0]
     ]
-    return Readiness(
+    return Detectability(
         strengths=strengths,
         undetectable=tuple(label for label, size in strengths.items() if size**2 <= SEEN),
         indistinguishable=tuple(sorted(alike, key=lambda pair: -pair[2])),

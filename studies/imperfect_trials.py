@@ -6,10 +6,10 @@ import numpy as np
 
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.structure.printed import counted
-from workbench.trials.dirt import CLEAN, DIRT_CLASSES, SIZES, TRIPLE
 from workbench.trials.hold import hold_one, processor_times
-from workbench.trials.make import draw_dirty_kinds
-from workbench.trials.scoring import NONE, reliability, tally_dirty
+from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, SIZES, TRIPLE
+from workbench.trials.make import draw_imperfect_kinds
+from workbench.trials.scoring import NONE, reliability, tally_imperfect
 
 CASES, SEED = 300, 20360101
 FEW = 10  # claims: a share of fewer is chance
@@ -30,8 +30,8 @@ _ERRORS = {
 }
 
 
-def plot_dirt(scores):
-    """How many trials of `score_dirty` were named correctly, by class and size of the small errors beside them."""
+def plot_imperfections(scores):
+    """How many trials of `score_imperfect` were named correctly, by class and size of the small errors beside them."""
     classes, sizes = list(dict.fromkeys(s["class"] for s in scores)), sorted({s["size"] for s in scores})
     figure, ax = new_figure(width=9, height=1.6 + 0.45 * len(classes))
     for row, name in enumerate(classes):
@@ -69,16 +69,18 @@ def plot_reliability(points):
         beside = (8, 4) if point.probability < 0.7 else (-60, -12)
         count = counted(point.claims, "claim")
         ax.annotate(count, (point.probability, point.right), beside, textcoords="offset points")
-    ax.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="stated probability", ylabel="share right")
+    ax.set(
+        xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="stated probability", ylabel="observed frequency"
+    )
     ax.legend(loc="lower right", fontsize=8)
     return figure
 
 
 def study(outcome, data: Path | None = None) -> None:
-    drawn = draw_dirty_kinds(CASES, SEED)
+    drawn = draw_imperfect_kinds(CASES, SEED)
     cases = [{**draw._asdict(), "kinds": list(draw.kinds), "seed": SEED + i} for i, draw in enumerate(drawn)]
     found = outcome.run(cases, hold_one)
-    # a bench on which the effect would not show beside that dirt is no trial
+    # a bench on which the effect would not show beside those imperfections is no trial
     held = [result for result in found if result.error is None]
     unsuited = [result for result in found if result.error is not None and "no case with" in str(result.error)]
     scores = [result["score"] for result in held]
@@ -87,15 +89,17 @@ def study(outcome, data: Path | None = None) -> None:
             outcome.say(f"seed {result['seed']}: {result.error}")
         elif not result["score"]["named"]:
             score = result["score"]
-            outcome.say(f"seed {result['seed']}, {score['class']}: true {score['hidden']}, diagnosed {score['told']}")
+            outcome.say(
+                f"seed {result['seed']}, {score['class']}: true {score['hidden']}, diagnosed {score['diagnosed']}"
+            )
     outcome.table("scores", {result["seed"]: result["score"] for result in held})
-    by_class = {name: tally_dirty(s for s in scores if s["class"] == name) for name in DIRT_CLASSES}
-    by_size = {size: tally_dirty(s for s in scores if s["size"] == size) for size in SIZES}
+    by_class = {name: tally_imperfect(s for s in scores if s["class"] == name) for name in IMPERFECTIONS}
+    by_size = {size: tally_imperfect(s for s in scores if s["size"] == size) for size in SIZES}
     outcome.table("by class", by_class)
     outcome.table("by size", by_size)
     outcome.table("processor time, s", processor_times(held))
 
-    whole = tally_dirty(scores)
+    whole = tally_imperfect(scores)
     quiet = sum(score["hidden"] == NONE for score in scores)
     outcome.check(f"trials of {CASES} that ended in an error", len(found) - len(held) - len(unsuited), 0)
     outcome.check("share named", whole["named"], 0.9, at_least=True)
@@ -108,7 +112,7 @@ def study(outcome, data: Path | None = None) -> None:
     outcome.table("reliability", [point._asdict() for point in points])
     off = max((abs(p.right - p.probability) for p in points if p.claims >= FEW), default=0.0)
     outcome.check(f"reliability: distance from the diagonal of {FEW} claims or more", off, 0.1)
-    outcome.figure("named", plot_dirt(scores), "Share named correctly, by class and size of the small errors.")
+    outcome.figure("named", plot_imperfections(scores), "Share named correctly, by class and size of the small errors.")
     outcome.figure(
         "reliability", plot_reliability(points), "Share of claims that are right, by the probability stated."
     )

@@ -1,4 +1,4 @@
-"""Dirty trials: the small errors are those that were asked for, and scores count what is named beside them."""
+"""Imperfect trials: the small errors are those that were asked for, and scores count what is named beside them."""
 
 from dataclasses import replace
 
@@ -13,11 +13,11 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 from workbench.structure.profile import Profile
 from workbench.trials.benches import draw_bench
-from workbench.trials.dirt import DIRT_CLASSES, MIMICS, SIZES, Dirt, draw_dirt
 from workbench.trials.finite_elements import Alterations, element_modes
-from workbench.trials.make import TWINS, draw_dirty_kinds, make_trial
+from workbench.trials.imperfections import IMPERFECTIONS, MIMICS, SIZES, Imperfections, draw_imperfections
+from workbench.trials.make import TWINS, draw_imperfect_kinds, make_trial
 from workbench.trials.plant import Plant
-from workbench.trials.scoring import reliability, score_dirty, tally_dirty
+from workbench.trials.scoring import reliability, score_imperfect, tally_imperfect
 
 
 @pytest.fixture(scope="module")
@@ -25,9 +25,9 @@ def bench():
     return draw_bench(np.random.default_rng(2))
 
 
-def _residuals(dirt: str, size: float = 1.0, seed: int = 3) -> tuple[np.ndarray, np.ndarray, dict]:
+def _residuals(imperfections: str, size: float = 1.0, seed: int = 3) -> tuple[np.ndarray, np.ndarray, dict]:
     """What the nominal model leaves of the loudest record of a case that hides nothing, in units of stated noise."""
-    case, label = make_trial(seed, dirt=dirt, size=size)
+    case, label = make_trial(seed, imperfections=imperfections, size=size)
     high = next(r for r in case.fit if r.name == "high")
     left = high.outputs - simulate(case.rig, high.inputs, sample_time=high.sample_time).outputs
     return left / np.array([[s.noise_std] for s in case.rig.sensors]), high.inputs, label
@@ -53,8 +53,8 @@ def test_coloured_noise_has_its_size_and_its_memory(size, memory):
 
 @pytest.mark.slow
 def test_inputs_are_logged_with_noise_and_a_hammer_at_rest_is_not():
-    (clean, _), (dirty, _) = (make_trial(3, dirt=dirt) for dirt in ("clean", "input"))
-    for one, other in zip(clean.fit, dirty.fit, strict=True):
+    (clean, _), (imperfect, _) = (make_trial(3, imperfections=imperfections) for imperfections in ("clean", "input"))
+    for one, other in zip(clean.fit, imperfect.fit, strict=True):
         off = other.inputs - one.inputs
         rms = np.sqrt(np.mean(one.inputs**2, axis=1))
         np.testing.assert_allclose(off.std(axis=1), 0.01 * rms, rtol=0.1)
@@ -62,7 +62,7 @@ def test_inputs_are_logged_with_noise_and_a_hammer_at_rest_is_not():
 
 def test_gains_are_off_by_a_per_cent():
     """The gains of actuators and sensors, found from the readings alone, leave noise."""
-    case, _ = make_trial(3, dirt="gain")
+    case, _ = make_trial(3, imperfections="gain")
     record, noise = case.fit[0], np.array([s.noise_std for s in case.rig.sensors])
     each = np.array(
         [
@@ -82,7 +82,7 @@ def test_gains_are_off_by_a_per_cent():
 @pytest.mark.slow
 def test_actuators_and_sensors_stand_off_their_places():
     """The places of all of them, found from the readings alone, leave noise."""
-    case, _ = make_trial(6, dirt="place")
+    case, _ = make_trial(6, imperfections="place")
     record, rig = next(r for r in case.fit if r.name == "high"), case.rig
     noise = np.array([s.noise_std for s in rig.sensors])
     n, stated = len(rig.actuators), np.array([p.at for p in (*rig.actuators, *rig.sensors)])
@@ -106,7 +106,7 @@ def test_actuators_and_sensors_stand_off_their_places():
 
 def test_offset_is_an_error_of_all_stiffness_and_all_damping():
     """The catalogue's own two effects, of the sizes that are drawn, leave noise alone."""
-    case, label = make_trial(3, dirt="offset")
+    case, label = make_trial(3, imperfections="offset")
     record, noise = case.fit[0], np.array([[s.noise_std] for s in case.rig.sensors])
 
     def left(logarithms):
@@ -127,7 +127,7 @@ def test_late_sensors_read_what_was_a_fraction_of_a_sample_before(bench):
     """The late reading is that of a plant sampled ten times as often, three of its samples before."""
     dt, n = bench.sample_time, 60
     commands = np.random.default_rng(0).standard_normal((len(bench.rig.actuators), n))
-    late = Dirt(delays=(0.3,) * len(bench.rig.sensors)).on(Plant.of(bench.rig), dt).solved()
+    late = Imperfections(delays=(0.3,) * len(bench.rig.sensors)).on(Plant.of(bench.rig), dt).solved()
     readings = late.readings(late.move(commands, dt)[0], dt)
     fine = Plant.of(bench.rig).solved()
     moved, _ = fine.move(np.repeat(commands, 10, axis=1), dt / 10)
@@ -151,23 +151,26 @@ def test_waves_of_stiffness_and_mass_shift_the_mode_of_half_their_length():
 
 
 def test_shape_errors_are_those_of_a_member_with_that_mass_stiffness_and_damping(bench):
-    """A beam or rod that has the drawn profiles and ratios from the first moves as the dirty plant does."""
+    """A beam or rod that has the drawn profiles and ratios from the first moves as the imperfect plant does."""
     structure = bench.rig.structure
-    dirt = draw_dirt("shape", 1.0, bench, np.random.default_rng(4))
+    imperfections = draw_imperfections("shape", 1.0, bench, np.random.default_rng(4))
     grid = np.linspace(0.0, structure.length, 400)
-    spread = [np.std(_wave(waves, grid / structure.length)) for waves in (dirt.stiffness_waves, dirt.mass_waves)]
+    spread = [
+        np.std(_wave(waves, grid / structure.length))
+        for waves in (imperfections.stiffness_waves, imperfections.mass_waves)
+    ]
     np.testing.assert_allclose(spread, 0.02, rtol=0.05)
-    assert np.abs(np.log(dirt.damping_factors)).max() <= 0.3
+    assert np.abs(np.log(imperfections.damping_factors)).max() <= 0.3
     name = "bending_stiffness" if isinstance(structure, Beam) else "axial_stiffness"
     changed = replace(
         structure,
-        mass_per_length=_varied(structure.mass_per_length, dirt.mass_waves, structure.length),
-        damping=ModalDamping(bench.rig.modes.zeta * dirt.damping_factors),
-        **{name: _varied(getattr(structure, name), dirt.stiffness_waves, structure.length)},
+        mass_per_length=_varied(structure.mass_per_length, imperfections.mass_waves, structure.length),
+        damping=ModalDamping(bench.rig.modes.zeta * imperfections.damping_factors),
+        **{name: _varied(getattr(structure, name), imperfections.stiffness_waves, structure.length)},
     )
     rig = replace(bench.rig, structure=changed, modes=changed.modes(bench.rig.modes.n_modes, tolerance=1e-9))
     commands = np.random.default_rng(0).standard_normal((len(rig.actuators), 200))
-    plant = dirt.on(Plant.of(bench.rig), bench.sample_time).solved()
+    plant = imperfections.on(Plant.of(bench.rig), bench.sample_time).solved()
     readings = plant.readings(plant.move(commands, bench.sample_time)[0], bench.sample_time)
     expected = simulate(rig, commands, sample_time=bench.sample_time).outputs
     np.testing.assert_allclose(readings, expected, atol=2e-3 * np.abs(expected).max())
@@ -182,9 +185,9 @@ def _varied(profile: Profile, waves, length) -> Profile:
 
 
 def test_a_strong_effect_hides_in_every_class_and_nothing_in_every_third():
-    drawn = draw_dirty_kinds(99, 7)
-    for name in DIRT_CLASSES:
-        of_class = [draw for draw in drawn if draw.dirt == name]
+    drawn = draw_imperfect_kinds(99, 7)
+    for name in IMPERFECTIONS:
+        of_class = [draw for draw in drawn if draw.imperfections == name]
         assert {draw.size for draw in of_class} == set(SIZES)
         hidden = {len(draw.kinds) for draw in of_class}
         assert hidden == ({3} if name == "triple" else {0, 1})
@@ -195,9 +198,9 @@ def test_a_strong_effect_hides_in_every_class_and_nothing_in_every_third():
 
 def test_an_unknown_class_and_a_negative_size_are_refused(bench):
     with pytest.raises(ValueError, match="sand"):
-        make_trial(1, dirt="sand")
+        make_trial(1, imperfections="sand")
     with pytest.raises(ValueError, match="size"):
-        draw_dirt("noise", -1.0, bench, np.random.default_rng(0))
+        draw_imperfections("noise", -1.0, bench, np.random.default_rng(0))
 
 
 # --- scores
@@ -220,22 +223,22 @@ TOLD = {
 
 def test_an_effect_is_named_where_its_place_is_within_three_percent():
     verdict = {"effects": [TOLD], "budget": {"unexplained": 0.03}}
-    found = score_dirty(verdict, LABEL, domain=10.0)
+    found = score_imperfect(verdict, LABEL, domain=10.0)
     assert found["named"] and not found["wrong"] and not found["false_alarm"]
     assert found["covered"] == (2, 3), "the place is four deviations off"
     assert found["budget_error"] == pytest.approx(0.02)
-    assert not score_dirty(verdict, LABEL, domain=5.0)["named"]
-    both = score_dirty({"effects": [TOLD, {"kind": "sensor_bias", "output": "d1"}]}, LABEL, domain=10.0)
+    assert not score_imperfect(verdict, LABEL, domain=5.0)["named"]
+    both = score_imperfect({"effects": [TOLD, {"kind": "sensor_bias", "output": "d1"}]}, LABEL, domain=10.0)
     assert both["wrong"] and not both["named"] and both["budget_error"] is None
-    unknown = score_dirty({"effects": [{"kind": "unknown"}]}, LABEL, domain=10.0)
+    unknown = score_imperfect({"effects": [{"kind": "unknown"}]}, LABEL, domain=10.0)
     assert not unknown["wrong"] and not unknown["named"]
 
 
 def test_whatever_is_named_where_nothing_hides_is_a_false_alarm():
     none = {**LABEL, "effects": [{"kind": "none"}]}
-    assert score_dirty({"effects": [TOLD]}, none, domain=10.0)["false_alarm"]
-    assert not score_dirty({"effects": []}, none, domain=10.0)["false_alarm"]
-    assert not score_dirty({"effects": [{"kind": "unknown"}]}, none, domain=10.0)["false_alarm"]
+    assert score_imperfect({"effects": [TOLD]}, none, domain=10.0)["false_alarm"]
+    assert not score_imperfect({"effects": []}, none, domain=10.0)["false_alarm"]
+    assert not score_imperfect({"effects": [{"kind": "unknown"}]}, none, domain=10.0)["false_alarm"]
 
 
 def test_two_of_three_count_where_the_budget_says_that_something_is_left():
@@ -243,13 +246,13 @@ def test_two_of_three_count_where_the_budget_says_that_something_is_left():
     two = [TOLD, {"kind": "sensor_gain", "output": "d2", "parameters": {}}]
     for left, named in ((0.2, True), (0.01, False)):
         verdict = {"effects": two, "budget": {"unexplained": left}}
-        assert score_dirty(verdict, three, domain=10.0, outputs=("d1", "d2"))["named"] is named
+        assert score_imperfect(verdict, three, domain=10.0, outputs=("d1", "d2"))["named"] is named
 
 
 def test_shares_are_of_what_there_is_to_count():
-    right = score_dirty({"effects": [TOLD], "budget": {"unexplained": 0.2}}, LABEL, domain=10.0)
-    silent = score_dirty({"effects": []}, LABEL, domain=10.0)
-    counted = tally_dirty([right, silent])
+    right = score_imperfect({"effects": [TOLD], "budget": {"unexplained": 0.2}}, LABEL, domain=10.0)
+    silent = score_imperfect({"effects": []}, LABEL, domain=10.0)
+    counted = tally_imperfect([right, silent])
     assert counted["named"] == 0.5 and counted["wrong"] == 0.0 and counted["false_alarms"] == 0
     assert counted["covered"] == pytest.approx(2 / 3) and counted["honest"] == 0.0 and counted["placed"] == 1.0
 
@@ -260,12 +263,12 @@ def test_claims_are_those_of_the_verdict_and_its_alternatives():
         "effects": [TOLD],
         "alternatives": [{"kind": "one_sided_stop", "probability": 0.2}, {"kind": "clearance", "probability": 0.1}],
     }
-    right = score_dirty(verdict, LABEL, domain=10.0)["claims"]
+    right = score_imperfect(verdict, LABEL, domain=10.0)["claims"]
     np.testing.assert_allclose(right, [(0.7, 1), (0.2, 0), (0.1, 1)])
     pair = {**LABEL, "effects": [*LABEL["effects"], {"kind": "sensor_gain", "output": "d1", "gain": 1.1}]}
     verdict["alternatives"] = [{"kind": "sensor_gain[d1] + clearance", "probability": 0.4}]
-    np.testing.assert_allclose(score_dirty(verdict, pair, domain=10.0)["claims"], [(0.6, 0), (0.4, 1)])
-    assert not score_dirty({**verdict, "outcome": "part"}, pair, domain=10.0)["claims"]
+    np.testing.assert_allclose(score_imperfect(verdict, pair, domain=10.0)["claims"], [(0.6, 0), (0.4, 1)])
+    assert not score_imperfect({**verdict, "outcome": "part"}, pair, domain=10.0)["claims"]
 
 
 def test_reliability_of_claims_that_are_right_as_often_as_they_say():
@@ -277,8 +280,8 @@ def test_reliability_of_claims_that_are_right_as_often_as_they_say():
 
 @pytest.mark.slow
 def test_a_strong_effect_alters_the_readings_by_more_than_a_diagnosis_leaves_alone():
-    """The first draw of this seed hides a lag as large as what the dirt does, and below a hundredth of the signal."""
-    case, label = make_trial(620445, kinds=["actuator_lag"], dirt="shape", size=0.5)
+    """The first draw of this seed hides a lag as large as what the imperfections do, and below 1 % of the signal."""
+    case, label = make_trial(620445, kinds=["actuator_lag"], imperfections="shape", size=0.5)
     (effect,) = label["effects"]
     kind = kind_named("actuator_lag")
     there = Effect(kind, effect.get("input", "all"), {"time_constant": effect["time_constant"]})

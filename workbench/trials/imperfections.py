@@ -1,4 +1,4 @@
-"""Dirt: the small errors of a real test that no effect of the catalogue names, in classes and sizes."""
+"""Imperfections: the small errors of a real test that no effect of the catalogue names, in classes and sizes."""
 
 from dataclasses import dataclass, replace
 
@@ -9,7 +9,7 @@ from workbench.trials.benches import Bench
 from workbench.trials.plant import Plant
 
 CLEAN, TRIPLE = "clean", "triple"
-DIRT_CLASSES = (CLEAN, "shape", "offset", "noise", "coloured", "input", "late", "gain", "place", "mixed", TRIPLE)
+IMPERFECTIONS = (CLEAN, "shape", "offset", "noise", "coloured", "input", "late", "gain", "place", "mixed", TRIPLE)
 SIZES = (0.5, 1.0, 2.0)
 MIXED = ("shape", "offset", "noise", "input", "late")  # each at half the size
 
@@ -25,7 +25,7 @@ LATE = 0.3  # of a sample: the latest sensor, at most
 CALIBRATION = 0.01  # standard deviation of the gain of each actuator and each sensor
 PLACED = 0.002  # standard deviation of the place of each, in each coordinate, over the extent: 4 mm of 2 m
 
-# What a class of dirt does itself, and no verdict could tell from it.
+# What imperfections of a class do themselves, and no verdict could tell from them.
 MIMICS: dict[str, frozenset[str]] = {
     CLEAN: frozenset(),
     "shape": frozenset({"modulus_error", "modal_damping", "axial_load", "truncated_modes"}),
@@ -42,7 +42,7 @@ MIMICS["mixed"] = frozenset().union(*(MIMICS[name] for name in MIXED))
 
 
 @dataclass(frozen=True)
-class Dirt:
+class Imperfections:
     """Small errors of a test.
 
     Attributes:
@@ -72,7 +72,7 @@ class Dirt:
     moved: tuple[tuple[float, ...], ...] = ()
 
     def on(self, plant: Plant, sample_time: float) -> Plant:
-        """The plant with this dirt, before any effect is hidden in it."""
+        """The plant with these imperfections, before any effect is hidden in it."""
         n = len(plant.actuators)
         delays = self.delays or (0.0,) * len(plant.sensors)
         gains = self.gains or (1.0,) * (n + len(plant.sensors))
@@ -110,51 +110,53 @@ class Dirt:
         )
 
 
-def draw_dirt(name: str, size: float, bench: Bench, rng: np.random.Generator) -> Dirt:
-    """Dirt of a class at random.
+def draw_imperfections(name: str, size: float, bench: Bench, rng: np.random.Generator) -> Imperfections:
+    """Imperfections of a class at random.
 
     Args:
-        name: of `DIRT_CLASSES`.
+        name: of `IMPERFECTIONS`.
         size: 1 for what a careful laboratory has; 0 for none.
 
     Raises:
         ValueError: an unknown class, a negative size.
     """
-    if name not in DIRT_CLASSES:
-        raise ValueError(f"dirt {name!r} is none of {', '.join(DIRT_CLASSES)}")
+    if name not in IMPERFECTIONS:
+        raise ValueError(f"imperfections {name!r} are none of {', '.join(IMPERFECTIONS)}")
     if not size >= 0:
-        raise ValueError(f"the size of dirt must be 0 or more; got {size}")
-    dirt = Dirt()
+        raise ValueError(f"the size of imperfections must be 0 or more; got {size}")
+    imperfections = Imperfections()
     for part in MIXED if name == "mixed" else (name,):
-        dirt = _with_part(dirt, part, 0.5 * size if name == "mixed" else size, bench, rng)
-    return dirt
+        imperfections = _with_part(imperfections, part, 0.5 * size if name == "mixed" else size, bench, rng)
+    return imperfections
 
 
-def _with_part(dirt: Dirt, name: str, size: float, bench: Bench, rng: np.random.Generator) -> Dirt:
+def _with_part(
+    imperfections: Imperfections, name: str, size: float, bench: Bench, rng: np.random.Generator
+) -> Imperfections:
     if name == "shape":
         spread = rng.uniform(-1.0, 1.0, bench.rig.modes.n_modes) * DAMPING_SPREAD * size
         waves = [_waves(VARIATION * size, rng) for _ in range(2)]
         factors = tuple(map(float, np.exp(spread)))
-        return replace(dirt, stiffness_waves=waves[0], mass_waves=waves[1], damping_factors=factors)
+        return replace(imperfections, stiffness_waves=waves[0], mass_waves=waves[1], damping_factors=factors)
     if name == "offset":
         stiffness, damping = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.5, 1.0, 2) * size
         factors = np.exp(np.array([STIFFNESS_OFFSET * stiffness, DAMPING_OFFSET * damping]))
-        return replace(dirt, stiffness_factor=float(factors[0]), damping_factor=float(factors[1]))
+        return replace(imperfections, stiffness_factor=float(factors[0]), damping_factor=float(factors[1]))
     if name == "noise":
-        return replace(dirt, noise_ratio=NOISE_RATIO**size)
+        return replace(imperfections, noise_ratio=NOISE_RATIO**size)
     if name == "coloured":
-        return replace(dirt, noise_memory=NOISE_MEMORY ** (1.0 / size) if size > 0 else 0.0)
+        return replace(imperfections, noise_memory=NOISE_MEMORY ** (1.0 / size) if size > 0 else 0.0)
     if name == "input":
-        return replace(dirt, logging_noise=LOGGING_NOISE * size)
+        return replace(imperfections, logging_noise=LOGGING_NOISE * size)
     if name == "late":
         delays = tuple(map(float, rng.uniform(0.0, LATE * size, len(bench.rig.sensors))))
-        return replace(dirt, delays=delays, interpolated=bool(rng.random() < 0.5))
+        return replace(imperfections, delays=delays, interpolated=bool(rng.random() < 0.5))
     if name == "gain":
         ports = len(bench.rig.actuators) + len(bench.rig.sensors)
-        return replace(dirt, gains=tuple(map(float, np.exp(CALIBRATION * size * rng.standard_normal(ports)))))
+        return replace(imperfections, gains=tuple(map(float, np.exp(CALIBRATION * size * rng.standard_normal(ports)))))
     if name == "place":
-        return replace(dirt, moved=_off_places(bench, PLACED * size, rng))
-    return dirt
+        return replace(imperfections, moved=_off_places(bench, PLACED * size, rng))
+    return imperfections
 
 
 def _moved(where: Where, by: tuple[float, ...]) -> Where:

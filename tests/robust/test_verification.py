@@ -12,7 +12,7 @@ from workbench.design.loop.rig_loop import LoopTest
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import LinearSpring, PeriodicForce
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import verify
+from workbench.robust.verification import verify
 
 
 def test_what_no_loop_can_be_made_of_is_refused(rig):
@@ -38,7 +38,7 @@ def test_what_no_loop_can_be_made_of_is_refused(rig):
         ({"seed": "x"}, "seed is a whole number, 0 or more; got 'x'"),
         ({"controlled": 2}, r"controlled is a sequence of modes, counted from zero, such as \(0, 1\); got 2"),
         ({"controlled": ("a",)}, "a mode counted from zero, is a whole number"),
-        ({"centre": controller}, "centre is the rig whose small-gain margin is stated; got DigitalController"),
+        ({"margin_rig": controller}, "margin_rig is the rig whose small-gain margin is stated; got DigitalController"),
     ):
         with pytest.raises(TypeError, match=match):
             verify(certain, controller, test, **given)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from workbench.robust.prediction import Prediction
 
 
-def possible_rig(
+def uncertain_rig(
     case: "Case", verdict: Path | None, *, workers: int | None, report: Callable[[str, float], None]
 ) -> "tuple[UncertainRig, tuple[float, ...] | None]":
     """The uncertain rig of a case, and the noise (n_outputs,) that its diagnosis found; from a verdict where given.
@@ -30,21 +30,21 @@ def possible_rig(
         ValueError: no verdict of this case, or channels that are certainly exchanged or turned.
     """
     from workbench.gap.diagnose import SECONDS, diagnose_case
-    from workbench.gap.report.wiring import check_kept_apart, wiring
+    from workbench.gap.report.setup_faults import check_disjoint, setup_faults
     from workbench.robust.posterior import UncertainRig
 
     if verdict is not None:
         return read_verdict(verdict, case.rig)
-    check_kept_apart(case.fit, case.validation)
+    check_disjoint(case.fit, case.validation)
     kept = Path("out") / f"{case.name}-verdict.json"
-    for fault in wiring(case.rig, case.fit, case.validation):
+    for fault in setup_faults(case.rig, case.fit, case.validation):
         if fault.certain:
             raise ValueError(
                 f"{fault.sentence.rstrip('.')}; correct the case, or go on as it is by `workbench diagnose CASE"
-                f" --as-wired --json {kept.name}`, and give that file as --verdict"
+                f" --uncorrected --json {kept.name}`, and give that file as --verdict"
             )
     errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
-    found = diagnose_case(case, workers=workers, report=report)
+    found = diagnose_case(case, workers=workers, progress=report)
     write_verdict(found, kept)
     errors.print(f"  {found.sentence}")
     errors.print(f"  verdict    {short(kept)}: with --verdict {short(kept)} the next command need not diagnose")
@@ -75,10 +75,10 @@ def predicted(
     from workbench.robust.prediction import check_draws, predict
 
     check_draws(draws)  # before the diagnosis
-    possible, noise = possible_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))
+    uncertain, noise = uncertain_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))
     return predict(
-        possible, record, noise_std=noise, draws=draws, seed=seed,
-        report=lambda what, done: report(what, 0.7 + 0.3 * done),
+        uncertain, record, noise_std=noise, draws=draws, seed=seed,
+        progress=lambda what, done: report(what, 0.7 + 0.3 * done),
     )  # fmt: skip
 
 

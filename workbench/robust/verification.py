@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from workbench.arguments import whole
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, of_loops, run_loop
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
@@ -128,42 +128,43 @@ def _plain(value: float) -> float | None:
     return float(f"{value:.6g}") if np.isfinite(value) else None
 
 
+@former_arguments(possible="rig", centre="margin_rig")
 @one_blas_thread
 def verify(
-    possible: UncertainRig | Sequence[Rig],
+    rig: UncertainRig | Sequence[Rig],
     controller: DigitalController,
     test: LoopTest,
     *,
     controlled: Sequence[int] = (),
     draws: int = 200,
     seed: int = 0,
-    centre: Rig | None = None,
+    margin_rig: Rig | None = None,
 ) -> Verification:
     """What a controller does on samples of an uncertain rig under a test, all nonlinear elements in.
 
     What the diagnosis leaves unexplained is drawn too: an error of each sensor's gain within ± that share.
 
     Args:
-        possible: rig with its uncertainty, or rigs drawn from it.
+        rig: rig with its uncertainty, or rigs drawn from it.
         controller: of the test's sample time.
         test: what each loop is put through, with noise of its own where it has a seed.
         controlled: zero-based modes whose work is W_C.
         draws: how many rigs, where they are not drawn yet.
         seed: of the draws.
-        centre: the rig whose small-gain margin is stated; the first where rigs are given.
+        margin_rig: the rig whose small-gain margin is stated; the first where rigs are given.
 
     Raises:
         TypeError: no uncertain rig, no sampled controller or no test, or no number where one is asked for.
         ValueError: a controller or a test that does not fit the rig, draws that are no whole number above zero, or a
             controlled mode that the rigs do not have.
     """
-    _check_kinds(possible, controller, test, centre)
+    _check_kinds(rig, controller, test, margin_rig)
     draws, seed = whole(draws, WHAT_DRAWS, least=1), whole(seed, "seed")
-    if isinstance(possible, UncertainRig):
-        rigs: Sequence[Rig] = drawn_with_errors(possible, draws, seed)
-        centre = centre or possible.rig
+    if isinstance(rig, UncertainRig):
+        rigs: Sequence[Rig] = drawn_with_errors(rig, draws, seed)
+        margin_rig = margin_rig or rig.rig
     else:
-        rigs, centre = possible, centre or possible[0]
+        rigs, margin_rig = rig, margin_rig or rig[0]
     index = _indices(controlled)
     n_modes = min(rig.modes.n_modes for rig in rigs)
     strange = [r for r in index if not 0 <= r < n_modes]
@@ -187,7 +188,7 @@ def verify(
 
     found = _Draw(*(list(values) for values in zip(*of_loops(rigs, controller, test, drawn))))
     margin, frequency = small_gain_margin(
-        centre, controller, modes_in_motion(centre, run_loop(centre, controller, test))
+        margin_rig, controller, modes_in_motion(margin_rig, run_loop(margin_rig, controller, test))
     )
     dt = test.sample_time
     with np.errstate(over="ignore", invalid="ignore"):
@@ -215,17 +216,17 @@ def _indices(controlled: Sequence[int]) -> list[int]:
     return [whole(r, "each of controlled, a mode counted from zero,") for r in controlled]
 
 
-def _check_kinds(possible: object, controller: object, test: object, centre: object) -> None:
+def _check_kinds(uncertain: object, controller: object, test: object, margin_rig: object) -> None:
     """Refuse what no loop can be made of."""
-    drawn = isinstance(possible, Sequence) and len(possible) > 0 and all(isinstance(rig, Rig) for rig in possible)
-    if not (isinstance(possible, UncertainRig) or drawn):
+    drawn = isinstance(uncertain, Sequence) and len(uncertain) > 0 and all(isinstance(rig, Rig) for rig in uncertain)
+    if not (isinstance(uncertain, UncertainRig) or drawn):
         raise TypeError(
-            f"a controller is verified on an UncertainRig, or on rigs drawn from it; got {type(possible).__name__}:"
+            f"a controller is verified on an UncertainRig, or on rigs drawn from it; got {type(uncertain).__name__}:"
             " UncertainRig.of(verdict) is what a diagnosis leaves"
         )
     check_loop_kinds(controller, test)
-    if not isinstance(centre, Rig | None):
-        raise TypeError(f"centre is the rig whose small-gain margin is stated; got {type(centre).__name__}")
+    if not isinstance(margin_rig, Rig | None):
+        raise TypeError(f"margin_rig is the rig whose small-gain margin is stated; got {type(margin_rig).__name__}")
 
 
 def check_loop_kinds(controller: object, test: object) -> None:
@@ -268,17 +269,17 @@ class _Draw(NamedTuple):
     of_controlled: Any
 
 
-def drawn_with_errors(possible: UncertainRig, draws: int, seed: int = 0) -> tuple[Rig, ...]:
-    """Rigs drawn from what is possible, each sensor's gain off by what is unexplained: uniform within ± that share."""
+def drawn_with_errors(uncertain: UncertainRig, draws: int, seed: int = 0) -> tuple[Rig, ...]:
+    """Samples of an uncertain rig, each sensor's gain off by what is unexplained: uniform within ± that share."""
     rng = np.random.default_rng(seed)
-    rigs = possible.draws(draws, rng)
-    if not possible.unexplained:
+    rigs = uncertain.draws(draws, rng)
+    if not uncertain.unexplained:
         return rigs
     return tuple(
         replace(
             rig,
             sensors=tuple(
-                replace(s, gain=s.gain * (1.0 + possible.unexplained * rng.uniform(-1.0, 1.0))) for s in rig.sensors
+                replace(s, gain=s.gain * (1.0 + uncertain.unexplained * rng.uniform(-1.0, 1.0))) for s in rig.sensors
             ),
         )
         for rig in rigs

@@ -1,4 +1,4 @@
-"""Modes that depend on amplitude, seen in the free decay after a blow.
+"""Modes that depend on amplitude, seen in the free decay after an impact.
 
 A driven response holds nothing else to compare such a mode with than more modes near by. Where nothing drives the
 structure any more, frequency and damping are found at one amplitude after the other.
@@ -21,20 +21,20 @@ from workbench.records.record import Record
 
 
 @dataclass(frozen=True)
-class AfterBlowsSettings:
+class AfterImpactsSettings:
     """Constants of the look at free decays."""
 
     share: float = 0.2  # of the time of an identification
-    least: float = 0.5  # share of a record that the last blow must leave, for the decay to tell of its modes
+    least: float = 0.5  # share of a record that the last impact must leave, for the decay to tell of its modes
     matters: float = 0.1  # of the half-power bandwidth: a mode that moves by less within a decay is a linear one
     near: float = 0.1  # of the frequency of a mode, within which one identified from all of the record is the same
 
 
-AFTER_BLOWS = AfterBlowsSettings()
+AFTER_IMPACTS = AfterImpactsSettings()
 
 
 @dataclass(frozen=True)
-class AfterBlows:
+class AfterImpacts:
     """The modes of free decays, some of which depend on amplitude; empty where none does.
 
     Attributes:
@@ -73,49 +73,49 @@ class AfterBlows:
         found = {}
         for k, pole in enumerate(self.changing):
             r = int(np.argmin(np.abs(poles - pole)))
-            if abs(poles[r] - pole) < AFTER_BLOWS.near * abs(pole):
+            if abs(poles[r] - pole) < AFTER_IMPACTS.near * abs(pole):
                 found[r] = k
         return found
 
 
-def after_blows(records: Sequence[Record], budget: Budget) -> AfterBlows:
+def after_impacts(records: Sequence[Record], budget: Budget) -> AfterImpacts:
     """The modes that depend on amplitude, where every record ends in free decay; none otherwise.
 
     Args:
-        records: inputs zero between blows.
+        records: inputs zero between impacts.
         budget: of the identification; a share of it is used.
     """
     decays = [_free_decay(record) for record in records]
     if not all(decays):
-        return AfterBlows()
+        return AfterImpacts()
     free = [decay for decay in decays if decay is not None]
-    part = budget.aside(AFTER_BLOWS.share)
+    part = budget.aside(AFTER_IMPACTS.share)
     with suppress(ValueError, np.linalg.LinAlgError):  # nothing decays freely: the inputs alone tell
         refined = identify_within(free, part).without_artefacts(np.pi / free[0].sample_time).refined
         if not part.unfinished:
             return _that_matter(refined, amplitude_dependence(free, refined))
-    return AfterBlows()
+    return AfterImpacts()
 
 
 def _free_decay(record: Record) -> Record | None:
     """What follows the last sample that drives, if it is most of the record."""
     driven = np.flatnonzero(record.inputs.any(axis=0))
     behind = int(driven[-1]) + 2 if driven.size else record.n_samples  # an input straight between samples ends one on
-    if record.n_samples - behind < AFTER_BLOWS.least * record.n_samples:
+    if record.n_samples - behind < AFTER_IMPACTS.least * record.n_samples:
         return None
     decay = record.between(record.start_time + behind * record.sample_time)
     return replace(decay, inputs=decay.inputs[:0], input_channels=())
 
 
-def _that_matter(refined: Refined, by_amplitude: AmplitudeDependence) -> AfterBlows:
+def _that_matter(refined: Refined, by_amplitude: AmplitudeDependence) -> AfterImpacts:
     """Those that move by more than a linear model could overlook."""
     poles, changing, scatter = refined.modes.poles, [], []
     for r in np.flatnonzero(by_amplitude.depends).tolist():
         omega = by_amplitude.omega[np.isfinite(by_amplitude.omega[:, r]), r]
-        if np.ptp(omega) > AFTER_BLOWS.matters * abs(poles[r].real):
+        if np.ptp(omega) > AFTER_IMPACTS.matters * abs(poles[r].real):
             changing.append(r)
             scatter.append(float(omega.std()))
     if not changing:
-        return AfterBlows()
+        return AfterImpacts()
     figures = tuple(by_amplitude.figures(r) for r in changing)
-    return AfterBlows(tuple(poles.tolist()), tuple(poles[changing].tolist()), tuple(scatter), figures)
+    return AfterImpacts(tuple(poles.tolist()), tuple(poles[changing].tolist()), tuple(scatter), figures)

@@ -1,6 +1,6 @@
-"""Faults of wiring, of units and of bookkeeping, looked for before any effect.
+"""Faults of the test set-up, looked for before any effect: of wiring, of units and of bookkeeping.
 
-A fault is believed where its mend takes nearly all of the gap away on the channels that it concerns. Physics gone
+A fault is believed where its correction takes nearly all of the gap away on the channels that it concerns. Physics gone
 astray does not do that: no missing effect turns a sign, multiplies by 1000, or exchanges two channels.
 """
 
@@ -18,13 +18,15 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, predict
 from workbench.structure.damping import ModalDamping
 
-Mended = tuple[Rig, tuple[Record, ...]]
-Mend = Callable[[Rig, Sequence[Record]], Mended]
+Corrected = tuple[Rig, tuple[Record, ...]]
+Correction = Callable[[Rig, Sequence[Record]], Corrected]
 
-WIDE_GAP = 0.3  # root mean square per standard deviation of a channel from which it may be wired wrongly: a turned sign
+WIDE_GAP = (
+    0.3  # root mean square per standard deviation of a channel from which it may be connected wrongly: a turned sign
+)
 # leaves 2, an exchange about 1.4, a factor of 2π at least 0.84
 LEFT = 0.15  # share of a channel's measured power that may remain beyond the noise: a prediction of nothing leaves all
-CLOSED = 0.9  # share of the closable power that a mend must take away, on the channels that it concerns
+CLOSED = 0.9  # share of the closable power that a correction must take away, on the channels that it concerns
 NEAR = 0.15  # relative error of a gain that still is that factor: the least ratio of two of them is 1.56
 MOST_CHANNELS = 12  # pairs of inputs are simulated one by one: beyond, only neighbours are
 MOST_ROUNDS = 4  # faults that hide one another are found one after the other
@@ -56,33 +58,33 @@ WORST = 1e12  # times the measured power: a prediction that leaves more is of no
 
 
 @dataclass(frozen=True, eq=False)
-class WiringFault:
-    """A fault of wiring, units or bookkeeping.
+class SetupFault:
+    """A fault of the test set-up: of wiring, units or bookkeeping.
 
     Attributes:
         kind: "exchanged inputs", "exchanged outputs", "sign", "unit", "quantity", "sample rate", "damping",
             "frequency", "copied channel" or "repeated record".
-        sentence: what is wrong, and the mend.
-        closes: share of the closable power of the gap that the mend takes away on the channels that it concerns; nan
-            where no prediction was needed to see the fault.
-        mend: (rig, records) -> (rig, records) without the fault.
-        records: names of those that show it and are mended; empty where the rig, or a channel of every record, is.
+        sentence: what is wrong, and the correction.
+        closes: share of the closable power of the gap that the correction takes away on the channels that it concerns;
+            nan where no prediction was needed to see the fault.
+        correction: (rig, records) -> (rig, records) without the fault.
+        records: names of those that show it and are corrected; empty where the rig, or a channel of every record, is.
         certain: False for a factor that may be one of units, where a gain near it explains far more: an error of
-            calibration is likelier. It is said and not mended.
+            calibration is likelier. It is said and not corrected.
     """
 
     kind: str
     sentence: str
     closes: float
-    mend: Mend
+    correction: Correction
     certain: bool = True
     records: tuple[str, ...] = ()
 
 
-def wiring(
+def setup_faults(
     rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0
-) -> tuple[WiringFault, ...]:
-    """The faults of wiring and units that the records show against the nominal rig, in the order to mend them.
+) -> tuple[SetupFault, ...]:
+    """The faults of the test set-up that the records show against the nominal rig, in the order to correct them.
 
     Each validation record is judged by itself: by each fault of the fit records, then by faults that it alone has.
 
@@ -97,61 +99,63 @@ def wiring(
     """
     check_names((*records, *validation))
     found = [*_repeated(records), *_copied(rig, records)]
-    seen_rig, seen = mended(found, rig, records)
+    seen_rig, seen = without_faults(found, rig, records)
     found += _by_rounds(seen_rig, seen, settle, WAYS)
     held = tuple(validation)
     for i, fault in enumerate(found):
         if fault.kind in OF_CHANNELS and fault.certain:
             found[i] = fault = _judged_on(held, fault, rig, settle)
-        rig, held = mended([fault], rig, held)
+        rig, held = without_faults([fault], rig, held)
     for record in held:
         found += [_of_one(record, fault) for fault in _by_rounds(rig, (record,), settle, WAYS_OF_ONE) if fault.certain]
     return tuple(found)
 
 
-def mended(faults: Iterable[WiringFault], rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+def without_faults(faults: Iterable[SetupFault], rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
     """The rig without the faults that are certain, and the records without those that they show."""
     kept = tuple(records)
     for fault in faults:
         if fault.certain:
-            each = [(r,) if fault.records and r.name not in fault.records else fault.mend(rig, (r,))[1] for r in kept]
+            each = [
+                (r,) if fault.records and r.name not in fault.records else fault.correction(rig, (r,))[1] for r in kept
+            ]
             kept = tuple(record for one in each for record in one)
-            rig, _ = fault.mend(rig, ())
+            rig, _ = fault.correction(rig, ())
     return rig, kept
 
 
 def _by_rounds(
-    rig: Rig, records: Sequence[Record], settle: float, ways: "Sequence[Callable[[_Gap], list[WiringFault]]]"
-) -> list[WiringFault]:
+    rig: Rig, records: Sequence[Record], settle: float, ways: "Sequence[Callable[[_Gap], list[SetupFault]]]"
+) -> list[SetupFault]:
     """Faults that hide one another, one kind after the other."""
-    found: list[WiringFault] = []
+    found: list[SetupFault] = []
     for _ in range(MOST_ROUNDS):
         faults = _best(rig, records, settle, ways)
         found += faults
         if not any(fault.certain for fault in faults):
             break
-        rig, records = mended(faults, rig, records)
+        rig, records = without_faults(faults, rig, records)
     return found
 
 
-def _judged_on(held: Sequence[Record], fault: WiringFault, rig: Rig, settle: float) -> WiringFault:
-    """A fault of the fit records, with the validation records that agree better with the model by its mend."""
+def _judged_on(held: Sequence[Record], fault: SetupFault, rig: Rig, settle: float) -> SetupFault:
+    """A fault of the fit records, with the validation records that agree better with the model by its correction."""
 
     def left(of: Rig, these: Sequence[Record]) -> float:
         return float(np.minimum(_Gap.of(of, these, settle).before, WORST).sum())
 
-    showing = [r.name for r in held if left(*fault.mend(rig, (r,))) < left(rig, (r,))]
+    showing = [r.name for r in held if left(*fault.correction(rig, (r,))) < left(rig, (r,))]
     others = [r.name for r in held if r.name not in showing]
     sentence = f"{fault.sentence[:-1]}; not in {', '.join(others)}." if others else fault.sentence
     return replace(fault, sentence=sentence, records=(*fault.records, *showing))
 
 
-def _of_one(record: Record, fault: WiringFault) -> WiringFault:
+def _of_one(record: Record, fault: SetupFault) -> SetupFault:
     """A fault of a validation record alone: the rig stays as it is."""
     words = fault.sentence
     if fault.kind != "sample rate":  # that names its record
         words = f"In validation record {record.name}, {words[0].lower()}{words[1:]}"
-    return replace(fault, sentence=words, records=(record.name,), mend=partial(_records_alone, fault.mend))
+    return replace(fault, sentence=words, records=(record.name,), correction=partial(_records_alone, fault.correction))
 
 
 def check_names(records: Sequence[Record]) -> None:
@@ -169,7 +173,7 @@ def check_names(records: Sequence[Record]) -> None:
             )
 
 
-def check_kept_apart(records: Sequence[Record], validation: Sequence[Record]) -> None:
+def check_disjoint(records: Sequence[Record], validation: Sequence[Record]) -> None:
     """Refuse validation records that repeat a record to be fitted.
 
     Raises:
@@ -198,14 +202,14 @@ def _same(one: Record, other: Record) -> bool:
     )
 
 
-def _repeated(records: Sequence[Record]) -> list[WiringFault]:
+def _repeated(records: Sequence[Record]) -> list[SetupFault]:
     faults, again = [], set()
     for i, j in combinations(range(len(records)), 2):
         if j not in again and i not in again and _same(records[i], records[j]):
             again.add(j)
             first, second = records[i].name, records[j].name
             faults.append(
-                WiringFault(
+                SetupFault(
                     "repeated record",
                     f"The records {first} and {second} hold the same samples: leave {second} out.",
                     np.nan,
@@ -215,9 +219,9 @@ def _repeated(records: Sequence[Record]) -> list[WiringFault]:
     return faults
 
 
-def _copied(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
+def _copied(rig: Rig, records: Sequence[Record]) -> list[SetupFault]:
     """Outputs with the same samples: noise differs from sensor to sensor, so one is a copy."""
-    faults: list[WiringFault] = []
+    faults: list[SetupFault] = []
     gone: set[int] = set()
     for i, j in combinations(range(len(rig.sensors)), 2):
         one, other = rig.sensors[i], rig.sensors[j]
@@ -234,7 +238,7 @@ def _copied(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
         gone.add(copy)
         kept = i + j - copy
         faults.append(
-            WiringFault(
+            SetupFault(
                 "copied channel",
                 f"The outputs {one.name} and {other.name} hold the same samples, and the model agrees better with"
                 f" {rig.sensors[kept].name}: measure {rig.sensors[copy].name} again, or leave it out.",
@@ -284,7 +288,7 @@ class _Gap:
 
     @property
     def wide(self) -> Flags:
-        """(n_outputs,) where that is too much for an effect; a channel that never moves shows no wiring."""
+        """(n_outputs,) where that is too much for an effect; a channel that never moves shows no connection."""
         moves = np.any([np.ptp(y, axis=1) > 0 for y in self.measured], axis=0)
         return np.asarray(moves & (self.before > np.maximum(WIDE_GAP**2, 4.0 * self.noise)))
 
@@ -316,9 +320,9 @@ def _counted(measured: Sequence[Floats], predicted: Sequence[Floats]) -> list[Fl
 
 
 def _best(
-    rig: Rig, records: Sequence[Record], settle: float, ways: Sequence[Callable[[_Gap], list[WiringFault]]]
-) -> list[WiringFault]:
-    """The faults of the kind that closes most, doubtful ones where none is certain; none where no mend closes most."""
+    rig: Rig, records: Sequence[Record], settle: float, ways: Sequence[Callable[[_Gap], list[SetupFault]]]
+) -> list[SetupFault]:
+    """The faults of the kind that closes most, doubtful ones where none is certain; none where none closes most."""
     gap = _Gap.of(rig, records, settle)
     # a record at a low level may be sampled wrongly and yet leave no wide gap over all records
     found = [way(gap) for way in (ways if gap.wide.any() else (_rates,))]
@@ -329,13 +333,13 @@ def _best(
     return found[0] if len(found) == 1 else max(found, key=lambda faults: _overall(faults, gap), default=[])
 
 
-def _overall(faults: Sequence[WiringFault], gap: _Gap) -> float:
-    """Minus the share of the measured power that remains with the mends."""
-    rig, kept = mended(faults, gap.rig, gap.records)
+def _overall(faults: Sequence[SetupFault], gap: _Gap) -> float:
+    """Minus the share of the measured power that remains with the corrections."""
+    rig, kept = without_faults(faults, gap.rig, gap.records)
     return -float(np.minimum(_Gap.of(rig, kept, gap.settle).before, 1.0).mean())
 
 
-def _scaled_outputs(gap: _Gap) -> list[WiringFault]:
+def _scaled_outputs(gap: _Gap) -> list[SetupFault]:
     """Outputs that read a known factor times what is predicted."""
     rig = gap.rig
     over = sum((p**2).sum(axis=1) for p in gap.predicted)
@@ -373,8 +377,8 @@ def _scaled_outputs(gap: _Gap) -> list[WiringFault]:
         sentence = f"{_one(f'{who} {what}', names)}{rest}: {cure}{' (the outputs)' if rest else ''}."
         if not certain:
             sentence = _doubtful(f"{who} {what}{rest}", gains[outputs] / factor - 1.0)
-        mend = partial(_outputs_times, dict.fromkeys(names, 1.0 / factor))
-        faults.append(WiringFault(kind, sentence, closes, mend, certain, gap.names))
+        correction = partial(_outputs_times, dict.fromkeys(names, 1.0 / factor))
+        faults.append(SetupFault(kind, sentence, closes, correction, certain, gap.names))
     return faults
 
 
@@ -403,7 +407,7 @@ def _factor(gain: float) -> float | None:
     return min(near, key=lambda factor: abs(gain / factor - 1.0), default=None)
 
 
-def _exchanged_outputs(gap: _Gap) -> list[WiringFault]:
+def _exchanged_outputs(gap: _Gap) -> list[SetupFault]:
     rig = gap.rig
     for i, j in combinations(np.flatnonzero(gap.wide), 2):
         order = np.arange(len(rig.sensors))
@@ -413,28 +417,28 @@ def _exchanged_outputs(gap: _Gap) -> list[WiringFault]:
         if closes >= CLOSED:
             one, other = rig.sensors[i].name, rig.sensors[j].name
             sentence = f"The outputs {one} and {other} are exchanged: swap them."
-            mend = partial(_exchanged, "outputs", one, other)
-            return [WiringFault("exchanged outputs", sentence, closes, mend, records=gap.names)]
+            correction = partial(_exchanged, "outputs", one, other)
+            return [SetupFault("exchanged outputs", sentence, closes, correction, records=gap.names)]
     return []
 
 
-def _exchanged_inputs(gap: _Gap) -> list[WiringFault]:
+def _exchanged_inputs(gap: _Gap) -> list[SetupFault]:
     rig, records = gap.rig, gap.records
-    found: list[WiringFault] = []
+    found: list[SetupFault] = []
     n = len(rig.actuators)
     for i, j in combinations(range(n), 2):
         if n > MOST_CHANNELS and j != i + 1:
             continue
         one, other = rig.actuators[i].name, rig.actuators[j].name
-        mend = partial(_exchanged, "inputs", one, other)
-        closes = gap.closes(*mend(rig, records))
+        correction = partial(_exchanged, "inputs", one, other)
+        closes = gap.closes(*correction(rig, records))
         if closes >= CLOSED:
             sentence = f"The inputs {one} and {other} are exchanged: swap them."
-            found.append(WiringFault("exchanged inputs", sentence, closes, mend, records=gap.names))
+            found.append(SetupFault("exchanged inputs", sentence, closes, correction, records=gap.names))
     return sorted(found, key=lambda fault: -fault.closes)[:1]
 
 
-def _scaled_inputs(gap: _Gap) -> list[WiringFault]:
+def _scaled_inputs(gap: _Gap) -> list[SetupFault]:
     """Inputs that a linear rig would need a known factor larger or smaller, by least squares on their responses."""
     rig, records = gap.rig, gap.records
     n = len(rig.actuators)
@@ -460,8 +464,8 @@ def _scaled_inputs(gap: _Gap) -> list[WiringFault]:
     wrong = {p: factor for p, factor in known.items() if factor is not None}
     if not wrong or (len(wrong) == acting.size and len(set(wrong.values())) == 1):
         return []
-    mend = partial(_inputs_times, {rig.actuators[p].name: factor for p, factor in wrong.items()})
-    closes = gap.closes(*mend(rig, records))
+    correction = partial(_inputs_times, {rig.actuators[p].name: factor for p, factor in wrong.items()})
+    closes = gap.closes(*correction(rig, records))
     if closes < CLOSED:
         return []
     freely, noise = _squares(target - matrix @ gains), float(gap.noise.sum()) * target.size / gap.noise.size
@@ -479,7 +483,7 @@ def _scaled_inputs(gap: _Gap) -> list[WiringFault]:
             sentence = _doubtful(what, gains[inputs] / factor - 1.0)
         kind = "sign" if factor == -1.0 else "unit"
         own = partial(_inputs_times, dict.fromkeys(names, factor))
-        faults.append(WiringFault(kind, sentence, closes, own, certain, gap.names))
+        faults.append(SetupFault(kind, sentence, closes, own, certain, gap.names))
     return faults
 
 
@@ -487,7 +491,7 @@ def _squares(values: Floats) -> float:
     return float(values @ values)
 
 
-def _quantities(gap: _Gap) -> list[WiringFault]:
+def _quantities(gap: _Gap) -> list[SetupFault]:
     """Outputs that are another time derivative of the motion than their label says."""
     rig, records = gap.rig, gap.records
     meant: dict[tuple[str, str], list[int]] = {}
@@ -506,12 +510,12 @@ def _quantities(gap: _Gap) -> list[WiringFault]:
         closed = gap.closed(gap.power(gap.predict(_relabelled(rig, names, quantity), records)))
         what = _one(f"{_named('output', names)} are {quantity}, not {said}", names)
         sentence = f'{what}: state the quantity "{quantity}".'
-        mend = partial(_quantity_set, frozenset(names), quantity)
-        faults.append(WiringFault("quantity", sentence, float(closed[outputs].min()), mend))
+        correction = partial(_quantity_set, frozenset(names), quantity)
+        faults.append(SetupFault("quantity", sentence, float(closed[outputs].min()), correction))
     return faults
 
 
-def _rates(gap: _Gap) -> list[WiringFault]:
+def _rates(gap: _Gap) -> list[SetupFault]:
     """Records sampled at another rate than they are said to be."""
     rig, records = gap.rig, gap.records
     wrong: dict[float, list[int]] = {}
@@ -534,16 +538,16 @@ def _rates(gap: _Gap) -> list[WiringFault]:
         times = ", ".join(dict.fromkeys(f"{records[i].sample_time / factor:.6g}" for i in at))
         what = _one(f"{_named('record', names)} are sampled at {RATES[factor]} the stated rate", names)
         sentence = f"{what}: state sample_time = {times} s."
-        mend = partial(_rate_times, factor)
-        whole = gap.closes(*mend(rig, records)) if len(at) == len(records) else np.nan
-        faults.append(WiringFault("sample rate", sentence, whole, mend, records=tuple(names)))
+        correction = partial(_rate_times, factor)
+        whole = gap.closes(*correction(rig, records)) if len(at) == len(records) else np.nan
+        faults.append(SetupFault("sample rate", sentence, whole, correction, records=tuple(names)))
     return faults
 
 
-def _structure(gap: _Gap) -> list[WiringFault]:
+def _structure(gap: _Gap) -> list[SetupFault]:
     """Damping in per cent, frequencies in rad/s for Hz and the other way about."""
     rig, records = gap.rig, gap.records
-    tries: list[tuple[str, str, Mend]] = []
+    tries: list[tuple[str, str, Correction]] = []
     zeta = float(rig.modes.zeta.max(initial=0.0))
     if zeta > PER_CENT_FROM and (rig.structure is None or isinstance(rig.structure.damping, ModalDamping)):
         sentence = (
@@ -555,7 +559,10 @@ def _structure(gap: _Gap) -> list[WiringFault]:
         for factor, words in ((TURN, "Hz where rad/s is"), (1.0 / TURN, "rad/s where Hz is")):
             sentence = f"The natural frequencies look like {words} meant: multiply them by {factor:.6g}."
             tries.append(("frequency", sentence, partial(_modes_times, factor, 1.0)))
-    found = [WiringFault(kind, sentence, gap.closes(*mend(rig, records)), mend) for kind, sentence, mend in tries]
+    found = [
+        SetupFault(kind, sentence, gap.closes(*correction(rig, records)), correction)
+        for kind, sentence, correction in tries
+    ]
     found = [fault for fault in found if fault.closes >= CLOSED]
     return sorted(found, key=lambda fault: -fault.closes)[:1]
 
@@ -586,35 +593,35 @@ WAYS_OF_ONE = (_scaled_outputs, _exchanged_outputs, _exchanged_inputs, _scaled_i
 WAYS = (*WAYS_OF_ONE[:-1], _quantities, _rates, _structure)
 
 
-# --- mends: of (rig, records), once all before these is given
+# --- corrections: of (rig, records), once all before these is given
 
 
-def _records_alone(mend: Mend, rig: Rig, records: Sequence[Record]) -> Mended:
+def _records_alone(correction: Correction, rig: Rig, records: Sequence[Record]) -> Corrected:
     """The rig as it is."""
-    return rig, mend(rig, records)[1]
+    return rig, correction(rig, records)[1]
 
 
-def _without_record(name: str, rig: Rig, records: Sequence[Record]) -> Mended:
+def _without_record(name: str, rig: Rig, records: Sequence[Record]) -> Corrected:
     return rig, tuple(record for record in records if record.name != name)
 
 
-def _without_output(name: str, rig: Rig, records: Sequence[Record]) -> Mended:
+def _without_output(name: str, rig: Rig, records: Sequence[Record]) -> Corrected:
     sensors = tuple(sensor for sensor in rig.sensors if sensor.name != name)
-    return replace(rig, sensors=sensors), tuple(r.only([s.name for s in sensors]) for r in records)
+    return replace(rig, sensors=sensors), tuple(r.select_outputs([s.name for s in sensors]) for r in records)
 
 
-def _outputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Mended:
+def _outputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Corrected:
     by = np.array([factors.get(sensor.name, 1.0) for sensor in rig.sensors])
     sensors = tuple(replace(s, noise_std=abs(f) * s.noise_std) for s, f in zip(rig.sensors, by, strict=True))
     return replace(rig, sensors=sensors), tuple(replace(r, outputs=by[:, None] * r.outputs) for r in records)
 
 
-def _inputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Mended:
+def _inputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Corrected:
     by = np.array([factors.get(actuator.name, 1.0) for actuator in rig.actuators])
     return rig, tuple(replace(record, inputs=by[:, None] * record.inputs) for record in records)
 
 
-def _exchanged(side: str, one: str, other: str, rig: Rig, records: Sequence[Record]) -> Mended:
+def _exchanged(side: str, one: str, other: str, rig: Rig, records: Sequence[Record]) -> Corrected:
     """Two "inputs" or two "outputs"."""
     names = [port.name for port in (rig.actuators if side == "inputs" else rig.sensors)]
     order = list(range(len(names)))
@@ -628,15 +635,15 @@ def _relabelled(rig: Rig, names: Iterable[str], quantity: str) -> Rig:
     return replace(rig, sensors=tuple(replace(s, quantity=quantity) if s.name in named else s for s in rig.sensors))
 
 
-def _quantity_set(names: frozenset[str], quantity: str, rig: Rig, records: Sequence[Record]) -> Mended:
+def _quantity_set(names: frozenset[str], quantity: str, rig: Rig, records: Sequence[Record]) -> Corrected:
     return _relabelled(rig, names, quantity), tuple(records)
 
 
-def _rate_times(factor: float, rig: Rig, records: Sequence[Record]) -> Mended:
+def _rate_times(factor: float, rig: Rig, records: Sequence[Record]) -> Corrected:
     return rig, tuple(replace(r, sample_time=r.sample_time / factor) for r in records)
 
 
-def _modes_times(omega: float, zeta: float, rig: Rig, records: Sequence[Record]) -> Mended:
+def _modes_times(omega: float, zeta: float, rig: Rig, records: Sequence[Record]) -> Corrected:
     modes = replace(rig.modes, omega=omega * rig.modes.omega, damping=omega * zeta * rig.modes.damping)
     structure = rig.structure
     if structure is not None and isinstance(structure.damping, ModalDamping):
