@@ -161,6 +161,8 @@ def test_noise_of_a_colour_is_told_from_what_a_force_leaves(memory):
     assert are_coloured(list(noise)).all()
     assert not are_coloured(list(noise + slow * [[1.0], [2.0], [-1.5]])).any()
     assert not are_coloured(list(noise + ringing / ringing.std())).any()
+    assert not are_coloured(list(noise + 1.5)).any()
+    assert not are_coloured(list(noise + np.linspace(0.0, 3.0, 2000))).any()
     assert not are_coloured(list(noise[:, :1])).any()
 
 

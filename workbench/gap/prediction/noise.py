@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.signal import detrend
 
 from workbench.arrays import Floats
 from workbench.gap.prediction.residuals import FitData
@@ -34,6 +35,7 @@ class NoiseSettings:
     flat: float = 0.6  # likewise, of a spectrum that has none: 0.8 and more of white noise in 1400 samples
     peak: float = 4.0  # times what its neighbours say that a band would hold: noise has none in 16,000 samples
     together: float = 0.2  # correlation of two sensors' noise: chance alone makes 0.15 in 600 samples
+    offset: float = 4.0  # standard deviations of a mean of noise
     bands: int = 50  # in which peaks are looked for, at most, so that one is narrower than its neighbourhood
 
 
@@ -64,8 +66,8 @@ def are_coloured(residuals: Sequence[np.ndarray]) -> np.ndarray:
     """Whether what is left at each sensor (n_outputs,) is noise of a first-order spectrum, however loud.
 
     Such noise has no peaks but that slope, and goes its own way at every sensor; what a structure answers to a force
-    that a model lacks has the peaks of its modes, or moves all sensors together. Of one sensor nobody can tell, nor of
-    a record too short for its bands to have neighbours.
+    that a model lacks has the peaks of its modes, or moves all sensors together, and no offset or
+    drift is noise. Of one sensor nobody can tell, nor of a record too short for its bands to have neighbours.
 
     Args:
         residuals: (n_outputs, n_samples) measured less predicted, one per record.
@@ -82,13 +84,18 @@ def _is_coloured(levelled: Floats) -> np.ndarray:
     if means.shape[1] <= 2 * NOISE.reach or not levelled.any(axis=1).all():
         return np.zeros(n_outputs, bool)
     together = np.abs(np.corrcoef(levelled) - np.eye(n_outputs)).max(axis=1)
-    return np.asarray((means < NOISE.peak * _floor(means)).all(axis=1) & (together < NOISE.together))
+    # means of both halves, which an offset or a drift moves, in standard deviations of those of noise
+    halves = np.array([half.mean(axis=1) for half in np.array_split(levelled, 2, axis=1)])
+    apart = np.abs(halves).max(axis=0) / levelled.std(axis=1) * np.sqrt(n_samples / 2.0)
+    has_no_peak = (means < NOISE.peak * _floor(means)).all(axis=1)
+    return np.asarray(has_no_peak & (together < NOISE.together) & (apart < NOISE.offset))
 
 
 def _levelled(residuals: Sequence[np.ndarray]) -> list[Floats]:
-    """r_n - ρ r_{n-1}, with the correlation ρ of each sensor's residuals over one sample in all records."""
-    power = sum((r**2).sum(axis=1) for r in residuals)
-    after = sum((r[:, 1:] * r[:, :-1]).sum(axis=1) for r in residuals)
+    """r_n - ρ r_{n-1}, with the correlation ρ over one sample of what swings at each sensor in all records."""
+    swings = [detrend(r) for r in residuals]
+    power = sum((r**2).sum(axis=1) for r in swings)
+    after = sum((r[:, 1:] * r[:, :-1]).sum(axis=1) for r in swings)
     correlation = np.divide(after, power, out=np.zeros_like(power), where=power > 0)[:, None]
     return [r[:, 1:] - correlation * r[:, :-1] for r in residuals]
 
