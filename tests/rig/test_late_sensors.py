@@ -66,6 +66,20 @@ def test_a_rate_limited_force_is_read_between_samples(rig, samples, hold):
     assert (error < 1e-3).all(), error
 
 
+@pytest.mark.parametrize("samples", [-3, 2])
+def test_a_late_accelerometer_reads_friction_that_turns_between_samples(rig, samples):
+    """Where the friction acts, by friction that all but jumps: straight lines between its samples are 20 % off."""
+    dt = 2 * np.pi / rig.modes.omega[3] / 8.0
+    inputs = np.random.default_rng(1).standard_normal((1, 200))
+    rig = replace(rig, elements=(CoulombFriction(0.7, 0.2, 1e-3),))
+    fine = simulate(rig, inputs.repeat(FINE, axis=1), sample_time=dt / FINE, substeps=8).outputs[2]
+    late = replace(rig, sensors=tuple(replace(s, delay=samples * dt / FINE) for s in rig.sensors))
+    expected = np.roll(fine, samples)[::FINE][2:-1]
+    for substeps, within in ((4, 0.05), (80, 1e-3)):
+        read = simulate(late, inputs, sample_time=dt, substeps=substeps).outputs[2, 2:-1]
+        assert (read - expected).std() < within * expected.std()
+
+
 @pytest.mark.parametrize("share", [-1e-6, 1e-6])
 def test_a_sensor_hardly_late_reads_what_a_prompt_one_does(rig, share):
     """Beside friction that turns within the sample; before it, the force of an actuator held at the last sample."""

@@ -49,7 +49,8 @@ class BetweenSamples:
     such that q and q' come out at both ends as they are. So it is exact for inputs held over each sample, delayed or
     lagged too, and of second order for forces that follow laws. p_0 and p_1 are linear in the motion at both ends, so a
     reading at any time is a weighted sum of that. An acceleration has the forces at both ends as they are, straight
-    between, in their place: of a force that turns within the interval these tell its mean alone.
+    between, in their place: of a force that turns within the interval these tell its mean alone. Beside laws, an
+    accelerometer therefore reads a motion of more samples (`Motion.finely`).
 
     Attributes:
         omega, damping: (n_modes,) of each mode alone.

@@ -94,8 +94,13 @@ class Motion:
         later = Motion(q, v, forces, stiffness, self.damping, steps, held, self.finer)
         if self.finer is None:
             return later
-        times, move_again = self.finer
-        return replace(later, finer=(times, lambda: move_again().after(times * lead)))
+        times, _ = self.finer
+        return replace(later, finer=(times, lambda: self.finely.after(times * lead)))
+
+    @cached_property
+    def finely(self) -> "Motion":
+        """The same motion with more samples, where there is one; of many sensors that are late, and asked for once."""
+        return self if self.finer is None else self.finer[1]()
 
 
 def simulate(
@@ -147,9 +152,13 @@ def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8,
 
 def is_stepped(rig: Rig) -> bool:
     """Whether the motion has no closed form and is stepped through time."""
-    if rig.stiffness_rate != 0 or any(np.isfinite(actuator.rate_limit) for actuator in rig.actuators):
+    if rig.stiffness_rate != 0 or _is_rate_limited(rig):
         return True
     return any(not isinstance(e, elements.PeriodicForce | elements.RandomForce) for e in rig.elements)
+
+
+def _is_rate_limited(rig: Rig) -> bool:
+    return any(np.isfinite(actuator.rate_limit) for actuator in rig.actuators)
 
 
 def steps_exactly(rig: Rig) -> bool:
@@ -161,16 +170,16 @@ def steps_exactly(rig: Rig) -> bool:
 def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
     """What the sensors read of a motion, noise apart: (n_sensors, n_samples); clipped and rounded in the mean."""
     outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
-    late, every = None, 1
-    if any(sensor.delay and not sensor.interpolated for sensor in rig.sensors):
-        every, finer = (1, motion) if motion.finer is None else (motion.finer[0], motion.finer[1]())
-        late = finer.between_samples(sample_time / every)
     for order, here, shapes in _shapes_at_sensors(rig):
         delays = np.array([0.0 if rig.sensors[j].interpolated else rig.sensors[j].delay for j in here])
-        if late is None or not delays.all():
+        if not delays.all():
             outputs[here] = shapes @ getattr(motion, QUANTITIES[order])
-        if late is not None and delays.any():
+        if delays.any():
             behind = np.flatnonzero(delays)
+            every, moved = 1, motion
+            if motion.finer is not None and (order == 2 or _is_rate_limited(rig)):
+                every, moved = motion.finer[0], motion.finely
+            late = moved.between_samples(sample_time / every)
             outputs[np.array(here)[behind]] = late.earlier(order, shapes[behind], delays[behind])[:, ::every]
     for j, sensor in enumerate(rig.sensors):
         if sensor.delay and sensor.interpolated:
@@ -315,7 +324,7 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
     held = participation[:, :n_inputs] @ at_samples[:n_inputs] if input_hold == "zero" else 0.0
     damping = np.diag(np.diag(modes.damping))
     found = Motion(q, v, participation @ at_samples + f, stiffness, damping, steps, held)
-    if substeps == 1 or not any(np.isfinite(actuator.rate_limit) for actuator in rig.actuators):
+    if substeps == 1 or not (rig.elements or _is_rate_limited(rig)):
         return found
     return replace(found, finer=(substeps, lambda: _move_finely(rig, inputs, sample_time, substeps, input_hold)))
 
