@@ -22,6 +22,14 @@ from workbench.identification.input_output.fit_errors import fixed_std, pole_cov
 from workbench.identification.input_output.force_window import force_window
 from workbench.identification.input_output.held_out import left_about, unpredictive_remarks, without_unpredictive
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
+from workbench.identification.input_output.input_noise import (
+    blow_noise,
+    input_noise,
+    noise_levels,
+    noise_remarks,
+    spread_by_inputs,
+    with_white_noise,
+)
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, added_misfit, only, projected, scaled_vectors, settled
 from workbench.identification.input_output.model_order import (
@@ -30,6 +38,7 @@ from workbench.identification.input_output.model_order import (
     fit_of_poles,
     is_about_distorted,
     select_modes,
+    sure_modes,
 )
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.peak_shape import overlap_remarks
@@ -218,7 +227,8 @@ def identify_driven(
         straight: former name of `input_hold="first"`; it warns.
 
     Returns:
-        `Driven`. Its standard errors hold in noise of any smooth spectrum.
+        `Driven`. Its standard errors hold in noise of any smooth spectrum, and beside white noise of the inputs, which
+        is found where two modes or more show it, and remarked.
 
     Raises:
         ValueError: no inputs, inputs that never move or move alike; records that differ; too few samples; no mode.
@@ -234,7 +244,8 @@ def identify_driven(
         raise ValueError(f"input_hold is {' or '.join(map(repr, HOLDS))}; got {input_hold!r}")
     check_inputs(records)
     clipped = dict.fromkeys(fault.message for record in records for fault in input_faults(record))
-    records, windowed = force_window(records)
+    logged = records
+    records, windowed = force_window(logged)
     by_amplitude = after_impacts(records, budget)
     data = KnownInputs(
         records,
@@ -284,7 +295,7 @@ def identify_driven(
     left = [pole for pole in beside if pole not in (*named, *by_amplitude.changing)]
     changes = (*changes, *unpredictive_remarks(fit, left))
     found = _report(
-        records, data, selected, (*clipped, *windowed, *drift, *remarks, *overlap, *changes, *budget.remarks)
+        logged, records, data, selected, (*clipped, *windowed, *drift, *remarks, *overlap, *changes, *budget.remarks)
     )
     deviation = found.modes.omega * found.zeta_std + 1j * found.omega_std
     decays = by_amplitude.remarks(fit.poles, _sizes(data, fit), deviation)
@@ -387,13 +398,17 @@ def _late(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
 
 def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selected:
     """Those of a start, or else of a subspace model, and as many more as the first estimate of the noise needs."""
-    if start is None:
-        poles = subspace_poles(data.records, data.whole, 2 * how["max_modes"] + DRIVEN.spare)
-        poles = np.append(poles[~is_about_distorted(data, poles)], data.free)
-        start = fit_of_poles(data, poles, how["false_alarm"])
+    start = _start(data, **how) if start is None else start
     few = _few(how)
     few["max_modes"] = max(few["max_modes"], start.poles.size)
     return _predictive(data, select_modes(data, start=start, **few), how["budget"])
+
+
+def _start(data: KnownInputs, **how: Any) -> Fit:
+    """The modes of a subspace model."""
+    poles = subspace_poles(data.records, data.whole, 2 * how["max_modes"] + DRIVEN.spare)
+    poles = np.append(poles[~is_about_distorted(data, poles)], data.free)
+    return fit_of_poles(data, poles, how["false_alarm"])
 
 
 def _predictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
@@ -432,7 +447,12 @@ def _selected(
 ) -> tuple[KnownInputs, Selected]:
     """The modes, the strongest first; in combinations of the outputs that share no noise where these share some."""
     how["budget"] = budget
-    strongest = _strongest(data, **how) if strongest is None else strongest
+    start = _start(data, **how) if strongest is None else strongest.fit
+    sure = sure_modes(data, start, how["false_alarm"], budget)
+    noise = input_noise(data, sure)
+    if noise is not None:
+        (data, start), strongest = with_white_noise(data, sure, noise, how["false_alarm"], budget), None
+    strongest = _strongest(data, start, **how) if strongest is None else strongest
     data = data.with_distorted(strongest.distorted)
     apart = data.apart(strongest.fit)
     if apart is None:
@@ -548,21 +568,40 @@ def _with_noise(
     return data, selected
 
 
-def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, remarks: tuple[str, ...]) -> Driven:
-    fit, n = selected.fit, selected.fit.poles.size
+def _report(
+    logged: Sequence[Record],
+    records: Sequence[Record],
+    data: KnownInputs,
+    selected: Selected,
+    remarks: tuple[str, ...],
+) -> Driven:
+    fit, n, further = selected.fit, selected.fit.poles.size, None
+    if data.measured is None:
+        noise_ratio, beside = data.noise_ratios(fit)
+        shared, std = data.disturbed(fit), blow_noise(logged, records)
+        if std.any():
+            further = spread_by_inputs(data, fit, std, [record.inputs != 0.0 for record in records])
+    else:
+        data = data.as_measured()
+        fit = settled(data, projected(data, fit.poles, fit.participation))
+        noise = noise_levels(data, fit, records)
+        own = (noise.outputs / fit.noise)[:, None] ** 2
+        noise_ratio, beside, shared = np.tile(own, n), np.tile(own.T, (data.fixed.shape[1], 1)), np.ones(n)
+        everywhere = [np.ones(record.inputs.shape, bool) for record in records]
+        further = spread_by_inputs(data, fit, noise.inputs, everywhere)
+        remarks = (*noise_remarks(records, noise), *remarks)
     channels, n_inputs = records[0].output_channels, records[0].n_inputs
     derivative = time_derivatives(channels)[:, None]
     shapes, participation = scaled_vectors(fit, np.arange(n), derivative)
-    noise_ratio, beside = data.noise_ratios(fit)
-    vectors = vector_covariance(fit, noise_ratio, derivative, np.arange(n), shapes, n_inputs)
+    vectors = vector_covariance(fit, noise_ratio, derivative, np.arange(n), shapes, n_inputs, further)
     direct = np.zeros((len(channels), n_inputs))
     direct_std = np.zeros_like(direct)
     if data.feedthrough:
         direct = fit.coefficients[2 * n : 2 * n + n_inputs].T
-        direct_std = fixed_std(fit, noise_ratio, beside)[:n_inputs].T
+        direct_std = fixed_std(fit, noise_ratio, beside, further)[:n_inputs].T
     return Driven(
         modes=SampledModes.of_poles(fit.poles, shapes, records[0].positions),
-        covariance=frozen(pole_covariance(fit, noise_ratio * data.disturbed(fit))),
+        covariance=frozen(pole_covariance(fit, noise_ratio * shared, further)),
         vector_covariance=frozen(vectors),
         participation=frozen(participation[:, :n_inputs], complex),
         feedthrough=frozen(direct),

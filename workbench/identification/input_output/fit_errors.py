@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.arrays import scaled_inverse, symmetric_root
+from workbench.arrays import Floats, scaled_inverse, symmetric_root
 from workbench.identification.input_output.modal_fit import Fit, Part, free_parameters, moves, normal
 from workbench.identification.signal.modal_estimates import by_poles
 
@@ -30,33 +30,45 @@ def covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
     return np.asarray(bound @ normal(replace(fit, parts=rescaled), fit.noise)[0] @ bound)
 
 
-def pole_covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
-    """Of (ω, ζ), (2 n_modes, 2 n_modes)."""
+def pole_covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0, further: Floats | None = None) -> np.ndarray:
+    """Of (ω, ζ), (2 n_modes, 2 n_modes); `further` as in `errors`."""
     n, q = fit.poles.size, fit.participation.shape[1] + 1
     free = free_parameters(fit)
     at = np.searchsorted(free, np.r_[q * np.arange(n), q * n + q * np.arange(n)])
     jacobian = by_poles(fit.poles)
-    return np.asarray(jacobian @ covariance(fit, noise_ratio)[np.ix_(at, at)] @ jacobian.T)
+    whole = covariance(fit, noise_ratio)[np.ix_(at, at)]
+    if further is not None:
+        whole = whole + further[np.ix_(at, at)]
+    return np.asarray(jacobian @ whole @ jacobian.T)
 
 
-def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray) -> np.ndarray:
+def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray, further: Floats | None = None) -> np.ndarray:
     """Covariance of figures of (poles, participation, amplitudes) by their exact first-order change.
 
     Args:
         figures: analytic up to conjugation, real (k,) of poles (n,), participation (n, n_excitations) and amplitudes
             (n_outputs, n).
         noise_ratio: κ, (n_outputs, n_modes).
+        further: covariance that is added, of the free unknowns, then of the coefficients of each output.
     """
     n, p = fit.participation.shape
     free, size, at = free_parameters(fit), n * (p + 1), (fit.poles, fit.participation, fit.amplitudes)
     drift = np.concatenate([-np.einsum("ct,tkj->ckj", part.tilt, moves(fit, part)) for part in fit.parts], axis=2)
     changes = []
-    for column in _root(covariance(fit, noise_ratio)).T:
+
+    def add(unknowns: Floats, c: Floats | None = None) -> None:
+        """A change of the free unknowns, and of the coefficients, which go along with these unless given."""
         whole = np.zeros(2 * size)
-        whole[free] = column
+        whole[free] = unknowns
         step = (whole[:size] + 1j * whole[size:]).reshape(n, p + 1)
-        c = np.einsum("ckj,k->cj", drift, whole)
+        c = np.einsum("ckj,k->cj", drift, whole) if c is None else c
         changes.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
+
+    for column in _root(covariance(fit, noise_ratio)).T:
+        add(column)
+    if further is not None:
+        for column in _root(further).T:
+            add(column[: free.size], column[free.size :].reshape(fit.noise.size, -1).T)
     for part, outputs in fit.outputs():
         spread = _root(part.spread[: 2 * n, : 2 * n])
         for output in range(outputs.start, outputs.stop):
@@ -74,7 +86,13 @@ def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray) -> np.ndarray:
 
 
 def vector_covariance(
-    fit: Fit, noise_ratio: np.ndarray, derivative: np.ndarray, kept: np.ndarray, shapes: np.ndarray, n_inputs: int
+    fit: Fit,
+    noise_ratio: np.ndarray,
+    derivative: np.ndarray,
+    kept: np.ndarray,
+    shapes: np.ndarray,
+    n_inputs: int,
+    further: Floats | None = None,
 ) -> np.ndarray:
     """Of each mode's shape over its largest entry, real part, then of its participation factors, real and imaginary.
 
@@ -84,6 +102,7 @@ def vector_covariance(
         kept: (n_kept,) the modes that are reported.
         shapes: (n_outputs, n_kept) as they are reported, see `scaled_vectors`.
         n_inputs: how many excitations, the first ones, are inputs.
+        further: as in `errors`.
 
     Returns:
         (n_kept, k, k), k = n_outputs + 2 n_inputs.
@@ -101,24 +120,28 @@ def vector_covariance(
         driven = participation[kept, :n_inputs] * (0.5 * seen[largest, each] / scale)[:, None]
         return np.concatenate([relative.real.T, driven.real, driven.imag], axis=1).ravel()
 
-    found = errors(fit, figures, noise_ratio).reshape(kept.size, k, kept.size, k)[each, :, each]
+    found = errors(fit, figures, noise_ratio, further).reshape(kept.size, k, kept.size, k)[each, :, each]
     found[each, largest], found[each, :, largest] = 0.0, 0.0  # one by definition
     return found
 
 
-def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray, further: Floats | None = None) -> np.ndarray:
     """Standard errors of the coefficients of the fixed columns, (n_fixed, n_outputs).
 
     Args:
         noise_ratio: κ, (n_outputs, n_modes).
         fixed: κ of each fixed column and output, (n_fixed, n_outputs).
+        further: as in `errors`.
     """
     bound, free, n, found = covariance(fit, noise_ratio), free_parameters(fit), 2 * fit.poles.size, []
     for part, outputs in fit.outputs():
         drift = np.einsum("ct,tkj->ckj", part.tilt[n:], moves(fit, part)[:, free])
         own = np.diag(part.spread)[n:, None] * fit.noise[outputs] ** 2 * fixed[:, outputs]
-        found.append(np.sqrt(own + np.einsum("ckj,kl,clj->cj", drift, bound, drift)))
-    return np.hstack(found)
+        found.append(own + np.einsum("ckj,kl,clj->cj", drift, bound, drift))
+    variance = np.hstack(found)
+    if further is not None:
+        variance += np.diag(further)[free.size :].reshape(fit.noise.size, -1).T[n:]
+    return np.asarray(np.sqrt(variance))
 
 
 def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:

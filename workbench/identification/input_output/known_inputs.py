@@ -62,6 +62,7 @@ class KnownInputs:
         changing: poles of the modes that move along these.
         distorted: poles about which no further mode is looked for.
         free: poles of the modes of a free decay within the records, to start from where some of them are distorted.
+        measured: the records as they were, where noise of their inputs was made white.
     """
 
     def __init__(
@@ -79,7 +80,9 @@ class KnownInputs:
         changing: tuple[complex, ...] = (),
         distorted: tuple[complex, ...] = (),
         free: tuple[complex, ...] = (),
+        measured: Sequence[Record] | None = None,
     ) -> None:
+        self.measured = measured
         self.distorted, self.free = distorted, free
         self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
         self.dt, self.places = records[0].sample_time, records[0].positions
@@ -128,7 +131,7 @@ class KnownInputs:
     def with_columns(self, rows: Floats, changing: tuple[complex, ...]) -> "KnownInputs":
         """The same records with fixed columns of modes that change, (n_rows, n_columns) as the fit sees rows."""
         before = np.zeros((self.first, rows.shape[1]))
-        samples = np.vstack([piece for part in self.rows for piece in (before, self._samples(rows[part]))])
+        samples = np.vstack([piece for part in self.rows for piece in (before, self.samples(rows[part]))])
         beside = samples if self.beside is None else np.hstack([self.beside, samples])
         return self._with(beside=beside, changing=(*self.changing, *changing))
 
@@ -147,6 +150,22 @@ class KnownInputs:
             for r in self.records
         ]
         return self._with(records=halves)
+
+    def with_inputs(self, records: Sequence[Record]) -> "KnownInputs":
+        """The same records with other inputs, as samples of equal weight."""
+        return self._with(records=records, line_std=None)
+
+    def with_white_noise(self, records: Sequence[Record]) -> "KnownInputs":
+        """Such records in which noise of the inputs was made white, as samples of equal weight."""
+        return self._with(records=records, measured=self.records, line_std=None)
+
+    def as_measured(self) -> "KnownInputs":
+        """The records as they were before, as samples of equal weight."""
+        return self._with(records=self.measured, measured=None, line_std=None)
+
+    def from_rest(self, records: Sequence[Record]) -> "KnownInputs":
+        """Other records of the same inputs that begin at rest, as samples of equal weight beside a constant alone."""
+        return self._with(records=records, line_std=None, at_rest=True, drift=0, beside=None, changing=())
 
     def with_drift(self, degree: int) -> "KnownInputs":
         """The same records with polynomials of time beside the modes, of this degree."""
@@ -179,21 +198,21 @@ class KnownInputs:
 
         Poles and participation stay as they are. None where the outputs may share no noise.
         """
-        found = independent(self.records, [left.T for left in self._left(fit)])
+        found = independent(self.records, [left.T for left in self.left(fit)])
         return None if found is None else self._with(records=found[0], line_std=None)
 
     def disturbed(self, fit: Fit) -> Floats:
         """Variance of what noise does to each mode over that of noise which outputs do not share, (n_modes,)."""
-        return disturbed(correlation([left.T for left in self._left(fit)]), fit.amplitudes / fit.noise[:, None])
+        return disturbed(correlation([left.T for left in self.left(fit)]), fit.amplitudes / fit.noise[:, None])
 
     def beside_as(self, other: "KnownInputs") -> "KnownInputs":
         """The same records, lines of equal weight, with the fixed columns that another has beside its own."""
         return self._with(line_std=None, beside=other.beside, changing=other.changing)
 
-    def _left(self, fit: Fit) -> list[np.ndarray]:
+    def left(self, fit: Fit) -> list[np.ndarray]:
         """What a fit leaves of the samples of each record, (n_samples, n_outputs)."""
         raw = fit.residual if self.weights is None else fit.residual / self.weights
-        return [self._samples(raw[rows]) for rows in self.rows]
+        return [self.samples(raw[rows]) for rows in self.rows]
 
     def _with(self, **changed: Any) -> "KnownInputs":
         same = {
@@ -209,6 +228,7 @@ class KnownInputs:
             "changing": self.changing,
             "distorted": self.distorted,
             "free": self.free,
+            "measured": self.measured,
         }
         return KnownInputs(**{**same, **changed})
 
@@ -219,11 +239,11 @@ class KnownInputs:
 
     def noise_spectrum(self, fit: Fit) -> list[np.ndarray] | None:
         """Relative noise of the lines of each record, as `noise_spectrum` estimates it from the residual."""
-        taken = self._taken(fit)
+        taken = self.taken(fit)
         shares = [taken[rows] for rows in self.rows]
-        return noise_spectrum(self._left(fit), self._measured(), shares, fit.poles.size, self._free(fit))
+        return noise_spectrum(self.left(fit), self._measured(), shares, fit.poles.size, self._free(fit))
 
-    def _taken(self, fit: Fit) -> np.ndarray:
+    def taken(self, fit: Fit) -> np.ndarray:
         """Leverage of each line, the share of its noise that the fit took, (n_rows, n_outputs)."""
         phi, t = columns(self, fit.poles, fit.participation)
         if not self.by_line:
@@ -252,10 +272,10 @@ class KnownInputs:
         coordinates = [modal_coordinate(self.responses(pole), l_r) for pole, l_r in each]
         near, beside, energy, power = [], [], [], []
         for k, rows in enumerate(self.rows):
-            left = self._samples(fit.residual[rows] / std[k])
+            left = self.samples(fit.residual[rows] / std[k])
             near.append(noise_near(fit.poles, left, np.ones(left.shape[1]), self.dt))
             weights = np.ones((1, std.shape[1])) if self.weights is None else self.weights[rows]
-            seen = [self._samples(weight[:, None] * self.fixed[rows]) for weight in weights.T]
+            seen = [self.samples(weight[:, None] * self.fixed[rows]) for weight in weights.T]
             along = [noise_along(fixed, rest, fit.poles.size) for fixed, rest in zip(seen, left.T[:, :, None])]
             beside.append(np.hstack(along))
             squares = np.broadcast_to(weights**2, left.shape).T
@@ -297,13 +317,13 @@ class KnownInputs:
         """Columns of samples as the fit sees them."""
         return self.rows_of([samples[rows] for rows in self.rows]) if self.by_line else samples
 
-    def _samples(self, rows: np.ndarray) -> np.ndarray:
+    def samples(self, rows: np.ndarray) -> np.ndarray:
         """Rows of one record as samples."""
         return samples_of(rows) if self.by_line else rows
 
     def modulated(self, rows: Floats, factor: Floats) -> Floats:
         """Columns (n_rows, k) times a factor at each sample, (n_samples,) of all records."""
-        return self.rows_of([self._samples(rows[part]) * factor[part, None] for part in self.rows])
+        return self.rows_of([self.samples(rows[part]) * factor[part, None] for part in self.rows])
 
     @property
     def time(self) -> Floats:
@@ -313,7 +333,7 @@ class KnownInputs:
     def modal_coordinate(self, pole: complex, l_r: np.ndarray) -> list[np.ndarray]:
         """z of a mode at the samples of each record, (n_samples,) complex each."""
         z = np.column_stack(modal_coordinate(self.responses(pole), l_r))
-        return [self._samples(z[part]) @ np.array([1.0, 1j]) for part in self.rows]
+        return [self.samples(z[part]) @ np.array([1.0, 1j]) for part in self.rows]
 
     def rows_of(self, samples: Sequence[np.ndarray]) -> Floats:
         """Columns (n_samples, k) of each record as the fit sees them, one below the other."""
@@ -394,7 +414,7 @@ class KnownInputs:
         crossed, own = [], []
         for record, rows in zip(self.records, self.rows):
             weights = np.ones((1, residual.shape[1])) if self.weights is None else self.weights[rows]
-            y = np.fft.rfft(self._samples(weights * residual[rows]).T, size)
+            y = np.fft.rfft(self.samples(weights * residual[rows]).T, size)
             lines = np.pi / self.dt * np.arange(len(weights)) / len(weights)
             counted = np.array([np.interp(omega, lines, weight**2) for weight in weights.T])
             seen = self._shifted(record.inputs)[:, self.first :]
@@ -424,7 +444,7 @@ class KnownInputs:
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         longest = max(self.rows, key=lambda rows: rows.stop - rows.start)
-        power = (np.abs(np.fft.rfft(self._samples(residual[longest]), axis=0)[1:]) ** 2).mean(axis=1)
+        power = (np.abs(np.fft.rfft(self.samples(residual[longest]), axis=0)[1:]) ** 2).mean(axis=1)
         at = round(pole.imag / self.resolution) - 1
         beside = power[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
         return max(1.0, float(np.median(beside) / power.mean())) if beside.size else 1.0

@@ -144,6 +144,11 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
     return projected(data, poles, np.array(participation, complex).reshape(poles.size, size // 2))
 
 
+def sure_modes(data: Measurement, start: Fit, false_alarm: float, budget: Budget) -> Fit:
+    """The modes of a start that noise of any smooth spectrum hardly makes, fitted."""
+    return _Modes(data, false_alarm, budget).started(start, SELECTION.weak)
+
+
 def _of_rank_one(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
     """Participation (n_excitations,) of the outer product nearest to residues (2 n_excitations, n_outputs).
 
@@ -202,15 +207,18 @@ class _Modes:
     def settled(self, model: Fit) -> Fit:
         return settled(self.data, model, budget=self.budget)
 
-    def started(self, start: Fit) -> Fit:
+    def started(self, start: Fit, times: float = 1.0) -> Fit:
         """A start fitted, without the modes that are spurious or that the others may take over.
 
         The weaker half of them goes, then half of those that are left; one that goes in error is found again.
+
+        Args:
+            times: the threshold, which a mode must exceed.
         """
         model = settled(self.data, start, SELECTION.few_steps, self.budget, ORDER.decided)
         while model.poles.size and not self.budget.spent("check of each mode"):
             statistic = np.where(_spurious(self.data, model), 0.0, whole_statistic_of(model))
-            is_weak = statistic < [self.threshold(model, pole) for pole in model.poles]
+            is_weak = statistic < [times * self.threshold(model, pole) for pole in model.poles]
             weak = np.flatnonzero(is_weak & ~_changes(self.data, model.poles))
             if not weak.size:
                 break
