@@ -66,9 +66,10 @@ class AmplitudeDependence:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """One on each mode that depends on amplitude."""
+        """One on each mode that depends on amplitude, or on time, as a decay tells one from the other by nothing."""
         return tuple(
-            f"mode {r + 1} depends on amplitude: {self.figures(r)}" for r in np.flatnonzero(self.depends).tolist()
+            f"mode {r + 1} depends on amplitude or time: {self.figures(r)}"
+            for r in np.flatnonzero(self.depends).tolist()
         )
 
     def figures(self, r: int) -> str:
@@ -136,13 +137,17 @@ def _segments(
             continue
         if not found.converged:
             continue
-        sure = found.omega_std < ASSUMPTIONS.least_sure * found.modes.omega
+        # One pole may have wandered off, and another taken its place in the order.
+        away = np.abs(np.subtract.outer(found.modes.poles, modes.poles[there]))
+        own = away.argmin(axis=1)
+        sure = away.argmin(axis=0)[own] == np.arange(own.size)
+        sure &= found.omega_std < ASSUMPTIONS.least_sure * found.modes.omega
         sure &= found.modes.frequencies_hz * span > ASSUMPTIONS.least_cycles
+        there = there[own]
         sure &= beats[there] * span > 2.0 * np.pi  # of two that beat more slowly, one looks like a mode that changes
-        there = there[sure]
         values = (found.modes.omega, found.omega_std, found.modes.zeta, found.zeta_std)
-        figures[0, w, there] = np.sqrt(mean[:, there].max(axis=0))
-        figures[1:, w, there] = np.stack(values)[:, sure]
+        figures[0, w, there[sure]] = np.sqrt(mean[:, there[sure]].max(axis=0))
+        figures[1:, w, there[sure]] = np.stack(values)[:, sure]
     return record.start_time + record.sample_time * edges[:-1], figures
 
 
