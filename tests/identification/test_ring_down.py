@@ -154,3 +154,20 @@ def test_proportional_damping_is_told():
     fit = ring_down(free_decay(modes, sample_time=0.05, n_samples=600, noise_std=0.02, seed=1)).proportional
     error = np.array([fit.damping.g1 - 0.002, fit.damping.g2 - 0.1])
     assert fit.probability > 0.01 and (np.abs(error) < 3.5 * fit.standard_errors).all()
+
+
+def test_the_first_swing_of_heavily_damped_modes_is_no_settling():
+    """The same modes are found as without a search for drifts."""
+    omega, zeta = np.array([295.7, 553.3, 772.9, 913.5]), np.array([0.2, 0.15, 0.2, 0.1])
+    shapes = np.array(
+        [[0.36, -0.58, 0.57, -0.36], [0.58, -0.36, -0.36, 0.6], [0.6, 0.36, -0.38, -0.6], [0.37, 0.6, 0.6, 0.36]]
+    )
+    time, decay = 0.0005 * np.arange(2000), np.sqrt(1.0 - zeta**2) * omega
+    each = (shapes[0] / decay)[:, None] * np.exp(-np.outer(zeta * omega, time)) * np.sin(np.outer(decay, time))
+    motion = shapes @ each
+    noise = np.random.default_rng(0).standard_normal(motion.shape) * 1e-3 * motion.std(axis=1, keepdims=True)
+    channels = tuple(Channel(f"y{i}", "displacement") for i in range(4))
+    found = ring_down(Record(0.0005, motion + noise, channels))
+    assert not [note for note in found.notes if "settling" in note]
+    np.testing.assert_allclose(found.modes.omega, omega, rtol=1e-3)
+    np.testing.assert_allclose(found.modes.zeta, zeta, rtol=5e-3)
