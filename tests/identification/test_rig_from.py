@@ -10,6 +10,8 @@ from workbench.draw.plot import plot
 from workbench.identification.ambient import AmbientModes
 from workbench.identification.driven import identify_driven
 from workbench.identification.rig_from import rig_from
+from workbench.identification.ring_down import ring_down
+from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -208,3 +210,20 @@ def test_what_does_not_fit_is_refused(found):
         rig_from(found, driving_point=("F", "d4"))
     with pytest.raises(ValueError, match="must name the 4 outputs"):
         rig_from(found, outputs=[Channel("only", "displacement")])
+
+
+def test_a_rig_of_output_only_modes_has_the_errors_of_shapes_and_warns_of_complex_ones():
+    modes = SampledModes([8.0, 30.0], [0.01, 0.02], [[1.0, 0.5], [0.3, -0.8]], [0.0, 1.0])
+    record = free_decay(modes, sample_time=0.02, n_samples=600, noise_std=0.005)
+    found = ring_down(record)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rig = rig_from(found, modal_masses=[4.0, 0.25])
+    np.testing.assert_allclose(
+        rig.modes.shape_covariance, found.shape_covariance / np.array([4.0, 0.25])[:, None, None]
+    )
+    turned = SampledModes(modes.omega, modes.zeta, modes.shapes * [[1.0, 1.0], [1j, 1.0]], modes.positions)
+    with pytest.warns(
+        UserWarning, match=r"mode 1 at 1.273 Hz is complex: the nearest real mode leaves 29 % of its shape"
+    ):
+        rig_from(AmbientModes(turned, np.eye(4), np.ones(2), 0.0, ()), outputs=record.output_channels, modal_masses=1.0)

@@ -16,6 +16,7 @@ from workbench.identification.free_decay.ibrahim import stabilise, stable_modes,
 from workbench.identification.free_decay.order import identify_within
 from workbench.identification.free_decay.preparation import Drift, decay_start, without_drift, without_polynomial
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
+from workbench.identification.signal.clocks import shape_remarks
 from workbench.identification.signal.data_quality import check_data_quality, data_faults, of_same_sensors
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.overtones import multiple_of
@@ -139,7 +140,15 @@ def ring_down(
         found.threshold,
         amplitude_dependence(cut, found.refined),
         proportional_fit(found.refined, sure) if len(sure) > 1 else None,
-        (*notes, *more, *budget.remarks, *_goes_on(found.refined, cut), *doubtful, *coloured),
+        (
+            *notes,
+            *more,
+            *budget.remarks,
+            *_goes_on(found.refined, cut),
+            *shape_remarks(found.refined, cut[0].output_names, sure),
+            *doubtful,
+            *coloured,
+        ),
     )
 
 
