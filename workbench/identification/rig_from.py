@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from workbench.arrays import symmetric_root
 from workbench.identification.driven import Driven
 from workbench.identification.signal.clocks import CLOCKS, far_from_real
-from workbench.identification.signal.modal_estimates import normalised_shapes
+from workbench.identification.signal.modal_estimates import normalised_shapes, set_up_remarks
 from workbench.identification.transfer import TransferModes
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
@@ -145,6 +145,8 @@ def _of_residues(
     sizes = np.linalg.svd(residues.real, compute_uv=False)
     cost = np.sqrt(np.maximum(1.0 - sizes[:, 0] ** 2 / np.sum(np.abs(residues) ** 2, axis=(1, 2)), 0.0))
     _warn_of_complex(modes, cost, "residues")
+    for remark in set_up_remarks(identified):
+        warnings.warn(remark, stacklevel=4)
     pair = _pair(out, into, driving_point)
     masses = None if modal_masses is None else _masses(modal_masses, modes.n_modes)
     at_out, at_in = np.split(_scaled(residues.real, pair, masses), [len(out)], axis=1)
