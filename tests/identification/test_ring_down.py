@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from workbench.identification.ring_down import _check_undriven, ring_down
+from workbench.identification.signal.data_quality import dropouts
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -171,3 +172,20 @@ def test_the_first_swing_of_heavily_damped_modes_is_no_settling():
     assert not [note for note in found.notes if "settling" in note]
     np.testing.assert_allclose(found.modes.omega, omega, rtol=1e-3)
     np.testing.assert_allclose(found.modes.zeta, zeta, rtol=5e-3)
+
+
+@pytest.mark.parametrize("which", [[1], [0, 1]])
+def test_lost_samples_are_named_and_are_no_dependence_on_amplitude(which):
+    record = decay(noise=0.001)
+    outputs = record.outputs.copy()
+    outputs[which, 300:306] = outputs[which, 299:300]
+    told = ring_down(replace(record, outputs=outputs), start=0.0)
+    assert any("'y2' stays" in note or "'y1' stays" in note for note in told.notes)
+    assert any("for 7 samples from 5.98 s on" in note for note in told.notes) and not told.by_amplitude.depends.any()
+    assert not [note for note in ring_down(record).notes if "stays" in note]
+
+
+def test_a_coarse_sensor_loses_no_samples():
+    """Rounded to a hundredth of the motion, an output repeats itself where it turns back and where it ends."""
+    record = decay(noise=0.002)
+    assert dropouts(replace(record, outputs=np.round(record.outputs, 2))) == ()

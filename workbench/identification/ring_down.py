@@ -17,7 +17,7 @@ from workbench.identification.free_decay.order import identify_within
 from workbench.identification.free_decay.preparation import Drift, decay_start, without_drift, without_polynomial
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
 from workbench.identification.signal.clocks import shape_remarks
-from workbench.identification.signal.data_quality import check_data_quality, data_faults, of_same_sensors
+from workbench.identification.signal.data_quality import check_data_quality, data_faults, dropouts, of_same_sensors
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.overtones import multiple_of
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
@@ -117,6 +117,7 @@ def ring_down(
         cut.append(record.between(begins))
         notes += notes_here if len(records) == 1 else [f"{record.name}: {note}" for note in notes_here]
         check_data_quality(cut[-1])
+        notes += _dropouts(cut[-1])
         _check_undriven(cut[-1])
     try:
         found, cut, more = _without_drift(cut, n_modes, budget)
@@ -200,6 +201,19 @@ def _without_drift(
     i, j = np.unravel_index(int(np.argmax(in_noise)), in_noise.shape)
     name, drift = records[0].output_names[j], taken[int(i)]
     return found, cleared, [f"{drift.words} of {drift.size[j]:.3g} was removed from output {name!r}"]
+
+
+def _dropouts(record: Record) -> list[str]:
+    """A remark where outputs stay at one value amid motion."""
+    found = dropouts(record)
+    if not found:
+        return []
+    name, at, count = found[0]
+    more = f" (and {len(found) - 1} more like that)" if len(found) > 1 else ""
+    return [
+        f"in record {record.name!r} output {name!r} stays at one value for {count} samples from {at:.6g} s on{more}:"
+        " lost data? Frequencies by amplitude are not compared there; leave it out, or cut the record"
+    ]
 
 
 def _is_swing(drift: Drift) -> bool:
