@@ -1,4 +1,4 @@
-"""Data quality: faulty channels of a record, dead, copied, clipped, upsampled or of no stated quantity; lost samples."""
+"""Data quality: lost samples; faulty channels, dead, copied, clipped, upsampled or of no stated quantity."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
