@@ -1,6 +1,7 @@
 """From a bench to a rig in one line: what was identified simulates, and answers to an added mass, as the structure."""
 
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,9 @@ from workbench.draw.plot import plot
 from workbench.identification.ambient import AmbientModes
 from workbench.identification.driven import identify_driven
 from workbench.identification.rig_from import rig_from
+from workbench.identification.ring_down import ring_down
+from workbench.identification.signal.synthesis import free_decay
+from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -208,3 +212,52 @@ def test_what_does_not_fit_is_refused(found):
         rig_from(found, driving_point=("F", "d4"))
     with pytest.raises(ValueError, match="must name the 4 outputs"):
         rig_from(found, outputs=[Channel("only", "displacement")])
+
+
+def test_a_rig_of_output_only_modes_has_the_errors_of_shapes_and_warns_of_complex_ones():
+    modes = SampledModes([8.0, 30.0], [0.01, 0.02], [[1.0, 0.5], [0.3, -0.8]], [0.0, 1.0])
+    record = free_decay(modes, sample_time=0.02, n_samples=600, noise_std=0.005)
+    found = ring_down(record)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rig = rig_from(found, modal_masses=[4.0, 0.25])
+    np.testing.assert_allclose(
+        rig.modes.shape_covariance, found.shape_covariance / np.array([4.0, 0.25])[:, None, None]
+    )
+    turned = SampledModes(modes.omega, modes.zeta, modes.shapes * [[1.0, 1.0], [1j, 1.0]], modes.positions)
+    with pytest.warns(
+        UserWarning, match=r"mode 1 at 1.273 Hz is complex: the nearest real mode leaves 29 % of its shape"
+    ):
+        rig_from(AmbientModes(turned, np.eye(4), np.ones(2), 0.0, ()), outputs=record.output_channels, modal_masses=1.0)
+
+
+def test_one_mode_of_two_set_ups_is_no_pair():
+    """Two roving sensors: their mass lowers the frequencies of a chain, M s² + C s + K, in the second set-up."""
+    n, f = 4, np.arange(5.0, 60.0, 0.25)
+    stiffness = 4e4 * (2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+
+    def receptance(added, rows):
+        mass = np.diag(2.0 + np.array(added))
+        s = 2j * np.pi * f
+        each = [np.linalg.inv(mass * x**2 + (5e-5 * stiffness) * x + stiffness) * x**2 for x in s]
+        return np.moveaxis(np.array(each), 0, -1)[rows, :1]
+
+    channels = tuple(Channel(f"y{i}", "acceleration") for i in range(n))
+
+    def identified(*set_ups):
+        h = np.concatenate([receptance(added, rows) for added, rows in set_ups])
+        size = 3e-3 * np.sqrt((np.abs(h) ** 2).mean(axis=-1, keepdims=True))
+        noise = np.random.default_rng(0).standard_normal((2, *h.shape))
+        return identify_transfer(h + size * (noise[0] + 1j * noise[1]), f, channels=channels)
+
+    bare, loaded = ([0.0] * 4, slice(2)), ([0.0, 0.0, 0.08, 0.05], slice(2, 4))
+    force = [Channel("F", "force")]
+    both = identified(bare, loaded)
+    assert both.modes.n_modes == 2 * n and any("share no sensor" in remark for remark in both.remarks)
+    with pytest.warns(UserWarning, match="share no sensor"), suppress(ValueError):
+        rig_from(both, inputs=force, outputs=channels, driving_point=("F", "y0"))
+    alone = identified(([0.0] * 4, slice(4)))
+    assert alone.modes.n_modes == n and not any("share no sensor" in remark for remark in alone.remarks)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rig_from(alone, inputs=force, outputs=channels, driving_point=("F", "y0"))

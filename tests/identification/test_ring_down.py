@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from workbench.identification.ring_down import _check_undriven, ring_down
+from workbench.identification.signal.data_quality import dropouts
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -154,3 +155,37 @@ def test_proportional_damping_is_told():
     fit = ring_down(free_decay(modes, sample_time=0.05, n_samples=600, noise_std=0.02, seed=1)).proportional
     error = np.array([fit.damping.g1 - 0.002, fit.damping.g2 - 0.1])
     assert fit.probability > 0.01 and (np.abs(error) < 3.5 * fit.standard_errors).all()
+
+
+def test_the_first_swing_of_heavily_damped_modes_is_no_settling():
+    """The same modes are found as without a search for drifts."""
+    omega, zeta = np.array([295.7, 553.3, 772.9, 913.5]), np.array([0.2, 0.15, 0.2, 0.1])
+    shapes = np.array(
+        [[0.36, -0.58, 0.57, -0.36], [0.58, -0.36, -0.36, 0.6], [0.6, 0.36, -0.38, -0.6], [0.37, 0.6, 0.6, 0.36]]
+    )
+    time, decay = 0.0005 * np.arange(2000), np.sqrt(1.0 - zeta**2) * omega
+    each = (shapes[0] / decay)[:, None] * np.exp(-np.outer(zeta * omega, time)) * np.sin(np.outer(decay, time))
+    motion = shapes @ each
+    noise = np.random.default_rng(0).standard_normal(motion.shape) * 1e-3 * motion.std(axis=1, keepdims=True)
+    channels = tuple(Channel(f"y{i}", "displacement") for i in range(4))
+    found = ring_down(Record(0.0005, motion + noise, channels))
+    assert not [note for note in found.notes if "settling" in note]
+    np.testing.assert_allclose(found.modes.omega, omega, rtol=1e-3)
+    np.testing.assert_allclose(found.modes.zeta, zeta, rtol=5e-3)
+
+
+@pytest.mark.parametrize("which", [[1], [0, 1]])
+def test_lost_samples_are_named_and_are_no_dependence_on_amplitude(which):
+    record = decay(noise=0.001)
+    outputs = record.outputs.copy()
+    outputs[which, 300:306] = outputs[which, 299:300]
+    told = ring_down(replace(record, outputs=outputs), start=0.0)
+    assert any("'y2' stays" in note or "'y1' stays" in note for note in told.notes)
+    assert any("for 7 samples from 5.98 s on" in note for note in told.notes) and not told.by_amplitude.depends.any()
+    assert not [note for note in ring_down(record).notes if "stays" in note]
+
+
+def test_a_coarse_sensor_loses_no_samples():
+    """Rounded to a hundredth of the motion, an output repeats itself where it turns back and where it ends."""
+    record = decay(noise=0.002)
+    assert dropouts(replace(record, outputs=np.round(record.outputs, 2))) == ()

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 
 from workbench.arrays import symmetric_root
 from workbench.identification.driven import Driven
+from workbench.identification.signal.clocks import CLOCKS, far_from_real
+from workbench.identification.signal.modal_estimates import normalised_shapes, set_up_remarks
 from workbench.identification.transfer import TransferModes
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
@@ -18,7 +20,6 @@ from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.domain import NamedPoints, place_array
 from workbench.structure.modes import Modes, PointShapes, SampledModes
 
-COMPLEX = 0.1  # share of a mode's residues that the nearest real mode may leave without a warning
 # of the direct term of accelerations: what modes may leave of it, and standard errors of it, that are no rigid motion
 LEFT, SURE = 0.1, 5.0
 STEP = 1e-3  # of a standard error: of the differences that its propagation takes
@@ -51,7 +52,7 @@ def rig_from(
 
     Returns:
         A rig at named points: each input and output is one, by its name. Its modes carry the covariance of frequencies,
-        damping and shapes (of output-only modes the standard errors of shapes, where they are known).
+        damping and shapes (of output-only modes that of shapes where it is known).
 
     Raises:
         ValueError: channels that are missing, shapes that nothing scales, a driving point where a mode would have a
@@ -143,12 +144,9 @@ def _of_residues(
     residues = _residues(modes, modes.shapes, identified.participation)
     sizes = np.linalg.svd(residues.real, compute_uv=False)
     cost = np.sqrt(np.maximum(1.0 - sizes[:, 0] ** 2 / np.sum(np.abs(residues) ** 2, axis=(1, 2)), 0.0))
-    for r in np.flatnonzero(cost > COMPLEX):
-        warnings.warn(
-            f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz is complex: the nearest real mode leaves"
-            f" {100 * cost[r]:.0f} % of its residues",
-            stacklevel=4,
-        )
+    _warn_of_complex(modes, cost, "residues")
+    for remark in set_up_remarks(identified):
+        warnings.warn(remark, stacklevel=4)
     pair = _pair(out, into, driving_point)
     masses = None if modal_masses is None else _masses(modal_masses, modes.n_modes)
     at_out, at_in = np.split(_scaled(residues.real, pair, masses), [len(out)], axis=1)
@@ -271,11 +269,14 @@ def _of_shapes(identified: Any, out: tuple[Channel, ...], modal_masses: ArrayLik
         raise ValueError(
             "no input was measured, so the shapes have no scale; give modal_masses= for shapes whose largest entry is 1"
         )
-    largest = modes.shapes[np.argmax(np.abs(modes.shapes), axis=0), np.arange(modes.n_modes)]
+    _warn_of_complex(modes, far_from_real(modes), "shape")
+    real = normalised_shapes(modes.shapes).real
+    largest = real[np.argmax(np.abs(real), axis=0), np.arange(modes.n_modes)]
     root = np.sqrt(_masses(modal_masses, modes.n_modes))
-    std = getattr(identified, "shape_std", None)
-    covariance = None if std is None else np.array([np.diag(row**2) for row in (std / np.abs(largest) / root).T])
-    return _Shapes((modes.shapes / largest).real / root, _points(out), covariance)
+    relative = getattr(identified, "shape_covariance", None)
+    return _Shapes(
+        real / largest / root, _points(out), None if relative is None else relative / root[:, None, None] ** 2
+    )
 
 
 def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:
@@ -283,6 +284,16 @@ def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:
     if not (np.isfinite(masses).all() and (masses > 0).all()):
         raise ValueError(f"modal_masses must be positive, kg, one per mode; got {modal_masses!s}")
     return masses
+
+
+def _warn_of_complex(modes: SampledModes, cost: np.ndarray, what: str) -> None:
+    """Warn of modes of which the nearest real one leaves a share, (n_modes,), that is not small."""
+    for r in np.flatnonzero(cost > CLOCKS.far):
+        warnings.warn(
+            f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz is complex: the nearest real mode leaves"
+            f" {100 * cost[r]:.0f} % of its {what}",
+            stacklevel=5,
+        )
 
 
 def _pair(

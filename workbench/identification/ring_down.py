@@ -16,11 +16,12 @@ from workbench.identification.free_decay.ibrahim import stabilise, stable_modes,
 from workbench.identification.free_decay.order import identify_within
 from workbench.identification.free_decay.preparation import Drift, decay_start, without_drift, without_polynomial
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
-from workbench.identification.signal.data_quality import check_data_quality, data_faults, of_same_sensors
+from workbench.identification.signal.clocks import shape_remarks
+from workbench.identification.signal.data_quality import check_data_quality, data_faults, dropouts, of_same_sensors
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.overtones import multiple_of
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
-from workbench.identification.signal.searches import SECONDS, Budget, Progress
+from workbench.identification.signal.searches import SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import Record, as_records
 from workbench.renamed import Renamed
 from workbench.structure.modes import SampledModes
@@ -116,6 +117,7 @@ def ring_down(
         cut.append(record.between(begins))
         notes += notes_here if len(records) == 1 else [f"{record.name}: {note}" for note in notes_here]
         check_data_quality(cut[-1])
+        notes += _dropouts(cut[-1])
         _check_undriven(cut[-1])
     try:
         found, cut, more = _without_drift(cut, n_modes, budget)
@@ -139,7 +141,15 @@ def ring_down(
         found.threshold,
         amplitude_dependence(cut, found.refined),
         proportional_fit(found.refined, sure) if len(sure) > 1 else None,
-        (*notes, *more, *budget.remarks, *_goes_on(found.refined, cut), *doubtful, *coloured),
+        (
+            *notes,
+            *more,
+            *budget.remarks,
+            *_goes_on(found.refined, cut),
+            *shape_remarks(found.refined, cut[0].output_names, sure),
+            *doubtful,
+            *coloured,
+        ),
     )
 
 
@@ -165,7 +175,8 @@ def _without_drift(
     # A drift larger than the modes would be searched for modes first; a parabola is none.
     drifts = [without_drift(record, poles, most=RING_DOWN.parabola) for record in records]
     variances = [(d.record.outputs.var(axis=1), r.outputs.var(axis=1)) for d, r in zip(drifts, records, strict=True)]
-    if any((left < RING_DOWN.dominant * whole).any() for left, whole in variances):
+    dominant = any((left < RING_DOWN.dominant * whole).any() for left, whole in variances)
+    if dominant and not any(_is_swing(drift) for drift in drifts):
         taken = drifts
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(RING_DOWN.drift_rounds):
@@ -190,6 +201,26 @@ def _without_drift(
     i, j = np.unravel_index(int(np.argmax(in_noise)), in_noise.shape)
     name, drift = records[0].output_names[j], taken[int(i)]
     return found, cleared, [f"{drift.words} of {drift.size[j]:.3g} was removed from output {name!r}"]
+
+
+def _dropouts(record: Record) -> list[str]:
+    """A remark where outputs stay at one value amid motion."""
+    found = dropouts(record)
+    if not found:
+        return []
+    name, at, count = found[0]
+    more = f" (and {len(found) - 1} more like that)" if len(found) > 1 else ""
+    return [
+        f"in record {record.name!r} output {name!r} stays at one value for {count} samples from {at:.6g} s on{more}:"
+        " lost data? Frequencies by amplitude are not compared there; leave it out, or cut the record"
+    ]
+
+
+def _is_swing(drift: Drift) -> bool:
+    """Whether what settles is over within a period of the motion left: the first swing of heavily damped modes."""
+    left = drift.record.outputs - drift.record.outputs.mean(axis=1, keepdims=True)
+    omega = np.linalg.norm(np.diff(left)) / max(float(np.linalg.norm(left)), 1e-300) / drift.record.sample_time
+    return drift.time_constant is not None and bool(drift.time_constant * omega < 2.0 * np.pi)
 
 
 def _identified(records: list[Record], n_modes: int | None, budget: Budget) -> Identified:
@@ -341,7 +372,8 @@ def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, 
 
     Slower than the record is long: a drift. A damping ratio not three standard errors above zero: a hum, if it goes on
     to the end, or, three below zero, a growth. A whole multiple of the frequency of a mode thirty times as strong:
-    perhaps only the distortion of that one (a mode may stand there too: those of a hinged beam do).
+    perhaps only the distortion of that one (a mode may stand there too: those of a hinged beam do). Damped more than
+    0.3: it hardly rings, and may stand for a drift.
     """
     modes, found = refined.modes, []
     size = np.abs(np.stack(refined.amplitudes) / refined.noise[:, :, None]).max(axis=(0, 1))
@@ -359,6 +391,8 @@ def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, 
         elif zeta < doubt:
             goes_on = zeta * modes.omega[r] * span < 1.0
             found.append("does not decay: mains hum?" if goes_on else "damping no larger than its error")
+        elif zeta > SELECTION.most_damped:
+            found.append("hardly rings: a drift?")
         else:
             found.append("")
     return tuple(found)

@@ -21,7 +21,13 @@ from workbench.identification.input_output.modal_fit import Fit, projected, scal
 from workbench.identification.input_output.model_order import Selected, select_modes, statistic_of
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
-from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, repeated_remarks, time_derivatives
+from workbench.identification.signal.modal_estimates import (
+    SURE,
+    ParticipatingModes,
+    repeated_remarks,
+    set_up_remarks,
+    time_derivatives,
+)
 from workbench.identification.signal.overtones import overtone_remarks
 from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress, check_count
@@ -177,7 +183,12 @@ def identify_transfer(
     overlap = overlap_remarks(whole.modes.poles, h.shape[0] * h.shape[1])
     deviation = whole.modes.omega * whole.zeta_std + 1j * whole.omega_std
     overtones = overtone_remarks(whole.modes.poles, np.sqrt(whole.statistic), 2.0 * np.pi * whole.scatter_hz, deviation)
-    about = (*_acausal(h, f), *repeated_remarks(whole), *([] if noise is None else _of_stated_noise(whole.misfit)))
+    about = (
+        *_acausal(h, f),
+        *repeated_remarks(whole),
+        *set_up_remarks(whole),
+        *([] if noise is None else _of_stated_noise(whole.misfit)),
+    )
     whole = replace(whole, remarks=(*about, *whole.remarks, *overlap, *_uneven(whole), *overtones, *budget.remarks))
     if whole.modes.n_modes == 0:
         raise ValueError(

@@ -43,3 +43,16 @@ def test_one_stretch_compares_nothing():
     record = free_decay(truth, sample_time=0.02, n_samples=300, noise_std=0.02)
     with pytest.raises(ValueError, match="two stretches or more"):
         amplitude_dependence(record, refine(record, truth), stretches=1)
+
+
+def test_a_pole_that_wanders_off_gives_no_mode_the_figures_of_another():
+    """A linear structure, one sensor of which reads next to nothing for six samples in the third stretch."""
+    time, omega = 0.002 * np.arange(1500), np.array([344.2714, 653.3213, 885.0571])
+    amplitudes = np.array([[36.9, 73.9, 47.5], [52.6, 23.9, -89.2], [38.0, -65.1, 32.8]])
+    motion = amplitudes @ (np.exp(-0.01 * np.outer(omega, time)) * np.sin(np.outer(omega, time)))
+    motion += np.random.default_rng(0).standard_normal(motion.shape) * 3e-3 * motion.std(axis=1, keepdims=True)
+    motion[1, 300:306] = [0.0, 0.1, 0.0, 0.1, 0.0, 0.1]
+    record = Record(0.002, motion, tuple(Channel(f"y{i}", "acceleration") for i in range(3)))
+    found = amplitude_dependence(record, refine(record, SampledModes(omega, [0.01] * 3, np.eye(3), np.arange(3))))
+    seen = np.isfinite(found.omega)
+    assert seen[:2].all() and np.abs(found.omega / omega - 1.0)[seen].max() < 0.01

@@ -173,3 +173,16 @@ def test_what_would_split_a_mode_again_waits_for_modes_elsewhere():
     assert problem.strongest(of(0), [(first, 0.0)]).imag == pytest.approx(60.0, abs=0.5)
     problem, of = search_of(poles[:2], [1.0, 0.8])
     assert problem.strongest(of(0), [(first, 0.0)]).imag < 25.0
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_modes_that_drift_in_time_are_all_found(seed):
+    """Frequencies fall by 0.5 % over the record; what the strongest leaves is no noise to whiten the others by."""
+    time, omega = 0.002 * np.arange(3000), np.array([344.2714, 653.3213, 885.0571])
+    amplitudes = np.array([[18.5, 37.0, 23.8], [26.3, 12.0, -44.7], [19.0, -32.6, 16.4]])
+    phase = np.outer(omega, time - 0.005 * time**2 / (2.0 * time[-1]))
+    motion = amplitudes @ (np.exp(-0.003 * np.outer(omega, time)) * np.sin(phase))
+    noise = np.random.default_rng(seed).standard_normal(motion.shape) * 1e-3 * motion.std(axis=1, keepdims=True)
+    channels = tuple(Channel(f"y{i}", "acceleration") for i in range(3))
+    found = identify(Record(0.002, motion + noise, channels)).modes.omega
+    assert all((np.abs(found / true - 1.0) < 0.005).any() for true in omega), found

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine
+from workbench.identification.signal.data_quality import dropouts
 from workbench.identification.signal.modal_estimates import Refined
 from workbench.records.record import Record, as_records
 from workbench.renamed import Renamed
@@ -67,9 +68,10 @@ class AmplitudeDependence:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """One on each mode that depends on amplitude."""
+        """One on each mode that depends on amplitude, or on time, as a decay tells one from the other by nothing."""
         return tuple(
-            f"mode {r + 1} depends on amplitude: {self.figures(r)}" for r in np.flatnonzero(self.depends).tolist()
+            f"mode {r + 1} depends on amplitude or time: {self.figures(r)}"
+            for r in np.flatnonzero(self.depends).tolist()
         )
 
     def figures(self, r: int) -> str:
@@ -120,6 +122,7 @@ def _segments(
     edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
     figures = np.full((5, stretches, modes.n_modes), np.nan)
     apart = np.abs(np.subtract.outer(modes.omega, modes.omega))
+    lost = [(at, at + (count - 1) * record.sample_time) for _, at, count in dropouts(record)]
     beats = np.where(np.eye(modes.n_modes, dtype=bool), np.inf, apart).min(axis=1)
     for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
         span, decay = (last - first) * record.sample_time, -modes.poles.real
@@ -128,22 +131,29 @@ def _segments(
         mean = begun**2 * _mean_of_decay(2.0 * decay * span)
         statistic = (0.5 * (last - first) * mean / noise[:, None] ** 2).sum(axis=0)
         there = np.flatnonzero(statistic > ASSUMPTIONS.least_statistic)
+        begins, ends = record.start_time + record.sample_time * np.array([first, last - 1])
         if there.size == 0 or last - first < 4 * (there.size + 1):
             continue
+        if any(since <= ends and until >= begins for since, until in lost):  # would look like a change of the modes
+            continue
         try:
-            stretch = record.between(*(record.start_time + record.sample_time * np.array([first, last - 1])))
+            stretch = record.between(begins, ends)
             found = in_coloured_noise(refine(stretch, modes.select(list(there)), offset=True), stretch)
         except np.linalg.LinAlgError:
             continue
         if not found.converged:
             continue
-        sure = found.omega_std < ASSUMPTIONS.least_sure * found.modes.omega
+        # One pole may have wandered off, and another taken its place in the order.
+        away = np.abs(np.subtract.outer(found.modes.poles, modes.poles[there]))
+        own = away.argmin(axis=1)
+        sure = away.argmin(axis=0)[own] == np.arange(own.size)
+        sure &= found.omega_std < ASSUMPTIONS.least_sure * found.modes.omega
         sure &= found.modes.frequencies_hz * span > ASSUMPTIONS.least_cycles
+        there = there[own]
         sure &= beats[there] * span > 2.0 * np.pi  # of two that beat more slowly, one looks like a mode that changes
-        there = there[sure]
         values = (found.modes.omega, found.omega_std, found.modes.zeta, found.zeta_std)
-        figures[0, w, there] = np.sqrt(mean[:, there].max(axis=0))
-        figures[1:, w, there] = np.stack(values)[:, sure]
+        figures[0, w, there[sure]] = np.sqrt(mean[:, there[sure]].max(axis=0))
+        figures[1:, w, there[sure]] = np.stack(values)[:, sure]
     return record.start_time + record.sample_time * edges[:-1], figures
 
 

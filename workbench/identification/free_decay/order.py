@@ -48,6 +48,9 @@ class OrderSettings:
     long: int = 100_000  # values in all from which modes are taken in many at a time
     max_modes: int = 40  # unless the call says more: fits of more at once take minutes
     whitened: int = 2  # times that coloured noise is learnt from the residual, and the modes from it in turn
+    # of the energy that is left, up to which modes no more selected in whitened records leave it if they stay, and are
+    # modes: those that were fitted to coloured noise take a part of it
+    whitened_away: float = 0.1
     # candidates below the limit one after the other, and candidates that split a mode, after which the search ends
     most_weak: int = 2
     most_splits: int = 6
@@ -130,9 +133,12 @@ def identify_within(
         if white is None:
             break
         again, fewer = _selected(white, most, false_alarm, search_time, records, verdicts)
-        # What a mode that depends on amplitude leaves is no noise either, and whitens the mode away.
+        # What a mode that depends on amplitude or time leaves is no noise either, and whitens modes away.
         if not fewer.poles.size and explained:
             break
+        all_modes = np.append(fewer.poles, model.poles[again.lost(model.poles, fewer.poles)])
+        if explained and _left(records, all_modes) < ORDER.whitened_away * _left(records, fewer.poles):
+            fewer = again.fitted(all_modes, fewer.weights)
         problem, model = again, fewer
     problem.budget = budget
     return problem.report(model, records) if model.poles.size else _refuse(records)
@@ -201,7 +207,7 @@ class _FreeDecay:
         self.verdicts = [] if verdicts is None else verdicts
         self.halves: list[tuple[complex, float]] = []
         self.rejected: list[tuple[complex, float]] = []
-        self.nothing = self._fitted(np.zeros(0, complex), np.ones((len(records), records[0].n_outputs)))
+        self.nothing = self.fitted(np.zeros(0, complex), np.ones((len(records), records[0].n_outputs)))
 
     def n_modes(self, model: _Model) -> int:
         return model.poles.size
@@ -240,7 +246,7 @@ class _FreeDecay:
         return candidate
 
     def extended(self, model: _Model, candidate: complex) -> _Model:
-        return self._fitted(np.append(model.poles, candidate), model.weights, DECIDES)
+        return self.fitted(np.append(model.poles, candidate), model.weights, DECIDES)
 
     def gain(self, smaller: _Model, larger: _Model) -> float:
         """Noise unknown: Σ_ij N_i log(s²_smaller / s²_larger), records i, sensors j."""
@@ -267,7 +273,7 @@ class _FreeDecay:
         return splits
 
     def settled(self, model: _Model) -> _Model:
-        return self._fitted(self._reconsidered(model).poles, model.weights)
+        return self.fitted(self._reconsidered(model).poles, model.weights)
 
     def _reconsidered(self, model: _Model) -> _Model:
         """With what seemed to split a mode while others were missing, each judged beside all the others of its kind."""
@@ -281,9 +287,9 @@ class _FreeDecay:
         n, trial = model.poles.size, model
         with suppress(np.linalg.LinAlgError):
             spurious = np.zeros(0, bool)
-            trial = self._fitted(np.append(model.poles, found), model.weights, DECIDES)
+            trial = self.fitted(np.append(model.poles, found), model.weights, DECIDES)
             while trial.poles.size > n and (spurious := self._spurious(trial.poles, trial)).any():
-                trial = self._fitted(trial.poles[~spurious], trial.weights, DECIDES)
+                trial = self.fitted(trial.poles[~spurious], trial.weights, DECIDES)
         return trial if trial.poles.size > n else model
 
     def suspects(self, model: _Model) -> Iterator[tuple[complex, _Model, bool]]:
@@ -340,10 +346,14 @@ class _FreeDecay:
         or damps them too much to ring."""
         away = np.abs(np.subtract.outer(poles, refined))
         damped = (-refined.real > SELECTION.most_damped * np.abs(refined))[away.argmin(axis=1)]
-        away = away.min(axis=1)
-        return np.asarray(damped | (away > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width)))
+        return np.asarray(damped | self.lost(poles, refined))
 
-    def _fitted(self, poles: np.ndarray, weights: np.ndarray, how: Mapping[str, Any] = FULLY) -> _Model:
+    def lost(self, poles: np.ndarray, found: np.ndarray) -> np.ndarray:
+        """Which poles have none of those found within a few of their bandwidths."""
+        away = np.abs(np.subtract.outer(poles, found)).min(axis=1, initial=np.inf)
+        return np.asarray(away > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width))
+
+    def fitted(self, poles: np.ndarray, weights: np.ndarray, how: Mapping[str, Any] = FULLY) -> _Model:
         """Poles after a search, sensors then weighted by the noise found in each record."""
         if poles.size == 0:
             residuals = [grid.nothing for grid in self.grids]
@@ -354,7 +364,7 @@ class _FreeDecay:
         return _Model(poles, 1.0 / np.sqrt(variances(np.maximum(_squares(residuals), self.round_off), n)), residuals)
 
     def _without(self, model: _Model, r: int) -> _Model:
-        return self._fitted(np.delete(model.poles, r), model.weights, DECIDES)
+        return self.fitted(np.delete(model.poles, r), model.weights, DECIDES)
 
     def _spurious(self, poles: np.ndarray, model: _Model) -> np.ndarray:
         """Which of some poles are spurious, in the noise that a model leaves."""
@@ -507,6 +517,12 @@ def _geometric(a: np.ndarray, b: np.ndarray, n: int, end: np.ndarray) -> np.ndar
     sums = (1.0 - np.outer(a**n, end)) / gap
     sums[whole] = n
     return np.asarray(sums)
+
+
+def _left(records: Sequence[Record], poles: np.ndarray) -> float:
+    """Mean share of the energy of an output that modes leave."""
+    each = ((r.outputs.var(axis=1), project(r, poles, True).residual.var(axis=0)) for r in records)
+    return float(np.mean([left / np.maximum(whole, 1e-300) for whole, left in each]))
 
 
 def _squares(residuals: Sequence[np.ndarray]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Data quality: faulty channels of a record, dead, copied, clipped, upsampled or of no stated quantity."""
+"""Data quality: lost samples; faulty channels, dead, copied, clipped, upsampled or of no stated quantity."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,6 +28,9 @@ class DataSettings:
     predictor_order: int = 16  # samples that predict the next
     longest: int = 20_000  # samples in which copies are looked for
     noise_free: float = 1e-9  # innovation over the signal: below, sensors of one mode are alike without being copies
+    fewest_equal: int = 4  # samples in a row: of so many a lost message is told from a turning point
+    about: int = 32  # samples on either side of them, which show how the output moves
+    moves: float = 100.0  # resolutions of the output that it moves there from sample to sample
     block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
 
 
@@ -138,6 +141,29 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
                     " give it once"
                 )
     return records
+
+
+def dropouts(record: Record) -> tuple[tuple[str, float, int], ...]:
+    """Where an output stays at one value amid motion, as lost messages of a wireless sensor leave it.
+
+    At an end of its range an output is clipped, and that is another fault.
+
+    Returns:
+        name of the output, time of the first such sample in s, number of samples; in order of outputs and time.
+    """
+    found = []
+    for name, row in zip(record.output_names, record.outputs, strict=True):
+        still = np.flatnonzero(np.diff(row) == 0.0)
+        if still.size < DATA.fewest_equal - 1:
+            continue
+        resolution, ends = np.diff(np.unique(row)).min(initial=np.inf), (row.min(), row.max())
+        for run in np.split(still, np.flatnonzero(np.diff(still) > 1) + 1):
+            first, last = int(run[0]), int(run[-1]) + 1
+            beside = row[max(first - DATA.about, 0) : first + 1], row[last : last + DATA.about + 1]
+            moves = min(float(np.median(np.abs(np.diff(part)))) if part.size > 2 else 0.0 for part in beside)
+            if run.size >= DATA.fewest_equal - 1 and moves > DATA.moves * resolution and row[first] not in ends:
+                found.append((name, float(record.time[first]), run.size + 1))
+    return tuple(found)
 
 
 def _dead(record: Record) -> Iterator[DataFault]:

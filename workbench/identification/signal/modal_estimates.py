@@ -14,6 +14,9 @@ from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes, frozen
 from workbench.structure.printed import Printed, counted
 
+# of two neighbours that are one mode of two set-ups: relative distance of frequencies at most; cosine between the sizes
+# of their shapes, of which noise leaves 0.01, at most; and between those of their participation factors at least
+NEAR, APART, ALIKE = 0.05, 0.1, 0.9
 SURE = 3.0  # standard errors below zero from which on a damping ratio is negative
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
 
@@ -257,6 +260,27 @@ def repeated_remarks(found: "ModalEstimates") -> tuple[str, ...]:
     return (
         f"modes {', '.join(pairs)} may be one repeated root: only the plane of their two shapes is determined, and each"
         " shape is one of many in it, which need not be real",
+    )
+
+
+def set_up_remarks(found: ParticipatingModes) -> tuple[str, ...]:
+    """A remark on neighbours that the same inputs move and that share no sensor: one mode of two set-ups.
+
+    Roving sensors load the structure elsewhere in each set-up, so that each has frequencies of its own. A mode that an
+    input moves is seen at the place of that input, in every set-up.
+    """
+    modes, pairs = found.modes, []
+    shapes, inputs = np.abs(modes.shapes.T), np.abs(found.participation)
+    shapes, inputs = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (shapes, inputs))
+    for r in range(modes.n_modes - 1):
+        near = np.ptp(modes.omega[r : r + 2]) < NEAR * modes.omega[r]
+        if near and shapes[r] @ shapes[r + 1] < APART and inputs[r] @ inputs[r + 1] > ALIKE:
+            pairs.append(f"{r + 1} and {r + 2} ({modes.frequencies_hz[r]:.4g} Hz)")
+    if not pairs:
+        return ()
+    return (
+        f"modes {', '.join(pairs)} share no sensor: one mode, measured in two set-ups that load the structure"
+        " differently? Then neither has its whole shape, and modal masses are wrong: identify each set-up alone",
     )
 
 

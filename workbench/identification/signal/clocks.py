@@ -1,0 +1,104 @@
+"""Complex shapes: how far each is from real, and the sensor whose own clock makes them so.
+
+What a sensor records τ late has its entries of the shapes, s_jr, turned by e^{-λ_r τ}: the phase grows with frequency.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.identification.signal.modal_estimates import SURE, ShapeEstimates
+from workbench.identification.signal.searches import FALSE_ALARM
+from workbench.structure.modes import SampledModes
+
+
+@dataclass(frozen=True)
+class ClocksSettings:
+    """Constants of the search for a sensor that is late."""
+
+    far: float = 0.1  # of a shape's size: what its nearest real one leaves, from which on it is remarked
+    periods: float = 4.0  # of the fastest mode: the longest time that a sensor is taken to be late
+    steps: int = 200  # of each period
+    least: float = 0.1  # of a shape's size: an entry that has a phase
+
+
+CLOCKS = ClocksSettings()
+
+
+def far_from_real(modes: SampledModes) -> np.ndarray:
+    """Share of each shape's size that the nearest real shape leaves, (n_modes,): 0 of a real one, 0.71 at most.
+
+    Of Σ |s_j|² the best phase leaves ½ (1 - MPC^½), MPC the phase collinearity.
+    """
+    return np.sqrt(0.5 * np.maximum(1.0 - np.sqrt(modes.phase_collinearity), 0.0))
+
+
+def shape_remarks(found: ShapeEstimates, names: Sequence[str], only: Sequence[int]) -> tuple[str, ...]:
+    """A remark where shapes are far from real, beyond their errors; it names the sensor that is late, if one is.
+
+    Args:
+        found: modes, and the covariance of their shapes.
+        names: (n_outputs,) of the sensors.
+        only: the modes to look at, from 0.
+    """
+    far, error = far_from_real(found.modes), np.sqrt(np.trace(found.shape_covariance, axis1=1, axis2=2))
+    error = error / np.linalg.norm(found.modes.shapes, axis=0)
+    which = [r for r in only if far[r] > max(CLOCKS.far, SURE * error[r])]
+    if not which:
+        return ()
+    late = _late(found.modes.select(list(only)))
+    if late is None:
+        which_modes = ("mode " if len(which) == 1 else "modes ") + ", ".join(str(r + 1) for r in which)
+        return (
+            f"{which_modes}: the shape is complex, the nearest real one leaves up to {100 * far[which].max():.0f} %:"
+            " sensors that are not on one clock, close modes, or damping that is not proportional",
+        )
+    j, seconds = late
+    side = "late" if seconds > 0 else "early"
+    return (
+        f"output {names[j]!r} is {abs(1e3 * seconds):.3g} ms {side} beside the others, by its phase in every mode: put"
+        " it on their clock, or its part of the shapes is wrong",
+    )
+
+
+def _late(modes: SampledModes) -> tuple[int, float] | None:
+    """The sensor that makes all shapes real once it is put right, and how late it is, s; None where it may be chance.
+
+    A lateness agrees with the phases of n modes to δ by chance in (2 δ / π)^n, and up to a time T there are T ω / δ of
+    them to choose from.
+    """
+    omega, poles, n_outputs = modes.poles.imag, modes.poles, modes.n_outputs
+    longest = CLOCKS.periods * 2.0 * np.pi / omega.max()
+    times = np.linspace(-longest, longest, int(2 * CLOCKS.periods * CLOCKS.steps) + 1)
+    best: tuple[float, int, float] | None = None
+    for j in range(n_outputs):
+        own, others = modes.shapes[j], np.delete(modes.shapes, j, axis=0)
+        seen = np.abs(own) > CLOCKS.least * np.linalg.norm(modes.shapes, axis=0)
+        if np.count_nonzero(seen) < 2:
+            continue
+        turn = np.angle(own) - 0.5 * np.angle((others**2).sum(axis=0))
+
+        coarse = times[np.argmin(_disagreement(turn[seen], omega[seen], times))]
+        fine = coarse + np.linspace(-1.0, 1.0, 2 * CLOCKS.steps + 1) * (times[1] - times[0])
+        apart = _disagreement(turn[seen], omega[seen], fine)
+        seconds = float(fine[np.argmin(apart)])
+        delta = max(float(apart.min()), (fine[1] - fine[0]) * omega.max())
+        tries = n_outputs * (1.0 + abs(seconds) * omega.max() / delta)
+        chance = tries * (2.0 * delta / np.pi) ** np.count_nonzero(seen)
+        if best is None or chance < best[0]:
+            best = chance, j, seconds
+    if best is None or best[0] > FALSE_ALARM:
+        return None
+    _, j, seconds = best
+    right = modes.shapes.copy()
+    right[j] *= np.exp(poles * seconds)
+    if (far_from_real(SampledModes(modes.omega, modes.zeta, right, modes.positions)) > CLOCKS.far).any():
+        return None
+    return j, seconds
+
+
+def _disagreement(turn: np.ndarray, omega: np.ndarray, late: np.ndarray) -> np.ndarray:
+    """Largest phase over the modes, modulo π, that is left of `turn` (n_modes,) once put right, (n_late,) rad."""
+    left = np.abs(np.angle(np.exp(2j * (turn + np.outer(late, omega)))))
+    return np.asarray(0.5 * left.max(axis=1))
