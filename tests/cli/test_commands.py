@@ -171,6 +171,10 @@ def test_design_has_observers_of_rigid_modes_and_says_what_is_on_the_axis(tmp_pa
     assert result.exit_code == 0 and "IMSC on a Luenberger observer" in result.output, result.output
     # two undamped laws, through exact modal coordinates: whatever rounding makes of poles on the axis
     assert [line.split()[-2:] for line in result.output.splitlines()[2:4]] == [["marginally", "stable"]] * 2
+    by_ratio = run("design", free, "--control", 2, "--damping", 0.2)
+    assert by_ratio.exit_code == 0 and "what is rigid (mode 1, 2) has no damping ratio" in by_ratio.output, (
+        by_ratio.output
+    )
     free.write_text(free.read_text().replace("modes = 9", "modes = 2"))
     assert "rigid modes alone set no time" in run("design", free, "--control", 2).output
 
@@ -385,6 +389,7 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
             "find room for 2 on the intervals left, 0 to 0.5 m:",
         ),
         (("place", "{rig}", "--control", 9), "residual"),
+        (("place", "{rig}", "--control", 1, "--effort", 0.01), "--effort counts in multiples of"),
         (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
         (("place", "{rig}", "--control", 4, "--at", "1,2,3,11"), "outside the structure"),
         (("place", "{rig}", "--control", 4, "--at", "1 to 9"), "between commas"),

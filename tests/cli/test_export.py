@@ -48,6 +48,23 @@ def test_a_controller_of_a_case_is_written(run, rig, tmp_path, estimator):
     assert [one.step([1.0]), one.step([0.0])] != [[0.0], [0.0]]
 
 
+def test_a_rigid_mode_that_nothing_holds_is_told(run, rig, tmp_path):
+    """Rounding of its pole is no margin."""
+    rig.write_text(
+        RIG.replace('right = "hinged"', 'right = "free"').replace("damping_ratio = 0.01", "damping_ratio = 0.1")
+    )
+    result = run("export", rig, "--weight", 1e4, "--rate-hz", 100, "--to", tmp_path / "one.py")
+    said = " ".join(result.output.split())
+    assert "stability margin 0 1/s, 0 1/s in continuous time" in said, said
+    assert "nothing holds the displacement of what is rigid (mode 1)" in said and "none of rigid modes" in said
+
+
+def test_a_kalman_filter_asks_for_the_noise_of_its_outputs(run, rig, tmp_path):
+    rig.write_text(RIG.replace("noise_std = 0.001", "", 1))
+    result = run("export", rig, "--rate-hz", 100, "--estimator", "kalman", "--to", tmp_path / "one.py")
+    assert result.exit_code == 2 and "noise_std of d1 is 0" in " ".join(result.stderr.split())
+
+
 @pytest.mark.parametrize(("law", "asked"), [("poles", 0.3), ("imsc", 0.7)])
 def test_the_damping_that_a_law_gives_is_told(run, rig, tmp_path, law, asked):
     """With R = 1 / (2 ζ² ω²) of IMSC and x² = 1 + 2 ζ²: 4 ζ_c² x = 4 ζ_0² + 2 ζ² + 2 (x - 1) (near ζ)."""

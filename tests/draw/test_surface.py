@@ -51,9 +51,10 @@ def test_a_placement_is_drawn_over_the_nodal_lines_of_the_next_mode(size):
     figure.draw_without_rendering()
     title, beside = figure.axes[0]._left_title, figure.axes[1].yaxis
     assert not title.get_window_extent().overlaps(beside.get_tightbbox())
+    assert title.get_window_extent().y1 <= figure.bbox.y1 and beside.get_label_text().endswith("[J]")
     left, right = figure.axes
     assert "nodal lines of mode 3" in left.get_title("left") and not left.lines[0].get_clip_on()
-    assert "forbidden" in [text.get_text() for text in left.get_legend().get_texts()]
+    assert "forbidden" in [text.get_text() for text in figure.legends[0].get_texts()]
     nodal = next(c for c in left.collections if c.get_linewidths()[0] == 1.4)
     line = np.vstack([path.vertices for path in nodal.get_paths()])
     np.testing.assert_allclose(line[:, 1], B / 2, atol=1e-3)

@@ -94,3 +94,10 @@ def test_errors_within_the_margin_leave_the_loop_stable(rig, controller):
 def test_what_is_unstable_bears_nothing_and_no_feedback_bears_all(rig, controller):
     assert small_gain_margin(rig, replace(controller, c=-40.0 * controller.c))[0] == 0.0
     assert small_gain_margin(rig, replace(controller, c=0.0 * controller.c, b=0.0 * controller.b))[0] == np.inf
+
+
+def test_a_mode_above_half_the_rate_has_its_own_damping(rig, controller):
+    """Without control, sampled at nearly its frequency: the pole in the z plane is that of a slow motion too."""
+    period = 2.0 * np.pi / (1.02 * rig.modes.omega[-1])
+    silent = replace(controller, sample_time=period, c=0.0 * controller.c, e=0.0 * controller.e)
+    assert loop_poles(rig, silent).damping == pytest.approx(rig.modes.zeta, rel=1e-6)

@@ -64,15 +64,18 @@ def damping_by(modes: "Modes", law: "Law | OnOffLaw") -> str:
     """The damping ratios that a law gives: not those asked for where its weights come from a rule of thumb."""
     import numpy as np
 
+    from workbench.design.laws.coupled import controlled_plant
     from workbench.design.laws.law import Law
-    from workbench.design.loop.closed_loop import close_loop
 
     if not isinstance(law, Law):
         return f"{law.name} switches and gives no damping ratio"
-    own = [*law.controlled, *(modes.n_modes + r for r in law.controlled)]
-    poles = np.linalg.eigvals(close_loop(modes, law).matrix[np.ix_(own, own)])
+    a, b = controlled_plant(modes, law.controlled, law.actuators)
+    poles = np.linalg.eigvals(a - b @ law.gain)
     swinging = sorted(poles[poles.imag > 0], key=abs)
-    ratios = ", ".join(f"{-p.real / abs(p):.3g}" for p in swinging) or "1 or more"
+    found = [f"{-p.real / abs(p):.3g}" for p in swinging]
+    if (modes.omega[list(law.controlled)] == 0).any():
+        found.append("none of rigid modes")
+    ratios = ", ".join(found) or "1 or more"
     return f"damping ratio of the controlled modes by {law.name}, every modal coordinate known: {ratios}"
 
 
@@ -113,5 +116,11 @@ def observed(
     if estimator == "luenberger":
         return luenberger(rig.modes, law, sensors, poles=usual_poles(rig.modes, law.controlled))
     # a noise of variance σ² held over each sample has the intensity σ² T
+    silent = [s.name for s in sensors if s.noise_std == 0]
+    if silent:
+        raise ValueError(
+            f"a Kalman filter trusts outputs by their noise, and noise_std of {', '.join(silent)} is 0: give it in the"
+            " case file, or take --estimator luenberger"
+        )
     noise = [s.noise_std**2 * sample_time for s in sensors]
     return kalman(rig.modes, law, sensors, disturbance=disturbance, noise=noise)

@@ -1,6 +1,7 @@
 """`workbench place`: actuator placement."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -64,6 +65,7 @@ def place(
     """
     import numpy as np
 
+    from workbench.design.laws.law import DesignError
     from workbench.design.placement.certificate import certify
     from workbench.design.placement.limits import Limits
     from workbench.design.placement.placement import nodes_of_mode, placement_task
@@ -76,6 +78,9 @@ def place(
         raise ValueError(f"--certify is a share between 0 and 1; got {certified_gap:g}")
     found = read_structure_rig(rig)
     modes, struck = found.modes, impulse_place(found, impulse_at)
+    if not modes.proportional:
+        say("damping couples the modes: places are compared without its coupling terms")
+        modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
     domain = modes.domain
     candidates = _candidates(domain, at, grid)
     if certified_gap is not None and isinstance(domain, Rectangle) and candidates is None:
@@ -100,7 +105,13 @@ def place(
             forbidden=tuple(_zone(domain, text) for text in forbid or ()),
             candidates=candidates,
         )
-        best = least_work(task, limits)
+        try:
+            best = least_work(task, limits)
+        except DesignError as error:
+            if "effort" not in str(error):
+                raise
+            counted = f"--effort counts in multiples of {usual.effort:.4g}, that of actuators {usual.status}"
+            raise DesignError(f"{error}; {counted}") from error
         certificate = None
         if certified_gap is not None:
             wanted = 1.0 - certified_gap

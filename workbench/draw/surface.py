@@ -184,12 +184,14 @@ def plot_surface_placement(
         right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
     if impulse_at is not None:
         left.plot(*impulse_at, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
-    first = f"mode {n + 1},\n{modes.frequencies_hz[n]:.3g} Hz, the lowest residual mode"
-    left.set_title(f"{modes.domain}, with the nodal lines of {first}", fontsize=10)
-    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), fontsize=9, ncols=2)
+    (a, b), lines = modes.domain.length, f"nodal lines of mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz"
+    left.set_title(f"{modes.domain}\n{lines}, the lowest residual mode", fontsize=10)
+    # at the top of its room: a layout that finds room inside it for the title gives it none above
+    left.set(anchor="N", xticks=(0.0, a), yticks=(0.0, b), xlabel="x [m]", ylabel="y [m]")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", fontsize=9, ncols=4)
     work = np.concatenate([placement.by_mode for placement in placements.values()])
     most, least = float(work.max()), float(work.min())
-    right.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=few_ticks(numbers), yscale="log")
+    right.set(xlabel="residual mode", ylabel="spillover work, W_r [J]", xticks=few_ticks(numbers), yscale="log")
     # a mode at whose nodes they stand takes none but rounding
     right.set_ylim(max(SHOWN_WORK * most, 0.3 * least), 3.0 * most)
     return figure

@@ -11,6 +11,8 @@ from workbench.rig.rig import shape_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
 
+DELAY_ORDER = 0.7  # of the delay line, per radian of the fastest mode that passes meanwhile
+
 
 def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     """Modal forces per unit command, B_rj = φ_r at its place, or the slope there for a moment: (n_modes, n_actuators).
@@ -50,28 +52,12 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     for part in parts:
         if not part.linear:
             raise ValueError(f"{part} is not linear, so the rig has no StateSpace; simulate it instead")
-    n = modes.n_modes
-    b = input_matrix(modes, actuators)
-    shapes = output_matrix(modes, sensors)
-    a = modes.state_matrix
-    bb = np.vstack([np.zeros_like(b), b])
-    c = np.zeros((len(sensors), 2 * n))
-    d = np.zeros((len(sensors), len(actuators)))
-    for j, sensor in enumerate(sensors):
-        order = MEASURED[sensor.quantity][1]
-        if order < 2:
-            c[j, order * n : (order + 1) * n] = shapes[j]
-        else:
-            c[j] = shapes[j] @ a[n:]
-            d[j] = shapes[j] @ b
-    states = [f"q{r + 1}" for r in range(n)] + [f"dq{r + 1}" for r in range(n)]
-    a, bb, c, d, states = _with_actuator_lags(a, bb, c, d, states, actuators)
-    a, bb, c, d, states = _with_sensor_lags(a, bb, c, d, states, sensors)
+    a, b, c, d, states = modal_plant(modes, actuators, sensors)
     return control.ss(
         a,
-        bb,
-        c,
-        d,
+        b,
+        c[: len(sensors)],
+        d[: len(sensors)],
         inputs=signal_names(x.name for x in actuators),
         outputs=signal_names(y.name for y in sensors),
         states=signal_names(states),
@@ -79,42 +65,78 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     )
 
 
+def modal_plant(
+    modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[Sensor]
+) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
+    """A, B, C, D and the names of the states, from commands to readings, then to what the commands have become.
+
+    Lags and delays count, a delay as of `delay_line`; what is not linear does not. The last n_actuators rows of C and D
+    are the commands where they act, before the gains.
+    """
+    n, m = modes.n_modes, len(actuators)
+    force = input_matrix(modes, actuators)
+    shapes = output_matrix(modes, sensors)
+    a, b = modes.state_matrix, np.vstack([np.zeros_like(force), force])
+    c, d = np.zeros((len(sensors) + m, 2 * n)), np.zeros((len(sensors) + m, m))
+    for j, sensor in enumerate(sensors):
+        order = MEASURED[sensor.quantity][1]
+        if order < 2:
+            c[j, order * n : (order + 1) * n] = shapes[j]
+        else:
+            c[j] = shapes[j] @ a[n:]
+            d[j] = shapes[j] @ force
+    d[len(sensors) :] = np.eye(m)
+    states = [f"q{r + 1}" for r in range(n)] + [f"dq{r + 1}" for r in range(n)]
+    for j, actuator in enumerate(actuators):
+        for what, (pa, pb, pc) in lateness(actuator, modes):
+            size = len(pa)
+            a = np.block([[a, b[:, [j]] * pc], [np.zeros((size, len(a))), pa]])
+            c = np.hstack([c, d[:, [j]] * pc])
+            b, d = np.vstack([b, np.zeros((size, m))]), d.copy()
+            b[:, j], d[:, j] = np.r_[np.zeros(len(a) - size), pb], 0.0
+            states += _named(f"{actuator.name}_{what}", size)
+    for j, sensor in enumerate(sensors):
+        for what, (pa, pb, pc) in lateness(sensor, modes):
+            size = len(pa)
+            a = np.block([[a, np.zeros((len(a), size))], [np.outer(pb, c[j]), pa]])
+            b = np.vstack([b, np.outer(pb, d[j])])
+            c, d = np.hstack([c, np.zeros((len(c), size))]), d.copy()
+            c[j], d[j] = np.r_[np.zeros(len(a) - size), pc], 0.0
+            states += _named(f"{sensor.name}_{what}", size)
+    return a, b, c, d, states
+
+
+def _named(name: str, size: int) -> list[str]:
+    return [name] if size == 1 else [f"{name}{i + 1}" for i in range(size)]
+
+
+Late = tuple[Floats, Floats, Floats]
+
+
+def lateness(part: Actuator | Sensor, modes: Modes) -> list[tuple[str, Late]]:
+    """The delay and the lag of an actuator or a sensor, where it has them: what each is, and its (A, b, c)."""
+    found: list[tuple[str, Late]] = []
+    if part.delay > 0:
+        found.append(("delay", delay_line(part.delay, float(modes.omega.max()))))
+    if part.time_constant > 0:
+        rate = np.array([1.0 / part.time_constant])
+        found.append(("lag", (-rate[:, None], rate, np.ones(1))))
+    return found
+
+
+def delay_line(delay: float, fastest: float) -> Late:
+    """A delay as a linear system (A, b, c), to a millionth up to the fastest frequency, rad/s.
+
+    The Padé approximation of order [N-1/N] in Legendre polynomials, which stay well conditioned (Voelker, Kajić &
+    Eliasmith, NeurIPS 32 (2019)).
+    """
+    order = 6 + int(np.ceil(DELAY_ORDER * delay * fastest))
+    i: Floats = np.arange(order, dtype=float)
+    odd, sign = (2.0 * i + 1.0) / delay, (-1.0) ** i
+    a = -odd[:, None] * np.where(i[:, None] < i, 1.0, np.outer(sign, sign))
+    return np.asarray(a), odd * sign, np.ones(order)
+
+
 def signal_names(names: Iterable[str]) -> list[str]:
     """Names of signals as python-control allows them: a point, which it keeps for subsystems, becomes a line below."""
     return [name.replace(".", "_") for name in names]
-
-
-def _with_actuator_lags(
-    a: Floats, b: Floats, c: Floats, d: Floats, states: list[str], actuators: Sequence[Actuator]
-) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
-    for j, actuator in enumerate(actuators):
-        if actuator.time_constant > 0:
-            rate = 1.0 / actuator.time_constant
-            size = a.shape[0]
-            a = np.block([[a, b[:, [j]]], [np.zeros((1, size)), np.array([[-rate]])]])
-            c = np.hstack([c, d[:, [j]]])
-            b = np.vstack([b, np.zeros((1, b.shape[1]))])
-            b[:, j] = 0.0
-            b[-1, j] = rate
-            d = d.copy()
-            d[:, j] = 0.0
-            states = [*states, f"{actuator.name}_lag"]
-    return a, b, c, d, states
-
-
-def _with_sensor_lags(
-    a: Floats, b: Floats, c: Floats, d: Floats, states: list[str], sensors: Sequence[Sensor]
-) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
-    for j, sensor in enumerate(sensors):
-        if sensor.time_constant > 0:
-            rate = 1.0 / sensor.time_constant
-            size = a.shape[0]
-            a = np.block([[a, np.zeros((size, 1))], [rate * c[[j]], np.array([[-rate]])]])
-            b = np.vstack([b, rate * d[[j]]])
-            c = np.hstack([c, np.zeros((c.shape[0], 1))])
-            c[j] = 0.0
-            c[j, -1] = 1.0
-            d = d.copy()
-            d[j] = 0.0
-            states = [*states, f"{sensor.name}_lag"]
-    return a, b, c, d, states

@@ -47,7 +47,7 @@ class LoopPoles:
 
     Attributes:
         poles: (n_states,) in the z plane.
-        damping: (n_modes,) ratio of the pole in which a mode moves most.
+        damping: (n_modes,) ratio of the pole in which a mode moves most, above half the rate at the alias next to it.
     """
 
     poles: np.ndarray
@@ -73,9 +73,14 @@ def loop_poles(rig: Rig, controller: DigitalController, modes: Modes | None = No
     moved = np.abs(modes.omega[:, None] * vectors[:n]) ** 2 + np.abs(vectors[n : 2 * n]) ** 2
     share = moved / np.maximum(moved.sum(axis=0), 1e-300) * (np.abs(poles) > 1e-6)
     rates = np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / controller.sample_time
-    ratio = -rates.real / np.maximum(np.abs(rates), 1e-300)
-    ratio = np.where(np.abs(rates.imag) * controller.sample_time < 1e-9, np.sign(-rates.real), ratio)
-    return LoopPoles(poles, ratio[np.argmax(share, axis=1)])
+    own = rates[np.argmax(share, axis=1)]
+    # a pole in the z plane is that of every alias
+    around = 2.0 * np.pi / controller.sample_time
+    aliases = np.array([way * own.imag + around * np.round((modes.omega - way * own.imag) / around) for way in (1, -1)])
+    nearest = np.abs(aliases - modes.omega).argmin(axis=0)
+    omega = np.take_along_axis(aliases, nearest[None], axis=0)[0]
+    ratio = -own.real / np.maximum(np.hypot(own.real, omega), 1e-300)
+    return LoopPoles(poles, np.where(np.abs(omega) < 1e-9 / controller.sample_time, np.sign(-own.real), ratio))
 
 
 def _closed(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

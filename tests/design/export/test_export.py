@@ -14,16 +14,20 @@ from scipy.signal import cont2discrete
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays, sampled
-from workbench.design.estimation.observers import luenberger
+from workbench.design.estimation.observers import kalman, luenberger
 from workbench.design.export.export import export, write_controller
+from workbench.design.export.sampled import sample_design
 from workbench.design.export.sampled_loop import sampled_loop
 from workbench.design.export.source import command_words, reading_words
+from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
+from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Interval
+from workbench.structure.member import Beam
 from workbench.structure.modes import Modes
 
 RATE = 200.0
@@ -276,3 +280,19 @@ def test_what_cannot_be_handed_over_is_refused_with_the_remedy(modes, observer, 
     unstable = luenberger(modes, fierce, SENSORS, poles=20 * modes.omega[:2] * (-0.3 + 1j))
     with pytest.raises(DesignError, match="unstable in continuous time"):
         export(modes, unstable, sample_rate_hz=1e4)
+
+
+def test_a_slow_actuator_is_in_the_margin_of_continuous_time():
+    """A lag that stabilises: the loop without it grows, and was refused."""
+    beam = Beam(
+        length=1.7, mass_per_length=0.9, bending_stiffness=13.0, left="clamped", right="free",
+        damping=ModalDamping(0.002),
+    )  # fmt: skip
+    modes, drive = beam.modes(6), Actuator("a", 0.80816, time_constant=0.076105)
+    law = coupled_lqr(modes, 1, [drive], weight=0.0014165)
+    sensors = [Sensor("y", 1.46274)]
+    controller = kalman(modes, law, sensors, disturbance=1.0, noise=1.0374e-6)
+    parts = (controller.state, controller.reads, controller.commands, controller.direct)
+    true = control.feedback(state_space(modes, [drive], sensors), control.ss(*parts), sign=1).poles().real.max()
+    found = sample_design(modes, controller, sample_rate_hz=2000.0)
+    assert true < 0 and f"{-true:.3g} 1/s in continuous time" in found.remarks[0]

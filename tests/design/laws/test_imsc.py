@@ -211,3 +211,11 @@ def test_a_closed_loop_cannot_be_written_to():
     for array in (loop.matrix, loop.feedback):
         with pytest.raises(ValueError, match="read-only"):
             array *= 0.5
+
+
+def test_poles_are_those_asked_for_where_damping_couples_the_modes():
+    coupled = np.array([[0.02, 0.3], [-0.3, 0.05]])  # a damper and a spinning part
+    two = replace(modes(2), damping=coupled)
+    asked = np.array([-0.05 + 0.1j, -0.1 + 0.5j])
+    found = close_loop(two, imsc_poles(two, 2, actuators(2.0, 4.0), poles=asked)).poles
+    np.testing.assert_allclose(np.sort_complex(found[found.imag > 0]), np.sort_complex(asked), atol=1e-9)

@@ -1,5 +1,7 @@
 """Places for coupled LQR: figures against the law itself, and an optimum that no grid beats."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from workbench.design.loop.closed_loop import close_loop, impulse_state, initial
 from workbench.design.placement.coupled_placement import coupled_batch, coupled_costs, place_coupled
 from workbench.design.placement.coupled_scan import scan_coupled
 from workbench.design.placement.limits import Limits
+from workbench.design.placement.task import placement_task
 from workbench.design.spillover.spillover import effort, spillover
 from workbench.rig.actuators import Actuator
 
@@ -58,3 +61,22 @@ def test_refusals(modes):
     with pytest.raises(DesignError, match="on the grid"):
         scan_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(effort=1e-6), n_places=9)
     assert coupled_costs(modes, 2, [5.0], impulse_at=6.3, weight=10.0).residual_work == np.inf
+
+
+def test_the_damping_of_the_modes_is_in_law_and_effort(modes):
+    damped = replace(modes, damping=np.diag(0.2 * modes.omega))
+    state = impulse_state(damped, 6.3)
+    state[13:] = 0.0
+    found = coupled_costs(damped, 4, [1.3, 2.6, 5.2], impulse_at=6.3, weight=10.0)
+    law = coupled_lqr(damped, 4, found.law.actuators, weight=10.0)
+    np.testing.assert_allclose(found.law.gain, law.gain, atol=1e-9 * np.abs(law.gain).max())
+    assert found.effort == pytest.approx(effort(damped, law, state), rel=1e-8)
+    work, spent = coupled_batch(damped, 4, np.array([[1.3, 2.6, 5.2]]), impulse_at=6.3, weight=10.0)
+    assert (work[0], spent[0]) == pytest.approx((found.residual_work, found.effort), rel=1e-9)
+
+
+@pytest.mark.parametrize("place", [coupled_costs, lambda modes, n, at, **asked: placement_task(modes, n, **asked)])
+def test_damping_that_couples_the_modes_is_refused(modes, place):
+    coupled = replace(modes, damping=0.1 * np.ones((9, 9)))
+    with pytest.raises(DesignError, match="damping couples the modes"):
+        place(coupled, 2, [1.3, 2.6], impulse_at=6.3, weight=10.0)

@@ -15,7 +15,7 @@ from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state, initial_response
 from workbench.design.spillover.explain import explain_spillover
 from workbench.design.spillover.remedies import spillover_remedies, sufficient_sensors
-from workbench.design.spillover.spillover import finite_spillover
+from workbench.design.spillover.spillover import effort, energy_gained, finite_spillover
 from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
@@ -316,3 +316,84 @@ def test_the_filter_cures_it_with_sensors_enough():
 def test_what_cannot_be_is_refused(act, words):
     with pytest.raises(DesignError, match=words):
         act(beam())
+
+
+def chain(damper):
+    """Six masses in a row, one with a damper of its own: modes that damping couples, and poles from M, K, C."""
+    mass, k = np.diag([3.0, 2, 4, 1, 2, 1.5]), np.array([900.0, 700, 800, 600, 500, 400])
+    stiffness = np.diag(k + np.r_[k[1:], 0.0]) - np.diag(k[1:], 1) - np.diag(k[1:], -1)
+    damping = 5e-4 * stiffness
+    damping[3, 3] += damper
+    names = NamedPoints(names=tuple(f"n{i}" for i in range(6)))
+    lower = [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)]
+    poles = np.linalg.eigvals(np.block([[np.zeros((6, 6)), np.eye(6)], lower]))
+    return FiniteElements(mass, stiffness, nodes=names, damping=damping).modes(6), poles
+
+
+@pytest.mark.parametrize("damper", [25.0, 60.0])
+def test_paths_add_up_where_damping_couples_the_modes(damper):
+    modes, poles = chain(damper)
+    law = imsc(modes, 2, [Actuator("a", "n2"), Actuator("b", "n5")], weight=0.05)
+    found = explain_spillover(
+        modes, luenberger(modes, law, [Sensor("y1", "n0"), Sensor("y2", "n4")], poles=[-3 + 5j, -4 + 11j])
+    )
+    for shift in found.shifts:
+        assert np.abs(poles - shift.pole).min() < 1e-9 * abs(shift.pole)
+        assert sum(path.shift for path in shift.paths) == pytest.approx(shift.shift, abs=1e-9 * abs(shift.pole))
+
+
+@pytest.mark.parametrize(
+    "late",
+    [
+        ({"time_constant": 0.09}, {}),
+        ({}, {"time_constant": 0.09}),
+        ({"delay": 0.4}, {}),
+        ({"delay": 0.3, "time_constant": 0.05}, {"delay": 0.2}),
+    ],
+    ids=["slow actuator", "slow sensor", "late actuator", "all of it"],
+)
+def test_lags_and_delays_are_in_the_loop(late):
+    """Against python-control, which takes a delay by its own Padé approximation; the paths count them too."""
+    modes, (acts, reads) = beam(4, zeta=0.02), late
+    law = coupled_lqr(modes, 1, [Actuator("F", 3.0, **acts)], weight=0.1)
+    controller = kalman(modes, law, [Sensor("y", 4.2, **reads)], disturbance=1.0, noise=1e-3)
+    found = explain_spillover(modes, controller)
+    prompt = [replace(part, delay=0.0) for part in (*law.actuators, *controller.sensors)]
+    plant = state_space(modes, prompt[:1], prompt[1:])
+    delay = acts.get("delay", 0.0) + reads.get("delay", 0.0)
+    if delay:
+        plant = plant * control.tf2ss(control.tf(*control.pade(delay, 8)))
+    parts = (controller.state, controller.reads, controller.commands, controller.direct)
+    true = control.feedback(plant, control.ss(*parts), sign=1).poles()
+    slow = true[np.abs(true) < 1.2 * modes.omega[-1]]
+    assert all(np.abs(found.poles - pole).min() < 1e-6 * abs(pole) for pole in slow)
+    assert found.margin == pytest.approx(-true.real.max(), rel=1e-5)
+    for shift in found.shifts:
+        assert sum(path.shift for path in shift.paths) == pytest.approx(shift.shift, abs=1e-8 * abs(shift.pole))
+
+
+def test_a_slow_actuator_counts_in_work_and_effort():
+    """Work in all modes is what the energies lose beside friction: without friction all of it."""
+    modes = beam(4, zeta=0.0)
+    law = coupled_lqr(modes, 1, [Actuator("F", 3.0, time_constant=0.5)], weight=0.1)
+    loop, state = close_loop(modes, law), impulse_state(modes, 6.3)
+    np.testing.assert_allclose(finite_spillover(loop, state, 30.0).by_mode, energy_gained(loop, state, 30.0), atol=1e-9)
+    time = np.linspace(0.0, 300.0, 60_001)
+    squares = (initial_response(loop, state, time).forces ** 2).sum(axis=0)
+    assert effort(modes, law, state) == pytest.approx(np.trapezoid(squares, time), rel=1e-4)
+
+
+def test_a_marginally_stable_loop_needs_no_remedy():
+    """Rigid modes whose displacement nothing holds stand on the axis whatever rounding makes of them."""
+    modes = Beam(
+        length=2.0, mass_per_length=1.0, bending_stiffness=10.0, left="free", right="free", damping=ModalDamping(0.01)
+    ).modes(6)
+
+    def redesign(actuators, sensors, share):
+        law = coupled_lqr(modes, 3, actuators, weight=0.1)
+        sensors = [Sensor(f"y{i}", x) for i, x in enumerate(sensors)]
+        return luenberger(modes, replace(law, gain=share * law.gain), sensors, poles=[-1 + 1j, -2 + 2j, -3 + 20j])
+
+    actuators = [Actuator("a", 0.1), Actuator("b", 1.3), Actuator("c", 1.9)]
+    assert close_with(modes, redesign(actuators, [0.1, 1.3], 1.0)).stability == "marginally stable"
+    assert spillover_remedies(modes, redesign, actuators, [0.1, 1.3]) == ()

@@ -100,3 +100,11 @@ def test_refusals():
         open_loop(beam(), law, [1j], np.ones((3, 1)))
     with pytest.raises(DesignError, match="too alike"):
         open_loop(beam(), law, [-0.1 + 1j] * 3, np.ones((3, 3)))
+
+
+def test_a_loop_on_the_axis_counts_as_it_does_elsewhere():
+    undamped = beam(zeta=0.0)
+    law = imsc(undamped, 3, PLACES, weight=30.0)
+    drawn = perturbed_modes(undamped, 0.01, count=12)
+    found = robustness(drawn, {"IMSC": law}, state=impulse_state(undamped, 6.3), final_time=5.0)["IMSC"]
+    assert found.share == stable_share(drawn, law) == 1.0 and np.isfinite(found.work).all()

@@ -1,14 +1,16 @@
 """Work by mode: closed form, exact finite time, energy balance, and the modal filters behind it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
-from workbench.design.laws.law import DesignError
+from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.spillover.spillover import effort, energy_gained, finite_spillover, quadratic_cost, spillover
 from workbench.rig.actuators import Actuator
@@ -139,3 +141,35 @@ def test_work_on_a_plate_against_quadrature_of_the_closed_loop():
 
     work = quad_vec(power, 0.0, 3.0, epsabs=0.0, epsrel=1e-11)[0]
     np.testing.assert_allclose(finite_spillover(loop, state, 3.0).by_mode[3:], work, rtol=1e-8)
+
+
+GYROSCOPIC = np.array([[0.0, 0.3, 0.0], [-0.3, 0.0, 0.2], [0.0, -0.2, 0.0]])
+LOCAL = 0.2 * np.outer([0.6, 0.9, 0.5], [0.6, 0.9, 0.5]) + 0.01 * np.eye(3)
+
+
+@pytest.mark.parametrize("damping", [0.1 * GYROSCOPIC + 0.02 * np.eye(3), LOCAL], ids=["gyroscopic", "local damper"])
+def test_effort_and_cost_count_what_damping_between_modes_brings(damping):
+    """Against the Lyapunov equation of the whole plant."""
+    coupled = replace(modes(3), damping=damping)
+    actuators = [Actuator("F1", 2.0), Actuator("F2", 4.5)]
+    chosen, state = imsc(coupled, 2, actuators, weight=20.0), np.array([0, 0, 0, 1.0, 0.5, 0.3])
+    b = np.vstack([np.zeros((3, 2)), coupled.phi([2.0, 4.5]).T])
+    gain = np.zeros((2, 6))
+    gain[:, [0, 1, 3, 4]] = chosen.gain
+    a = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.diag(coupled.omega**2), -damping]])
+    gramian = solve_continuous_lyapunov(a - b @ gain, -np.outer(state, state))
+    weighed = np.diag([*coupled.omega[:2] ** 2, 0.0, 1.0, 1.0, 0.0]) + 20.0 * gain.T @ gain
+    assert effort(coupled, chosen, state) == pytest.approx(np.trace(gain @ gramian @ gain.T), rel=1e-9)
+    assert quadratic_cost(coupled, chosen, state, 20.0) == pytest.approx(np.trace(weighed @ gramian), rel=1e-9)
+
+
+def test_gyroscopic_modes_are_refused_where_work_stays_in_no_mode():
+    spun = replace(modes(3), damping=GYROSCOPIC)
+    chosen = imsc(spun, 2, [Actuator("F1", 2.0), Actuator("F2", 4.5)], weight=20.0)
+    with pytest.raises(DesignError, match="carries it from mode to mode"):
+        spillover(spun, chosen, impulse_state(spun, 6.3))
+
+
+def test_a_law_that_settles_nothing_costs_without_end():
+    idle = Law(np.zeros((1, 4)), (0, 1), (Actuator("F", 2.0),))
+    assert quadratic_cost(modes(3), idle, impulse_state(modes(3), 6.3), 1.0) == np.inf

@@ -64,17 +64,26 @@ class Controller(Printed):
         return tuple(sorted({sensor.at for sensor in self.sensors}))
 
 
-def reading(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
-    """R (n_channels, 2 n_modes), from the state (q, q') to the readings.
+def check_readable(sensors: Sequence[Sensor]) -> None:
+    """Refuse what is not a function of the state alone.
 
     Raises:
-        ValueError: an accelerometer, whose reading is not a function of the state alone.
+        ValueError: an accelerometer.
     """
     for sensor in sensors:
         if MEASURED[sensor.quantity][1] > 1:
             raise ValueError(
                 f"sensor {sensor.name} reads {sensor.quantity}; a controller here reads displacement or velocity"
             )
+
+
+def reading(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
+    """R (n_channels, 2 n_modes), from the state (q, q') to the readings, lags and delays left out.
+
+    Raises:
+        ValueError: an accelerometer.
+    """
+    check_readable(sensors)
     shapes = output_matrix(modes, sensors)
     rates = np.array([MEASURED[sensor.quantity][1] for sensor in sensors])[:, None]
     return np.hstack([np.where(rates == 0, shapes, 0.0), np.where(rates == 1, shapes, 0.0)])

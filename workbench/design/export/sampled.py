@@ -10,7 +10,7 @@ from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, sampled
 from workbench.design.export.sampled_loop import MOST_PAST, sampled_loop
 from workbench.design.export.source import command_words, reading_words
-from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.law import DesignError, Law, numbered
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import close_with
 from workbench.renamed import Renamed
@@ -91,13 +91,21 @@ class SampledDesign(Printed):
     @property
     def remarks(self) -> tuple[str, ...]:
         """What a user should know before it runs: stability before and after sampling, and what is aliased."""
-        before = close_with(self.modes, self.source).margin
+        before = close_with(self.modes, self.source)
         delay = f"delay margin {1e3 * self.delay_margin:.3g} ms"
         if not np.isfinite(self.delay_margin):
             delay = f"delay margin beyond {MOST_LATE} samples"
-        said = [f"stability margin {self.margin:.3g} 1/s, {before:.3g} 1/s in continuous time; {delay}"]
-        rate, own = self.sample_rate_hz, self.source.law.controlled
-        folded = [(r, f) for r, f in enumerate(self.modes.frequencies_hz) if f > 0.5 * rate and r not in own]
+        # rounding is no margin
+        own = 0.0 if abs(self.margin) * self.controller.sample_time < ON_CIRCLE else self.margin
+        continuous = 0.0 if before.stability == "marginally stable" else before.margin
+        said = [f"stability margin {own:.3g} 1/s, {continuous:.3g} 1/s in continuous time; {delay}"]
+        rate, law = self.sample_rate_hz, self.source.law
+        free = [r for i, r in enumerate(law.controlled) if self.modes.omega[r] == 0 and not law.gain[:, i].any()]
+        if free:
+            said.append(
+                f"nothing holds the displacement of what is rigid (mode {numbered(free)}); poles of its own would"
+            )
+        folded = [(r, f) for r, f in enumerate(self.modes.frequencies_hz) if f > 0.5 * rate and r not in law.controlled]
         if folded:
             r, f = folded[0]
             more = f", and {len(folded) - 1} more above it" if len(folded) > 1 else ""

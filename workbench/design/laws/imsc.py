@@ -77,7 +77,7 @@ def pole_gains(omega: ArrayLike, poles: ArrayLike, damping: ArrayLike = 0.0) -> 
 
 
 def imsc(modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, weight: ArrayLike) -> Law:
-    """The optimal IMSC law: closed-form Riccati gains, one mode at a time.
+    """The optimal IMSC law: closed-form Riccati gains, one mode at a time; damping that couples modes is left out.
 
     Args:
         modes: at hand; those not controlled are residual.
@@ -87,18 +87,21 @@ def imsc(modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actu
     """
     index = controlled_indices(modes, controlled)
     c = np.diag(modes.damping)[list(index)]
-    gains = riccati_gains(modes.omega[list(index)], weight, c)
-    return _law(modes, index, actuators, gains, "IMSC", partial(imsc, weight=weight))
+    g1, g2 = riccati_gains(modes.omega[list(index)], weight, c)
+    return _law(modes, index, actuators, (np.diag(g1), np.diag(g2)), "IMSC", partial(imsc, weight=weight))
 
 
 def imsc_poles(
     modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, poles: ArrayLike
 ) -> Law:
-    """The IMSC law with the closed-loop poles given, one of each conjugate pair per controlled mode, rad/s."""
+    """The IMSC law with the closed-loop poles given, one of each conjugate pair per controlled mode, rad/s.
+
+    Damping that couples controlled modes is cancelled, so that each is independent as it is controlled.
+    """
     index = controlled_indices(modes, controlled)
-    c = np.diag(modes.damping)[list(index)]
-    again = partial(imsc_poles, poles=poles)
-    return _law(modes, index, actuators, pole_gains(modes.omega[list(index)], poles, c), "IMSC poles", again)
+    g1, g2 = pole_gains(modes.omega[list(index)], poles)
+    gains = np.diag(g1), np.diag(g2) - modes.damping[np.ix_(index, index)]
+    return _law(modes, index, actuators, gains, "IMSC poles", partial(imsc_poles, poles=poles))
 
 
 def _law(
@@ -110,4 +113,4 @@ def _law(
     designed_by: Callable[..., Law],
 ) -> Law:
     spread = np.linalg.pinv(participation(modes, index, actuators))
-    return Law(spread @ np.hstack([np.diag(g) for g in gains]), index, tuple(actuators), name, designed_by)
+    return Law(spread @ np.hstack(gains), index, tuple(actuators), name, designed_by)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from workbench.arrays import Complexes, Floats
-from workbench.design.estimation.controller import Controller, reading
+from workbench.arrays import Complexes, Flags, Floats
+from workbench.design.estimation.controller import Controller, check_readable
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import DesignError, Law, linear
 from workbench.design.loop.peak import largest
-from workbench.rig.statespace import input_matrix
+from workbench.rig.statespace import modal_plant
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import counted, place_text
@@ -27,18 +27,25 @@ ON_AXIS = 1e-9  # of the fastest pole
 
 def stability(poles: np.ndarray) -> str:
     """Of a loop: stable, unstable, or marginally stable where its rightmost pole is on the axis but for rounding."""
-    rightmost, rounding = poles.real.max(), ON_AXIS * max(np.abs(poles).max(), 1.0)
-    return "stable" if rightmost < -rounding else "unstable" if rightmost > rounding else "marginally stable"
+    rightmost, by = poles.real.max(), rounding(poles)
+    return "stable" if rightmost < -by else "unstable" if rightmost > by else "marginally stable"
+
+
+def rounding(poles: np.ndarray) -> float:
+    """How far rounding may move a pole off the axis, 1/s."""
+    return float(ON_AXIS * max(np.abs(poles).max(), 1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """x' = A x, x = (q, q') of every mode, then the states of an observer where there is one, forces u = -K x̂ in it.
+    """x' = A x: (q, q') of every mode, lags and delays of actuators and sensors, an observer; forces u = -K x̂ in it.
+
+    A delay is in it as of `delay_line`.
 
     Attributes:
         modes: all of them.
         law: that closes the loop.
-        matrix: (n_states, n_states) A, rad/s; n_states is 2 n_modes but for an observer's.
+        matrix: (n_states, n_states) A, rad/s; n_states is 2 n_modes where there is nothing else.
         feedback: (n_actuators, n_states) from the state to the actuator forces, sign included.
     """
 
@@ -69,6 +76,21 @@ class ClosedLoop:
     def stable(self) -> bool:
         """Whether no pole is to the right of the axis (undamped residual modes sit on it)."""
         return self.stability != "unstable"
+
+    def behind(self, states: Flags) -> Flags:
+        """Which states (n_states,) move the given ones, directly or by way of others, themselves among them.
+
+        What couples modes in proportional damping is rounding, and couples none.
+        """
+        n, links = self.modes.n_modes, self.matrix != 0
+        if self.modes.proportional:
+            unfed = n + np.flatnonzero(~self.feedback[:, n : 2 * n].any(axis=0))
+            links[n : 2 * n, unfed] &= np.eye(n, dtype=bool)[:, unfed - n]
+        found, new = states.copy(), states
+        while new.any():
+            new = links[new].any(axis=0) & ~found
+            found = found | new
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,21 +158,24 @@ def close_loop(modes: Modes, law: Law | Controller, filter_: ModalFilter | None 
             )
     estimate = np.kron(np.eye(2), seen)
     feedback = -law.gain @ estimate
-    b = input_matrix(modes, law.actuators)
-    return ClosedLoop(modes, law, modes.state_matrix + np.vstack([np.zeros_like(b), b]) @ feedback, feedback)
+    a, b, c, d, _ = modal_plant(modes, law.actuators, ())
+    commands = np.hstack([feedback, np.zeros((len(feedback), len(a) - 2 * n))])
+    return ClosedLoop(modes, law, a + b @ commands, c + d @ commands)
 
 
 def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
-    """The loop of all modes, controlled and residual, states (q, q', z); a law alone reads exact modal coordinates."""
+    """The loop of all modes, states as of `ClosedLoop`; a law alone reads exact modal coordinates."""
     if isinstance(controller, Law):
         return close_loop(modes, controller)
-    b = input_matrix(modes, controller.law.actuators)
-    force = np.vstack([np.zeros_like(b), b])
-    r = reading(modes, controller.sensors)
-    feedback = np.hstack([controller.direct @ r, controller.commands])
-    plant = modes.state_matrix + force @ controller.direct @ r
-    matrix = np.block([[plant, force @ controller.commands], [controller.reads @ r, controller.state]])
-    return ClosedLoop(modes, controller.law, matrix, feedback)
+    check_readable(controller.sensors)
+    a, b, c, d, _ = modal_plant(modes, controller.law.actuators, controller.sensors)
+    count = len(controller.sensors)
+    reads, forces, passed = c[:count], c[count:], d[count:]
+    commands = np.hstack([controller.direct @ reads, controller.commands])
+    plant = np.block([[a, np.zeros((len(a), len(controller.state)))], [controller.reads @ reads, controller.state]])
+    matrix = plant + np.vstack([b @ commands, np.zeros((len(controller.state), len(plant)))])
+    forces = np.hstack([forces, np.zeros((len(forces), len(controller.state)))])
+    return ClosedLoop(modes, controller.law, matrix, forces + passed @ commands)
 
 
 def impulse_state(modes: Modes, at: Place, impulse: float = 1.0) -> Floats:
@@ -190,12 +215,10 @@ def peak_force(loop: ClosedLoop, state: np.ndarray, final_time: float) -> float:
         state: as for `initial_response`.
         final_time: s; may be infinite.
     """
-    n = loop.modes.n_modes
-    own = np.r_[list(loop.law.controlled), [n + r for r in loop.law.controlled]]
-    # residual modes of which nothing is fed back are left out: they would be poles that need not decay
-    if not _controlled_alone(loop):
-        own = np.arange(loop.matrix.shape[0])
-    own = own[loop.matrix[:, own].any(axis=0)]  # a rigid displacement that no gain answers moves nothing
+    # what the forces do not depend on is left out: residual modes would be poles that need not decay
+    own = np.flatnonzero(loop.behind(np.asarray(loop.feedback.any(axis=0))))
+    if not own.size:
+        return 0.0
     state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
     poles, vectors = np.linalg.eig(loop.matrix[np.ix_(own, own)])
     amplitudes = (loop.feedback[:, own] @ vectors) * np.linalg.solve(vectors, state[own].astype(complex))

@@ -101,7 +101,8 @@ def certify(
     Args:
         placement: that of `place` unless given.
         gap: share of W_R to be proven.
-        seconds, max_cells: after which the search stops with the bound that it has reached.
+        seconds, max_cells: after which the search stops with the bound that it has reached. The first search on a
+            machine compiles for about a minute before, which does not count.
         progress: called with the bound, W_R of the placement and the cells bounded so far.
 
     Raises:

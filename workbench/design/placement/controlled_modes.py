@@ -74,9 +74,14 @@ def controlled_mode_count(
         places: of n actuators; the nodes of mode n+1 unless given.
 
     Raises:
-        DesignError: a disturbance that gives no energy, or no n whose actuators can be placed.
+        DesignError: modes with damping, a disturbance that gives no energy, or no n whose actuators can be placed.
     """
     n_modes = modes.n_modes
+    if modes.damping.any():
+        raise DesignError(
+            "modes to count have no damping, which would take energy from all of them; give"
+            " replace(modes, damping=np.zeros_like(modes.damping))"
+        )
     energy = 0.5 * (state[n_modes:] ** 2 + (modes.omega * state[:n_modes]) ** 2)
     if not energy.sum() > 0:
         raise DesignError("the disturbance gives no mode any energy, so there is nothing to control")

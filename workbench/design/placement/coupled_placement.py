@@ -15,7 +15,7 @@ from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError, Law, weighed_states
 from workbench.design.loop.peak import largest
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.task import Placement
+from workbench.design.placement.task import Placement, check_uncoupled
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, modal_state_matrix
 from workbench.threads import one_blas_thread
@@ -78,7 +78,8 @@ def place_coupled(
             options = {"maxfev": 250 * n_actuators, "xatol": 1e-6 * modes.length, "fatol": 1e-9}
             ends.append(minimize(lambda x: look(x)[0], draws[i], method="Nelder-Mead", options=options))
     if not ends:
-        raise DesignError("no place drawn keeps the limits of coupled LQR; raise them or lower the spacing")
+        lower = " or lower the spacing" * (limits.spacing > 0)
+        raise DesignError(f"no place drawn keeps the limits of coupled LQR; raise them{lower}")
     best = min(ends, key=lambda end: end.fun)
     found = coupled_costs(modes, n_controlled, best.x, impulse_at=impulse_at, weight=weight)
     optima = tuple(sorted(((np.sort(e.x), float(np.exp(e.fun))) for e in ends), key=lambda pair: pair[1]))
@@ -90,16 +91,22 @@ def coupled_costs(
 ) -> Placement:
     """Residual work and effort of coupled LQR with force actuators at the positions; infinite where it is unstable.
 
+    Effort and peak force are those of the law, the modes' own damping included; W_R is the work on residual modes as if
+    these had none.
+
     Args:
-        modes: controlled first, then residual; undamped, residual ones at rest at first.
+        modes: controlled first, then residual, which are at rest at first.
         n_controlled: how many; any number of actuators.
         impulse_at: place of the impulse (N s).
         weight: R of the actuator forces.
+
+    Raises:
+        DesignError: damping that couples the modes.
     """
     positions = np.sort(np.asarray(positions, float))
     n, m = n_controlled, positions.size
     shapes = modes.phi(positions).T
-    states, a, costs = _weighed(modes.omega[:n])
+    states, a, costs = _weighed(modes, n)
     b = np.vstack([np.zeros((n, m)), shapes[:n]])[states]
     start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]][states]
     try:
@@ -128,11 +135,12 @@ def coupled_costs(
     )
 
 
-def _weighed(omega: Floats) -> tuple[Integers, Floats, Floats]:
+def _weighed(modes: Modes, n: int) -> tuple[Integers, Floats, Floats]:
     """The states whose motion costs anything, their A and their costs: the displacement of a rigid mode does not."""
-    n = len(omega)
+    check_uncoupled(modes)
+    omega = modes.omega[:n]
     states = weighed_states(omega)
-    a = modal_state_matrix(omega**2, np.zeros(n))
+    a = modal_state_matrix(omega**2, modes.damping[:n, :n])
     return states, a[np.ix_(states, states)], np.r_[omega**2, np.ones(n)][states]
 
 
@@ -152,10 +160,13 @@ def coupled_batch(
     """W_R and effort (n_placements,) of coupled LQR at many placements (n_placements, n_actuators).
 
     Infinite where no regulator stabilises.
+
+    Raises:
+        DesignError: damping that couples the modes.
     """
     n, count = n_controlled, len(positions)
     shapes = modes.phi(positions.ravel()).reshape(*positions.shape, modes.n_modes)
-    states, a, costs = _weighed(modes.omega[:n])
+    states, a, costs = _weighed(modes, n)
     size = len(states)
     b = np.zeros((count, size, positions.shape[1]))
     b[:, size - n :] = shapes[:, :, :n].transpose(0, 2, 1)

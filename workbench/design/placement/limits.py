@@ -231,15 +231,16 @@ def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None
     measured = {"effort": costs.effort, "peak force": costs.peak_force, "condition": costs.condition}
     asked = {"effort": limits.effort, "peak force": limits.peak_force, "condition": limits.condition}
     head = f"no placement of {n} actuators meets the limits"
-    spaced = within["spacing"]
+    spaced, apart, lower = within["spacing"], "", ""
+    if limits.spacing > 0:
+        apart, lower = f" with spacing {limits.spacing:g}", " or lower the spacing"
     if not spaced.any():
         return f"{head}: spacing {limits.spacing:g} leaves no room; lower it"
     for name, values in measured.items():
         if not (within[name] & spaced).any():
             least = values[spaced].min()
             return (
-                f"{head}: {name} limit {asked[name]:.4g} with spacing {limits.spacing:g}; the least met was"
-                f" {least:.4g}: raise the limit or lower the spacing"
+                f"{head}: {name} limit {asked[name]:.4g}{apart}; the least met was {least:.4g}: raise the limit{lower}"
             )
     for one, other in combinations(measured, 2):
         if not (within[one] & within[other] & spaced).any():

@@ -259,11 +259,12 @@ def placement_task(
         actuator: what is to be placed, a point force unless given; a `piezo_patch` or a moment, with its gain.
 
     Raises:
-        DesignError: no residual mode, an impulse that moves nothing, probabilities that are none, or a time that is not
-            positive.
+        DesignError: no residual mode, damping that couples the modes, an impulse that moves nothing, probabilities that
+            are none, or a time that is not positive.
     """
     if not 1 <= n_controlled < modes.n_modes:
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
+    check_uncoupled(modes)
     if not final_time > 0:
         raise DesignError(f"the final time must be positive; got {final_time}")
     if not np.isfinite(impulse) or impulse == 0:
@@ -330,6 +331,19 @@ def placement_task(
         weight=frozen(np.broadcast_to(np.asarray(weight, float), n)),
         actuator=Actuator("F", modes.domain.grid(2)[0]) if actuator is None else actuator,
     )
+
+
+def check_uncoupled(modes: Modes) -> None:
+    """Refuse damping that couples the modes: what is placed by would leave its work out.
+
+    Raises:
+        DesignError: such damping.
+    """
+    if not modes.proportional:
+        raise DesignError(
+            "damping couples the modes, and places are compared mode by mode; neglect its coupling terms by"
+            " replace(modes, damping=np.diag(np.diag(modes.damping))), and check the design by finite_spillover"
+        )
 
 
 def patch_of(rig: Rig) -> Actuator | None:

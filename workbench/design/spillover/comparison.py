@@ -10,7 +10,7 @@ from workbench.design.estimation.modal_filter import filter_on
 from workbench.design.estimation.observers import luenberger, usual_poles
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
-from workbench.design.laws.law import DesignError, Law, controlled_indices
+from workbench.design.laws.law import DesignError, Law, controlled_indices, numbered
 from workbench.design.loop.closed_loop import close_loop, peak_force
 from workbench.design.spillover.explain import Explanation, explain_spillover
 from workbench.design.spillover.spillover import Spillover, check_final_time, effort, finite_spillover, quadratic_cost
@@ -33,7 +33,7 @@ class Compared:
         effort: ∫ FᵀF dt over all time.
         peak_force: largest |F| of any actuator up to the final time, at any instant, to a millionth.
         work: in every mode up to the final time.
-        poles: (2 n_modes,) of the loop through exact modal coordinates, rad/s.
+        poles: (n_states,) of the loop through exact modal coordinates, rad/s.
         stability: of that loop, as of a `ClosedLoop`.
     """
 
@@ -58,24 +58,31 @@ class Compared:
 def laws_of(
     modes: Modes, controlled: int, actuators: Sequence[Actuator], *, weight: float, damping: float | None = None
 ) -> tuple[list[Law], list[str]]:
-    """The laws to be had, IMSC and coupled LQR, and by poles of a damping ratio where one is given; why IMSC is not.
+    """The laws to be had, IMSC and coupled LQR, and by poles of a damping ratio where one is given; why others are not.
 
     Raises:
         DesignError: no law is to be had.
     """
     makers: list[Callable[[], Law]] = [lambda: imsc(modes, controlled, actuators, weight=weight)]
     coupled: list[Callable[[], Law]] = [lambda: coupled_lqr(modes, controlled, actuators, weight=weight)]
-    if damping is not None:
-        if not 0 < damping < 1:
-            raise DesignError(f"the damping ratio wanted must lie between 0 and 1; got {damping:g}")
-        omega = modes.omega[list(controlled_indices(modes, controlled))]
+    refused: list[str] = []
+    if damping is not None and not 0 < damping < 1:
+        raise DesignError(f"the damping ratio wanted must lie between 0 and 1; got {damping:g}")
+    omega = modes.omega[list(controlled_indices(modes, controlled))]
+    rigid = numbered(np.flatnonzero(omega == 0).tolist())
+    if damping is not None and rigid:
+        refused.append(
+            f"no law by poles, for what is rigid (mode {rigid}) has no damping ratio; design by the weight, or give"
+            " poles of its own to coupled_poles"
+        )
+    elif damping is not None:
         poles = omega * (-damping + 1j * np.sqrt(1 - damping**2))
         makers.append(lambda: imsc_poles(modes, controlled, actuators, poles=poles))
         coupled.append(lambda: coupled_poles(modes, controlled, actuators, poles=poles))
     if controlled <= len(actuators):
-        return [make() for make in (*makers, *coupled)], []
+        return [make() for make in (*makers, *coupled)], refused
     why = f"IMSC needs as many actuators as controlled modes, {controlled}; there are {len(actuators)}: add actuators"
-    return [make() for make in coupled], [why]
+    return [make() for make in coupled], [why, *refused]
 
 
 @one_blas_thread

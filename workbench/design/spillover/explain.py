@@ -2,11 +2,13 @@
 
 Without mode r the rest of the loop answers readings y with forces T(s) y. Mode r closes that loop at s = λ + Δ:
 
-    (s - λ)(s - λ') = b_rᵀ T(s) c_r(s),   so   Δ = Σ_ji b_rj T_ji(s) c_ir(s) / (s - λ'),
+    (s - λ) E(s) = b_r(s)ᵀ T(s) c_r(s),   so   Δ = Σ_ji b_rj T_ji c_ir / E(s),
 
-one term for each actuator j and sensor i; λ' is the mode's other pole, λ* where it oscillates. At s = λ this is the
-perturbation of the eigenvalue to first order; at the pole of the full loop it is exact. Either spillover at zero, b_r
-or c_r, leaves the mode where it was (Balas 1978).
+one term for each actuator j and sensor i. E(s) = s - λ', the mode's other pole, λ* where it oscillates. Damping that
+couples mode r and the others, of dynamic stiffness Z(s), by the row d and the column e of s C, has it move through
+these: b_r - d Z⁻¹ B stands for b_r, c_r - c Z⁻¹ e for c_r, and (s - λ) E(s) = s² + s c_rr + ω_r² - d Z⁻¹ e, λ a pole
+of the structure with all its damping. At s = λ this is the perturbation of the eigenvalue to first order; at the pole
+of the full loop it is exact. Either spillover at zero, b_r or c_r, leaves the mode where it was (Balas 1978).
 """
 
 from collections.abc import Sequence
@@ -16,11 +18,13 @@ import numpy as np
 from scipy.linalg import eig
 from scipy.optimize import linear_sum_assignment
 
-from workbench.arrays import Complexes
+from workbench.arrays import Complexes, Flags, Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.laws.law import DesignError, linear
-from workbench.design.loop.closed_loop import ClosedLoop, close_with
-from workbench.rig.statespace import input_matrix
+from workbench.design.loop.closed_loop import ClosedLoop, close_with, rounding
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.rig.statespace import input_matrix, lateness
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes
 from workbench.structure.printed import Printed, counted, place_text
@@ -154,30 +158,41 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
     loop = close_with(modes, controller)
     rest = _Rest(modes, controller)
     residual = [r for r in range(modes.n_modes) if r not in controller.law.controlled]
-    shifts = [_OneMode(rest, r).shifted(pole) for r, pole in zip(residual, _poles_of(loop, residual), strict=True)]
+    free = _free_poles(modes)
+    closed = [_as_of(loop, pole) for pole in _poles_of(loop.matrix, modes.n_modes, residual)]
+    shifts = [_OneMode(rest, r, free[r]).shifted(pole) for r, pole in zip(residual, closed, strict=True)]
     shifts.sort(key=lambda m: -m.closed_pole.real)
     alone = close_with(modes.select(controller.law.controlled), controller)
     return Explanation(loop, tuple(shifts), alone.margin, _behind(modes, controller, loop, shifts, alone.stable))
 
 
-def _poles_of(loop: ClosedLoop, residual: Sequence[int]) -> list[complex]:
-    """The pole of each residual mode in the loop, upper half plane: of the two that are its own, the less stable.
+def _free_poles(modes: Modes) -> list[complex]:
+    """The pole of each mode without control, upper half plane; the slower one of a mode that does not oscillate."""
+    if modes.proportional:
+        c = np.diag(modes.damping)
+        return [complex(pole) for pole in -0.5 * c + np.sqrt(0.25 * c**2 - modes.omega**2 + 0j)]
+    return _poles_of(modes.state_matrix, modes.n_modes, range(modes.n_modes))
+
+
+def _poles_of(matrix: Floats, n: int, wanted: Sequence[int]) -> list[complex]:
+    """The pole of each mode wanted, of n, upper half plane: of the two that are its own, the less stable.
 
     Modes share out the poles by |w_k,r' v_k,r|, left and right eigenvectors: how much a stiffer mode r moves pole k.
     """
-    if not residual:
+    if not len(wanted):
         return []
-    n = loop.modes.n_modes
-    poles, left, right = eig(loop.matrix, left=True, right=True)
+    poles, left, right = eig(matrix, left=True, right=True)
     share = np.abs(left[n : 2 * n] * right[:n])
     share /= np.maximum(share.sum(axis=0), np.finfo(float).tiny)
-    _, own = linear_sum_assignment(share[np.repeat(residual, 2)], maximize=True)
-    found = []
-    for pair in poles[own].reshape(-1, 2):
-        pole = max(pair, key=lambda p: float(p.real))
-        pole = loop.poles[np.abs(loop.poles - pole).argmin()]
-        found.append(complex(pole.real, abs(pole.imag)))
-    return found
+    _, own = linear_sum_assignment(share[np.repeat(wanted, 2)], maximize=True)
+    found = (max(pair, key=lambda p: float(p.real)) for pair in poles[own].reshape(-1, 2))
+    return [complex(pole.real, abs(pole.imag)) for pole in found]
+
+
+def _as_of(loop: ClosedLoop, pole: complex) -> complex:
+    """The same pole to the last digit as the loop has it."""
+    found = loop.poles[np.abs(loop.poles - pole).argmin()]
+    return complex(found.real, abs(found.imag))
 
 
 def _behind(
@@ -186,16 +201,16 @@ def _behind(
     """The residual mode that destabilises a loop: one that grows, else one without which the loop is stable."""
     if loop.stable or not shifts:
         return None
-    if stable_alone and shifts[0].closed_pole.real > 0:
+    if stable_alone and shifts[0].closed_pole.real > rounding(loop.poles):
         return shifts[0]
 
-    def margin_without(one: PoleShift) -> float:
-        return close_with(modes.select([r for r in range(modes.n_modes) if r != one.mode]), controller).margin
+    def without(one: PoleShift) -> ClosedLoop:
+        return close_with(modes.select([r for r in range(modes.n_modes) if r != one.mode]), controller)
 
     suspects = sorted(shifts, key=lambda m: -abs(m.shift))[:SUSPECTS]
-    margins = [margin_without(one) for one in suspects]
-    best = int(np.argmax(margins))
-    return suspects[best] if margins[best] > 0 else None
+    loops = [without(one) for one in suspects]
+    best = int(np.argmax([each.margin for each in loops]))
+    return suspects[best] if loops[best].stable else None
 
 
 class _Rest:
@@ -209,49 +224,75 @@ class _Rest:
 
     def forces(self, r: int, s: complex) -> np.ndarray:
         """T(s) (n_actuators, n_channels) without mode r."""
-        n, c = self.modes.n_modes, self.controller
-        others = np.arange(n) != r
-        seen = self.seen[:, :n][:, others] + s * self.seen[:, n:][:, others]
-        pushed = self.pushed[others]
-        if self._apart:
-            stiff = s**2 + s * np.diag(self.modes.damping)[others] + self.modes.omega[others] ** 2
-            # an undamped twin of the mode answers without bound at their pole: a hair beside it
-            hair = TWIN * max(abs(s), self.slowest) ** 2
-            plant = (seen / np.where(stiff == 0, hair, stiff)) @ pushed
-        else:
-            stiff = np.diag(s**2 + self.modes.omega[others] ** 2) + s * self.modes.damping[np.ix_(others, others)]
-            plant = seen @ np.linalg.solve(stiff, pushed)
+        c, others = self.controller, np.arange(self.modes.n_modes) != r
+        plant = self.read(s)[:, others] @ self.moved(others, s, self.pushed[others])
         own = c.direct + c.commands @ np.linalg.solve(s * np.eye(len(c.state)) - c.state, c.reads)
+        own = self._late(c.law.actuators, s)[:, None] * own * self._late(c.sensors, s)
         # least squares: where the rest has this pole too, as of several rigid modes that one sensor reads, no one
         # solution is the mode's share of it
         return np.asarray(np.linalg.lstsq(np.eye(len(own)) - own @ plant, own, rcond=None)[0])
+
+    def read(self, s: complex) -> Complexes:
+        """(n_channels, n_modes): what the sensors read of each mode, before their own lags and delays."""
+        n = self.modes.n_modes
+        return np.asarray(self.seen[:, :n] + s * self.seen[:, n:])
+
+    def moved(self, others: Flags, s: complex, forces: np.ndarray) -> Complexes:
+        """Z(s)⁻¹ forces: how modal forces (n_others, n) on some modes move these."""
+        diagonal = s**2 + s * np.diag(self.modes.damping)[others] + self.modes.omega[others] ** 2
+        # an undamped twin of the mode answers without bound at their pole: a hair beside it
+        diagonal = np.where(diagonal == 0, TWIN * max(abs(s), self.slowest) ** 2, diagonal)
+        if self._apart:
+            return np.asarray(forces / diagonal[:, None])
+        stiff = s * self.modes.damping[np.ix_(others, others)]
+        np.fill_diagonal(stiff, diagonal)
+        return np.asarray(np.linalg.solve(stiff, forces))
+
+    def _late(self, parts: Sequence[Actuator | Sensor], s: complex) -> Complexes:
+        """What lag and delay of each part make of a signal at s, (n_parts,)."""
+        found = np.ones(len(parts), complex)
+        for j, part in enumerate(parts):
+            for _, (a, b, c) in lateness(part, self.modes):
+                found[j] *= c @ np.linalg.solve(s * np.eye(len(b)) - a, b)
+        return found
 
 
 class _OneMode:
     """One residual mode in the loop of all the rest."""
 
-    def __init__(self, rest: _Rest, r: int) -> None:
-        modes = rest.modes
-        self._rest, self._r = rest, r
-        self._pushed, self._seen = rest.pushed[r], rest.seen[:, [r, modes.n_modes + r]]
-        c, omega = modes.damping[r, r], modes.omega[r]
-        self.pole = complex(-0.5 * c + np.sqrt(complex(0.25 * c**2 - omega**2)))
-        self._other = -c - self.pole
+    def __init__(self, rest: _Rest, r: int, pole: complex) -> None:
+        self._rest, self._r, self.pole = rest, r, pole
+        damping, self._others = rest.modes.damping, np.arange(rest.modes.n_modes) != r
+        coupled = not rest.modes.proportional
+        self._by, self._on = coupled * damping[r, self._others], coupled * damping[self._others, r]
+
+    def _slope(self, s: complex) -> complex:
+        """E(s), without the difference of what is nearly equal: Z(s)⁻¹ - Z(λ)⁻¹ by the resolvent identity."""
+        rest, others, own = self._rest, self._others, s + self.pole
+        alone = complex(own + rest.modes.damping[self._r, self._r])
+        if rest.modes.proportional:
+            return alone
+        answer = rest.moved(others, self.pole, self._on[:, None])
+        between = own * answer + rest.modes.damping[np.ix_(others, others)] @ answer
+        inner = rest.moved(others, s, own * self._on[:, None] - self.pole**2 * between)
+        return alone - complex(self._by @ inner[:, 0])
 
     def _terms(self, s: complex) -> Complexes:
         """Shares (n_actuators, n_channels) of the movement that s would be."""
-        forces, read = self._rest.forces(self._r, s), self._seen @ np.array([1.0, s])
-        terms: Complexes = self._pushed[:, None] * forces * read
+        rest, others = self._rest, self._others
+        read, slope = rest.read(s), self._slope(s)
+        pushed = rest.pushed[self._r] - s * self._by @ rest.moved(others, s, rest.pushed[others])
+        seen = read[:, self._r] - s * read[:, others] @ rest.moved(others, s, self._on[:, None])[:, 0]
+        terms: Complexes = pushed[:, None] * rest.forces(self._r, s) * seen
         # of a double pole one may stay, that of a rigid mode whose velocity alone is read say: nothing moves it
-        stays = abs(s - self._other) <= DOUBLE * self._rest.slowest
-        return 0.0 * terms if stays else terms / (s - self._other)
+        return 0.0 * terms if abs(slope) <= DOUBLE * rest.slowest else terms / slope
 
     def shifted(self, closed: complex) -> PoleShift:
         return PoleShift(self._r, self.pole, closed, self._paths(closed))
 
     def _paths(self, closed: complex) -> tuple[Path, ...]:
         exact = self._terms(closed)
-        double = abs(self.pole - self._other) <= DOUBLE * abs(self.pole)
+        double = abs(self._slope(self.pole)) <= DOUBLE * abs(self.pole)
         first = np.full_like(exact, complex(np.nan, np.nan)) if double else self._terms(self.pole)
         sensors = self._rest.controller.sensors
         found = []

@@ -12,7 +12,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError
-from workbench.design.loop.closed_loop import close_with
+from workbench.design.loop.closed_loop import close_with, rounding
 from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import Between, Domain, NamedPoints, Place, Where, centred_at, middle, reach, same_place
@@ -75,7 +75,7 @@ def spillover_remedies(
         modes: of the full plant.
         redesign: the way the controller was designed.
         actuators, sensors: as they stand; sensors by place: x or (x, y) in m, or names of points.
-        margin: wanted of the rightmost pole, 1/s; 0 for stability alone.
+        margin: wanted of the rightmost pole, 1/s; 0 for no growth, which a marginally stable loop has too.
         max_added: sensors to try.
 
     Raises:
@@ -87,18 +87,16 @@ def spillover_remedies(
     start = _Setting(tuple(actuators), tuple(sorted(same_place(at) for at in sensors)))
 
     def met(setting: _Setting) -> float:
-        """How far the margin exceeds what is wanted; -inf where there is no such design."""
-        try:
-            loop = close_with(modes, redesign(setting.actuators, setting.sensors, setting.share))
-        except (DesignError, ValueError):
-            return -np.inf
-        return loop.margin - margin
+        """How far the margin exceeds what is wanted, and more than by rounding; -inf where there is no such design."""
+        found, by = _margin(modes, redesign, setting)
+        return found - by - margin
 
     def remedy(kind: str, change: str, size: float, setting: _Setting) -> Remedy:
         controller = redesign(setting.actuators, setting.sensors, setting.share)
         return Remedy(kind, change, size, close_with(modes, controller).margin, controller)
 
-    if met(start) > 0:
+    # a marginally stable loop does not grow: no change of rounding alone is a remedy
+    if sum(_margin(modes, redesign, start)) >= margin:
         return ()
     found = []
     given_up = _least(lambda size: met(replace(start, share=1.0 - size)), 1.0)
@@ -137,16 +135,22 @@ def sufficient_sensors(
 
     Three further numbers of sensors must do too, lest one count be lucky.
     """
-    margins = np.full(most, -np.inf)
+    margins, enough = np.full(most, -np.inf), np.zeros(most)
     for k in range(1, most + 1):
         places = modes.length * np.arange(1, k + 1) / (k + 1)
-        try:
-            margins[k - 1] = close_with(modes, redesign(tuple(actuators), tuple(places), 1.0)).margin
-        except (DesignError, ValueError):
-            continue
-        if k > 3 and (margins[k - 4 : k] > 0.0).all():
+        margins[k - 1], enough[k - 1] = _margin(modes, redesign, _Setting(tuple(actuators), tuple(places)))
+        if k > 3 and (margins[k - 4 : k] > enough[k - 4 : k]).all():
             return k - 3, margins[:k]
     return None, margins
+
+
+def _margin(modes: Modes, redesign: Redesign, setting: _Setting) -> tuple[float, float]:
+    """The margin of a design and what rounding may make of it; -inf where there is no such design."""
+    try:
+        loop = close_with(modes, redesign(setting.actuators, setting.sensors, setting.share))
+    except (DesignError, ValueError):
+        return -np.inf, 0.0
+    return loop.margin, rounding(loop.poles)
 
 
 def _least(met: Callable[[float], float], most: float) -> float | None:

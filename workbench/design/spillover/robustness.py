@@ -26,7 +26,7 @@ class Robustness:
     """A design on many perturbed models.
 
     Attributes:
-        margins: (n_draws,) stability margin of each, 1/s.
+        margins: (n_draws,) stability margin of each, 1/s; ± rounding where the loop is marginally stable.
         work: (n_draws,) W_R up to the final time; nan where unstable.
     """
 
@@ -39,7 +39,7 @@ class Robustness:
     @property
     def share(self) -> float:
         """Share of the perturbed models on which the loop of all modes is stable."""
-        return float(np.mean(self.margins > 0))
+        return float(np.mean(np.isfinite(self.work)))
 
     @property
     def standard_error(self) -> float:
@@ -145,7 +145,7 @@ def robustness(
         for i, modes in enumerate(possible):
             loop = close_with(modes, controller)
             margins[i] = loop.margin
-            if margins[i] > 0:
+            if loop.stable:
                 work[i] = finite_spillover(loop, state, final_time).residual_total
         found[name] = Robustness(margins, work)
     return found

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
 
 from workbench.arrays import Complexes, Flags, Floats
-from workbench.design.laws.coupled import controlled_plant
+from workbench.design.laws.coupled import ON_AXIS
 from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.loop.closed_loop import ClosedLoop
+from workbench.design.loop.closed_loop import ClosedLoop, close_loop
 from workbench.design.loop.on_off_response import motion, switchings
 from workbench.rig.linear import integrated
 from workbench.rig.statespace import input_matrix
@@ -88,13 +88,13 @@ def force_transform(modes: Modes, law: Law, state: Floats, s: Complexes) -> Comp
         state: (2 n_modes,) at t = 0, all modes; only the controlled ones matter.
         s: (n_s,) complex, rad/s.
     """
-    loop, start, gain, _ = _controlled_loop(modes, law, state)
+    loop, start, feedback, _ = _controlled_loop(modes, law, state)
     values, vectors = np.linalg.eig(loop)
     if np.linalg.cond(vectors) < 1e6:
-        weights = -(gain @ vectors) * np.linalg.solve(vectors, start.astype(complex))
+        weights = (feedback @ vectors) * np.linalg.solve(vectors, start.astype(complex))
         return np.asarray(weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None])))
     eye = np.eye(loop.shape[0])
-    return np.array([-gain @ np.linalg.solve(si * eye - loop, start) for si in np.asarray(s)]).T
+    return np.array([feedback @ np.linalg.solve(si * eye - loop, start) for si in np.asarray(s)]).T
 
 
 def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
@@ -104,17 +104,17 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
     gains ½|b_rᵀF(iω_r)|², and one already moving also Re(conj(q_r'(0) + iω_r q_r(0)) b_rᵀ F(iω_r)).
 
     Raises:
-        DesignError: damped residual modes (take a finite time), or a loop that does not settle.
+        DesignError: damping, gyroscopic terms among it (take a finite time), or a loop that does not settle.
     """
     n, index = modes.n_modes, list(law.controlled)
     residual = [r for r in range(n) if r not in law.controlled]
-    if np.linalg.eigvals(_controlled_loop(modes, law, state)[0]).real.max() >= 0:
-        raise DesignError("the controlled modes do not settle, so their work has no limit; take a finite time")
-    if np.diag(modes.damping).max() > 0:
+    if modes.damping.any():
         raise DesignError(
-            "modes are damped, so friction shares the work: use"
+            "damping shares the work or carries it from mode to mode: use"
             " workbench.design.spillover.spillover.finite_spillover(close_loop(modes, law), state, final_time)"
         )
+    if np.linalg.eigvals(_controlled_loop(modes, law, state)[0]).real.max() >= 0:
+        raise DesignError("the controlled modes do not settle, so their work has no limit; take a finite time")
     work = np.zeros(n)
     work[index] = -_energies(modes, state)[index]
     if residual:
@@ -128,16 +128,17 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
 
 
 def _controlled_loop(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats, Floats, Flags]:
-    """A - B K of the controlled modes alone, their part of a state of all modes, K, and the states that these are of.
+    """A of the controlled modes and of all that moves them, their part of a state, the forces' rows, which states.
 
-    The displacement of a rigid mode to which no gain answers moves nothing, and is left out.
+    Others move them where damping couples them. The displacement of a rigid mode to which no gain answers moves
+    nothing, and is left out.
     """
-    a, b = controlled_plant(modes, law.controlled, law.actuators)
-    index = list(law.controlled)
-    loop = a - b @ law.gain
-    kept = loop.any(axis=0)
-    start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
-    return loop[np.ix_(kept, kept)], start[kept], law.gain[:, kept], kept
+    loop, index = close_loop(modes, law), np.array(law.controlled)
+    own = np.asarray(loop.feedback.any(axis=0))
+    own[np.r_[index[modes.omega[index] > 0], modes.n_modes + index]] = True
+    kept = loop.behind(own)
+    start = np.r_[state, np.zeros(kept.size - np.size(state))]
+    return loop.matrix[np.ix_(kept, kept)], start[kept], loop.feedback[:, kept], kept
 
 
 def check_final_time(final_time: float) -> None:
@@ -191,28 +192,30 @@ def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
 
 
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
-    """∫ Fᵀ F dt over all time, exact modal coordinates fed back, by a Lyapunov equation."""
-    gramian, gain, _ = _gramian(modes, law, state)
-    return float(np.trace(gain @ gramian @ gain.T))
+    """∫ Fᵀ F dt over all time, exact modal coordinates fed back, by a Lyapunov equation; inf where they do not fade."""
+    return _integral(modes, law, state, 0.0, 1.0)
 
 
-def _gramian(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats, Flags]:
-    """∫ x xᵀ dt over all time of the controlled modes, with K and which of their states these are."""
-    loop, start, gain, kept = _controlled_loop(modes, law, state)
+def _integral(modes: Modes, law: Law, state: Floats, energies: float, weight: float | Floats) -> float:
+    """∫ (energies Σ (q_r'² + ω_r² q_r²) + Fᵀ R F) dt over all time, the sum over the controlled modes."""
+    loop, start, feedback, kept = _controlled_loop(modes, law, state)
+    poles = np.linalg.eigvals(loop)
+    if poles.real.max() >= -ON_AXIS * np.abs(poles).max():
+        return np.inf
     gramian: Floats = solve_continuous_lyapunov(loop, -np.outer(start, start))
-    return gramian, gain, kept
+    index, weighed = np.array(law.controlled), np.zeros(kept.size)
+    weighed[index], weighed[modes.n_modes + index] = energies * modes.omega[index] ** 2, energies
+    r = feedback.T @ weight @ feedback if np.ndim(weight) else weight * feedback.T @ feedback
+    return float(np.trace((np.diag(weighed[kept]) + r) @ gramian))
 
 
 def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np.ndarray) -> float:
-    """∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt of the controlled modes over all time: one measure for every law.
+    """∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt of the controlled modes over all time; inf where they do not fade.
 
     Args:
         weight: R, a number or (n_actuators, n_actuators); R BᵀB weighs modal forces, R fᵀf.
     """
-    index, (gramian, gain, kept) = list(law.controlled), _gramian(modes, law, state)
-    r = gain.T @ weight @ gain if isinstance(weight, np.ndarray) and weight.ndim else weight * gain.T @ gain
-    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))][kept]) + r
-    return float(np.trace(q @ gramian))
+    return _integral(modes, law, state, 1.0, weight)
 
 
 def modal_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> float:
@@ -234,9 +237,11 @@ def distributed_cost(modes: Modes, controlled: int | Sequence[int], state: np.nd
 
 def _energies(modes: Modes, state: Floats) -> Floats:
     n = modes.n_modes
-    return 0.5 * (state[n:] ** 2 + (modes.omega * state[:n]) ** 2)
+    return 0.5 * (state[n : 2 * n] ** 2 + (modes.omega * state[:n]) ** 2)
 
 
 def energy_gained(loop: ClosedLoop, state: np.ndarray, final_time: float) -> np.ndarray:
     """Energy of each mode at the final time less that at the start, (n_modes,), from the motion itself."""
-    return _energies(loop.modes, expm(loop.matrix * final_time) @ state) - _energies(loop.modes, state)
+    start = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
+    end = expm(loop.matrix * final_time) @ start
+    return _energies(loop.modes, end) - _energies(loop.modes, start)
