@@ -12,12 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
+from scipy.linalg import expm
 
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
+from workbench.design.laws.moments import second_moments, settled_moments
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import motion, switchings
@@ -178,26 +179,6 @@ def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: floa
     return Spillover(power @ weights, law.controlled, final_time)
 
 
-def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
-    """∫_0^t x xᵀ dt for x' = A x: from dM/dt = A M + M Aᵀ + x0 x0ᵀ, doubled up from a short time.
-
-    Balanced first: displacements and rates of a fast structure differ by its frequency, and round-off by its square.
-    """
-    a, (scale, _) = matrix_balance(a, permute=False, separate=True)
-    state = state / scale
-    size = a.shape[0]
-    halvings = max(0, int(np.ceil(np.log2(max(np.abs(a).sum(axis=1).max() * final_time, 1.0)))))
-    h = final_time / 2**halvings
-    block = np.block([[-a, np.outer(state, state)], [np.zeros_like(a), a.T]]) * h
-    exponential = expm(block)
-    transition = exponential[size:, size:].T
-    moments: Floats = transition @ exponential[:size, size:]
-    for _ in range(halvings):
-        moments = moments + transition @ moments @ transition.T
-        transition = transition @ transition
-    return np.asarray(scale[:, None] * moments * scale)
-
-
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
     """∫ Fᵀ F dt over all time, exact modal coordinates fed back, by a Lyapunov equation."""
     gramian, gain, _ = _gramian(modes, law, state)
@@ -207,8 +188,7 @@ def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
 def _gramian(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats, Flags]:
     """∫ x xᵀ dt over all time of the controlled modes, with K and which of their states these are."""
     loop, start, gain, kept = _controlled_loop(modes, law, state)
-    gramian: Floats = solve_continuous_lyapunov(loop, -np.outer(start, start))
-    return gramian, gain, kept
+    return settled_moments(loop, start), gain, kept
 
 
 def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np.ndarray) -> float:
