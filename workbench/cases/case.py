@@ -127,6 +127,15 @@ def in_units(channels: Sequence[Channel], units: Units) -> tuple[Channel, ...]:
     return tuple(replace(channel, unit=units.named(channel.unit)) for channel in channels)
 
 
+def read_units(path: str | Path) -> Units:
+    """The units of a TOML file as a case has, by which results are told; SI where it names none.
+
+    Raises:
+        CaseError: naming the file, the key, the value, and what would be right.
+    """
+    return _units(table_of(Path(path)))
+
+
 def read_rig(path: str | Path) -> Rig:
     """A rig from a TOML file with [structure], [[input]] and [[output]], as a case has; records are not looked at.
 

@@ -58,7 +58,7 @@ SPELLINGS = (
     ("µ", "u"), ("μ", "u"), ("²", "^2"), ("**", "^"), ("·", " "), ("*", " "), ("⋅", " "), ("º", "°"),
     ("/sec", "/s"), ("/s/s", "/s^2"), ("/s2", "/s^2"), (" s^-2", "/s^2"), (" s^-1", "/s"), ("/(s^2)", "/s^2"),
 )  # fmt: skip
-SI_NAME = re.compile(r"\b(m|kg|s|N|Hz)\b")
+SI_NAME = re.compile(r"\b(m|kg|s|N|Hz|J)(?![^\W²³])")
 POWERS = re.compile(r"(/?)\s*([A-Za-z]+)(?:\^(\d))?")
 BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*([^()]*(?:\(s\^2\))?[^()]*)\))")
 AFTER_SLASH = re.compile(r"(.*\S)\s+/\s+(\S.*)")  # as DIN and ISO label axes
@@ -138,7 +138,8 @@ class Units:
 
     def _by_si(self) -> dict[str, str]:
         hertz = "Hz" if self.time == "s" else f"1/{self.time}"
-        return {"m": self.length, "kg": self.mass, "s": self.time, "N": self.force, "Hz": hertz}
+        energy = "J" if (self.force, self.length) == ("N", "m") else f"{self.force} {self.length}"
+        return {"m": self.length, "kg": self.mass, "s": self.time, "N": self.force, "Hz": hertz, "J": energy}
 
 
 def _in_si(text: str, si: str) -> float:
