@@ -6,10 +6,10 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.optimize import least_squares
 
-from workbench.cases.units import Units
 from workbench.draw.gap import plot_budget, plot_unmodelled_force
 from workbench.gap.diagnose import diagnose
 from workbench.records.record import Channel, Record
+from workbench.records.units import Units
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from workbench.cases.case import Case, CaseError, read_case
-from workbench.cases.units import Units
 from workbench.cases.writing import write_case
+from workbench.records.files import read_record
+from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
+from workbench.records.units import Units
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -242,6 +244,29 @@ def test_all_shared_cases_load():
         structure = table["structure"]
         assert case.rig.modes.n_modes == structure.get("modes", len(structure.get("natural_frequencies_hz", ())))
         assert all(isinstance(r, Record) and isinstance(r.output_channels[0], Channel) for r in case.fit)
+
+
+@pytest.mark.parametrize("heads", [["d1", "a1"], ["d1 [mm]", "a1 [mm/s2]"], ["d1 [m]", "a1 [g]"]])
+def test_units_that_a_file_states_become_those_of_the_case(case, tmp_path, heads):
+    folder = write_case(replace(case, units=Units("mm", "t", "s", "N")), tmp_path / "in mm").parent
+    known = read_case(folder).fit[0]
+    file = folder / tomllib.loads((folder / "case.toml").read_text())["record"][0]["file"]
+    stated = known.outputs / ([[1000.0], [9806.65]] if "[g]" in heads[1] else 1.0)
+    table = np.vstack([known.time, known.inputs, stated]).T
+    header = ",".join(["t", *known.input_names, *heads])
+    np.savetxt(file.with_suffix(".csv"), table, "%.17g", ",", header=header, comments="")
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text(text.replace(file.name, file.with_suffix(".csv").name))
+    read = read_case(folder).fit[0]
+    np.testing.assert_allclose(read.outputs, known.outputs, rtol=1e-12)
+    assert [c.unit for c in read.output_channels] == ["mm", "mm/s^2"]
+
+
+def test_units_of_a_file_that_nobody_can_tell_in_those_of_the_case_are_refused(tmp_path):
+    (tmp_path / "r.csv").write_text("t,y [mm]\n" + "".join(f"{0.1 * i:.1f},{i}\n" for i in range(20)))
+    assert read_record(tmp_path / "r.csv", units=Units("in", "t", "s", "N")).outputs[0, -1] == pytest.approx(19 / 25.4)
+    with pytest.raises(RecordFileError, match=r"'Elle' of \[units\] is not known in m: name one of m, cm, mm"):
+        read_record(tmp_path / "r.csv", units=Units("Elle", "t", "s", "N"))
 
 
 def test_inputs_are_held_or_run_straight_as_the_case_says(case, tmp_path):

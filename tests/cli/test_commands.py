@@ -71,6 +71,7 @@ def test_identify_finds_the_modes_and_their_number(tmp_path):
     path, found = write_record(record, tmp_path / "ring.csv"), tmp_path / "found.json"
     result = run("identify", path, "--json", found)
     assert result.exit_code == 0, result.output
+    assert "damping is not of Rayleigh's form" in result.output  # it is modal, and as classical as that
     modes = json.loads(found.read_text())
     exact = (np.arange(1, 5) * np.pi / 10) ** 2 / (2 * np.pi)
     assert len(modes["frequencies_hz"]) == 4
@@ -145,6 +146,14 @@ def test_identify_reads_transfer_functions(tmp_path):
     ):
         refused = run("identify", path, *options)
         assert refused.exit_code == 2 and said in " ".join(refused.output.split())
+
+
+def test_designs_and_placements_are_told_in_the_units_of_the_file(rig, tmp_path):
+    rig.write_text(rig.read_text() + '[units]\nlength = "mm"\nmass = "t"\ntime = "s"\nforce = "N"\n')
+    laws = run("design", rig, "--control", 4, "--weight", 20).output
+    assert "W_C [N mm]  W_R [N mm]" in laws and "R weighs FᵀF" in laws
+    placed = run("place", rig, "--control", 2, "--figure", tmp_path / "places.png")
+    assert "places [mm]" in placed.output and "W_R [N mm]" in placed.output and (tmp_path / "places.png").is_file()
 
 
 def test_design_reports_the_works_of_section_5_8(rig, tmp_path):

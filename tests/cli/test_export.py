@@ -65,6 +65,14 @@ def test_a_kalman_filter_asks_for_the_noise_of_its_outputs(run, rig, tmp_path):
     assert result.exit_code == 2 and "noise_std of d1 is 0" in " ".join(result.stderr.split())
 
 
+def test_a_controller_is_told_in_the_units_of_the_case(run, rig, tmp_path):
+    rig.write_text(RIG + '[units]\nlength = "mm"\nmass = "t"\ntime = "s"\nforce = "kN"\n')
+    assert run("export", rig, "--rate-hz", 100, "--to", tmp_path / "one.c").exit_code == 0
+    header = (tmp_path / "one.h").read_text()
+    for told in ("displacement at x = 0.3, mm", "force at x = 0.45, kN", "displacement of mode 1, t^0.5 mm"):
+        assert told in header
+
+
 @pytest.mark.parametrize(("law", "asked"), [("poles", 0.3), ("imsc", 0.7)])
 def test_the_damping_that_a_law_gives_is_told(run, rig, tmp_path, law, asked):
     """With R = 1 / (2 ζ² ω²) of IMSC and x² = 1 + 2 ζ²: 4 ζ_c² x = 4 ζ_0² + 2 ζ² + 2 (x - 1) (near ζ)."""

@@ -54,6 +54,19 @@ def test_a_planned_test_is_predicted_from_its_inputs_alone(run, case):
     assert "95 % bands from 40 draws" in (case / "out" / "late-prediction.html").read_text()
 
 
+def test_a_prediction_is_told_in_the_units_of_the_case(run, case):
+    file = case / "late" / "case.toml"
+    file.write_text(file.read_text() + '[units]\nlength = "mm"\nmass = "kg"\ntime = "s"\nforce = "mN"\n')
+    rows = np.column_stack([0.01 * np.arange(200), np.ones(200)])
+    rms = []
+    for name, heading, values in (("plain", "F1", rows), ("stated", "F1 [N]", rows * [1.0, 1e-3])):
+        np.savetxt(case / f"{name}.csv", values, delimiter=",", header=f"t,{heading}", comments="")
+        done = run("predict", "late", f"{name}.csv", "--verdict", "verdict.json", "--draws", 40)
+        assert done.exit_code == 0, done.output
+        rms.append(next(line.split()[1:] for line in done.output.splitlines() if line.strip().startswith("d0")))
+    assert rms[0] == rms[1] and rms[0][0] == "mm"
+
+
 @pytest.mark.slow
 def test_tests_are_checked_and_logged_beside_the_case(run, case):
     for name, holds in (("friday", True), ("monday", False)):

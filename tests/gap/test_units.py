@@ -7,12 +7,12 @@ from math import isclose, prod
 import numpy as np
 import pytest
 
-from workbench.cases import units as named_units
 from workbench.cases.case import Case
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Parameter
 from workbench.gap.effects.nonlinear import BEYOND
+from workbench.records import units as named_units
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 from scipy.io import savemat
@@ -102,6 +103,31 @@ def test_channels_of_unequal_length_are_named(tmp_path):
     np.savez(tmp_path / "x.npz", t=np.arange(5.0), a=np.arange(5.0), b=np.arange(4.0))
     with pytest.raises(RecordFileError, match="'b' has 4 samples"):
         read_record(tmp_path / "x.npz")
+
+
+def matlab_7_3(path, structs):
+    """A file as MATLAB writes structs with -v7.3: a group each, rows as columns."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, fields in structs.items():
+            group = file.create_group(name)
+            group.attrs["MATLAB_class"] = np.bytes_("struct")
+            for field, values in fields.items():
+                group.create_dataset(field, data=np.asarray(values).T).attrs["MATLAB_class"] = np.bytes_("double")
+    with open(path, "r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+
+
+@pytest.mark.parametrize("write", [savemat, matlab_7_3])
+def test_the_fields_of_one_struct_are_signals(write, tmp_path):
+    t = 0.01 * np.arange(50.0)
+    fields = {"t": t[:, None], "a1": np.sin(t)[:, None], "a2": np.cos(t)[:, None]}
+    write(tmp_path / "one.mat", {"meas": fields})
+    read = read_record(tmp_path / "one.mat")
+    assert read.output_names == ("a1", "a2") and read.sample_time == pytest.approx(0.01)
+    np.testing.assert_allclose(read.outputs, [np.sin(t), np.cos(t)])
+    write(tmp_path / "two.mat", {"meas": fields, "other": fields})
+    with pytest.raises(RecordFileError, match=r"no signals but in structs: meas with .*a1.*; other with .*'-struct'"):
+        read_record(tmp_path / "two.mat")
 
 
 @pytest.mark.parametrize("ending", [".npz", ".mat"])

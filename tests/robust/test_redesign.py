@@ -17,7 +17,7 @@ from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
-from workbench.robust.on_rig import fitted, impulse_test, tuned
+from workbench.robust.on_rig import default_estimator, fitted, impulse_test, tuned
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.redesign import redesign
@@ -426,6 +426,9 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
         redesign(plain, controller, sample_time=DT, impulse_at=7.0)
     with pytest.raises(DesignError, match="moves none of the controlled modes"):
         redesign(plain, controller, sample_time=DT, impulse_at=0.0)
+    heard = replace(rig, sensors=(Sensor("a", 0.5, "acceleration"),))
+    with pytest.raises(DesignError, match="observers here do not read accelerations"):
+        default_estimator(heard, controller.law, LoopTest(2, DT, 0.8))
     late = uncertain(rig, effect("actuator_delay", "all", delay=0.04))
     with pytest.raises(DesignError, match=r"delay of F1, 40 ms, is 40,000 samples .* sample at 1.25e\+04 Hz or slower"):
         redesign(late, controller, sample_time=1e-6, test=LoopTest(2, 1e-6, 0.8))

@@ -1,6 +1,6 @@
 """A case folder: a nominal model, and records measured on the real structure."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,11 @@ from workbench.cases.tables import (
     tables,
     text,
 )
-from workbench.cases.units import SI, Units
 from workbench.records.files import read_record
 from workbench.records.limits import RecordFileError, check_file
 from workbench.records.npz_file import arrays as load_arrays
-from workbench.records.record import HOLDS, Record
+from workbench.records.record import HOLDS, Channel, Record
+from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.rig import Rig, derivative_of
 from workbench.rig.sensors import MEASURED, Sensor
@@ -96,7 +96,7 @@ def read_case(folder: str | Path) -> Case:
     rig = _rig(table, path)
     hold, units = _hold(table, str(path)), _units(table)
     records = [
-        (_in_units(_read_record(folder, {"input_hold": hold, **entry}, rig, path), units), _use(entry, path))
+        (_read_record(folder, {"input_hold": hold, **entry}, rig, path, units), _use(entry, path))
         for entry in tables(table, "record", path)
     ]
     fit = tuple(record for record, use in records if use == "fit")
@@ -122,13 +122,18 @@ def _units(table: dict[str, Any]) -> Units:
     return Units(**{name: text(units, name, "[units]") for name in UNITS})
 
 
-def _in_units(record: Record, units: Units) -> Record:
-    """The record with its channels in the units of the case."""
-    inputs, outputs = (
-        tuple(replace(channel, unit=units.named(channel.unit)) for channel in channels)
-        for channels in (record.input_channels, record.output_channels)
-    )
-    return replace(record, input_channels=inputs, output_channels=outputs)
+def in_units(channels: Sequence[Channel], units: Units) -> tuple[Channel, ...]:
+    """Channels of a rig, whose units have SI names, by those of a case."""
+    return tuple(replace(channel, unit=units.named(channel.unit)) for channel in channels)
+
+
+def read_units(path: str | Path) -> Units:
+    """The units of a TOML file as a case has, by which results are told; SI where it names none.
+
+    Raises:
+        CaseError: naming the file, the key, the value, and what would be right.
+    """
+    return _units(table_of(Path(path)))
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -380,7 +385,7 @@ def _use(entry: dict[str, Any], path: Path) -> str:
     return str(use)
 
 
-def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path) -> Record:
+def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, units: Units) -> Record:
     name = entry["name"]
     where = f"{path}: record {name!r}"
     check_keys(entry, RECORD, where)
@@ -388,7 +393,7 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path) -> R
     if sample_time <= 0:
         raise CaseError(f"{where}: sample_time must be positive; got {sample_time:g}")
     file = inside(folder, text(entry, "file", where), where)
-    arrays = _arrays(file, where)
+    arrays = _arrays(file, where, units)
     names = {a.name for a in rig.actuators} | {s.name for s in rig.sensors}
     missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
     if missing:
@@ -424,7 +429,12 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path) -> R
                 f"{file}: output {sensor.name!r} is flat at {level:g}: check the sensor and its cable, or leave it out"
             )
     inputs, outputs = (np.array([arrays[port.name] for port in ports]) for ports in (rig.actuators, rig.sensors))
-    return rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=_hold(entry, where))
+    record = rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=_hold(entry, where))
+    return replace(
+        record,
+        input_channels=in_units(record.input_channels, units),
+        output_channels=in_units(record.output_channels, units),
+    )
 
 
 def signals_of(record: Record) -> dict[str, np.ndarray]:
@@ -433,12 +443,12 @@ def signals_of(record: Record) -> dict[str, np.ndarray]:
     return {"t": record.time, **dict(channels)}
 
 
-def _arrays(file: Path, where: str) -> dict[str, np.ndarray]:
+def _arrays(file: Path, where: str, units: Units) -> dict[str, np.ndarray]:
     if not file.is_file():
         raise CaseError(f"{where}: there is no file {file}")
     try:
         check_file(file)
-        arrays = load_arrays(file) if file.suffix == ".npz" else signals_of(read_record(file))
+        arrays = load_arrays(file) if file.suffix == ".npz" else signals_of(read_record(file, units=units))
     except RecordFileError as error:
         raise CaseError(str(error)) from error
     for name, values in arrays.items():

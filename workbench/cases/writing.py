@@ -9,7 +9,7 @@ import numpy as np
 
 from workbench.cases.case import Case, signals_of
 from workbench.cases.points import write_points
-from workbench.cases.units import SI
+from workbench.records.units import SI
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, shape_of
 from workbench.rig.sensors import MEASURED, Sensor

@@ -101,7 +101,9 @@ def observed(
         )
     sensors = [s for s in rig.sensors if MEASURED[s.quantity][1] < 2]
     if not sensors:
-        raise ValueError("every output is an acceleration; an observer needs displacement or velocity, so add a sensor")
+        raise ValueError(
+            "every output is an acceleration, which no observer here reads; add one of displacement or velocity"
+        )
     if estimator == "modal-filter":
         rates = {s.at for s in sensors if s.quantity == "velocity"}
         places = [s.at for s in sensors if s.quantity == "displacement" and s.at in rates]

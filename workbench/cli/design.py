@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.rig_file import impulse_place, read_structure_rig
+from workbench.cli.rig_file import impulse_place, read_structure_rig, toml_of
 from workbench.cli.terminal import check_target, guarded, say, show_table, write_json
 from workbench.structure.printed import command_headings, place_text
 
@@ -40,13 +40,14 @@ def design(
     """
     import numpy as np
 
+    from workbench.cases.case import read_units
     from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.comparison import compare, laws_of, through_sensors
     from workbench.design.spillover.robustness import perturbed_modes, stable_share
     from workbench.rig.actuators import command_unit
 
     check_target(json_path)
-    found = read_structure_rig(rig)
+    found, units = read_structure_rig(rig), read_units(toml_of(rig))
     actuators = [a for a in found.actuators if not a.direct]
     n = len(actuators) if control is None else control
     modes, at = found.modes, impulse_place(found, impulse_at)
@@ -68,7 +69,11 @@ def design(
     say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {struck}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
-    show_table(("law", "cost", *command_headings(unit), "W_C [J]", "W_R [J]", "largest W_r", "loop"), shown)
+    told = map(units.named, (*command_headings(unit), "W_C [J]", "W_R [J]"))
+    show_table(("law", "cost", *told, "largest W_r", "loop"), shown)
+    if {row.law.name for row in rows} >= {"IMSC", "coupled LQR"}:
+        say("  R weighs FᵀF in the cost and coupled LQR, but modal forces fᵀf in IMSC: their order depends on masses")
+        say("  and units; --damping compares the laws at equal poles")
     tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]

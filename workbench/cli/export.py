@@ -7,6 +7,7 @@ import typer
 
 from workbench.cli import options
 from workbench.cli.control import check_rate, count_of, damping_by, law_from, observed
+from workbench.cli.rig_file import toml_of
 from workbench.cli.terminal import check_target, guarded, say, short, tell
 
 
@@ -14,7 +15,12 @@ from workbench.cli.terminal import check_target, guarded, say, short, tell
 def export(
     rig: options.RigPath,
     rate_hz: Annotated[float, typer.Option(help="Sampling rate at which the controller is to run.")],
-    to: Annotated[Path, typer.Option(metavar="FILE", help="File to write: NAME.c (with NAME.h), NAME.py or NAME.mat.")],
+    to: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE", help="File to write: NAME.c (with NAME.h), NAME.py or NAME.mat; NAME of letters, digits, _."
+        ),
+    ],
     law: options.LawName = "imsc",
     control: options.Control = None,
     weight: options.LawWeight = None,
@@ -33,17 +39,20 @@ def export(
 
     Example: workbench export case.toml --control 2 --damping 0.05 --rate-hz 500 --to controller.c
     """
-    from workbench.cases.case import read_rig
+    from workbench.cases.case import read_rig, read_units
     from workbench.design.export.export import export as hand_over
     from workbench.rig.sensors import MEASURED
 
     check_target(to)
     check_rate(rate_hz)
-    found = read_rig(rig / "case.toml" if rig.is_dir() else rig)
+    found = read_rig(toml_of(rig))
     chosen = law_from(found, law, count_of(found, control), weight, damping)
     unread = [s.name for s in found.sensors if MEASURED[s.quantity][1] > 1]
     observer = observed(found, chosen, estimator, disturbance=disturbance, sample_time=1.0 / rate_hz)
-    design = hand_over(found.modes, observer, to, sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms)
+    design = hand_over(
+        found.modes, observer, to,
+        sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms, units=read_units(toml_of(rig)),
+    )  # fmt: skip
     tell(design)
     say(f"  {damping_by(found.modes, chosen)}")
     if unread:

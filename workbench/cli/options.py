@@ -35,14 +35,16 @@ ImpulseAt = Annotated[
         help="Place of the impulse: m (X,Y on a plate), a point or an input by name; the hammer's unless given.",
     ),
 ]
-Weight = Annotated[float, typer.Option(help="Control weight R, of the forces in the quadratic cost.")]
+Weight = Annotated[
+    float, typer.Option(help="Control weight R: of forces in the cost and coupled LQR, of modal forces in IMSC.")
+]
 LawName = Annotated[str, typer.Option(help="Control law: imsc, coupled, poles or on-off.")]
 Control = Annotated[
     int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
 ]
 LawWeight = Annotated[
     float | None,
-    typer.Option("--weight", help="Control weight R, of the forces in the quadratic cost; in place of --damping."),
+    typer.Option("--weight", help="Control weight R, of forces (imsc: modal forces); in place of --damping."),
 ]
 Damping = Annotated[
     float | None,

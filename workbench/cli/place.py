@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.rig_file import impulse_place, place_in, read_structure_rig, typed_place
+from workbench.cli.rig_file import impulse_place, place_in, read_structure_rig, toml_of, typed_place
 from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, listed, middle
 from workbench.structure.printed import command_headings, place_text
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from workbench.design.placement.limits import Limits
     from workbench.design.placement.placement import PlacementTask
     from workbench.design.placement.task import Placement
+    from workbench.records.units import Units
     from workbench.rig.rig import Rig
 
 LEAST_SPACING = 1 / 20  # of the size of the structure, unless one is given
@@ -65,6 +66,7 @@ def place(
     """
     import numpy as np
 
+    from workbench.cases.case import read_units
     from workbench.design.laws.law import DesignError
     from workbench.design.placement.certificate import certify
     from workbench.design.placement.limits import Limits
@@ -76,7 +78,7 @@ def place(
     check_target(json_path, picture)
     if certified_gap is not None and not 0 < certified_gap < 1:
         raise ValueError(f"--certify is a share between 0 and 1; got {certified_gap:g}")
-    found = read_structure_rig(rig)
+    found, units = read_structure_rig(rig), read_units(toml_of(rig))
     modes, struck = found.modes, impulse_place(found, impulse_at)
     if not modes.proportional:
         say("damping couples the modes: places are compared without its coupling terms")
@@ -136,11 +138,12 @@ def place(
     )
     where = "points" if isinstance(domain, NamedPoints) else "places [m]"
     unit = command_unit([task.actuator])
-    show_table((where, "W_R [J]", *command_headings(unit), "condition number of B", ""), shown)
+    told = map(units.named, (where, "W_R [J]", *command_headings(unit)))
+    show_table((*told, "condition number of B", ""), shown)
     if certificate is not None:
         say(f"  {certificate}")
     if picture is not None:
-        _draw(picture, task, {"least work": best, usual.status: usual}, limits, struck)
+        _draw(picture, task, {"least work": best, usual.status: usual}, limits, struck, units)
     write_json(
         json_path,
         {
@@ -203,15 +206,25 @@ def _zone(domain: Domain, text: str) -> tuple[Place, Place]:
 
 
 def _draw(
-    path: Path, task: "PlacementTask", placements: "dict[str, Placement]", limits: "Limits", struck: Place
+    path: Path,
+    task: "PlacementTask",
+    placements: "dict[str, Placement]",
+    limits: "Limits",
+    struck: Place,
+    units: "Units",
 ) -> None:
-    """The best placement as a picture: over a plate's nodal lines, elsewhere its work mode by mode."""
+    """The placements as a picture: along a member, over a plate's nodal lines, at points the best's work by mode."""
+    from workbench.draw.design import plot_member_placement
     from workbench.draw.plot import plot
     from workbench.draw.surface import plot_surface_placement
 
-    if isinstance(task.modes.domain, Rectangle):
+    domain = task.modes.domain
+    if isinstance(domain, Rectangle):
         figure = plot_surface_placement(task, placements, limits=limits, impulse_at=struck)  # type: ignore[arg-type]
+    elif isinstance(domain, Interval):
+        figure = plot_member_placement(task, placements, limits=limits, impulse_at=struck, units=units)  # type: ignore[arg-type]
     else:
         figure = plot(next(iter(placements.values())))
+        figure.axes[0].set_ylabel(units.named(figure.axes[0].get_ylabel()))
     figure.savefig(path)
     say(f"  figure     {short(path)}")

@@ -7,6 +7,11 @@ from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Patch, Place, PlaceError
 
 
+def toml_of(path: Path) -> Path:
+    """The TOML file of a rig: itself, or that of a case folder."""
+    return path / "case.toml" if path.is_dir() else path
+
+
 def read_structure_rig(path: Path) -> Rig:
     """The rig of a TOML file or a case folder; an actuator at a node stands at its point in the actuator's direction.
 
@@ -15,7 +20,7 @@ def read_structure_rig(path: Path) -> Rig:
     """
     from workbench.cases.case import read_rig
 
-    found = read_rig(path / "case.toml" if path.is_dir() else path)
+    found = read_rig(toml_of(path))
     domain = found.modes.domain
     if isinstance(domain, NamedPoints) and domain.positions is None:
         raise ValueError(

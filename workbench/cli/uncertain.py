@@ -72,14 +72,16 @@ def predicted(
     report: Callable[[str, float], None],
 ) -> "Prediction":
     """The prediction of a record by the corrected rig, with bands by its uncertainty."""
+    from workbench.cases.case import in_units
     from workbench.robust.prediction import check_draws, predict
 
     check_draws(draws)  # before the diagnosis
     uncertain, noise = uncertain_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))
-    return predict(
+    found = predict(
         uncertain, record, noise_std=noise, draws=draws, seed=seed,
         progress=lambda what, done: report(what, 0.7 + 0.3 * done),
     )  # fmt: skip
+    return replace(found, channels=in_units(found.channels, case.units))
 
 
 def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...] | None]":
@@ -114,7 +116,7 @@ def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
         return own[name]
     if not Path(name).is_file():
         raise ValueError(f"{name!r} is neither a file nor a record of the case, which are {', '.join(own)}")
-    read = read_record(name, sample_rate_hz=sample_rate_hz)
+    read = read_record(name, sample_rate_hz=sample_rate_hz, units=case.units)
     return _with_inputs(read, tuple(actuator.name for actuator in case.rig.actuators))
 
 

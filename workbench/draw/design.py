@@ -7,9 +7,13 @@ from matplotlib.figure import Figure
 
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.controlled_modes import ControlledModeCount
+from workbench.design.placement.limits import Limits
+from workbench.design.placement.placement import Placement
+from workbench.design.placement.task import PlacementTask, extent
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, new_figure
+from workbench.records.units import SI, Units
 from workbench.structure.printed import place_text
 
 SHOWN_SHARE = 1e-5
@@ -81,6 +85,47 @@ def _without_residual_modes() -> Figure:
     figure, ax = new_figure(width=9, height=1.5)
     ax.axis("off")
     ax.text(0.5, 0.5, "every mode is controlled: no mode is residual, and nothing spills over", ha="center")
+    return figure
+
+
+def plot_member_placement(
+    task: PlacementTask,
+    placements: Mapping[str, Placement],
+    *,
+    limits: Limits | None = None,
+    impulse_at: float | None = None,
+    units: Units = SI,
+) -> Figure:
+    """Actuators along a structure over mode n + 1, the lowest residual one, and the work in each residual mode beside.
+
+    Args:
+        placements: by name, drawn in its colour, each on a line of its own.
+        limits: of which the forbidden zones are hatched.
+        impulse_at: where the impulse acts, m, marked by a star.
+        units: by which the axes are told.
+    """
+    n, modes = task.n_controlled, task.modes
+    figure, (left, right) = new_figure(1, 2, width=11, height=3.8)
+    x = np.linspace(0.0, modes.length, 201)
+    shape = modes.phi(x)[:, n]
+    left.plot(x, shape / np.abs(shape).max(), color=GREY, label=f"mode {n + 1}, the lowest residual one")
+    left.axhline(0.0, color=GREY, linewidth=0.8)
+    for i, (low, high) in enumerate(limits.forbidden if limits is not None else ()):
+        left.axvspan(low, high, facecolor="white", edgecolor=GREY, hatch="////", label="forbidden" if i == 0 else None)
+    numbers, width = n + 1 + np.arange(modes.n_modes - n), 0.8 / len(placements)
+    for i, (name, placement) in enumerate(placements.items()):
+        label = f"{name}: W_R = {placement.residual_work:.2g}"
+        height = np.full(n, -1.25 - 0.2 * i)
+        half = 0.5 * extent(task.actuator)
+        left.errorbar(placement.positions, height, xerr=half, fmt="o", color=COLOURS[i], markersize=8, label=label)
+        right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
+    if impulse_at is not None:
+        left.plot(impulse_at, 1.2, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse")
+    left.set(xlabel=units.named("x [m]"), yticks=[], title="where the actuators stand")
+    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=9, ncols=2)
+    most = max(float(placement.by_mode.max()) for placement in placements.values())
+    right.set(xlabel="residual mode", ylabel=units.named("spillover work, W_r [J]"), xticks=few_ticks(numbers))
+    right.set(yscale="log", ylim=(SHOWN_SHARE * most, 3.0 * most))
     return figure
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.cases.case import Case
-from workbench.cases.units import SI, Units
 from workbench.deadline import Deadline
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, names_in
@@ -37,6 +36,7 @@ from workbench.gap.report.verdict import Verdict
 from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.gap.search.finish import with_equals
 from workbench.records.record import Record, as_records
+from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict

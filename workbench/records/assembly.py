@@ -15,7 +15,7 @@ import numpy as np
 
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
-from workbench.records.units import Unit, split_unit, unit_named
+from workbench.records.units import SI, Unit, Units, split_unit, unit_named
 
 UNIFORM = 1e-3  # of the time step
 PART = 2**20  # steps looked at together
@@ -77,6 +77,7 @@ def record_of(
     *,
     sample_rate_hz: float | None,
     inputs: Sequence[str],
+    into: Units = SI,
 ) -> Record:
     """The record that a file held.
 
@@ -87,6 +88,7 @@ def record_of(
         header: the description as a JSON text.
         sample_rate_hz: where the file has no time.
         inputs: names of signals that went in, where the file does not say.
+        into: the units that those which the file states become.
 
     Raises:
         RecordFileError: naming the file, channel and row, and what would be right.
@@ -101,7 +103,7 @@ def record_of(
             row = int(np.argmax(bad))
             raise RecordFileError(f"{path}, channel {_name(key)!r}, row {row + 1}: {values[row]} is not a number")
     sampling = _sampling(path, time, n_samples, described, sample_rate_hz)
-    units = _units(key for key in signals if key not in described.channels)
+    units = _units(path, (key for key in signals if key not in described.channels), into)
     names = {key: split_unit(_name(key))[0] if key in units else _name(key) for key in signals}
     for name in inputs:
         if name not in names.values() and name not in map(_name, signals):
@@ -202,23 +204,26 @@ def _channel(path: Path, name: str, facts: Mapping[str, Any], unit: Unit | None)
         raise RecordFileError(f"{path}, channel {name!r}: {error}") from error
 
 
-def _units(keys: Iterable[str]) -> dict[str, Unit]:
+def _units(path: Path, keys: Iterable[str], into: Units) -> dict[str, Unit]:
     """The units that names of signals end in; none for names that would be alike without them."""
     split = {key: split_unit(_name(key)) for key in keys}
     alike = Counter(base for base, _ in split.values())
     found = {key: unit_named(text) for key, (base, text) in split.items() if text and alike[base] == 1}
-    return {key: unit for key, unit in found.items() if unit is not None and unit.quantity != "time"}
+    try:
+        return {key: into.taken(unit) for key, unit in found.items() if unit is not None and unit.quantity != "time"}
+    except ValueError as error:
+        raise RecordFileError(f"{path}: {error}") from None
 
 
 def unit_remark(name: str, written: str, unit: Unit) -> str:
-    """What to say of a signal that was brought to SI; nothing where it was in it."""
+    """What to say of a signal that was brought to other units; nothing where it was in it."""
     if unit.si == "counts":
         return f"{name}: in counts of unstated sensitivity; modes have no scale"
     return "" if unit.factor == 1.0 else f"{name}: {written} taken as {unit.factor:g} {unit.si}"
 
 
 def _rows(signals: Sequence[np.ndarray], units: Sequence[Unit | None], sampling: Sampling) -> np.ndarray:
-    """The signals one below the other, in SI and at equal steps; read-only, so that a record takes them as they are."""
+    """The signals one below the other, in their units, at equal steps; read-only, for a record to take as they are."""
     rows = np.array(signals, float)
     for row, unit in zip(rows, units, strict=True):
         if unit is not None and unit.factor != 1.0:

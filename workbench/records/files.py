@@ -18,6 +18,7 @@ from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_fil
 from workbench.records.named_arrays import signals_of
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions, complex_columns, holds_transfer, transfer_of
+from workbench.records.units import SI, Units
 
 FORMATS = {
     ".csv": csv_file,
@@ -45,11 +46,12 @@ def read_record(
     inputs: tuple[str, ...] = (),
     input_hold: str | None = None,
     limits: Limits = DEFAULT,
+    units: Units = SI,
 ) -> Record:
     """A record from a file; the format goes by its ending.
 
-    Units that the file states, behind the names as in `Acc [g]` or beside the data, become SI, and unequal time steps
-    equal ones: `Record.remarks` says so.
+    Units that the file states, behind the names as in `Acc [g]` or beside the data, become SI or those of `units`, and
+    unequal time steps equal ones: `Record.remarks` says so.
 
     Args:
         path: of a .csv, .txt, .asc, .dat, .tsv, .npz, .mat, .h5, .hdf5, .uff, .unv, .tdms or .wav file.
@@ -58,12 +60,15 @@ def read_record(
         input_hold: "zero" or "first", how inputs run between samples; as the file says unless given, "zero" where it
             does not, as those of other programs never do.
         limits: of memory and processor time.
+        units: in which the signals are wanted, those of a case say; numbers without a unit stay as they are.
 
     Raises:
         RecordFileError: naming file, channel and row, and what would be right; transfer functions; more than the
-            limits allow.
+            limits allow; a stated unit that cannot be told in `units`.
     """
-    found = read_measured(path, sample_rate_hz=sample_rate_hz, inputs=inputs, input_hold=input_hold, limits=limits)
+    found = read_measured(
+        path, sample_rate_hz=sample_rate_hz, inputs=inputs, input_hold=input_hold, limits=limits, units=units
+    )
     if isinstance(found, TransferFunctions):
         raise RecordFileError(
             f"{path} is complex: it holds transfer functions, no record. Their modes are found by `workbench identify`,"
@@ -79,6 +84,7 @@ def read_measured(
     inputs: tuple[str, ...] = (),
     input_hold: str | None = None,
     limits: Limits = DEFAULT,
+    units: Units = SI,
 ) -> Record | TransferFunctions:
     """What a file holds: a record, or transfer functions where it is complex.
 
@@ -88,7 +94,7 @@ def read_measured(
     `NAME magnitude`, `NAME phase [deg]`.
 
     Args:
-        path, inputs, input_hold, limits: as `read_record`.
+        path, inputs, input_hold, limits, units: as `read_record`; transfer functions are always in SI.
         sample_rate_hz: where the file itself has no time, or no lines: they then go from zero to half of it.
 
     Raises:
@@ -113,7 +119,7 @@ def read_measured(
                 f"{path} holds transfer functions, which name no inputs; leave them and their hold out"
             )
         return transfer_of(path, arrays, sample_rate_hz=sample_rate_hz)
-    record = record_of(path, time, signals, header, sample_rate_hz=sample_rate_hz, inputs=inputs)
+    record = record_of(path, time, signals, header, sample_rate_hz=sample_rate_hz, inputs=inputs, into=units)
     return record if input_hold is None else replace(record, input_hold=input_hold)
 
 

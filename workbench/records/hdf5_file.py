@@ -12,7 +12,7 @@ import numpy as np
 
 from workbench.records.confined import load_confined
 from workbench.records.limits import BYTES_PER_NUMBER, Limits, RecordFileError, check_counts
-from workbench.records.named_arrays import HEADER, numbered
+from workbench.records.named_arrays import HEADER, check_struct, numbered
 from workbench.records.transfer_functions import PLACES
 from workbench.records.units import unit_named
 
@@ -24,9 +24,15 @@ arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """The numbers and texts in the file itself, sizes known first, and its header; for a process of its own."""
     with h5py.File(path, "r") as file:
-        names = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
-        found = {name: file[name] for name in names if isinstance(file[name], h5py.Dataset)}
-        found = {name: dataset for name, dataset in found.items() if _is_read(dataset)}
+        held = _held(file)
+        found = {name: each for name, each in held.items() if isinstance(each, h5py.Dataset) and _is_read(each)}
+        structs = {name: _held(each) for name, each in held.items() if each.attrs.get("MATLAB_class") == b"struct"
+                   and isinstance(each, h5py.Group)}  # fmt: skip
+        if structs and not any(_is_signal(each) for each in found.values()):
+            fields = {name: each for name, each in next(iter(structs.values())).items()
+                      if isinstance(each, h5py.Dataset) and _is_read(each)}  # fmt: skip
+            check_struct(path, structs, fields)
+            found = fields | found
         check_counts(path, len(found), sum(map(_numbers, found.values())), limits)
         for name, dataset in found.items():
             if dataset.is_virtual or dataset.external:
@@ -58,6 +64,15 @@ def _in_units(name: str, dataset: Any) -> tuple[str, np.ndarray]:
 def is_hdf5(path: Path) -> bool:
     """Whether the file is one of HDF5, whatever its ending."""
     return bool(h5py.is_hdf5(path))
+
+
+def _held(group: Any) -> dict[str, Any]:
+    """What a group itself holds, by name; no links to elsewhere."""
+    return {name: group[name] for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)}
+
+
+def _is_signal(dataset: Any) -> bool:
+    return dataset.dtype.base.kind in "fiubc" and (dataset.size or 0) > 1
 
 
 def _is_text(dataset: Any) -> bool:

@@ -1,7 +1,7 @@
 """Signals out of named arrays, as NPZ, MAT and HDF5 hold them."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,25 @@ Signals = tuple[np.ndarray | None, dict[str, np.ndarray], str | None]
 def numbered(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The signals under names that every format allows; their own travel in the header."""
     return {f"{NUMBERED}{i}": np.asarray(values) for i, values in enumerate(signals.values())}
+
+
+def check_struct(path: Path, structs: Mapping[str, Collection[str]], read: Collection[str]) -> None:
+    """Refuse structs of MATLAB, and their fields, that stand where signals should, but for one with fields to read.
+
+    Args:
+        structs: fields, by struct.
+        read: fields of the one that hold signals.
+
+    Raises:
+        RecordFileError: naming them.
+    """
+    if len(structs) == 1 and read:
+        return
+    told = "; ".join(f"{name} with {', '.join(fields) or 'no fields'}" for name, fields in structs.items())
+    raise RecordFileError(
+        f"{path} holds no signals but in structs: {told}. One struct is read, whose fields are signals: write it"
+        " alone, as by save('x.mat', '-struct', 'NAME')"
+    )
 
 
 def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:

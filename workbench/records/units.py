@@ -1,7 +1,7 @@
-"""Units as instruments write them, and what they are in SI."""
+"""Units as instruments write them, what they are in SI, and sets of units that go together."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 
 
@@ -58,6 +58,8 @@ SPELLINGS = (
     ("µ", "u"), ("μ", "u"), ("²", "^2"), ("**", "^"), ("·", " "), ("*", " "), ("⋅", " "), ("º", "°"),
     ("/sec", "/s"), ("/s/s", "/s^2"), ("/s2", "/s^2"), (" s^-2", "/s^2"), (" s^-1", "/s"), ("/(s^2)", "/s^2"),
 )  # fmt: skip
+SI_NAME = re.compile(r"\b(m|kg|s|N|Hz|J)(?![^\W²³])")
+POWERS = re.compile(r"(/?)\s*([A-Za-z]+)(?:\^(\d))?")
 BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*([^()]*(?:\(s\^2\))?[^()]*)\))")
 AFTER_SLASH = re.compile(r"(.*\S)\s+/\s+(\S.*)")  # as DIN and ISO label axes
 TIME = {"t", "time", "zeit", "temps", "tiempo", "x_value", "timestamp", "time stamp", "elapsed time", "relative time"}
@@ -102,3 +104,52 @@ def time_base(name: str) -> str:
     numbered = NUMBERED.fullmatch(base)
     base = (underscore[1] if underscore else numbered[1] if numbered else base).lower()
     return base if base in TIME else ""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Names of a consistent set of units, by which numbers are read and results are told.
+
+    Attributes:
+        length, mass, time, force: such as "mm", "t", "s", "N"; force is that of mass · length / time².
+    """
+
+    length: str = "m"
+    mass: str = "kg"
+    time: str = "s"
+    force: str = "N"
+
+    def named(self, unit: str) -> str:
+        """A unit by its SI names, such as N s^2/m^2, by those of this set."""
+        own = self._by_si()
+        return SI_NAME.sub(lambda name: own[name[0]], unit)
+
+    def taken(self, unit: Unit) -> Unit:
+        """A unit in terms of this set in place of SI: of mm/s^2 one, where length is in mm and time in s.
+
+        Raises:
+            ValueError: a name of this set of which nobody knows what it is in SI.
+        """
+        factor, own = unit.factor, self._by_si()
+        for below, name, power in POWERS.findall(unit.si):
+            if own.get(name, name) != name:
+                factor *= _in_si(own[name], name) ** (int(power or 1) * (1 if below else -1))
+        return replace(unit, factor=factor, si=self.named(unit.si))
+
+    def _by_si(self) -> dict[str, str]:
+        hertz = "Hz" if self.time == "s" else f"1/{self.time}"
+        energy = "J" if (self.force, self.length) == ("N", "m") else f"{self.force} {self.length}"
+        return {"m": self.length, "kg": self.mass, "s": self.time, "N": self.force, "Hz": hertz, "J": energy}
+
+
+def _in_si(text: str, si: str) -> float:
+    unit = unit_named(text)
+    if unit is None or unit.si != si:
+        known = ", ".join(name for name, one in UNITS.items() if one.si == si)
+        raise ValueError(
+            f"{text!r} of [units] is not known in {si}: name one of {known}, or leave units out of the file"
+        )
+    return unit.factor
+
+
+SI = Units()

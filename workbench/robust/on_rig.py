@@ -166,7 +166,10 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
     """
     sensors = without([s for s in rig.sensors if MEASURED[s.quantity][1] < 2])
     if not sensors:
-        raise DesignError("no sensor of the rig reads displacement or velocity, so the state is unobservable; add one")
+        raise DesignError(
+            "no sensor of the rig reads displacement or velocity, and the observers here do not read accelerations; add"
+            " one that does"
+        )
     index = list(law.controlled)
     at = rig.actuators[0].at if test.impulse_at is None else test.impulse_at
     speed = np.abs(test.impulse * rig.modes.phi_at(at)[index])

@@ -1,6 +1,7 @@
 """A design handed over: python-control objects, a MAT file, or a step function in C or Python."""
 
 import keyword
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from workbench.design.export.sampled import SampledDesign, sample_design
 from workbench.design.export.source import source
 from workbench.design.laws.law import Law
 from workbench.design.laws.on_off import OnOffLaw
+from workbench.records.units import SI, Units
 from workbench.structure.modes import Modes
 
 LANGUAGES = {".c": "c", ".py": "python"}
@@ -24,6 +26,7 @@ def export(
     *,
     sample_rate_hz: float,
     computing_delay: float = 0.0,
+    units: Units = SI,
 ) -> SampledDesign:
     """The controller as a computer runs it once a sample, written to a file where a path is given.
 
@@ -35,6 +38,7 @@ def export(
         path: NAME.c (with NAME.h beside it), NAME.py or NAME.mat.
         sample_rate_hz: at which it is to run, Hz.
         computing_delay: from a reading to the first effect of its command, beside the actuators' own delays, s.
+        units: by which the file tells readings, commands and states.
 
     Raises:
         DesignError: a law that reads no sensors, a loop that is unstable, or a rate too slow for the modes; see
@@ -43,8 +47,10 @@ def export(
     """
     kind = None if path is None else check_name(Path(path))
     design = sample_design(modes, controller, sample_rate_hz=sample_rate_hz, computing_delay=computing_delay)
+    design = replace(design, units=units)
     if path is not None and kind is not None:
-        write_controller(design.controller, path, readings=design.readings, commands=design.commands)
+        named = replace(design.controller, states=design.states)
+        write_controller(named, path, readings=design.readings, commands=design.commands)
     return design
 
 

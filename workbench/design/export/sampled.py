@@ -13,6 +13,7 @@ from workbench.design.export.source import command_words, reading_words
 from workbench.design.laws.law import DesignError, Law, numbered
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import close_with
+from workbench.records.units import SI, Units
 from workbench.renamed import Renamed
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed
@@ -34,6 +35,7 @@ class SampledDesign(Printed):
         computing_delay: from a reading to the first effect of its command, s.
         poles: (n_states,) of the sampled loop of all modes, in the z-plane.
         delay_margin: further delay until a pole leaves the unit circle, s; infinite where 40 samples do not do it.
+        units: by which readings, commands and states are told.
     """
 
     modes: Modes
@@ -42,6 +44,7 @@ class SampledDesign(Printed):
     computing_delay: float
     poles: np.ndarray
     delay_margin: float
+    units: Units = SI
 
     def __post_init__(self) -> None:
         freeze(self, "poles", dtype=complex)
@@ -66,17 +69,17 @@ class SampledDesign(Printed):
     @property
     def states(self) -> tuple[str, ...]:
         """What each state of the controller is, in order."""
-        return self.controller.states
+        return tuple(map(self.units.named, self.controller.states))
 
     @property
     def readings(self) -> tuple[str, ...]:
         """What each reading is, in order."""
-        return reading_words(self.modes.domain, self.source.sensors)
+        return reading_words(self.modes.domain, self.source.sensors, self.units)
 
     @property
     def commands(self) -> tuple[str, ...]:
         """What each command is, in order."""
-        return command_words(self.modes.domain, self.source.law.actuators)
+        return command_words(self.modes.domain, self.source.law.actuators, self.units)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         late = f", {1e3 * self.computing_delay:.4g} ms to compute" if self.computing_delay else ""

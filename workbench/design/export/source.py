@@ -10,6 +10,7 @@ from jinja2 import Environment, StrictUndefined
 
 from workbench.design.estimation.digital import DigitalController
 from workbench.records.record import QUANTITIES
+from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator, force_unit
 from workbench.rig.sensors import Sensor
 from workbench.structure.domain import Domain
@@ -122,18 +123,20 @@ def _equations(given: _Numbers) -> list[str]:
     return lines
 
 
-def reading_words(domain: Domain, sensors: Sequence[Sensor]) -> tuple[str, ...]:
+def reading_words(domain: Domain, sensors: Sequence[Sensor], units: Units = SI) -> tuple[str, ...]:
     """What each reading is: sensor, quantity, place and unit."""
-    return tuple(f"{s.name}: {s.quantity} at {domain.text(s.at, DIGITS)}, {QUANTITIES[s.quantity]}" for s in sensors)
+    return tuple(
+        f"{s.name}: {s.quantity} at {domain.text(s.at, DIGITS)}, {units.named(QUANTITIES[s.quantity])}" for s in sensors
+    )
 
 
-def command_words(domain: Domain, actuators: Sequence[Actuator]) -> tuple[str, ...]:
+def command_words(domain: Domain, actuators: Sequence[Actuator], units: Units = SI) -> tuple[str, ...]:
     """What each command is: actuator, kind, place and unit; where it has a gain, what a unit of the command does."""
     return tuple(
-        f"{a.name}: {a.kind} at {domain.text(a.at, DIGITS)}, {force_unit(a)}"
+        f"{a.name}: {a.kind} at {domain.text(a.at, DIGITS)}, {unit}"
         if a.gain == 1
-        else f"{a.name}: command at {domain.text(a.at, DIGITS)}, {a.gain:.{DIGITS}g} {force_unit(a)} per unit"
-        for a in actuators
+        else f"{a.name}: command at {domain.text(a.at, DIGITS)}, {a.gain:.{DIGITS}g} {unit} per unit"
+        for a, unit in ((a, units.named(force_unit(a))) for a in actuators)
     )
 
 

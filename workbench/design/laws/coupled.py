@@ -53,12 +53,14 @@ def coupled_lqr(
     a, b = controlled_plant(modes, index, actuators)
     omega, size = modes.omega[list(index)], len(actuators)
     states = weighed_states(omega)
-    q = np.diag(np.r_[omega**2, np.ones(omega.size)][states])
+    # states ω q and q', of like size at any frequency, whose squares are the cost
+    scale = np.r_[omega, np.ones(omega.size)][states]
+    a = a[np.ix_(states, states)] * scale[:, None] / scale
     r = positive_definite(weight, size, f"the control weight must be symmetric and positive definite, {size} by {size}")
     # in commands of like cost, or one in other units makes R look singular
     unit = np.sqrt(np.diag(r).max() / np.diag(r))
     try:
-        found, _, poles = control.lqr(a[np.ix_(states, states)], b[states] * unit, q, r * np.outer(unit, unit))
+        found, _, poles = control.lqr(a, b[states] * unit, np.eye(len(states)), r * np.outer(unit, unit))
     except (np.linalg.LinAlgError, ValueError, control.ControlSlycot) as error:
         raise DesignError(
             f"no regulator stabilises modes {[i + 1 for i in index]} from these places: {error}"
@@ -68,7 +70,7 @@ def coupled_lqr(
             f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator"
         )
     gain = np.zeros((size, 2 * omega.size))
-    gain[:, states] = unit[:, None] * found
+    gain[:, states] = unit[:, None] * found * scale
     return Law(gain, index, actuators, "coupled LQR", partial(coupled_lqr, weight=weight))
 
 

@@ -8,11 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import LinAlgError, solve_continuous_are, solve_continuous_lyapunov
+from scipy.linalg import LinAlgError, solve_continuous_are
 from scipy.optimize import OptimizeResult, minimize
 
 from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError, Law, weighed_states
+from workbench.design.laws.moments import settled_moments
 from workbench.design.loop.peak import largest
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement, check_uncoupled
@@ -106,15 +107,15 @@ def coupled_costs(
     positions = np.sort(np.asarray(positions, float))
     n, m = n_controlled, positions.size
     shapes = modes.phi(positions).T
-    states, a, costs = _weighed(modes, n)
+    states, a, scale = _weighed(modes, n)
     b = np.vstack([np.zeros((n, m)), shapes[:n]])[states]
     start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]][states]
     try:
-        p = solve_continuous_are(a, b, np.diag(costs), weight * np.eye(m))
+        p = solve_continuous_are(a, b, np.eye(len(a)), weight * np.eye(m))
     except (LinAlgError, ValueError):
         return _impossible(positions, modes.n_modes - n)
     gain, whole = b.T @ p / weight, np.zeros((m, 2 * n))
-    whole[:, states] = gain
+    whole[:, states] = gain * scale
     loop = a - b @ gain
     values, vectors = np.linalg.eig(loop)
     if not values.real.max() < -ON_THE_AXIS * np.abs(values).max():
@@ -122,7 +123,7 @@ def coupled_costs(
     held = np.linalg.solve(vectors, start.astype(complex))
     force = -(gain @ vectors) * held @ (1.0 / (1j * modes.omega[None, n:] - values[:, None]))
     by_mode = 0.5 * np.abs(np.einsum("rj,jr->r", shapes[n:], force)) ** 2
-    gramian = solve_continuous_lyapunov(loop, -np.outer(start, start))
+    gramian = settled_moments(loop, start)
     return Placement(
         positions=positions,
         law=Law(whole, tuple(range(n)), forces_at(positions), "coupled LQR"),
@@ -136,12 +137,15 @@ def coupled_costs(
 
 
 def _weighed(modes: Modes, n: int) -> tuple[Integers, Floats, Floats]:
-    """The states whose motion costs anything, their A and their costs: the displacement of a rigid mode does not."""
+    """The states whose motion costs anything, A of ω q and q' of these, and what takes the states to them.
+
+    Their squares are the cost, and they are of like size at any frequency. A rigid mode's displacement costs nothing.
+    """
     check_uncoupled(modes)
     omega = modes.omega[:n]
-    states = weighed_states(omega)
-    a = modal_state_matrix(omega**2, modes.damping[:n, :n])
-    return states, a[np.ix_(states, states)], np.r_[omega**2, np.ones(n)][states]
+    states, scale = weighed_states(omega), np.r_[omega, np.ones(n)]
+    a = modal_state_matrix(omega**2, modes.damping[:n, :n])[np.ix_(states, states)]
+    return states, a * scale[states, None] / scale[states], scale[states]
 
 
 def forces_at(positions: np.ndarray) -> tuple[Actuator, ...]:
@@ -166,14 +170,14 @@ def coupled_batch(
     """
     n, count = n_controlled, len(positions)
     shapes = modes.phi(positions.ravel()).reshape(*positions.shape, modes.n_modes)
-    states, a, costs = _weighed(modes, n)
+    states, a, _ = _weighed(modes, n)
     size = len(states)
     b = np.zeros((count, size, positions.shape[1]))
     b[:, size - n :] = shapes[:, :, :n].transpose(0, 2, 1)
     hamiltonian = np.zeros((count, 2 * size, 2 * size))
     hamiltonian[:, :size, :size], hamiltonian[:, size:, size:] = a, -a.T
     hamiltonian[:, :size, size:] = -b @ b.transpose(0, 2, 1) / weight
-    hamiltonian[:, size:, :size] = -np.diag(costs)
+    hamiltonian[:, size:, :size] = -np.eye(size)
     values, vectors = np.linalg.eig(hamiltonian)
     stable = np.argsort(values.real, axis=1)[:, :size]
     poles = np.take_along_axis(values, stable, axis=1)

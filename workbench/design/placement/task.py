@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.linalg import expm
 
 from workbench.arrays import Floats, symmetric_root
 from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError, Law, weighed_states
+from workbench.design.laws.moments import settled_moments
 from workbench.design.loop.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.renamed import former_arguments
@@ -383,7 +384,7 @@ def participation_along(modes: Modes, actuator: Actuator, x: Floats, derivative:
 def _force_gramian(a: Floats, gains: Floats, rates: Floats, final_time: float) -> Floats:
     n = rates.shape[1]
     start = np.vstack([np.zeros((len(a) - n, rates.shape[0])), rates.T])
-    gramian: Floats = solve_continuous_lyapunov(a, -start @ start.T)
+    gramian = settled_moments(a, start)
     if np.isfinite(final_time):
         end = expm(a * final_time)
         gramian = gramian - end @ gramian @ end.T

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.design.laws.law import DesignError
+from workbench.design.laws.moments import second_moments
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import respond_on_off
-from workbench.design.spillover.spillover import check_final_time, on_off_work, second_moments
+from workbench.design.spillover.spillover import check_final_time, on_off_work
 from workbench.renamed import Renamed
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes

@@ -12,16 +12,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
+from scipy.linalg import expm
 
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.design.laws.coupled import ON_AXIS
 from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
+from workbench.design.laws.moments import second_moments, settled_moments
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop, close_loop
 from workbench.design.loop.on_off_response import motion, switchings
-from workbench.rig.linear import integrated
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import gauss_between
 from workbench.structure.modes import Modes, freeze
@@ -179,18 +179,6 @@ def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: floa
     return Spillover(power @ weights, law.controlled, final_time)
 
 
-def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
-    """∫_0^t x xᵀ dt for x' = A x: from dM/dt = A M + M Aᵀ + x0 x0ᵀ, doubled up from a short time.
-
-    Balanced first: displacements and rates of a fast structure differ by its frequency, and round-off by its square.
-    """
-    a, (scale, _) = matrix_balance(a, permute=False, separate=True)
-    state = state / scale
-    halvings = max(0, int(np.ceil(np.log2(max(np.abs(a).sum(axis=1).max() * final_time, 1.0)))))
-    _, moments = integrated(a, np.outer(state, state), final_time, halvings)
-    return np.asarray(scale[:, None] * moments * scale)
-
-
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
     """∫ Fᵀ F dt over all time, exact modal coordinates fed back, by a Lyapunov equation; inf where they do not fade."""
     return _integral(modes, law, state, 0.0, 1.0)
@@ -202,7 +190,7 @@ def _integral(modes: Modes, law: Law, state: Floats, energies: float, weight: fl
     poles = np.linalg.eigvals(loop)
     if poles.real.max() >= -ON_AXIS * np.abs(poles).max():
         return np.inf
-    gramian: Floats = solve_continuous_lyapunov(loop, -np.outer(start, start))
+    gramian = settled_moments(loop, start)
     index, weighed = np.array(law.controlled), np.zeros(kept.size)
     weighed[index], weighed[modes.n_modes + index] = energies * modes.omega[index] ** 2, energies
     r = feedback.T @ weight @ feedback if np.ndim(weight) else weight * feedback.T @ feedback

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from workbench.cases.units import SI, Units
 from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
@@ -16,6 +15,7 @@ from workbench.gap.report.budget import REMARKED, Budget, RecordToRecord, Shrink
 from workbench.gap.report.experiment import Experiment
 from workbench.gap.report.record_checks import Detectability
 from workbench.gap.search.attribute import Attribution
+from workbench.records.units import SI, Units
 from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints

@@ -253,12 +253,14 @@ def _proportional(fit: ProportionalFit | None) -> list[str]:
         return []
     if fit.probability < UNLIKELY:
         worst = float(np.abs(fit.standardised_residuals).max())
-        return [f"damping is not proportional: ζ deviates from (g1 ω + g2/ω)/2 by up to {worst:.0f} standard errors"]
+        return [
+            f"damping is not of Rayleigh's form: ζ deviates from (g1 ω + g2/ω)/2 by up to {worst:.0f} standard errors"
+        ]
     (g1, g1_std), (g2, g2_std) = (
         rounded(value, error)
         for value, error in zip((fit.damping.g1, fit.damping.g2), fit.standard_errors, strict=True)
     )
-    return [f"damping may be proportional: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
+    return [f"damping may be of Rayleigh's form: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
 
 
 def _by_amplitude(segments: AmplitudeDependence) -> dict[str, Any]:
