@@ -15,9 +15,10 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle
+from workbench.structure.member import Beam
 from workbench.structure.plate import Plate
 from workbench.trials.benches import draw_bench, experiments
-from workbench.trials.finite_elements import Alterations, matrix_modes
+from workbench.trials.finite_elements import Alterations, element_modes, matrix_modes
 from workbench.trials.hidden import stands
 from workbench.trials.hold import hold_trials
 from workbench.trials.make import KINDS, NOT_ON, draw_kinds, make_trial
@@ -89,7 +90,27 @@ def test_a_spring_on_a_plate_solves_the_secular_equation():
     assert found.omega[0] == pytest.approx(root, rel=1e-4)  # what the series leaves out
 
 
+def test_a_plate_whose_mass_varies_moves_a_mode_by_its_share_of_it():
+    """δω²/ω² = -∫ c cos(4π x / a) sin²(2π x / a) / ∫ sin² = c / 2 for mode (2, 1), and 0 for (1, 1), to first order."""
+    plate, c = _plate("simply supported", length=(1.2, 0.8)), 1e-3
+    altered = Alterations(mass_waves=(0.0, 0.0, 0.0, c))
+    one, other = (plate_modes(plate, [], 2, altered=each).omega for each in (Alterations(), altered))
+    np.testing.assert_allclose((other / one) ** 2 - 1.0, [0.0, 0.5 * c], atol=2e-3 * c)
+
+
 # --- a frame of beam elements
+
+
+def test_a_strip_that_varies_along_its_height_is_the_beam_that_does():
+    variation = {"stiffness_waves": (0.02, -0.03), "mass_waves": (-0.01, 0.02)}
+    heights = np.linspace(0.0, 2.0, 81)
+    nodes = {str(i): (0.0, h) for i, h in enumerate(heights)}
+    strips = [(str(i), str(i + 1), Section(axial=1e4, bending=5.0, mass=3.0)) for i in range(80)]
+    beam = Beam(length=2.0, mass_per_length=3.0, bending_stiffness=5.0, left="clamped", right="free")
+    frames = [plane_frame(nodes, strips, fixed=("0",), damping=ModalDamping(0.01), **v) for v in ({}, variation)]
+    one, other = (matrix_modes(frame, [], 3).omega for frame in frames)
+    beams = [element_modes(beam, np.zeros(0), 3, altered=Alterations(**v)).omega for v in ({}, variation)]
+    np.testing.assert_allclose(other / one, beams[1] / beams[0], rtol=2e-5)
 
 
 def test_a_leaning_strip_bends_and_stretches_as_a_cantilever():

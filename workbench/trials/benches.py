@@ -6,8 +6,8 @@ import numpy as np
 
 from workbench.cases.case import Case
 from workbench.rig.rig import Rig
-from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Structure
+from workbench.trials.finite_elements import Frame
 from workbench.trials.plant import ModalMotion, Plant, SolvedPlant, coloured_noise
 from workbench.trials.rigs import MEMBERS, draw_rig
 
@@ -27,7 +27,7 @@ class Bench:
         level: rms of the high level, N.
         snr_db: of each sensor in the low record of the nominal structure; None where the noise was given.
         feedback: of the closed loop, N s/m; None for no such record.
-        frame: the matrices behind modes at named points; None where there are none.
+        frame: makes the matrices behind modes at named points; None where there are none.
     """
 
     rig: Rig
@@ -36,7 +36,7 @@ class Bench:
     level: float
     snr_db: float | None
     feedback: float | None
-    frame: FiniteElements | None = None
+    frame: Frame | None = None
 
     def plant(self) -> Plant:
         """The real structure that is just what the rig takes it for."""
@@ -76,7 +76,7 @@ def bench_of(case: Case) -> Bench:
     return Bench(case.rig, loudest.sample_time, band, float(level[loudest]), None, None)
 
 
-def _suited(rig: Rig, frame: FiniteElements | None, rng: np.random.Generator) -> Bench:
+def _suited(rig: Rig, frame: Frame | None, rng: np.random.Generator) -> Bench:
     """A bench with sample time, band, level and noise that suit a rig; a member may be tested in closed loop too."""
     top = min(int(rng.integers(3, 6)), rig.modes.n_modes) - 1
     band = 1.1 * float(rig.modes.omega[top]) / (2.0 * np.pi)

@@ -2,7 +2,7 @@
 `Structure.modes`; of altered matrices; of altered modal data.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +35,8 @@ class Alterations:
         springs: (at, stiffness) to ground, or between two named points, N/m.
         rotational_stiffness: (left, right) in N m/rad, in place of the nominal one; None leaves it.
         tension: N, added to the nominal one.
-        stiffness_waves, mass_waves: (c_1, c_2, ...) of a smooth variation, 1 + Σ c_k cos(k π x / L) times nominal.
+        stiffness_waves, mass_waves: (c_1, c_2, ...) of a smooth variation, 1 + Σ c_k cos(k π x / L) times nominal:
+            along a member, along x of a plate, over the height of a frame.
     """
 
     stiffness_factor: float = 1.0
@@ -49,6 +50,8 @@ class Alterations:
 
 
 AS_NOMINAL = Alterations()
+# The matrices of a frame with `waves` of its stiffness and of its mass.
+Frame = Callable[[Sequence[float], Sequence[float]], FiniteElements]
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +191,7 @@ def _matrices(basis: Basis, member: Structure, altered: Alterations) -> tuple[sp
     profile = _stiffness(member)
 
     def rigidity(x: Floats) -> Floats:
-        values: Floats = altered.stiffness_factor * profile(x) * _waves(altered.stiffness_waves, x / member.length)
+        values: Floats = altered.stiffness_factor * profile(x) * waves(altered.stiffness_waves, x / member.length)
         for at, width, loss in altered.losses:
             values = values * np.where(np.abs(x - at) < width / 2, 1.0 - loss, 1.0)
         return values
@@ -197,7 +200,7 @@ def _matrices(basis: Basis, member: Structure, altered: Alterations) -> tuple[sp
         return d(u)[0] if isinstance(member, Bar) else dd(u)[0, 0]
 
     def density(x: Floats) -> Floats:
-        return np.asarray(member.mass_per_length(x) * _waves(altered.mass_waves, x / member.length))
+        return np.asarray(member.mass_per_length(x) * waves(altered.mass_waves, x / member.length))
 
     forms = (
         lambda u, v, w: rigidity(w.x[0]) * strain(u) * strain(v),
@@ -208,9 +211,9 @@ def _matrices(basis: Basis, member: Structure, altered: Alterations) -> tuple[sp
     return stiffness, mass.tolil(), slopes, Functional(lambda w: rigidity(w.x[0]) * strain(w["shape"]) ** 2)
 
 
-def _waves(waves: tuple[float, ...], share: np.ndarray) -> np.ndarray:
+def waves(coefficients: Sequence[float], share: np.ndarray) -> np.ndarray:
     """1 + Σ c_k cos(k π x / L), at shares x / L of the length."""
-    return sum((c * np.cos((k + 1) * np.pi * share) for k, c in enumerate(waves)), np.ones_like(share))
+    return sum((c * np.cos((k + 1) * np.pi * share) for k, c in enumerate(coefficients)), np.ones_like(share))
 
 
 def _hold_ends(stiffness: sparray, basis: Basis, member: Structure, altered: Alterations) -> list[int]:

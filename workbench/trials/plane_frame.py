@@ -1,6 +1,6 @@
 """A plane frame of beam elements, as matrices."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +9,7 @@ from workbench.arrays import Floats
 from workbench.structure.damping import Damping
 from workbench.structure.domain import NamedPoints
 from workbench.structure.finite_elements import FiniteElements
+from workbench.trials.finite_elements import waves
 
 DIRECTIONS = ("x", "y", "rz")
 
@@ -34,6 +35,8 @@ def plane_frame(
     *,
     fixed: Collection[str],
     damping: Damping,
+    stiffness_waves: Sequence[float] = (),
+    mass_waves: Sequence[float] = (),
 ) -> FiniteElements:
     """The matrices of a frame in the plane (x, y), each strip one beam element; node N has points N.x, N.y and N.rz.
 
@@ -41,15 +44,20 @@ def plane_frame(
         nodes: (x, y) of each, m.
         strips: the two nodes that each joins, and its section.
         fixed: nodes that are clamped to the ground; they have no points.
+        stiffness_waves, mass_waves: of a smooth variation over the height, see `waves`.
     """
+    upright = any(y for _, y in nodes.values())  # one that lies flat varies along its length
+    along = {node: place[upright] for node, place in nodes.items()}
+    size = max(along.values())
     free = [node for node in nodes if node not in fixed]
     index = {node: 3 * i for i, node in enumerate([*free, *fixed])}
     mass, stiffness = np.zeros((2, 3 * len(index), 3 * len(index)))
     for one, other, section in strips:
         rows = np.r_[index[one] + np.arange(3), index[other] + np.arange(3)]
         m, k = beam_element(np.array(nodes[one]), np.array(nodes[other]), section)
-        mass[np.ix_(rows, rows)] += m
-        stiffness[np.ix_(rows, rows)] += k
+        middle = np.array(0.5 * (along[one] + along[other]) / size)
+        mass[np.ix_(rows, rows)] += waves(mass_waves, middle) * m
+        stiffness[np.ix_(rows, rows)] += waves(stiffness_waves, middle) * k
     n = 3 * len(free)
     points = NamedPoints(
         tuple(f"{node}.{direction}" for node in free for direction in DIRECTIONS),

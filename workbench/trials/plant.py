@@ -12,11 +12,17 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.domain import Where
-from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Structure
 from workbench.structure.plate import Plate
 from workbench.trials import motion
-from workbench.trials.finite_elements import Alterations, ElementModes, element_modes, matrix_modes, modal_modes
+from workbench.trials.finite_elements import (
+    Alterations,
+    ElementModes,
+    Frame,
+    element_modes,
+    matrix_modes,
+    modal_modes,
+)
 from workbench.trials.plate_elements import plate_modes
 
 FINEST = 0.05  # radians of the highest mode in one step
@@ -31,7 +37,7 @@ class Plant:
         nominal: the rig it is taken for.
         actuators, sensors: as they really are, in the nominal order.
         n_modes: how many modes it shows.
-        frame: the matrices behind nominal modes at named points; None where those are all there is.
+        frame: makes the matrices behind nominal modes at named points; None where those are all there is.
         altered: what its structure has that the nominal one has not.
         damping_factor: of every damping ratio.
         damping_factors: of each mode's damping ratio, in their order; a mode beyond them takes 1.
@@ -50,7 +56,7 @@ class Plant:
     actuators: tuple[Actuator, ...]
     sensors: tuple[Sensor, ...]
     n_modes: int
-    frame: FiniteElements | None = None
+    frame: Frame | None = None
     altered: Alterations = field(default_factory=Alterations)
     damping_factor: float = 1.0
     damping_factors: tuple[float, ...] = ()
@@ -67,7 +73,7 @@ class Plant:
     logging_noise: float = 0.0
 
     @classmethod
-    def of(cls, nominal: Rig, frame: FiniteElements | None = None) -> "Plant":
+    def of(cls, nominal: Rig, frame: Frame | None = None) -> "Plant":
         """The real structure that is just what it is taken for."""
         return cls(nominal, nominal.actuators, nominal.sensors, nominal.modes.n_modes, frame)
 
@@ -97,7 +103,9 @@ class Plant:
         if isinstance(structure, Plate):
             return plate_modes(structure, places, self.n_modes, altered=self.altered)
         if self.frame is not None:
-            return matrix_modes(self.frame, places, self.n_modes, altered=self.altered)
+            frame = self.frame(self.altered.stiffness_waves, self.altered.mass_waves)
+            altered = replace(self.altered, stiffness_waves=(), mass_waves=())
+            return matrix_modes(frame, places, self.n_modes, altered=altered)
         return modal_modes(self.nominal.modes, places, altered=self.altered)
 
 

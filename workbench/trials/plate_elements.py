@@ -18,7 +18,7 @@ from workbench.arrays import Floats
 from workbench.structure.domain import Patch, gauss_between
 from workbench.structure.plate import Plate
 from workbench.structure.supports import HELD
-from workbench.trials.finite_elements import AS_NOMINAL, Alterations, ElementModes
+from workbench.trials.finite_elements import AS_NOMINAL, Alterations, ElementModes, waves
 
 ELEMENTS = 60  # along the longer side
 CROWDED = 0.7  # how much denser they are at the edges, for the singular corner of a clamped and a free one; below 1
@@ -45,15 +45,18 @@ def plate_modes(
     constant = plate.mass_per_area.is_constant and plate.bending_stiffness.is_constant
     if not constant or any(plate.tension) or plate.attachments:
         raise ValueError("trials are made on plates of one mass and one stiffness, without tension and attachments")
-    if altered.losses or altered.tension or altered.stiffness_waves or altered.mass_waves:
-        raise ValueError("trials know no local loss, tension or smooth variation of a plate")
+    if altered.losses or altered.tension:
+        raise ValueError("trials know no local loss and no tension of a plate")
     rigidity, nu = altered.stiffness_factor * float(plate.bending_stiffness(0.0, 0.0)), plate.poisson_ratio
     spacing = max(plate.length) / ELEMENTS
     x, y = (_Cubics.over(side, max(round(side / spacing), 8)) for side in plate.length)
-    twisted = 2.0 * (1.0 - nu) * kron(x.slopes, y.slopes)
-    across = nu * (kron(x.mixed, y.mixed.T) + kron(x.mixed.T, y.mixed))
-    stiffness = rigidity * (kron(x.bending, y.products) + kron(x.products, y.bending) + across + twisted)
-    mass = float(plate.mass_per_area(0.0, 0.0)) * kron(x.products, y.products)
+    bent, heavy = (
+        _Cubics.over(plate.length[0], x.nodes.size - 1, c) for c in (altered.stiffness_waves, altered.mass_waves)
+    )
+    twisted = 2.0 * (1.0 - nu) * kron(bent.slopes, y.slopes)
+    across = nu * (kron(bent.mixed, y.mixed.T) + kron(bent.mixed.T, y.mixed))
+    stiffness = rigidity * (kron(bent.bending, y.products) + kron(bent.products, y.bending) + across + twisted)
+    mass = float(plate.mass_per_area(0.0, 0.0)) * kron(heavy.products, y.products)
     free = []
     for along, sides in ((x, ("left", "right")), (y, ("bottom", "top"))):
         held: list[int] = []
@@ -93,8 +96,8 @@ class _Cubics:
     Attributes:
         nodes: (n_nodes,) m.
         values, slopes_at: (n_nodes,) the degrees of freedom of value and slope at each node.
-        products, slopes, bending: (size, size) ∫ φ_i φ_j, ∫ φ_i' φ_j' and ∫ φ_i'' φ_j''.
-        mixed: (size, size) ∫ φ_i φ_j''.
+        products, slopes, bending: (size, size) ∫ g φ_i φ_j, ∫ g φ_i' φ_j' and ∫ g φ_i'' φ_j''.
+        mixed: (size, size) ∫ g φ_i φ_j''.
     """
 
     nodes: Floats
@@ -106,15 +109,16 @@ class _Cubics:
     mixed: csc_array
 
     @classmethod
-    def over(cls, length: float, elements: int) -> "_Cubics":
+    def over(cls, length: float, elements: int, weight: Sequence[float] = ()) -> "_Cubics":
+        """Between the ends of a side, where g is that of `waves`."""
         share = np.linspace(0.0, 1.0, elements + 1)
         nodes = length * (share - CROWDED / (2.0 * np.pi) * np.sin(2.0 * np.pi * share))
         basis = Basis(MeshLine(nodes), ElementLineHermite(), intorder=8)
         forms = (
-            lambda u, v, w: u * v,
-            lambda u, v, w: d(u)[0] * d(v)[0],
-            lambda u, v, w: dd(u)[0, 0] * dd(v)[0, 0],
-            lambda u, v, w: dd(u)[0, 0] * v,
+            lambda u, v, w: waves(weight, w.x[0] / length) * u * v,
+            lambda u, v, w: waves(weight, w.x[0] / length) * d(u)[0] * d(v)[0],
+            lambda u, v, w: waves(weight, w.x[0] / length) * dd(u)[0, 0] * dd(v)[0, 0],
+            lambda u, v, w: waves(weight, w.x[0] / length) * dd(u)[0, 0] * v,
         )
         matrices = [csc_array(BilinearForm(form).assemble(basis)) for form in forms]
         return cls(nodes, basis.nodal_dofs[0], basis.nodal_dofs[1], *matrices)

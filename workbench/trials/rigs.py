@@ -14,6 +14,7 @@ from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
+from workbench.trials.finite_elements import Frame
 from workbench.trials.plane_frame import Section, plane_frame
 
 MEMBERS, PLATES, FRAMES = STRUCTURES = ("members", "plates", "frames")
@@ -23,8 +24,8 @@ STEEL = {"youngs_modulus": 2.1e11, "density": 7850.0}  # Pa, kg/m³
 PARTS = 6  # elements of a column or a floor, every other node a point
 
 
-def draw_rig(rng: np.random.Generator, structure: str) -> tuple[Rig, FiniteElements | None]:
-    """A nominal rig whose sensors have no noise yet, and for a frame the matrices behind its modes.
+def draw_rig(rng: np.random.Generator, structure: str) -> tuple[Rig, Frame | None]:
+    """A nominal rig whose sensors have no noise yet, and for a frame what makes the matrices behind its modes.
 
     Raises:
         ValueError: a structure that is none of `STRUCTURES`.
@@ -180,7 +181,7 @@ def _scattered(rng: np.random.Generator, length: tuple[float, float], n: int) ->
 # --- frames
 
 
-def _frame(rng: np.random.Generator) -> tuple[Rig, FiniteElements]:
+def _frame(rng: np.random.Generator) -> tuple[Rig, Frame]:
     """A portal frame of two or three storeys, clamped at its feet."""
     storeys = int(rng.integers(2, 4))
     width, height = (round(float(x), 2) for x in rng.uniform(0.3, 0.5, 2))
@@ -200,8 +201,13 @@ def _frame(rng: np.random.Generator) -> tuple[Rig, FiniteElements]:
         nodes |= {node: ((i + 1) / PARTS * width, k * height) for i, node in enumerate(inner)}
         strips += [(*ends, floor) for ends in pairwise([f"L{k}.{PARTS}", *inner, f"R{k}.{PARTS}"])]
         shown += inner[1::2]
-    frame = plane_frame(nodes, strips, fixed=("L0", "R0"), damping=_damping(rng))
-    modes = _at_points(frame, shown, int(rng.integers(14, 17)))
+    damping = _damping(rng)
+
+    def frame(stiffness_waves: Sequence[float] = (), mass_waves: Sequence[float] = ()) -> FiniteElements:
+        variation = {"stiffness_waves": stiffness_waves, "mass_waves": mass_waves}
+        return plane_frame(nodes, strips, fixed=("L0", "R0"), damping=damping, **variation)
+
+    modes = _at_points(frame(), shown, int(rng.integers(14, 17)))
     across = [f"{node}.{'y' if node[0] == 'F' else 'x'}" for node in shown]
     n_actuators, n_sensors = int(rng.integers(2, 4)), int(rng.integers(7, 10))
     *driven, hammer = (str(name) for name in rng.choice(across, n_actuators + 1, replace=False))
