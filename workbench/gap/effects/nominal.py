@@ -3,10 +3,11 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, expm
 
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Kind, Parameter
@@ -35,6 +36,7 @@ PLACE_UNIT = 0.001  # likewise, of the extent
 MOST_AHEAD = 0.9  # of a sample: the timing of a sensor is off by no more
 JUST_LATE = 1e-3  # of a sample: later, an accelerometer reads what was before a jump
 SURE = 1e-9  # of the largest variance of errors, each in units of its own: less is no doubt
+LITTLE, STRONG = 0.25, 25.0  # radians by which a coupling of one turns two modes: less is none, more is no small error
 WIDEST = 8.0  # prior deviations: bounds, far outside of what a nominal model can be off by
 
 
@@ -45,6 +47,7 @@ class NominalPrior:
     Attributes:
         stiffness, mass: relative, of each cosine along a structure whose profiles are known; of the modal mass else.
         frequency: relative, of each natural frequency by itself.
+        coupling: of each two modes by an uneven stiffness, over the root of the product of their own.
         damping: of the logarithm of each damping ratio.
         delay: of each sensor, in samples.
         gain: relative, of each actuator and each sensor, as far as they were calibrated.
@@ -63,6 +66,7 @@ class NominalPrior:
     stiffness: float = 0.0
     mass: float = 0.0
     frequency: float = 0.0
+    coupling: float = 0.0
     damping: float = 0.0
     delay: float = 0.0
     gain: float = 0.0
@@ -84,7 +88,7 @@ class NominalPrior:
         return tuple(name for name in GROUPS if getattr(self, name) > 0)
 
 
-GROUPS = ("stiffness", "mass", "frequency", "damping", "delay", "gain", "place", "shape", "record")
+GROUPS = ("stiffness", "mass", "frequency", "coupling", "damping", "delay", "gain", "place", "shape", "record")
 OUTSIDE = ("delay", "gain", "place", "shape", "record")  # groups that leave the modes as they are
 
 
@@ -164,6 +168,8 @@ def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
     if prior.frequency:
         elastic = (r for r in modes if rig.modes.omega[r - 1] > 0)
         yield from (believed(f"frequency_{r}", prior.frequency, PROFILE_UNIT) for r in elastic)
+    if prior.coupling:
+        yield from (believed(name, prior.coupling, PROFILE_UNIT) for name, *_ in _couplings(rig.modes.omega.tobytes()))
     if prior.damping:
         yield from (believed(f"damping_{r}", prior.damping, RATIO_UNIT) for r in modes)
     if prior.delay:
@@ -231,6 +237,8 @@ def _off_structure(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> R
     if not isinstance(rig.structure, Structure):
         rig = replace(rig, structure=None)  # what follows must change these modes, not solve others anew
     rig = _with_profiles(rig, prior, along)
+    if prior.coupling:
+        rig = replace(rig, modes=_turned(rig.modes, values))
     structure, modes = rig.structure, rig.modes
     frequency, damping = (_by_mode(values, group, modes.n_modes) for group in ("frequency", "damping"))
     if not (frequency.any() or damping.any()):
@@ -243,6 +251,33 @@ def _off_structure(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> R
     root = np.sqrt(stretch * more)
     modes = replace(modes, omega=modes.omega * stretch, damping=modes.damping * np.outer(root, root))
     return replace(rig, structure=structure, modes=modes)
+
+
+@lru_cache(maxsize=64)
+def _couplings(frequencies: bytes) -> tuple[tuple[str, int, int, float], ...]:
+    """Name of each two modes' coupling, both modes, and the angle by which a coupling of one turns them, rad.
+
+    To first order φ_r gains k_rs / (ω_r² - ω_s²) φ_s and φ_s loses as much of φ_r, with k_rs = e ω_r ω_s.
+    """
+    omega = np.frombuffer(frequencies)
+    found = []
+    for r, s in combinations(range(omega.size), 2):
+        apart = abs(omega[s] ** 2 - omega[r] ** 2)
+        angle = omega[r] * omega[s] / max(apart, omega[r] * omega[s] / STRONG) if omega[r] > 0 else 0.0
+        if angle > LITTLE:
+            found.append((f"coupling_{r + 1}_{s + 1}", r, s, float(angle)))
+    return tuple(found)
+
+
+def _turned(modes: Modes, values: dict[str, float]) -> Modes:
+    """The modes turned into one another by the errors of their coupling; mass-normalised still."""
+    angles = np.zeros((modes.n_modes, modes.n_modes))
+    for name, r, s, angle in _couplings(modes.omega.tobytes()):
+        angles[r, s] = angle * values.get(name, 0.0)
+    if not angles.any():
+        return modes
+    shapes, turn = modes.shapes, expm(angles - angles.T)
+    return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) @ turn)
 
 
 def _scaled(shapes: Shapes, factor: float) -> Shapes:

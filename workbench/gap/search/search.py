@@ -166,6 +166,7 @@ class Search:
             stiffness=0.02 if structured and not by_mode else 0.0,
             mass=0.0 if by_mode else 0.02,
             frequency=0.0 if structured and not by_mode else 0.005,
+            coupling=0.0 if structured else 0.01,
             damping=0.2,
             delay=0.1,
             gain=0.01 if len(self.rig.actuators) + len(self.rig.sensors) > 2 else 0.0,  # of one each: the mass says it
