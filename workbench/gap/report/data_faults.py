@@ -40,6 +40,8 @@ def _in_motion(rig: Rig, record: Record) -> list[str]:
     for sensor, y, jump in zip(rig.sensors, record.outputs, at_rest, strict=True):
         first = float(y[0])
         off = min(abs(first), abs(first - float(y.mean())), abs(first - float(jump)))
+        if abs(float(jump)) < sensor.noise_std:
+            jump = 0.0
         if off > max(AT_REST * sensor.noise_std, IN_MOTION * float(y.std()), UNSURE * abs(float(jump))):
             return [
                 f"Record {record.name!r} does not start from rest ({sensor.name} reads {first:.3g}, where at rest it"
