@@ -1,5 +1,7 @@
 """Modes against closed forms, transcendental equations, and an independent finite-element program."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -85,6 +87,39 @@ def test_elastic_end_against_its_equation():
     for omega in modes.omega:
         b = 10 * np.sqrt(omega)
         assert abs(brentq(equation, b - 1e-5, b + 1e-5, xtol=1e-14) / b - 1) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "load"),
+    [
+        ("hinged", "hinged", 1.0),
+        ("clamped", "free", 0.25),
+        ("clamped", "clamped", 4.0),
+        ("hinged", "clamped", 2.0457),
+        ("clamped", "sliding", 1.0),
+        ("sliding", "hinged", 0.25),
+        ("free", "free", 1.0),
+        ("hinged", "free", 1.0),
+        ("sliding", "sliding", 1.0),
+    ],
+)
+def test_buckling_load_closed_form(left, right, load):
+    """In units of pi² EI / L² (Timoshenko and Gere, Theory of Elastic Stability, 2.1); of a rod on a spring too."""
+    beam = Beam(length=0.9, mass_per_length=0.55, bending_stiffness=6.0, left=left, right=right, tension=3.0)
+    assert beam.buckling_load() == pytest.approx(load * 6.0 * (np.pi / 0.9) ** 2, rel=1e-4)
+
+
+def test_a_rigid_column_on_a_spring_buckles_under_k_times_l():
+    """A stiff rod, hinged below and held aside by a spring at its tip: P = k L."""
+    tip = PointSpring(0.9, 2.0)
+    beam = Beam(
+        length=0.9, mass_per_length=0.55, bending_stiffness=1e2, left="hinged", right="free", attachments=(tip,)
+    )
+    assert beam.buckling_load() == pytest.approx(2.0 * 0.9, rel=1e-3)
+    near = replace(beam, tension=-0.99 * 2.0 * 0.9)
+    assert near.modes(1).omega[0] < 0.2 * beam.modes(1).omega[0]
+    with pytest.raises(ValueError, match="buckling"):
+        replace(beam, tension=-1.01 * 2.0 * 0.9).modes(1)
 
 
 def test_axial_load_closed_form():

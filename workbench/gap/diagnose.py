@@ -10,22 +10,26 @@ from workbench.arrays import Floats
 from workbench.cases.case import Case
 from workbench.deadline import Deadline
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.effect import Effect, Kind, apply_all, names_in
-from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
+from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_in
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
 from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.where import locate, locate_force
 from workbench.gap.prediction.noise import noise_guessed
 from workbench.gap.prediction.residuals import lead_of
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.budget import (
+    PLURAL,
     Budget,
     Shrinkage,
+    are_small,
     budget_of,
+    left_with,
     mean_square,
     measure,
     noise_power,
     power_in,
     power_of_inputs,
+    sizes_of,
     with_held_out,
 )
 from workbench.gap.report.data_faults import data_faults
@@ -35,11 +39,14 @@ from workbench.gap.report.setup_faults import check_disjoint, setup_faults
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.gap.search.finish import with_equals
+from workbench.gap.search.jointly import too_large
+from workbench.gap.search.settings import JOINT
 from workbench.records.record import Record, as_records
 from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
+from workbench.structure.printed import joined_in_words
 from workbench.threads import one_blas_thread
 
 LIKELY = 0.01  # probability from which an alternative is worth an experiment
@@ -157,6 +164,8 @@ def diagnose(
         shrinkage = measure(rig, corrected, validation, settle=settle)
         accounted = with_held_out(rig, attribution.best.effects, validation, settle=settle)
         beyond = _beyond_models(rig, attribution, validation, settle, accounted)
+        if _leaves_much(attribution, shrinkage, beyond):
+            attribution = replace(attribution, outcome="part")
         disagreeing = _disagreeing(attribution, shrinkage, validation, settle, tolerance, beyond)
         outcome = _outcome(attribution, shrinkage, beyond, disagreeing)
         errors = next((e for e in accounted if e.kind is NOMINAL_ERRORS), None)
@@ -199,6 +208,7 @@ def diagnose(
                 *in_unseen,
                 *([OVER_FITTING] if outcome == "part" != attribution.outcome and not (in_unseen or of_setup) else []),
                 *_notes(attribution, budget, seconds, silent, sound),
+                *(_hiding(errors) if outcome == "explained" else ()),
             ),
         )
 
@@ -247,13 +257,15 @@ def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: fl
 
 def _left_of(rig: Rig, effects: Sequence[Effect], unseen: Sequence[Record], settle: float) -> float:
     """Mean square that a rig with effects leaves of records, each sensor by the standard deviation of its readings."""
-    return sum(mean_square(apply_all(rig, effects), record, settle) for record in unseen)
+    return sum(left_with(rig, effects, record, settle) for record in unseen)
 
 
 def _acts(
     rig: Rig, effects: Sequence[Effect], others: Sequence[Effect], unseen: Sequence[Record], settle: float
 ) -> float:
     """Mean square by which the readings of records differ between two sets of effects, in the same measure."""
+    if not can_be(rig, others):
+        return np.inf
     one, other = apply_all(rig, effects), apply_all(rig, others)
     return sum(power_in(record, predict(one, record) - predict(other, record), settle) for record in unseen)
 
@@ -263,6 +275,18 @@ def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray
         return "unknown"
     fails = found.outcome == "explained" and _fails_unseen(found, shrinkage, beyond)
     return "part" if fails else found.outcome
+
+
+def _leaves_much(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray) -> bool:
+    """Whether errors that no model has, and effects beside them, leave far more than noise of records held out.
+
+    Such errors bend to whatever is missing, and what they leave is no louder noise.
+    """
+    errors = next((e for e in found.best.effects if e.kind is NOMINAL_ERRORS), None)
+    if found.outcome != "explained" or shrinkage is None or are_small(sizes_of(errors)) or _unpredictable(found):
+        return False
+    _, after, floor = _powers(shrinkage)
+    return bool((after > JOINT.credible**2 * floor + beyond).any())
 
 
 def _beyond_models(
@@ -354,6 +378,19 @@ def _next(rig: Rig, found: Attribution, workers: Workers, units: Units) -> Exper
         if explained and probability > LIKELY:
             return replace(next_experiment(rig, found.best, other, found.search.data, workers), time=units.time)
     return None
+
+
+def _hiding(errors: Effect | None) -> tuple[str, ...]:
+    """A note where errors of the model are so large that an effect may be among them."""
+    if errors is None or not isinstance(errors.target, NominalPrior):
+        return ()
+    large = [PLURAL[group] for group in too_large(errors) if group in PLURAL]
+    if not large:
+        return ()
+    return (
+        f"The errors of the model in {joined_in_words(large)} are larger than those of a careful test: a linear effect,"
+        " such as a damper or a mass, may be hidden among them.",
+    )
 
 
 def _notes(

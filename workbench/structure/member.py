@@ -29,6 +29,8 @@ NO_SLIVER = 1e-5  # of the length: a jump of a profile this near an end or anoth
 TIP = 1e-9  # of the stiffness at midspan: an end that is no stiffer ends in a point
 CROWDING, COARSEST = 4.0, 0.25  # from segment to segment towards a tip, and the widest of them, of the length
 INSIDE = (np.arange(8) + 0.5) / 8  # where along a segment the length of waves is asked for
+BUCKLED = 3  # half waves that its segments can carry, and loads asked for: it buckles in the longest, beside a turn
+TURNS = 1e-7  # of the load of a half wave: below it a beam turns as a rigid body
 RIGID = 1e-13  # of the eigenvalue of a half wave: below it a mode moves as a rigid body
 
 
@@ -159,26 +161,12 @@ class _Member(Printed):
         rigidity = segments.assemble(stiffness, order)
         if tension:
             rigidity += segments.assemble(lambda x: np.full(x.shape, tension), 1)
-        held, essential = [], []
-        springs: list[tuple[float, np.ndarray]] = []  # stiffness, and the row that gives its elongation
-        last = segments.nodes.size - 1
-        for node, at, end in ((0, 0.0, self.left), (last, self.length, self.right)):
-            for derivative, spring in enumerate((end.translation, end.rotation)[:order]):
-                index = order * node + derivative
-                if spring == HELD:
-                    held.append(index)
-                    essential.append((at, derivative))
-                elif spring:
-                    springs.append((spring, segments.evaluation(at, derivative)))
+        held, essential, springs = self._restraints(segments)
         for part in self.attachments:
-            if isinstance(part, PointDamper):
-                continue
-            for derivative, value in enumerate(part.pair):
-                row = self._seen_at(segments, position(part.at), derivative)
-                if isinstance(part, PointMass):
+            if isinstance(part, PointMass):
+                for derivative, value in enumerate(part.pair):
+                    row = self._seen_at(segments, position(part.at), derivative)
                     mass += value * row.T @ row
-                else:
-                    springs.append((value, row))
         for spring, row in springs:
             rigidity += spring * row.T @ row
         free = np.delete(np.arange(segments.n_functions), held)
@@ -215,6 +203,27 @@ class _Member(Printed):
             coefficients[:, rigid] = coefficients[:, rigid] @ np.array([[c, s], [-s, c]])
         coefficients *= self._signs(segments, coefficients)
         return omega, coefficients, tuple(essential)
+
+    def _restraints(
+        self, segments: Segments
+    ) -> tuple[list[int], list[tuple[float, int]], list[tuple[float, np.ndarray]]]:
+        """Functions that ends hold, where they do (x, derivative), and springs with the rows of their elongations."""
+        order = segments.continuity + 1
+        held, essential = [], []
+        springs: list[tuple[float, np.ndarray]] = []
+        last = segments.nodes.size - 1
+        for node, at, end in ((0, 0.0, self.left), (last, self.length, self.right)):
+            for derivative, spring in enumerate((end.translation, end.rotation)[:order]):
+                if spring == HELD:
+                    held.append(order * node + derivative)
+                    essential.append((at, derivative))
+                elif spring:
+                    springs.append((spring, segments.evaluation(at, derivative)))
+        for part in self.attachments:
+            if isinstance(part, PointSpring):
+                for derivative, value in enumerate(part.pair):
+                    springs.append((value, self._seen_at(segments, position(part.at), derivative)))
+        return held, essential, springs
 
     def _signs(self, segments: Segments, coefficients: np.ndarray) -> np.ndarray:
         """+1 or -1 a mode, so that the first derivative that does not vanish at the left end is positive."""
@@ -379,6 +388,37 @@ class Beam(_Member):
     def modes(self, n_modes: int, *, tolerance: float = 1e-10) -> Modes:
         """The lowest `n_modes` modes, mass-normalised, resolved to `tolerance` in their highest derivative."""
         return self._solve(n_modes, self.bending_stiffness, 1, self.tension, tolerance)
+
+    @one_blas_thread
+    def buckling_load(self) -> float:
+        """The least compression, N, that bends the beam in equilibrium: P of K v = P G v, without its present tension.
+
+        G = ∫ w' w' dx. Turning as a rigid body, which an unheld beam does under any compression, is left out.
+
+        Raises:
+            ValueError: springs so negative that the beam is unstable without any compression.
+        """
+        segments = self._segments(BUCKLED, self.bending_stiffness, 1, 0)
+        rigidity = segments.assemble(self.bending_stiffness, 2)
+        slopes = segments.assemble(lambda x: np.ones(x.shape), 1)
+        held, _, springs = self._restraints(segments)
+        for spring, row in springs:
+            rigidity += spring * row.T @ row
+        on_ground = [part.pair[0] for part in self.attachments if isinstance(part, PointSpring)]
+        if not any((self.left.translation, self.right.translation, *on_ground)):
+            held.append(0)  # moved as a whole it bears no other load
+        free = np.delete(np.arange(segments.n_functions), held)
+        rigidity, slopes = rigidity[np.ix_(free, free)], slopes[np.ix_(free, free)]
+        unit = float(np.mean(self.bending_stiffness(self.length * INSIDE))) * (np.pi / self.length) ** 2
+        few = [free.size - BUCKLED, free.size - 1]
+        try:
+            # largest eigenvalues of the inverse problem, as of the modes
+            loads = 1.0 / eigh(slopes, rigidity + unit * slopes, eigvals_only=True, subset_by_index=few) - unit
+        except LinAlgError as error:
+            raise ValueError(_unstable(0.0)) from error
+        if (loads < -TURNS * unit).any():
+            raise ValueError(_unstable(0.0))
+        return float(loads[loads > TURNS * unit].min())
 
 
 Structure = Bar | Beam

@@ -19,6 +19,8 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import LAWS, simulate
 from workbench.rig.stepping import USER, element_force
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
 
 DT = 0.05
@@ -142,6 +144,76 @@ def test_friction_alike_both_ways_is_friction():
     numbers = {"force_forward": 0.3, "force_backward": 0.1, "smoothing_speed": 0.02}
     (friction,) = simpler_forms(Effect(kind_named("two_way_friction"), None, {"at": 0.8, **numbers}), rig())
     assert friction.values == {"at": 0.8, "force": pytest.approx(0.2), "smoothing_speed": 0.02}
+
+
+def frame() -> Rig:
+    """Three masses of 2 kg on springs of 800 N/m, all modes kept."""
+    stiffness = 800.0 * (2.0 * np.eye(3) - np.eye(3, k=1) - np.eye(3, k=-1))
+    points = NamedPoints(("S1", "S2", "S3"), positions=np.eye(3), directions=("x",) * 3)
+    modes = FiniteElements(2.0 * np.eye(3), stiffness, nodes=points, damping=ModalDamping(0.02)).modes(3)
+    sensors = tuple(Sensor(name, name, noise_std=1e-6) for name in points.names)
+    return Rig(modes, (Actuator("F", "S3"),), sensors)
+
+
+BETWEEN = {"at": Between("S2", "S1")}
+LIMITS = [
+    ("joint_slip", {**BETWEEN, "stiffness": 90.0, "yield_displacement": 1e-9}, "ground_spring"),
+    ("clearance", {**BETWEEN, "stiffness": 90.0, "gap": 1e-9}, "ground_spring"),
+    ("bouc_wen", {**BETWEEN, "stiffness": 90.0, "yield_displacement": 1e4}, "ground_spring"),
+    ("bouc_wen", {"at": "S2", "stiffness": 9e4, "yield_displacement": 1e-6}, "coulomb_friction"),
+    ("coulomb_friction", {"at": "S2", "force": 5e4, "smoothing_speed": 1e4}, "point_damper"),
+    (
+        "two_way_friction",
+        {"at": "S2", "force_forward": 0.1, "force_backward": 0.1, "smoothing_speed": 0.05},
+        "coulomb_friction",
+    ),
+    ("actuator_hysteresis", {"share": 0.2, "width": 1e-9}, "actuator_gain"),
+]
+
+
+@pytest.mark.parametrize(("name", "values", "limit"), LIMITS)
+def test_a_law_at_a_bound_of_its_numbers_is_its_limiting_case(name, values, limit):
+    nominal = frame()
+    target = "F" if name.startswith("actuator") else None
+    law = Effect(kind_named(name), target, values)
+    (simpler,) = (form for form in simpler_forms(law, nominal) if form.kind.name == limit)
+    command = np.repeat(np.random.default_rng(3).standard_normal((1, 60)), 4, axis=1)
+    plain, there, same = (
+        simulate(each, command, sample_time=0.02, substeps=64).outputs
+        for each in (nominal, law.apply(nominal), simpler.apply(nominal))
+    )
+    assert np.abs(there - plain).max() > 0.01 * np.abs(plain).max()
+    np.testing.assert_allclose(same, there, atol=0.03 * np.abs(there - plain).max())
+
+
+def test_a_joint_that_never_slips_changes_nothing():
+    nominal = frame()
+    joint = Effect(kind_named("joint_slip"), None, {**BETWEEN, "stiffness": 90.0, "yield_displacement": 1e4})
+    command = np.random.default_rng(3).standard_normal((1, 100))
+    plain, there = (simulate(r, command, sample_time=0.02).outputs for r in (nominal, joint.apply(nominal)))
+    np.testing.assert_allclose(there, plain, atol=1e-4 * np.abs(plain).max())
+
+
+def test_what_acts_between_two_points_is_not_called_one_to_ground():
+    nominal = frame()
+    for stiffness, words in ((90.0, "a spring (stiffness 90 N/m)"), (-90.0, "a loss of stiffness (stiffness -90 N/m)")):
+        between = Effect(kind_named("ground_spring"), None, {**BETWEEN, "stiffness": stiffness})
+        assert _described(between, nominal) == f"{words} between S2 and S1"
+        assert effect_json(between, nominal)["kind"] == "ground_spring"
+    damper = Effect(kind_named("point_damper"), None, {**BETWEEN, "coefficient": 2.0})
+    assert _described(damper, nominal) == "a viscous damper (coefficient 2 N s/m) between S2 and S1"
+    assert _described(damper.moved_to("S2"), nominal).startswith("a viscous damper to ground")
+
+
+def test_an_effect_is_unsure_where_a_number_that_is_stated_may_be_nothing():
+    joint = Effect(
+        kind_named("joint_slip"),
+        None,
+        {**BETWEEN, "stiffness": 90.0, "yield_displacement": 1e-8},
+        {"stiffness": 1.0, "yield_displacement": 1e-7},
+    )
+    assert joint.stands_out(frame()) and not joint.is_sure(frame())
+    assert replace(joint, deviations={"stiffness": 1.0, "yield_displacement": 1e-9}).is_sure(frame())
 
 
 def test_exchanged_channels_are_named_by_both():

@@ -39,6 +39,17 @@ def test_a_held_force_does_less_than_a_continuous_one(cycles):
     assert 1.0 - lost_between_samples([wave[::fine]]) == pytest.approx(powers[0] / powers[1], rel=0.01)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("memory", [0.5, 0.99, 0.9995])
+def test_the_power_of_a_force_of_equal_poles_is_its_closed_form(memory):
+    """Σ C(k + n - 1, n - 1)² x^k, x = memory², over which a linear solution loses all digits near 1."""
+    x = memory**2
+    numerators = ([1.0], [1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 9.0, 9.0, 1.0])
+    for stages, numerator in enumerate(numerators, start=1):
+        exact = np.polyval(numerator, x) / (1.0 - x) ** (2 * stages - 1)
+        assert _power(colour_of(memory, stages)) == pytest.approx(exact, rel=1e-9)
+
+
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.99])
 def test_what_follows_nothing(record, memory):
     force = lfilter([1.0], [1.0, -memory], np.random.default_rng(1).normal(size=N))

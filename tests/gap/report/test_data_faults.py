@@ -43,6 +43,19 @@ def test_a_record_that_begins_in_motion(rig, measured):
     assert data_faults(rig, [biased]) == (), "a constant offset is a bias"
 
 
+def test_accelerometers_tell_motion_from_the_jump_with_the_first_force(rig, record_of):
+    rig = replace(rig, sensors=tuple(replace(s, quantity="acceleration", noise_std=1e-3) for s in rig.sensors))
+    rng = np.random.default_rng(2)
+    command = np.repeat(rng.normal(size=200), 5)
+    command[0] = 30.0
+    record = record_of(rig, command[None], rng, name="high", substeps=8)
+    assert (np.abs(record.outputs[:, 0]) > record.outputs.std(axis=1)).any(), "a jump, which the rig predicts"
+    assert data_faults(rig, [record]) == ()
+    assert data_faults(rig, [altered(record, lambda y: np.multiply(y, 1.6, out=y))]) == ()
+    (said,) = data_faults(rig, [record.between(2.3)])
+    assert "does not start from rest" in said and "where at rest it would read" in said
+
+
 def test_a_channel_that_is_stuck(rig, measured):
     def hold(y):
         y[2, 300:700] = y[2, 300]

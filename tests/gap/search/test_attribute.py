@@ -18,7 +18,9 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
-from workbench.structure.domain import NamedPoints
+from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.modes import Modes, PointShapes
 
 OMEGA, MASS, NOISE, DOUBT = 10.0, 2.0, 1e-4, 3e-3
@@ -72,6 +74,28 @@ def test_friction_far_below_its_smoothing_speed_is_a_damper():
     (told,) = _as_it_stands(search, found, (), 0.0).effects
     assert told.kind is damper.kind
     assert told.values["coefficient"] == pytest.approx(0.3, abs=4.0 * told.deviations["coefficient"])
+
+
+def test_a_joint_of_hardly_any_yield_displacement_is_a_loss_of_stiffness():
+    """Its stiffness stands out and its yield displacement does not: the records do not need the latter."""
+    points = NamedPoints(("S1", "S2"), positions=np.eye(2, 3), directions=("x", "x"))
+    elements = FiniteElements(2.0 * np.eye(2), 100.0 * np.array([[2.0, -1.0], [-1.0, 1.0]]), nodes=points)
+    modes = replace(elements, damping=ModalDamping(0.02)).modes(2)
+    sensors = tuple(Sensor(name, name, noise_std=NOISE) for name in points.names)
+    nominal, where = Rig(modes, (Actuator("F", "S2"),), sensors), Between("S2", "S1")
+    loss = Effect(kind_named("ground_spring"), None, {"at": where, "stiffness": -15.0})
+    rng = np.random.default_rng(7)
+    clean = simulate(loss.apply(nominal), rng.normal(size=(1, 400)), sample_time=0.05, name="test")
+    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
+    data = FitData((record,), np.full(2, NOISE))
+    before = data.by_channel(data.residual(nominal))
+    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+    joint = Effect(kind_named("joint_slip"), None, {"at": where, "stiffness": 15.0, "yield_displacement": 1e-7})
+    found = with_intervals(nominal, fit(nominal, (joint,), data.stepped(8)), data.stepped(8))
+    assert found.effects[0].stands_out(nominal) and not found.effects[0].is_sure(nominal)
+    (told,) = _as_it_stands(search, found, (), 0.0).effects
+    assert told.kind is loss.kind
+    assert told.values["stiffness"] == pytest.approx(-15.0, abs=4.0 * told.deviations["stiffness"])
 
 
 @pytest.mark.parametrize(("speed", "stated"), [(1e-5, False), (0.05, True)])

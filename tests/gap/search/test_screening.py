@@ -7,16 +7,20 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
-from workbench.gap.effects.effect import Effect
+from workbench.gap.effects.effect import Effect, can_be, nearest_possible
+from workbench.gap.effects.nominal import NominalPrior, nominal_errors
+from workbench.gap.effects.structural import buckling_load
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
+from workbench.gap.report.budget import RUNAWAY, left_with
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.pairs import Pairs, _evidence
-from workbench.gap.search.screening import Screening, fitted_ahead, one_more
+from workbench.gap.search.screening import Screening, _starts, fitted_ahead, one_more
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import SELECTION
+from workbench.gap.search.stepwise import Stepwise
 from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import prediction_errors
 from workbench.structure.domain import Interval
@@ -44,6 +48,20 @@ def search(rig, record_of):
     quick = data.stepped(2)
     nominal = data.by_channel(data.residual(rig))
     return Search(rig, data, quick, quick.only(("1.0",)), CATALOGUE, lambda text, share: None, ALONE, nominal)
+
+
+def test_a_load_that_only_a_stiffer_beam_bears_ends_no_search(rig, search):
+    """Beside errors of the stiffness it was fitted; without them, or with weaker ones, the beam would buckle."""
+    load = Effect(kind_named("axial_load"), None, {"tension": -1.05 * buckling_load(rig)})
+    errors = nominal_errors(rig, NominalPrior(stiffness=0.02), {"stiffness_0": 0.1})
+    assert can_be(rig, (load, errors)) and not can_be(rig, (load,))
+    (weaker,) = nearest_possible(rig, (load,))
+    assert can_be(rig, (weaker,)) and -1.0 < weaker.values["tension"] / buckling_load(rig) < -0.9
+    assert nearest_possible(rig, (load,), (errors,))[0].values == load.values
+    assert _starts(replace(search, held=(errors,)), (load,), Evidence.of(rig, search.data))
+    assert left_with(rig, (load,), search.data.records[0], 0.0) == RUNAWAY
+    linear = replace(search, data=search.first.stepped(1), quick=search.first.stepped(1), by_mode=True)
+    assert np.isfinite(Stepwise(linear, 0.0).afresh((load,)).fit.cost)
 
 
 def screened(n_starts: int, seed: int) -> Screening:

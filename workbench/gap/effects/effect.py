@@ -19,6 +19,7 @@ from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 
 ALL = "all"
+WEAKER, WEAKENINGS = 0.9, 40  # share of the strength of effects that a rig cannot have, and how often it is taken
 COORDINATES = ("at", "x", "y")  # parameters that say where, along an interval or on a rectangle
 
 
@@ -230,6 +231,7 @@ class Kind:
         targets: rig -> what it can act on: input or output names, "all", an end; (None,) where there is no choice.
         nonlinear: whether it makes the response depend on level.
         phrase: how the sentence of the verdict calls it.
+        phrase_between: effect -> how the sentence calls one between two points; None for the same.
         simpler: effect, rig -> its limiting cases at bounds of its parameters, with values to start a fit from.
         more_general: effect -> what it is a limiting case of and records can mistake for it, with values to start a
             fit from.
@@ -261,6 +263,7 @@ class Kind:
     targets: Callable[[Rig], tuple[Any, ...]] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""
+    phrase_between: "Callable[[Effect], str] | None" = None
     simpler: Callable[["Effect", Rig], Iterable["Effect"]] = lambda effect, rig: ()
     more_general: Callable[["Effect"], Iterable["Effect"]] = lambda effect: ()
     merged: "Callable[[Effect, Effect], Effect | None]" = lambda effect, other: None
@@ -339,6 +342,12 @@ class Effect:
         off = any(abs(self.values[p.name] - p.neutral) > self.deviations[p.name] for p in tested)
         return off or not tested or self.kind.applied_first
 
+    def is_sure(self, rig: Rig) -> bool:
+        """Whether every number that a verdict states, but its place, is farther from nothing than its deviation."""
+        nothing = {p.name: p.neutral or 0.0 for p in self.parameters(rig) if p.name not in COORDINATES}
+        stated = [(name, value) for name, value in self.stated(rig).items() if name in nothing]
+        return all(not abs(value - nothing[name]) < self.deviations.get(name, 0.0) for name, value in stated)
+
     def stated(self, rig: Rig) -> dict[str, Any]:
         """The numbers that a verdict states, by name."""
         return self.numbers if self.kind.numbers is None else self.kind.numbers(self, rig)
@@ -351,6 +360,12 @@ class Effect:
     def moved_to(self, where: Where) -> "Effect":
         """The same effect elsewhere."""
         return replace(self, values={**self.values, **place_values(where)})
+
+    @property
+    def words(self) -> str:
+        """How a sentence calls it."""
+        between = self.kind.phrase_between
+        return between(self) if between is not None and isinstance(self.at, Between) else self.kind.words
 
     @property
     def label(self) -> str:
@@ -399,6 +414,25 @@ def can_be(rig: Rig, effects: Iterable[Effect]) -> bool:
     except (ValueError, np.linalg.LinAlgError):
         return False
     return True
+
+
+def nearest_possible(rig: Rig, effects: Sequence[Effect], beside: Sequence[Effect] = ()) -> tuple[Effect, ...]:
+    """The effects, weaker until a rig can have them beside others: what a stiffer beam bears may buckle this one.
+
+    As they are where no weaker ones can be either.
+    """
+    for share in WEAKER ** np.arange(WEAKENINGS):
+        weaker = tuple(_weakened(effect, rig, float(share)) for effect in effects)
+        if can_be(rig, (*weaker, *beside)):
+            return weaker
+    return tuple(effects)
+
+
+def _weakened(effect: Effect, rig: Rig, share: float) -> Effect:
+    """The effect with a share of what its numbers are off from where they change nothing."""
+    numbers = {p.name: p.neutral for p in effect.parameters(rig) if p.neutral is not None}
+    moved = {name: none + share * (effect.values[name] - none) for name, none in numbers.items()}
+    return replace(effect, values={**effect.values, **moved})
 
 
 def simpler_forms(effect: Effect, rig: Rig) -> tuple[Effect, ...]:

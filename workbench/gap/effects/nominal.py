@@ -38,6 +38,7 @@ JUST_LATE = 1e-3  # of a sample: later, an accelerometer reads what was before a
 SURE = 1e-9  # of the largest variance of errors, each in units of its own: less is no doubt
 LITTLE, STRONG = 0.25, 25.0  # radians by which a coupling of one turns two modes: less is none, more is no small error
 WIDEST = 8.0  # prior deviations: bounds, far outside of what a nominal model can be off by
+UNITS = 2.0  # as large as the largest size that errors are believed to have before any record
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,8 @@ def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
     def believed(
         name: str, std: float, unit: float, low: float = -np.inf, high: float = np.inf, sensor: str = ""
     ) -> Parameter:
-        reach, unit = WIDEST * max(std, unit), unit * weight_of(name, prior)
+        # a size that is learnt to be smaller than before leaves errors where they are
+        reach, unit = WIDEST * max(std, UNITS * unit), unit * weight_of(name, prior)
         prior_std = max(std * weight_of(name, prior) / unit, 1e-6)
         return Parameter(name, "", max(low, -reach), min(high, reach), scale=unit, prior_std=prior_std, sensor=sensor)
 

@@ -333,6 +333,11 @@ def _slipping(rig: Rig, _: object, v: dict[str, Any]) -> Rig:
     )
 
 
+def _always_slipping(joint: Effect, _: Rig) -> tuple[Effect, ...]:
+    """One that holds nothing before it slips is a loss of stiffness."""
+    return (Effect(GROUND_SPRING, None, {**place_values(joint.at), "stiffness": -joint.values["stiffness"]}),)
+
+
 JOINT_SLIP = Kind(
     name="joint_slip",
     path="structure",
@@ -341,6 +346,7 @@ JOINT_SLIP = Kind(
     starts=_slip_starts,
     targets=lambda rig: (None,) if isinstance(rig.modes.domain, NamedPoints) and any(rig.modes.domain.pairs()) else (),
     nonlinear=True,
+    simpler=_always_slipping,
     phrase="a joint that slips",
 )
 

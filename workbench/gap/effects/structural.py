@@ -266,6 +266,7 @@ GROUND_SPRING = Kind(
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointSpring(place_of(v), v["stiffness"]))),
     starts=_point_starts("stiffness", "displacement", "stiffness", signed=True),
     phrase="a spring to ground",
+    phrase_between=lambda spring: "a spring" if spring.values["stiffness"] > 0 else "a loss of stiffness",
     simpler=_turning_spring,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * w},
 )
@@ -280,6 +281,7 @@ POINT_DAMPER = Kind(
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
     starts=_point_starts("coefficient", "velocity", "damping"),
     phrase="a viscous damper to ground",
+    phrase_between=lambda damper: "a viscous damper",
     applied_last=True,
     force_laws={"velocity": lambda v, u: -v["coefficient"] * u},
 )
@@ -367,11 +369,13 @@ SUPPORT_ROTATION = Kind(
 
 
 def buckling_load(rig: Rig) -> float:
-    """Roughly the compression, N, that buckles a beam: that of one as stiff as the softest section."""
-    beam = _beam(rig)
-    x = (np.arange(40) + 0.5) / 40 * beam.length
-    held = sum(end.rotation == HELD for end in (beam.left, beam.right))
-    return float(np.min(beam.bending_stiffness(x))) * (np.pi / beam.length) ** 2 * (1.0 + held)
+    """The compression, N, that buckles a rig's beam."""
+    return _buckles_under(_beam(rig))
+
+
+@lru_cache(maxsize=64)
+def _buckles_under(beam: Beam) -> float:
+    return beam.buckling_load()
 
 
 def _pulled(rig: Rig, _: object, values: dict[str, float]) -> Rig:

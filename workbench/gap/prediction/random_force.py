@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
 from scipy.optimize import minimize
 
 from workbench.arrays import Floats
@@ -38,6 +37,7 @@ class RandomForceSettings:
     tolerance: float = 1e-4  # shares and logarithms
     loss_tolerance: float = 0.1  # twice a log-likelihood
     evaluations: int = 160
+    doublings: int = 40  # of samples, at most, over which a force's memory of what drives it is summed
     families: int = 3  # of colours, likeliest first, that are fitted to two records before one is to all
     curved_over: float = 2e-3  # of the extent: half of the stretch over which the likelihood's curvature is taken
     # what may be one random force of the surroundings: by how much its level spreads between records, relative; how far
@@ -238,10 +238,18 @@ def _filter(model: SampledModel, rig: Rig, at: Where, rms: float, colour: Floats
 
 
 def _power(colour: Floats) -> float:
-    """Variance of a force per variance of what drives its colour."""
-    drive = np.zeros_like(colour)
-    drive[-1, -1] = 1.0
-    return float(solve_discrete_lyapunov(colour, drive)[0, 0])
+    """Variance of a force per variance of what drives its colour: Σ (Aᵏ)₁ₙ², over twice as many samples each time.
+
+    Smith, SIAM J. Appl. Math. 16 (1968) 198. Stages in a row near a random walk are too much for a linear solution.
+    """
+    power, step = np.zeros_like(colour), colour
+    power[-1, -1] = 1.0
+    for _ in range(RANDOM_FORCE.doublings):
+        more = power + step @ power @ step.T
+        if np.array_equal(more, power):
+            break
+        power, step = more, step @ step
+    return float(power[0, 0])
 
 
 def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float:

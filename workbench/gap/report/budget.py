@@ -171,7 +171,7 @@ class Budget:
     @property
     def errors_are_small(self) -> bool:
         """Whether a careful laboratory could have a nominal model with these errors."""
-        return all(self.errors.get(f"{PLURAL[group]}_percent", 0.0) < most for group, most in MOST)
+        return are_small(self.errors)
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, as the case format asks for them: effects by kind."""
@@ -215,8 +215,7 @@ def budget_of(
 
     def squares(chosen: Sequence[Effect]) -> np.ndarray:
         """Mean square (n_records,) of what is left with these effects."""
-        real = apply_all(rig, chosen)
-        return np.array([mean_square(real, record, settle) for record in records])
+        return np.array([left_with(rig, chosen, record, settle) for record in records])
 
     labels, causes = labels_of(effects, rig.modes.domain), list(effects)
     alike, between = (None, None) if errors is None else parted(errors)
@@ -265,6 +264,15 @@ def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
     ]
 
 
+def left_with(rig: Rig, effects: Sequence[Effect], record: Record, settle: float) -> float:
+    """Mean square of what a rig with effects leaves of a record; without bounds of one that cannot be."""
+    try:
+        corrected = apply_all(rig, effects)
+    except (ValueError, np.linalg.LinAlgError):
+        return RUNAWAY
+    return mean_square(corrected, record, settle)
+
+
 def mean_square(rig: Rig, record: Record, settle: float) -> float:
     """Mean square of what a rig leaves of a record, each sensor by the standard deviation of its readings."""
     with np.errstate(over="ignore", invalid="ignore"):  # one effect of two that balance each other may run away
@@ -289,6 +297,11 @@ def power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.nd
     powers = loudest_logging_noise(rig, FitData(tuple(records), np.ones(len(rig.sensors)), settle=settle))
     scales = np.array([scale_of(record.outputs[:, lead_of(record, settle) :])[:, 0] for record in records])
     return np.asarray((powers / scales**2).mean(axis=1))
+
+
+def are_small(sizes: Mapping[str, float]) -> bool:
+    """Whether a careful laboratory could have a nominal model with errors of these sizes; see `sizes_of`."""
+    return all(sizes.get(f"{PLURAL[group]}_percent", 0.0) < most for group, most in MOST)
 
 
 def sizes_of(errors: Effect | None) -> dict[str, float]:
@@ -395,7 +408,7 @@ def with_held_out(
 
         def left(deviation: float, record: Record = record, name: str = name) -> float:
             own = replace(errors, values={**errors.values, name: deviation})
-            return mean_square(apply_all(rig, (*others, own)), record, settle)
+            return left_with(rig, (*others, own), record, settle)
 
         found = minimize_scalar(left, bounds=(-reach, reach), method="bounded", options={"xatol": SURELY * reach})
         values[name] = float(found.x)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.effects.nonlinear import any_beyond
@@ -243,7 +242,7 @@ class Verdict:
     def alternatives_in_words(self) -> tuple[tuple[str, float], ...]:
         """The alternatives in words, by the phrases of their kinds: (set, probability), likeliest first."""
         return tuple(
-            (in_words(fit.named, [effect.kind for effect in fit.effects]), probability)
+            (joined_in_words([_called(e) for e in fit.effects if not e.kind.applied_first]), probability)
             for fit, probability in self.attribution.alternatives
         )
 
@@ -359,6 +358,12 @@ def where_json(where: Where) -> dict[str, Any]:
     }
 
 
+def _called(effect: Effect) -> str:
+    """What an effect is called without its numbers, such as: a constant force of an actuator (F2)."""
+    _, _, target = effect.label.rstrip("]").partition("[")
+    return effect.words + (f" ({target})" if target else "")
+
+
 def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
     """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01; a wrong sensor gain (d4: gain 0.93)."""
     stated = effect.stated(nominal)
@@ -368,7 +373,7 @@ def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
         for name, unit in units.items()
         if name not in COORDINATES
     ]
-    kind, text = effect.kind, effect.kind.words
+    kind, text = effect.kind, effect.words
     inside = kind.remark(effect, nominal) if kind.remark is not None else ", ".join(n.strip() for n in numbers)
     if kind.path in ("actuator", "sensor"):
         target = effect.target if effect.target == ALL else kind.conjunction.join(names_in(effect.target))

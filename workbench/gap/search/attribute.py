@@ -252,15 +252,15 @@ def _anew(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
 
 
 def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
-    """The fit without effects of which no number stands out of its deviation, or with such a one as a limiting case.
+    """The fit without effects of which a number does not stand out of its deviation, or with a limiting case of it.
 
-    Where the records need it all the same, they tell two of its numbers together alone: friction far below its
-    smoothing speed is a damper, a hysteretic spring that always slides is friction.
+    Where the records need it all the same, they tell two of its numbers together alone, friction far below its
+    smoothing speed is a damper, or hardly one: a joint of hardly any yield displacement is a loss of stiffness.
     """
     data, rig = search.data.finely(SELECTION.fine), search.rig
 
     for effect in best.effects:
-        if effect in seen or effect.stands_out(rig):
+        if effect in seen or effect.kind.applied_first or (effect.stands_out(rig) and effect.is_sure(rig)):
             continue
         others = [e for e in best.effects if e is not effect and e not in seen]
         here = cost_of(rig, best.effects, data)

@@ -25,8 +25,12 @@ from workbench.rig.rig import Rig
 
 def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
     """Whether a careful laboratory could have a nominal model with these errors; those of damping where they count."""
-    widest = ((group, size) for group, size in _widest(errors.target) if damping or group != "damping")
-    return all(size_of(errors, group) < JOINT.plausible * size for group, size in widest)
+    return not [group for group in too_large(errors) if damping or group != "damping"]
+
+
+def too_large(errors: Effect) -> list[str]:
+    """The groups of errors that are larger than in a careful laboratory."""
+    return [group for group, size in _widest(errors.target) if size_of(errors, group) >= JOINT.plausible * size]
 
 
 def size_of(errors: Effect, group: str) -> float:

@@ -169,13 +169,12 @@ def _bounds(starts: list[Effect]) -> tuple[float, float]:
 
 def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[list[Effect]]:
     """Where to start every kind and target that may be there beside the given effects: one list a kind and target."""
-    rig = apply_all(search.rig, given)
-    left = search.data.by_channel(search.data.residual(apply_all(rig, search.held)))
+    left = search.data.by_channel(search.data.residual(apply_all(search.rig, (*given, *search.held))))
     starts = [
         [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
         for kind in search.catalogue
         if kind.found_in == "search"
-        for target in _targets_worth_trying(kind, rig, left)
+        for target in _targets_worth_trying(kind, search.rig, left)
     ]
     return [task for task in starts if task and not any(_repeats(task[0], effect) for effect in given)]
 

@@ -16,6 +16,7 @@ from workbench.gap.effects.effect import (
     key_of,
     merged_sets,
     more_general_sets,
+    nearest_possible,
     simpler_sets,
     with_one_simpler,
 )
@@ -580,7 +581,10 @@ class Stepwise:
         whole = data.predictions(apply_all(rig, beside))
 
         def altered(effect: Effect) -> float:
-            without = data.predictions(apply_all(rig, [e for e in beside if e is not effect]))
+            others = [e for e in beside if e is not effect]
+            if not can_be(rig, others):  # what the others need to be at all alters all
+                return np.inf
+            without = data.predictions(apply_all(rig, others))
             each = zip(whole, without, scales, strict=True)
             return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
 
@@ -612,7 +616,9 @@ class Stepwise:
         Where frequencies are off, motions of whole records run out of step; predictions one sample ahead show the way.
         """
         search = self.search
-        none = on_their_sides(search, nominal_errors(search.rig, search.prior), effects)
+        none = nominal_errors(search.rig, search.prior)
+        effects = nearest_possible(search.rig, effects, (none,))  # errors that are gone now may have held them
+        none = on_their_sides(search, none, effects)
         ahead = self._ahead(effects, none)
         *others, errors = ahead.effects
         # with frequencies set right the sides show better
