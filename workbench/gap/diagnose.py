@@ -231,13 +231,17 @@ def _faulty(effects: Sequence[Effect]) -> set[str]:
 def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: float) -> Attribution:
     """What was found, without effects that act on records held out and take nothing away there.
 
-    A trifle that is left of a measured gap bends to any law, on the records that were fitted; and a nearest set that
-    makes the gap of others larger corrects nothing.
+    A trifle that is left of a measured gap bends to any law, on the records that were fitted; and what makes
+    the gap of others larger, in a nearest set, corrects nothing.
     """
     effects = found.best.effects
     if found.outcome in ("part", "unknown") and not _unpredictable(found):
-        is_worse = _left_of(rig, effects, unseen, settle) > _left_of(rig, found.seen, unseen, settle)
-        return found.without(*(e for e in effects if e not in found.seen)) if is_worse else found
+        with_none, kept = _left_of(rig, found.seen, unseen, settle), effects
+        while len(kept) > len(found.seen) and _left_of(rig, kept, unseen, settle) > with_none:
+            fewer = [tuple(e for e in kept if e is not one) for one in kept if one not in found.seen]
+            kept = min(fewer, key=lambda rest: _left_of(rig, rest, unseen, settle))
+        dropped = [e for e in effects if e not in kept]
+        return _paid_for(rig, found.without(*dropped), unseen, settle) if dropped else found
     named = [e for e in effects if not e.kind.applied_first and e not in found.seen]
     if found.outcome != "explained" or len(named) < 2 or _unpredictable(found):
         return found

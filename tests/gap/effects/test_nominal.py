@@ -7,7 +7,11 @@ import numpy as np
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
-from workbench.rig.rig import shape_of
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig, shape_of
+from workbench.rig.sensors import Sensor
+from workbench.structure.damping import ModalDamping
+from workbench.trials.plane_frame import Section, plane_frame
 
 
 def test_an_exchanged_sensor_that_is_off_its_place_stays_on_the_structure(hinged_rig):
@@ -27,3 +31,31 @@ def test_errors_stay_where_they_are_when_their_size_is_learnt_to_be_smaller(hing
     rig = hinged_rig(n_modes=3)
     before = nominal_errors(rig, NominalPrior(stiffness=0.02), {"stiffness_1": 0.15})
     assert nominal_errors(rig, replace(before.target, stiffness=0.01), before.values).values == before.values
+
+
+def test_an_uneven_stiffness_turns_modes_into_one_another_as_it_does_in_the_matrices():
+    """To first order by e_rs = φ_rᵀ δK φ_s / (ω_r ω_s); what is left is of second order, and of modes beyond."""
+    section = Section(axial=1e6, bending=5.0, mass=3.0)
+    nodes = {f"{side}{k}": (x, 0.5 * k) for side, x in (("L", 0.0), ("R", 0.7)) for k in range(4)}
+    strips = [(f"{s}{k}", f"{s}{k + 1}", section) for s in "LR" for k in range(3)]
+    strips += [(f"L{k}", f"R{k}", section) for k in (1, 2, 3)]
+    even, uneven = (
+        plane_frame(nodes, strips, fixed=("L0", "R0"), damping=ModalDamping(0.01), stiffness_waves=waves)
+        for waves in ((), (0.01, -0.02))
+    )
+    modes, real = even.modes(8), uneven.modes(8)
+    names = [*modes.domain.names]
+    shapes, off = modes.phi(names), uneven.stiffness.toarray() - even.stiffness.toarray()
+    rig = Rig(modes, [Actuator("F", "L1.x")], [Sensor("a", "R3.x")])
+    prior = NominalPrior(coupling=0.01)
+    start = {}
+    for name in nominal_errors(rig, prior).values:
+        r, s = (int(number) - 1 for number in name.split("_")[1:])
+        start[name] = float(shapes[:, r] @ off @ shapes[:, s] / (modes.omega[r] * modes.omega[s]))
+    turned = apply_all(rig, (nominal_errors(rig, prior, start),)).modes.phi(names)
+    true = real.phi(names) * np.sign(np.sum(real.phi(names) * shapes, axis=0))
+    lowest = slice(0, 5)
+    before, after = (np.linalg.norm((x - true)[:, lowest]) for x in (shapes, turned))
+    assert after < 0.2 * before and before > 0.01 * np.linalg.norm(true[:, lowest])
+    mass = even.mass.toarray()
+    np.testing.assert_allclose(turned.T @ mass @ turned, np.eye(8), atol=1e-9)

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from workbench.deadline import Deadline
-from workbench.gap.diagnose import diagnose
+from workbench.gap.diagnose import diagnose, diagnose_case
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_errors
@@ -133,6 +133,15 @@ def test_noise_that_was_stated_too_small_is_found(rig, measured):
     assert verdict.outcome == "none" and not verdict.to_json()["effects"]
     assert verdict.budget.noise_ratio == pytest.approx(1.7, rel=0.05)
     assert any("1.7 times the stated" in note for note in verdict.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "kinds"), [(91002, ()), (91003, ("actuator_hysteresis",)), (91005, ())])
+def test_a_frame_that_is_uneven_hides_no_effect_and_makes_none(seed, kinds):
+    """Its mass and stiffness vary by 2 % over the height, which turns close modes into one another."""
+    case, label = make_trial(seed, kinds=[*kinds], imperfections="shape", structure="frames")
+    score = score_imperfect(diagnose_case(case, workers=1).to_json(), label, domain=case.rig.modes.domain)
+    assert score["named"] and not (score["wrong"] or score["false_alarm"])
 
 
 def coloured(rng, shape, memory):
