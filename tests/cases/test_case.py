@@ -277,7 +277,7 @@ def test_inputs_are_held_or_run_straight_as_the_case_says(case, tmp_path):
     (folder / "case.toml").write_text('input_hold = "first"\n' + text)
     assert read_case(folder).validation[0].input_hold == "first"
     (folder / "case.toml").write_text('input_hold = "second"\n' + text)
-    with pytest.raises(CaseError, match=r"zero \(held\) or first"):
+    with pytest.raises(CaseError, match=r"zero \(held\), first"):
         read_case(folder)
 
 

@@ -118,7 +118,7 @@ def test_identify_takes_inputs_that_run_straight(tmp_path):
     assert imaginary == pytest.approx(-81.0 / (2.0 * np.sqrt(81.0 - 0.3**2)), rel=1e-4)  # the residue, k / 2i ω_d
     assert real_parts[1] < 1e-3 < 0.3 < real_parts[0]
     refused = run("identify", path, "--inputs", "F", "--input-hold", "second")
-    assert refused.exit_code == 2 and "input_hold is zero (held) or first" in " ".join(refused.output.split())
+    assert refused.exit_code == 2 and "input_hold is zero (held), first" in " ".join(refused.output.split())
 
 
 def test_identify_reads_transfer_functions(tmp_path):

@@ -553,7 +553,7 @@ def test_what_a_hardening_spring_adds_to_each_resonance_is_no_mode(n_outputs):
 
 def test_half_a_record_that_ends_before_the_inputs_act_tells_nothing():
     record = measured(system(), excitation("noise", n=100))
-    data = KnownInputs([record], at_rest=False, straight=False, feedthrough=True, delays=np.full(2, 60.0))
+    data = KnownInputs([record], at_rest=False, hold="zero", feedthrough=True, delays=np.full(2, 60.0))
     fit = projected(data, POLES, np.ones((4, data.n_excitations), complex))
     assert without_unpredictive(data, fit, np.arange(4.0), Budget()) == (fit, ())
 
@@ -610,5 +610,5 @@ def test_the_former_name_of_the_hold_warns_and_an_unknown_one_is_refused():
     record = measured(system(), np.zeros((2, 200)))
     with pytest.warns(DeprecationWarning, match='input_hold="first"'), pytest.raises(ValueError, match="is zero"):
         identify_driven(record, straight=True)
-    with pytest.raises(ValueError, match="input_hold is 'zero' or 'first'; got 'straight'"):
+    with pytest.raises(ValueError, match="input_hold is 'zero' or 'first' or 'band-limited'; got 'straight'"):
         identify_driven(record, input_hold="straight")

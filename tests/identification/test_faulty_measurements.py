@@ -61,7 +61,7 @@ def test_filtered_alike_a_shaker_test_holds_its_modes(filtered):
 def test_a_pole_at_nyquist_has_a_statistic(filtered):
     """Half a turn a sample has no imaginary part, so that its two columns are one; such tests led there."""
     force, outputs, rate = filtered
-    data = KnownInputs([record(force, outputs, rate)], at_rest=True, straight=False, feedthrough=True)
+    data = KnownInputs([record(force, outputs, rate)], at_rest=True, hold="zero", feedthrough=True)
     fit = projected(data, 2.0 * np.pi * HZ[:1] * (-0.01 + 1j), np.ones((1, 1), complex))
     (part,) = fit.parts
     spread = part.spread.copy()

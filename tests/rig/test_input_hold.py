@@ -99,5 +99,5 @@ def test_a_filter_predicts_its_own_motion():
 def test_a_record_says_how_its_inputs_run():
     record = Record(DT, np.zeros((1, 9)), (Channel("y"),), np.ones((1, 9)), (Channel("u"),), input_hold="first")
     assert record.between(0.1).input_hold == record.select_outputs(["y"]).input_hold == "first"
-    with pytest.raises(ValueError, match=r"zero \(held\) or first"):
+    with pytest.raises(ValueError, match=r"zero \(held\), first"):
         replace(record, input_hold="second")

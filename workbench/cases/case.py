@@ -374,7 +374,10 @@ def _hold(table: dict[str, Any], where: str) -> str:
     """How inputs run between samples."""
     hold = table.get("input_hold", "zero")
     if hold not in HOLDS:
-        raise CaseError(f"{where}: input_hold is zero (held) or first (straight between samples); got {shown(hold)}")
+        raise CaseError(
+            f"{where}: input_hold is zero (held), first (straight between samples) or band-limited (as behind an"
+            f" anti-alias filter); got {shown(hold)}"
+        )
     return str(hold)
 
 

@@ -14,8 +14,9 @@ SampleRate = Annotated[float | None, typer.Option(help="Sampling rate, where the
 InputHold = Annotated[
     str | None,
     typer.Option(
-        metavar="ORDER",
-        help="How inputs run between samples: zero (held) or first (straight); as the file says unless given.",
+        metavar="HOLD",
+        help="How inputs run between samples: zero (held, as a command), band-limited (as a force measured behind an"
+        " anti-alias filter) or first (straight); as the file says unless given.",
     ),
 ]
 PagePath = Annotated[Path | None, typer.Option("--page", help="HTML file to write; default out/NAME.html.")]

@@ -21,7 +21,8 @@ from workbench.identification.input_output.excitation import check_inputs, unexc
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.force_window import force_window
 from workbench.identification.input_output.held_out import left_about, unpredictive_remarks, without_unpredictive
-from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
+from workbench.identification.input_output.input_delays import act_later, best_delays, first_lags, fractions
+from workbench.identification.input_output.input_holds import hold_remarks
 from workbench.identification.input_output.input_noise import (
     blow_noise,
     input_noise,
@@ -38,6 +39,7 @@ from workbench.identification.input_output.model_order import (
     fit_of_poles,
     is_about_distorted,
     select_modes,
+    statistic_of_each,
     sure_modes,
 )
 from workbench.identification.input_output.noise_spectrum import alike
@@ -85,7 +87,7 @@ class Driven(ParticipatingModes):
         feedthrough: (n_outputs, n_inputs) D: of accelerations, and of the modes above those identified.
         feedthrough_std: (n_outputs, n_inputs).
         delays: (n_inputs,) s, τ by which each input acts late.
-        input_hold: "zero" or "first": the order of the hold that inputs follow between samples.
+        input_hold: "zero", "first" or "band-limited": how inputs run between samples.
         sample_time: s, of the records.
         initial: one (n_modes,) complex a record: z_r at its first sample, where y = Re Σ 2 c_r z_r; zero if at rest.
         noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
@@ -165,8 +167,8 @@ class Driven(ParticipatingModes):
         silent = np.zeros((len(self.output_channels), u.shape[1]))
         driven = Record(self.sample_time, silent, self.output_channels, u, self.input_channels)
         delays = _checked_delays([driven], self.delays)
-        data = KnownInputs([driven], at_rest=True, straight=self.input_hold == "first", feedthrough=True, delays=delays)
-        y = self.feedthrough @ data.direct(u)
+        data = KnownInputs([driven], at_rest=True, hold=self.input_hold, feedthrough=True, delays=delays)
+        y = self.feedthrough @ data.direct(0)
         time = self.sample_time * np.arange(u.shape[1])
         for r, pole in enumerate(self.modes.poles):
             real, imaginary = data.responses(pole)
@@ -212,9 +214,11 @@ def identify_driven(
     Args:
         records: with the same inputs and outputs at one rate; each output may hold a constant, another in each record.
         at_rest: that nothing moves at the first sample; otherwise each record has an initial state of its own.
-        input_hold: "first" for inputs that follow a first-order hold, straight from sample to sample, as measured
-            signals through a filter nearly do; "zero" for a zero-order hold, as a converter gives them. As the records
-            say unless given.
+        input_hold: how inputs run between samples: "zero" for a zero-order hold, as of the command that a converter
+            gives out; "band-limited" for what holds nothing beyond half of the sample rate, as a force measured behind
+            the anti-alias filter of a logger; "first" for a first-order hold, straight from sample to sample, as a
+            force nearly runs that is slow against the sample rate. As the records say unless given; where these show
+            that another is true, a remark says which.
         feedthrough: whether there is a direct term: of accelerations, and of modes beyond the sample rate.
         delays: (n_inputs,) s, by which each input acts late; estimated unless given, up to 60 samples. Of inputs held
             between samples, with a direct term, the fraction of a sample is the one that makes the modes most nearly
@@ -250,7 +254,7 @@ def identify_driven(
     data = KnownInputs(
         records,
         at_rest=at_rest,
-        straight=hold == "first",
+        hold=hold,
         feedthrough=feedthrough,
         delays=_checked_delays(records, delays),
         distorted=by_amplitude.changing,
@@ -287,6 +291,7 @@ def identify_driven(
         remarks = (*_late_remarks(data), *remarks)
     fit = joined(data, selected.fit, budget)
     selected = selected if fit is selected.fit else selected.refitted(fit)
+    holds = hold_remarks(data, selected.fit, selected.limit, budget)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     late = budget.spent("check of modes that change within the record")
     in_decay = by_amplitude.among(fit.poles)
@@ -295,7 +300,11 @@ def identify_driven(
     left = [pole for pole in beside if pole not in (*named, *by_amplitude.changing)]
     changes = (*changes, *unpredictive_remarks(fit, left))
     found = _report(
-        logged, records, data, selected, (*clipped, *windowed, *drift, *remarks, *overlap, *changes, *budget.remarks)
+        logged,
+        records,
+        data,
+        selected,
+        (*clipped, *windowed, *drift, *holds, *remarks, *overlap, *changes, *budget.remarks),
     )
     deviation = found.modes.omega * found.zeta_std + 1j * found.omega_std
     decays = by_amplitude.remarks(fit.poles, _sizes(data, fit), deviation)
@@ -325,9 +334,11 @@ def _with_delays(
     where the modes leave what the inputs a sample earlier explain.
     """
     first = first_lags(data.records)
-    whole = np.maximum(first - (0 if data.straight else 1), 0)
+    if data.hold == "band-limited":
+        return _with_any_delays(data, first, budget, strongest, **how)
+    whole = np.maximum(first - (0 if data.hold == "first" else 1), 0)
     in_time: tuple[KnownInputs, Selected] | None = None
-    if not data.straight and not first.any():
+    if data.hold == "zero" and not first.any():
         return _selected(data, budget, strongest, **how)
     late = data.delayed_by(whole, any_fraction=True)
     strongest = _strongest(late, budget=budget, **how)
@@ -353,6 +364,36 @@ def _with_delays(
         return _selected(punctual, budget, _strongest(punctual, fit, budget=budget, **how), **how)
     late = data.delayed_by(whole + fraction)
     return late, selected.refitted(settled(late, _moved_to(late, data, fit), budget=budget))
+
+
+def _with_any_delays(
+    data: KnownInputs, first: Floats, budget: Budget, strongest: Selected | None, **how: Any
+) -> tuple[KnownInputs, Selected]:
+    """The modes, and how late each band-limited input acts, beside which no two columns stand for any fraction."""
+    late = data.delayed_by(first) if first.any() else data
+    for _ in range(DRIVEN.learnt):  # before any mode is looked for in what the delay makes
+        few, before = _start(late, **how), late
+        if few.poles.size:
+            late, _ = _in_time(late, few, budget)
+        if late is before:
+            break
+    late, selected = _selected(late, budget, strongest if late is data else None, **how)
+    if not selected.fit.poles.size:
+        return late, selected
+    found, fit = _in_time(late, selected.fit, budget)
+    return (late, selected) if found is late else (found, selected.refitted(settled(found, fit, budget=budget)))
+
+
+def _in_time(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit]:
+    """Band-limited inputs late by the delays that are the most likely, and the modes turned to them."""
+
+    def moved(delays: Floats) -> tuple[KnownInputs, Fit]:
+        other = data.delayed_by(delays)
+        return other, _moved_to(other, data, fit)
+
+    derivative = time_derivatives(data.records[0].output_channels)[:, None]
+    delays = best_delays(data.delays, moved, derivative, budget)
+    return (data, fit) if (delays == data.delays).all() else moved(delays)
 
 
 def _lateness(data: KnownInputs, fit: Fit, whole: Floats, budget: Budget) -> tuple[Floats, Floats]:
@@ -408,7 +449,10 @@ def _start(data: KnownInputs, **how: Any) -> Fit:
     """The modes of a subspace model."""
     poles = subspace_poles(data.records, data.whole, 2 * how["max_modes"] + DRIVEN.spare)
     poles = np.append(poles[~is_about_distorted(data, poles)], data.free)
-    return fit_of_poles(data, poles, how["false_alarm"])
+    fit = fit_of_poles(data, poles, how["false_alarm"])
+    if fit.poles.size <= how["max_modes"]:
+        return fit
+    return only(data, fit, np.argsort(statistic_of_each(fit))[-how["max_modes"] :])
 
 
 def _predictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
@@ -607,7 +651,7 @@ def _report(
         feedthrough=frozen(direct),
         feedthrough_std=frozen(direct_std),
         delays=frozen(data.delays * data.dt),
-        input_hold="first" if data.straight else "zero",
+        input_hold=data.hold,
         sample_time=data.dt,
         initial=tuple(
             frozen(np.zeros(n) if data.at_rest else participation[:, n_inputs + k], complex)

@@ -60,7 +60,7 @@ class Description:
         channels: by signal: kind, name, quantity, unit, at, noise_std, as far as given.
         name: of the record; None where only channels are described.
         sampling: (start, step), s; None where there are times alone.
-        input_hold: "zero" or "first".
+        input_hold: "zero", "first" or "band-limited".
     """
 
     channels: Mapping[str, Mapping[str, Any]]

@@ -57,8 +57,8 @@ def read_record(
         path: of a .csv, .txt, .asc, .dat, .tsv, .npz, .mat, .h5, .hdf5, .uff, .unv, .tdms or .wav file.
         sample_rate_hz: where the file itself has no time.
         inputs: names of the signals that went in, where the file does not say.
-        input_hold: "zero" or "first", how inputs run between samples; as the file says unless given, "zero" where it
-            does not, as those of other programs never do.
+        input_hold: "zero", "first" or "band-limited", how inputs run between samples; as the file says unless given,
+            "zero" where it does not, as those of other programs never do.
         limits: of memory and processor time.
         units: in which the signals are wanted, those of a case say; numbers without a unit stay as they are.
 

@@ -14,7 +14,8 @@ from workbench.structure.printed import Printed, counted, place_text
 if TYPE_CHECKING:
     import control  # takes seconds to import: most who read a record never need it
 
-HOLDS = ("zero", "first")  # how an input runs between samples: held, or straight from one to the next
+# how an input runs between samples: held, straight from one to the next, or as an anti-alias filter lets it
+HOLDS = ("zero", "first", "band-limited")
 QUANTITIES = {
     "displacement": "m",
     "slope": "rad",
@@ -65,8 +66,9 @@ class Record(Printed):
         output_channels: one `Channel` a row of `outputs`.
         inputs: (n_inputs, n_samples) signals that went in; may have no rows.
         input_channels: one `Channel` a row of `inputs`.
-        input_hold: "zero" where inputs are held over each sample interval, as a converter gives them, or "first" where
-            they run straight from sample to sample, as measured forces nearly do.
+        input_hold: "zero" where inputs are held over each sample interval, as a converter gives them, "band-limited"
+            where they hold nothing beyond half of the sample rate, as forces measured behind an anti-alias filter, or
+            "first" where they run straight from sample to sample, as forces slow against the sample rate nearly do.
         start_time: time of the first sample, s.
         name: how messages and plots call it.
         remarks: what reading the file changed: units, time steps.
@@ -97,8 +99,8 @@ class Record(Printed):
             raise ValueError(f"record {self.name!r}: the sample time must be positive; got {self.sample_time}")
         if self.input_hold not in HOLDS:
             raise ValueError(
-                f"record {self.name!r}: input_hold is zero (held) or first (straight between samples); got"
-                f" {self.input_hold!r}"
+                f"record {self.name!r}: input_hold is zero (held), first (straight between samples) or band-limited"
+                f" (as behind an anti-alias filter); got {self.input_hold!r}"
             )
         if outputs.shape[1] == 0:
             raise ValueError(f"record {self.name!r} is empty: it holds no samples")

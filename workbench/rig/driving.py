@@ -13,6 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from workbench.arrays import Complexes, Flags, Floats
+from workbench.records.band_limited import finer
 from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
 from workbench.rig.linear import shifted, whole_samples
@@ -167,7 +168,8 @@ def _forces_on_substeps(
     crooked = []
     h = sample_time / substeps
     for j, actuator in enumerate(actuators):
-        force = actuator_force(actuator, inputs[j])
+        given = finer(inputs[j : j + 1], substeps)[0] if input_hold == "band-limited" else inputs[j]
+        force = actuator_force(actuator, given)
         if input_hold == "zero":
             mean[j] = start = np.repeat(force, substeps)
             if np.isfinite(actuator.rate_limit):
@@ -176,8 +178,9 @@ def _forces_on_substeps(
                 change = np.diff(np.r_[start, 2.0 * mean[j, -1] - start[-1]])
                 share = np.minimum(np.abs(change) / most, 1.0)  # of the substep, until the ramp ends
                 rise[j] = change * share * (1.5 - share)
-        else:  # straight from sample to sample; after the last it stays
-            edges = np.interp(np.arange(mean.shape[1] + 1), substeps * np.arange(inputs.shape[1]), force)
+        else:  # straight from sample to sample, or from substep to substep; after the last it stays
+            every = mean.shape[1] // force.size
+            edges = np.interp(np.arange(mean.shape[1] + 1), every * np.arange(force.size), force)
             if np.isfinite(actuator.rate_limit):
                 _, edges = stepping.ramped(np.r_[edges[1:], edges[-1]], actuator.rate_limit * h)
             start = edges[:-1]

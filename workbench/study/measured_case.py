@@ -29,7 +29,7 @@ def measured_case(
         records: files to diagnose, of the same channels.
         validation: files that only measure how far the gap shrinks.
         inputs: names of the input channels, where the files do not say.
-        input_hold: "zero" or "first", how they run between samples; as the files say unless given.
+        input_hold: "zero", "first" or "band-limited", how they run between samples; as the files say unless given.
         quantity: of outputs whose files state none: "displacement", "velocity" or "acceleration".
         driving_point: an input and the output at its place, which scale the shapes; those of one name or place unless
             given.

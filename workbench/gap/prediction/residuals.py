@@ -190,7 +190,8 @@ class FitData:
             return np.concatenate([whiten(self.whiteners[record.name], left).ravel() for record, left in each])
         if observer is None:
             return np.concatenate([(r / self.noise[:, None]).ravel() for r in self.differences(rig)])
-        if is_stepped(rig) or steps_exactly(rig):
+        on_samples = all(record.input_hold != "band-limited" for record in self.records)
+        if is_stepped(rig) or (on_samples and steps_exactly(rig)):
             substeps, first = self.substeps if is_stepped(rig) else 1, self._from_the_first_sample
             rigs = [(rig.in_record(record.name), record) for record in self.records]
             # a sensor's fault does not change the motion, which may be known

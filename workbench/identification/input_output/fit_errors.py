@@ -141,7 +141,7 @@ def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray, further: Flo
     variance = np.hstack(found)
     if further is not None:
         variance += np.diag(further)[free.size :].reshape(fit.noise.size, -1).T[n:]
-    return np.asarray(np.sqrt(variance))
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))  # of columns next to alike, round-off may be more
 
 
 def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:

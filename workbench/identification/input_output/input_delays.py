@@ -7,18 +7,20 @@ and u_k-1, beside the modes (`known_inputs`): the columns fitted say what f was.
 direct term, leave nothing to tell the fraction by; it is then the one that makes the modes most nearly real.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
+from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import fixed_std
 from workbench.identification.input_output.known_inputs import KnownInputs, sources
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.model_order import statistic_of_each
-from workbench.identification.signal.searches import FALSE_ALARM
+from workbench.identification.signal.searches import FALSE_ALARM, Budget
 from workbench.records.record import Record
 
 
@@ -114,18 +116,13 @@ def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray
     """
     q = data.n_inputs
     columns, noise = _columns(data, fit)
-    seen = fit.amplitudes / fit.poles**derivative
-    turn = np.exp(-0.5j * np.angle((seen**2).sum(axis=0)))
-    phase = np.angle(1j * fit.participation[:, :q] / turn[:, None])
-    statistic = statistic_of_each(fit)
-    size = np.abs(fit.participation[:, :q]) ** 2
-    known = (statistic / (statistic + DELAYS.known))[:, None] * size / size.sum(axis=1, keepdims=True)
+    phase, known = _phases(data, fit, derivative)
     cost = np.zeros((TRIED.size, q))
     for k, f in enumerate(TRIED):
-        now, before = np.array([_columns_left(pole, data.dt, f, data.straight) for pole in fit.poles]).T
+        now, before = np.array([_columns_left(pole, data.dt, f, data.hold) for pole in fit.poles]).T
         l_r = fit.participation[:, :q] * np.exp(fit.poles * f * data.dt)[:, None]
         wanted = [np.real((l_r * of[:, None]).T @ fit.amplitudes.T) for of in (now, before)]
-        weight = (1.0 - f, f) if data.straight else (0.0, 1.0)
+        weight = (1.0 - f, f) if data.hold == "first" else (0.0, 1.0)
         left = columns - wanted
         if data.may_feel:  # the direct term takes what goes along its own columns
             across = weight[1] * left[0] - weight[0] * left[1]
@@ -137,10 +134,60 @@ def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray
     return np.asarray(TRIED[np.argmin(cost, axis=0)])
 
 
-def _columns_left(pole: complex, dt: float, fraction: float, straight: bool) -> tuple[complex, complex]:
+def best_delays(
+    start: Floats, moved: Callable[[Floats], tuple[KnownInputs, Fit]], derivative: np.ndarray, budget: Budget
+) -> Floats:
+    """Samples by which each band-limited input acts late, (n_inputs,); 0 where that is as likely.
+
+    Args:
+        start: (n_inputs,) about which to search.
+        moved: the inputs at some delays, and the modes turned to them.
+        derivative: (n_outputs, 1) of displacement, that each output measures.
+    """
+
+    def cost(delays: Floats) -> float:
+        data, fit = moved(delays)
+        turned, known = _phases(data, fit, derivative)
+        # a delay has a few rows fewer
+        return data.cost(fit) * n_rows / len(fit.residual) - DELAYS.real_modes * float(
+            (known * np.cos(2.0 * turned)).sum()
+        )
+
+    found, n_rows = start.astype(float), len(moved(start)[1].residual)
+    limit = chi2.isf(FALSE_ALARM / start.size, 1)
+    for i in range(start.size):
+        unit = np.eye(start.size)[i]
+
+        def at(delay: float, unit: Floats = unit, rest: Floats = found) -> float:
+            return cost(np.where(unit > 0, delay, rest))
+
+        # what comes before the delay in a sinc makes the first lag too early
+        middle = max(float(found[i]), 0.0)
+        middle_cost, after = at(middle), at(middle + 1.0)
+        while after < middle_cost and middle < DELAYS.most_lags and not budget.spent("search for delays of the inputs"):
+            middle, middle_cost, after = middle + 1.0, after, at(middle + 2.0)
+        lowest = max(middle - 1.0, 0.0)
+        best = minimize_scalar(at, bounds=(lowest, middle + 1.0), method="bounded", options={"xatol": 1e-3})
+        in_time = at(0.0) if lowest == 0.0 else np.inf
+        found[i] = best.x if best.fun < in_time - limit else 0.0
+    return found
+
+
+def _phases(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Phase of each participation factor beside that of a real mode, and its weight, (n_modes, n_inputs) each."""
+    q = data.n_inputs
+    seen = fit.amplitudes / fit.poles**derivative
+    turn = np.exp(-0.5j * np.angle((seen**2).sum(axis=0)))
+    statistic = statistic_of_each(fit)
+    size = np.abs(fit.participation[:, :q]) ** 2
+    known = (statistic / (statistic + DELAYS.known))[:, None] * size / size.sum(axis=1, keepdims=True)
+    return np.angle(1j * fit.participation[:, :q] / turn[:, None]), known
+
+
+def _columns_left(pole: complex, dt: float, fraction: float, hold: str) -> tuple[complex, complex]:
     """Of u_k and of u_k-1, what the response late by a fraction has beside e^{-λfΔt} times the one in time."""
     h, f = (1.0 - fraction) * dt, fraction
-    (c_0, c_1), _ = sources(pole, dt, straight)
-    (of_0, of_1), _ = sources(pole, h, straight)
+    (c_0, c_1), _ = sources(pole, dt, hold)
+    (of_0, of_1), _ = sources(pole, h, hold)
     turned = np.exp(-pole * f * dt)
     return of_1 * (1.0 - f) - turned * c_1, of_0 + of_1 * f - turned * c_0

@@ -1,7 +1,8 @@
 """Records with known inputs, as a `modal_fit.Measurement`: the response of each pole, and the noise.
 
 Each input u_i excites each pole, z' = λ z + Σ_i l_i u_i. Between samples the input is held, or straight from one
-to the next, so that z is exact at the samples:
+to the next, or it is limited to the band below half of the sample rate (`records/band_limited.py`); z is exact at the
+samples. Of the first two,
 
     z_k+1 = e^{λΔt} z_k + c_0 u_k + c_1 u_k+1
     held: c_0 = Δt φ_1, c_1 = 0;    straight: c_0 = Δt (φ_1 - φ_2), c_1 = Δt φ_2
@@ -13,7 +14,8 @@ the response is that of the step before carried on by h = (1 - f)Δt,
     z_k(f) = e^{λh} z_k-1 + c_0(h) u_k-1 + c_1(h) (f u_k-1 + (1 - f) u_k),
 
 which is e^{-λfΔt} z_k and a sum of u_k and u_k-1: whatever the fraction, modes with these two columns beside them are
-exact. Noise that is not white is weighted line by line of the cosine transform of all columns.
+exact. A band-limited input is itself interpolated at the fraction. Noise that is not white is weighted line by line of
+the cosine transform of all columns.
 """
 
 from collections.abc import Sequence
@@ -27,7 +29,7 @@ from scipy.fft import next_fast_len
 from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
-from workbench.arrays import Floats
+from workbench.arrays import Complexes, Floats
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, modal_coordinate, moves
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
@@ -40,6 +42,7 @@ from workbench.identification.signal.projection import (
     variances,
 )
 from workbench.identification.signal.searches import SELECTION
+from workbench.records.band_limited import later, response_of_pole, spectrum_of
 from workbench.records.record import Record
 
 # φ_k(x) = Σ x^i / (i + k)!, which ends below rounding for |x| < 6: a pole turns less than π a sample.
@@ -52,7 +55,7 @@ class KnownInputs:
 
     Args:
         records: with the same inputs and outputs at one rate.
-        at_rest, straight, feedthrough: as in `identify_driven`.
+        at_rest, hold, feedthrough: as in `identify_driven`; hold is its `input_hold`.
         delays: (n_inputs,) samples by which each input acts late; none unless given.
         any_fraction: whether each input acts later than that by any fraction of a sample, which stays unknown: then
             each has two columns of its own, that of its delay and that a sample later.
@@ -70,7 +73,7 @@ class KnownInputs:
         records: Sequence[Record],
         *,
         at_rest: bool,
-        straight: bool,
+        hold: str,
         feedthrough: bool,
         delays: np.ndarray | None = None,
         any_fraction: bool = False,
@@ -84,7 +87,7 @@ class KnownInputs:
     ) -> None:
         self.measured = measured
         self.distorted, self.free = distorted, free
-        self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
+        self.records, self.at_rest, self.hold, self.may_feel = records, at_rest, hold, feedthrough
         self.dt, self.places = records[0].sample_time, records[0].positions
         self.delays = np.zeros(records[0].n_inputs) if delays is None else np.asarray(delays, float)
         self.any_fraction = any_fraction
@@ -93,6 +96,14 @@ class KnownInputs:
         # Inputs before the record are unknown but at rest: what they move at once is left out.
         late = bool(any_fraction or self.fraction.any())
         self.first = 0 if at_rest else int(self.whole.max()) + late
+        self.driving, self.spectra = [record.inputs for record in records], [np.zeros((0, 0), complex)] * len(records)
+        if hold == "band-limited":
+            if self.fraction.any():
+                self.driving, self.fraction = (
+                    [later(u, self.fraction) for u in self.driving],
+                    np.zeros_like(self.delays),
+                )
+            self.spectra = [spectrum_of(u) for u in self.driving]
         lengths = [record.n_samples - self.first for record in records]
         ends = np.cumsum([0, *lengths])
         self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]
@@ -104,7 +115,7 @@ class KnownInputs:
             self.values = self.values * self.weights
         self.drift = drift
         slow = block_diag(*(legvander(np.linspace(-1.0, 1.0, length), drift) for length in lengths))
-        direct = np.vstack([self.direct(record.inputs).T[self.first :] for record in records])
+        direct = np.vstack([self.direct(k).T[self.first :] for k in range(len(records))])
         self.n_inputs = records[0].n_inputs
         self.n_excitations = self.n_inputs + (0 if at_rest else len(records))
         # The offset of each output holds an input that is constant already.
@@ -193,6 +204,10 @@ class KnownInputs:
         lengths = [rows.stop - rows.start for rows in found.rows]
         return found.weighted_by([_resampled(std, n) for std, n in zip(self.line_std, lengths, strict=True)])
 
+    def with_hold(self, hold: str, delays: np.ndarray) -> "KnownInputs":
+        """The same records with inputs that run otherwise between samples, late by these delays, samples."""
+        return self._with(hold=hold).delayed_by(delays)
+
     def apart(self, fit: Fit) -> "KnownInputs | None":
         """Combinations of the outputs of unit noise that share none of what a fit leaves, lines of equal weight.
 
@@ -218,7 +233,7 @@ class KnownInputs:
         same = {
             "records": self.records,
             "at_rest": self.at_rest,
-            "straight": self.straight,
+            "hold": self.hold,
             "feedthrough": self.may_feel,
             "delays": self.delays,
             "any_fraction": self.any_fraction,
@@ -296,13 +311,14 @@ class KnownInputs:
     def _measured(self) -> list[np.ndarray]:
         return [record.outputs.T[self.first :] for record in self.records]
 
-    def direct(self, u: np.ndarray) -> np.ndarray:
-        """What outputs feel at once of the inputs, (n_columns, n_samples)."""
+    def direct(self, record: int) -> np.ndarray:
+        """What outputs feel at once of the inputs of a record, (n_columns, n_samples)."""
+        u = self.driving[record]
         before = np.hstack([np.zeros((len(u), 1)), u[:, :-1]])
         if self.any_fraction:
             return np.vstack([self._shifted(u), self._shifted(before)])
         f = self.fraction[:, None]
-        late = (1.0 - f) * u + f * before if self.straight else before
+        late = (1.0 - f) * u + f * before if self.hold == "first" else before
         late[:, 0] = 0.0
         return self._shifted(np.where(f > 0.0, late, u))
 
@@ -371,14 +387,21 @@ class KnownInputs:
         """By record: z of each input from rest, the derivative of its sources by λ, (n_inputs, n_samples) each, and
         what an initial state of one decays to, (n_samples,). Those of the last pole are remembered."""
         if self._last is None or self._last[0] != pole:
-            inputs = [record.inputs for record in self.records]
-            each = [(*self._driven(u, pole), powers(pole * self.dt, u.shape[1])) for u in inputs]
+            each = [
+                (*self._driven(u, spectrum, pole), powers(pole * self.dt, u.shape[1]))
+                for u, spectrum in zip(self.driving, self.spectra, strict=True)
+            ]
             self._last = pole, each
         return self._last[1]
 
-    def _driven(self, inputs: np.ndarray, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+    def _driven(self, inputs: Floats, spectrum: Complexes, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         """z of each input from rest, and the derivative of its sources by λ, (n_inputs, n_samples) each."""
-        (now, after), (now_slope, after_slope) = sources(pole, self.dt, self.straight)
+        if self.hold == "band-limited":
+            z, slope = response_of_pole(spectrum, pole * self.dt, inputs.shape[1])
+            from_sources = np.zeros_like(z)
+            from_sources[:, 1:] = slope[:, 1:] - np.exp(pole * self.dt) * (slope[:, :-1] + z[:, :-1])
+            return self.dt * z, self.dt**2 * from_sources
+        (now, after), (now_slope, after_slope) = sources(pole, self.dt, self.hold)
         u = inputs.astype(complex)
         rest = -after * u[:, :1]
         x = lfilter([after, now], [1.0, -np.exp(pole * self.dt)], u, axis=1, zi=rest)[0]
@@ -395,7 +418,7 @@ class KnownInputs:
         for i in np.flatnonzero(self.fraction):
             f = self.fraction[i]
             h = (1.0 - f) * self.dt
-            of_values, of_slopes = sources(pole, h, self.straight)
+            of_values, of_slopes = sources(pole, h, self.hold)
             c_0, c_1 = of_values if slope is None else of_slopes
             u, carried = inputs[i], np.exp(pole * h)
             on = carried * (z[i] if slope is None else h * z[i] + slope[i])
@@ -465,12 +488,12 @@ def _resampled(line_std: np.ndarray, n_rows: int) -> np.ndarray:
     return np.column_stack([np.interp(at, lines, column) for column in line_std.T])
 
 
-def sources(pole: complex, dt: float, straight: bool) -> tuple[tuple[complex, complex], tuple[complex, complex]]:
-    """c_0, c_1 and their derivatives by λ."""
+def sources(pole: complex, dt: float, hold: str) -> tuple[tuple[complex, complex], tuple[complex, complex]]:
+    """c_0, c_1 of inputs held or straight between samples, and their derivatives by λ."""
     x = pole * dt
     powers = x ** np.arange(TERMS)
     sums: list[Any] = [(s @ powers, s[1:] * np.arange(1, TERMS) @ powers[:-1]) for s in SERIES]
     (phi1, phi1_slope), (phi2, phi2_slope) = sums
-    if not straight:
+    if hold == "zero":
         return (dt * phi1, 0.0), (dt**2 * phi1_slope, 0.0)
     return (dt * (phi1 - phi2), dt * phi2), (dt**2 * (phi1_slope - phi2_slope), dt**2 * phi2_slope)
