@@ -11,6 +11,7 @@ from workbench.design.estimation.observers import kalman
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.rig_loop import LoopTest
 from workbench.draw.plot import plot
+from workbench.draw.robust import plot_prediction
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.rig.elements import RandomForce
@@ -215,3 +216,15 @@ def test_what_cannot_be_predicted_or_checked_is_named(plain):
         predict_loop(one, "controller", LoopTest(50, 0.01, 0.3))
     unknown = predict(replace(one, outcome="unknown", unexplained=0.2), new, draws=60)
     assert "leaves the gap unexplained: 20 %" in str(unknown)
+
+
+def test_a_figure_of_a_check_shows_the_stretch_of_the_worst_reading(plain):
+    new = measured(plain, 1.0, np.random.default_rng(8), n=1500)
+    off = new.outputs.copy()
+    off[1, 1100] += 100.0 * off[1].std()
+    told = predict(uncertain(plain), new, draws=60)
+    figure = plot_prediction(told, replace(new, outputs=off))
+    lines = {line.get_label(): line for line in figure.axes[2].lines}
+    assert lines["measured"].get_xdata().size == 400
+    assert told.time[1100] in lines["measured"].get_xdata()
+    assert lines["measured"].get_zorder() < figure.axes[2].collections[0].get_zorder()

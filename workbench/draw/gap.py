@@ -91,7 +91,8 @@ def plot_where(verdict: Verdict) -> Figure:
         axes[0, 0].bar(n_modes + 1, 100 * where.share_above, color=GREY, label="above the last")
         axes[0, 0].legend()
     axes[0, 0].set(title="by mode: the band around each frequency", xlabel="mode", ylabel="share of the gap [%]")
-    axes[0, 1].bar([f"{top:.3g}" for top in where.band_edges_hz[1:]], 100 * where.band_shares, color=COLOURS[0])
+    tops = [f"{top:.3g}" if top < 1000.0 else f"{top:.0f}" for top in where.band_edges_hz[1:]]
+    axes[0, 1].bar(tops, 100 * where.band_shares, color=COLOURS[0])
     axes[0, 1].set(title="by octave", xlabel="up to [Hz]", ylabel="share of the gap [%]")
     names = [s.name for s in verdict.nominal.sensors]
     axes[1, 0].bar(names, 100 * where.sensor_shares, color=COLOURS[2])
