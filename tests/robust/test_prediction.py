@@ -11,11 +11,12 @@ from workbench.design.estimation.observers import kalman
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.rig_loop import LoopTest
 from workbench.draw.plot import plot
+from workbench.draw.robust import plot_prediction
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.rig.elements import RandomForce
 from workbench.rig.simulate import simulate
-from workbench.robust.check import check_prediction, log_test, read_log
+from workbench.robust.check import PredictionCheck, check_prediction, log_test, read_log
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.prediction import predict, predict_loop
 from workbench.trials.controlled import control_plant
@@ -97,8 +98,21 @@ def test_a_model_holds_on_its_own_tests_and_not_on_others(plain):
         new = measured(plain, gain, rng)
         checks.append(check_prediction(predict(uncertain(plain), new, seed=3), new))
     assert [check.holds for check in checks] == [True, True, False]
-    assert checks[2].overall < checks[2].expected_least
+    assert checks[2].coverage.min() < checks[2].expected_least
     assert "does not hold" in checks[2].sentence and "worst is sensor" in checks[2].sentence
+
+
+@pytest.mark.parametrize("n", [60, 100, 200])
+def test_a_model_holds_where_its_worst_sensor_has_what_is_expected_of_it(n):
+    """Of n draws with shares 1/n, 2/n, ... the hundredth part is worse: one of 100, none of 60."""
+    shares = np.arange(1, n + 1) / n
+    expected = np.repeat(shares[:, None, None], 2, axis=1)
+    for share in shares:
+        check = PredictionCheck("r", ("a", "b"), 100, [1.0, share], np.zeros((2, 0)), np.zeros((0, 2)), expected)
+        assert check.holds is bool(share >= check.expected_least) is bool(share > n // 100 / n)
+        assert ("The model holds" in check.sentence) is check.holds
+        assert not replace(check, allowed=1.15).holds
+    assert "no test of the model: 115 %" in replace(check, allowed=1.15).sentence
 
 
 def test_coloured_noise_of_the_same_size_is_seen_in_the_spectrum_alone(plain):
@@ -202,3 +216,15 @@ def test_what_cannot_be_predicted_or_checked_is_named(plain):
         predict_loop(one, "controller", LoopTest(50, 0.01, 0.3))
     unknown = predict(replace(one, outcome="unknown", unexplained=0.2), new, draws=60)
     assert "leaves the gap unexplained: 20 %" in str(unknown)
+
+
+def test_a_figure_of_a_check_shows_the_stretch_of_the_worst_reading(plain):
+    new = measured(plain, 1.0, np.random.default_rng(8), n=1500)
+    off = new.outputs.copy()
+    off[1, 1100] += 100.0 * off[1].std()
+    told = predict(uncertain(plain), new, draws=60)
+    figure = plot_prediction(told, replace(new, outputs=off))
+    lines = {line.get_label(): line for line in figure.axes[2].lines}
+    assert lines["measured"].get_xdata().size == 400
+    assert told.time[1100] in lines["measured"].get_xdata()
+    assert lines["measured"].get_zorder() < figure.axes[2].collections[0].get_zorder()

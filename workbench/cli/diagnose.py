@@ -108,7 +108,8 @@ def diagnose(
     shown = verdict.to_json()
     where = verdict.where
     if verdict.shows_gap:  # where there is no gap, noise is everywhere
-        say(f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on amplitude")
+        amplitude = {True: "; depends on amplitude", False: "; does not depend on amplitude", None: ""}
+        say(f"  path       {where.path}{amplitude[where.amplitude_dependent]}")
         say(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
     if verdict.shows_gap and where.path in ("structure", "environment"):
         if verdict.is_located:

@@ -19,6 +19,7 @@ from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
 
 MOST_BARS, FEW_BARS = 16, 6  # of named points: the likeliest are shown, and few have their names level
+SHOWN = 0.005  # of the gap: a bar that is lower is not seen
 
 
 def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record], *, time_unit: str = "s") -> Figure:
@@ -59,7 +60,7 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
 
 
 def plot_budget(budget: Budget) -> Figure:
-    """What causes the gap of each record: one bar per record, split by cause."""
+    """What causes the gap of each record: one bar per record, split by cause; beyond 100 % where they enlarge it."""
     causes = [label_in_words(label) for label in budget.effects]
     causes += ["errors of the nominal model", "unexplained", "noise"]
     colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], GREY]
@@ -71,7 +72,10 @@ def plot_budget(budget: Budget) -> Figure:
         if share.max() > 0.05:
             ax.barh(records, share, left=left, color=colour, label=cause, height=0.6)
         left += share
-    ax.set(xlim=(0, 100), xlabel="share of the gap's power [%]", title="what causes the gap of each record")
+    if left.max() > 100.0 * (1.0 + SHOWN):
+        ax.axvline(100.0, color=GREY, linestyle="--", label="gap of the nominal model")
+    ax.set(xlim=(0, max(100.0, left.max())), xlabel="share of the gap's power [%]")
+    ax.set_title("what causes the gap of each record")
     ax.invert_yaxis()
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.35), ncols=3)
     return figure
@@ -81,10 +85,14 @@ def plot_where(verdict: Verdict) -> Figure:
     """The gap taken apart: by mode, band, sensor, level and time, and the likelihood of a place."""
     where = verdict.where
     figure, axes = new_figure(3, 2, width=10, height=9.2)
-    modes = np.arange(1, where.mode_shares.size + 1)
-    axes[0, 0].bar(modes, 100 * where.mode_shares, color=COLOURS[0])
+    n_modes = where.mode_shares.size
+    axes[0, 0].bar(np.arange(1, n_modes + 1), 100 * where.mode_shares, color=COLOURS[0])
+    if where.share_above > SHOWN:
+        axes[0, 0].bar(n_modes + 1, 100 * where.share_above, color=GREY, label="above the last")
+        axes[0, 0].legend()
     axes[0, 0].set(title="by mode: the band around each frequency", xlabel="mode", ylabel="share of the gap [%]")
-    axes[0, 1].bar([f"{top:.3g}" for top in where.band_edges_hz[1:]], 100 * where.band_shares, color=COLOURS[0])
+    tops = [f"{top:.3g}" if top < 1000.0 else f"{top:.0f}" for top in where.band_edges_hz[1:]]
+    axes[0, 1].bar(tops, 100 * where.band_shares, color=COLOURS[0])
     axes[0, 1].set(title="by octave", xlabel="up to [Hz]", ylabel="share of the gap [%]")
     names = [s.name for s in verdict.nominal.sensors]
     axes[1, 0].bar(names, 100 * where.sensor_shares, color=COLOURS[2])
@@ -190,7 +198,9 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force:
         ax.set_xlabel(f"{name} {there} [{unit}]")
         law = _law(chosen, series, name)
         if law is not None:  # beneath the points, which it would hide where they follow it
-            ax.plot(*law, color=COLOURS[1], linewidth=5.0, alpha=0.6, zorder=1, label="fitted law")
+            explains = verdict.outcome == "explained" or any_beyond(verdict.effects)
+            label = "fitted law" if explains else "nearest law: it does not explain the gap"
+            ax.plot(*law, color=COLOURS[1], linewidth=5.0, alpha=0.6, zorder=1, label=label)
             ax.legend()
     axes[0].set(ylabel=f"unmodelled force [{force}]", title="unmodelled force, no law assumed")
     return figure

@@ -1,8 +1,11 @@
 """Figures of a corrected rig that is uncertain: the response predicted, and controllers on its draws."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from matplotlib.figure import Figure
 
+from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, in_units, new_figure, plain_ticks
 from workbench.records.record import Record
 from workbench.robust.prediction import LEVEL, Prediction, amplitudes
@@ -11,6 +14,7 @@ from workbench.robust.verification import SETTLED, interval
 
 OLD, NEW = COLOURS[1], COLOURS[0]
 MOST_SENSORS = 8
+STRETCH = 400  # samples of a test that are drawn over time: more would be a solid area
 BAND, TEST = COLOURS[0], COLOURS[1]
 
 
@@ -66,17 +70,19 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
 
     Args:
         prediction: with its bands.
-        measured: the test, drawn over them.
+        measured: the test, drawn beneath them, in the stretch about the reading that lies farthest outside.
     """
     shown = min(len(prediction.channels), MOST_SENSORS)
     figure, axes = new_figure(shown, 2, width=11, height=0.9 + 1.9 * shown, sharex="col", squeeze=False)
     rows = {} if measured is None else {c.name: row for c, row in zip(measured.output_channels, measured.outputs)}
+    piece = _around_worst(prediction, rows)
+    time = prediction.time[piece]
     f = prediction.frequencies_hz[1:]
     for j, (left, right) in enumerate(axes):
         channel = prediction.channels[j]
         band = {"color": BAND, "alpha": 0.3, "linewidth": 0, "label": f"{100 * LEVEL:g} % band"}
-        left.fill_between(prediction.time, prediction.lower[j], prediction.upper[j], **band)
-        left.plot(prediction.time, prediction.median[j], color=BAND, linewidth=0.8, label="predicted")
+        left.fill_between(time, prediction.lower[j, piece], prediction.upper[j, piece], **band)
+        left.plot(time, prediction.median[j, piece], color=BAND, linewidth=0.8, label="predicted")
         left.set_ylabel(in_units(channel.name, channel.unit))
         low, high = prediction.spectrum_lower[j, 1:], prediction.spectrum_upper[j, 1:]
         right.set_ylabel(in_units(f"|{channel.name}|", channel.unit))
@@ -84,11 +90,25 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
         right.fill_between(f, np.maximum(low, least), np.maximum(high, least), **band)
         right.loglog(f, np.maximum(prediction.spectrum_median[j, 1:], least), color=BAND, linewidth=0.8)
         if channel.name in rows:
-            left.plot(prediction.time, rows[channel.name], color=TEST, linewidth=0.8, label="measured")
-            right.loglog(f, np.maximum(amplitudes(rows[channel.name][None])[0, 1:], least), color=TEST, linewidth=0.8)
+            test = {"color": TEST, "linewidth": 0.8, "zorder": 0.5}  # beneath the band
+            left.plot(time, rows[channel.name][piece], label="measured", **test)
+            right.loglog(f, np.maximum(amplitudes(rows[channel.name][None])[0, 1:], least), **test)
     axes[0, 0].set_title("outputs")
     axes[0, 1].set_title("amplitude spectrum")
     axes[-1, 0].set_xlabel("time [s]")
     axes[-1, 1].set_xlabel("frequency [Hz]")
     axes[0, 0].legend(fontsize=8, ncols=3)
     return plain_ticks(figure)
+
+
+def _around_worst(prediction: Prediction, rows: Mapping[str, Floats]) -> slice:
+    """The samples about the reading that lies farthest outside its band, in widths of that; all where none was read."""
+    worst = np.full(prediction.time.size, -np.inf)
+    for channel, low, high in zip(prediction.channels, prediction.lower, prediction.upper):
+        if channel.name in rows:
+            y = rows[channel.name]
+            worst = np.maximum(worst, np.maximum(low - y, y - high) / max(float(np.mean(high - low)), 1e-300))
+    if not rows or worst.size <= STRETCH:
+        return slice(None)
+    first = int(np.clip(worst.argmax() - STRETCH // 2, 0, worst.size - STRETCH))
+    return slice(first, first + STRETCH)

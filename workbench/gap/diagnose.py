@@ -13,7 +13,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
 from workbench.gap.effects.nonlinear import any_beyond
-from workbench.gap.localisation.where import locate, locate_force
+from workbench.gap.localisation.where import Where, locate, locate_force
 from workbench.gap.prediction.noise import noise_guessed
 from workbench.gap.prediction.residuals import lead_of
 from workbench.gap.prediction.workers import Workers
@@ -58,6 +58,7 @@ HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left be
 CHANCE = 5.0  # standard deviations of the mean square of white noise: more than that is left of a record by no chance
 SECONDS = 120.0  # of processor time of this process and one beside it: twice what cases of a laboratory take at most
 SEARCH_SHARE = 0.8  # of that time; the rest is for intervals, budget and the next experiment
+ABOVE = 0.2  # of the gap, above the last mode of the model, from which on that is remarked
 BESIDE_ERRORS = 0.8  # likewise where the model itself is a little off: 4 % of the gap's power may be left
 
 
@@ -185,6 +186,7 @@ def diagnose(
         sound = outcome in ("none", "explained")
         in_records = () if sound else data_faults(rig, records, settle=settle)
         in_unseen = () if sound else data_faults(rig, validation, settle=settle)
+        where = locate(nominal, effects, place() if as_seen else locate_force(nominal.without(faulty)))
         of_setup = any(record.name in fault.records for fault in faults for record in validation)
         return Verdict(
             case=name,
@@ -192,7 +194,7 @@ def diagnose(
             disagreeing=disagreeing,
             effects=attribution.best.effects,
             alternatives=tuple((fit.named, probability) for fit, probability in attribution.alternatives),
-            where=locate(nominal, effects, place() if as_seen else locate_force(nominal.without(faulty))),
+            where=where,
             shrinkage=shrinkage,
             corrected=corrected,
             nominal=rig,
@@ -207,6 +209,7 @@ def diagnose(
                 *in_records,
                 *in_unseen,
                 *([OVER_FITTING] if outcome == "part" != attribution.outcome and not (in_unseen or of_setup) else []),
+                *([] if sound or disagreeing else _of_gap(outcome, where, budget, rig, units)),
                 *_notes(attribution, budget, seconds, silent, sound),
                 *(_hiding(errors) if outcome == "explained" else ()),
             ),
@@ -395,6 +398,24 @@ def _hiding(errors: Effect | None) -> tuple[str, ...]:
         f"The errors of the model in {joined_in_words(large)} are larger than those of a careful test: a linear effect,"
         " such as a damper or a mass, may be hidden among them.",
     )
+
+
+def _of_gap(outcome: str, where: Where, budget: Budget, rig: Rig, units: Units) -> Iterator[str]:
+    """What is said of a gap that is not explained."""
+    if where.share_above > ABOVE:
+        last = f"{rig.modes.frequencies_hz[-1]:.4g} {'Hz' if units.time == 's' else f'1/{units.time}'}"
+        yield (
+            f"{100.0 * where.share_above:.0f} % of the gap lies above the last mode of the model ({last}): add modes to"
+            " the model, or excite and compare below that."
+        )
+    if where.is_distorted:
+        i, j = np.unravel_index(where.distortions.argmax(), where.distortions.shape)
+        yield (
+            f"Record {where.record_names[i]!r}: on {('odd', 'even')[j]} lines that the inputs do not have, the gap is"
+            f" {10.0 * np.log10(where.distortions[i, j]):.0f} dB above the noise: something there is nonlinear."
+        )
+    if outcome == "unknown" and budget.is_open and budget.errors:
+        yield "Most of the gap is unexplained: sizes of errors of the model, fitted beside it, are no findings."
 
 
 def _notes(

@@ -47,6 +47,7 @@ class Prediction(Printed):
             then in each frequency band. A test of a true model gives such shares.
         name: of what is predicted.
         notes: what else a reader should know.
+        allowed: rms of what the rig leaves unexplained, over that of the readings, which the bands allow for.
     """
 
     time: Floats
@@ -62,6 +63,7 @@ class Prediction(Printed):
     expected: Floats
     name: str = "prediction"
     notes: tuple[str, ...] = ()
+    allowed: float = 0.0
 
     def __post_init__(self) -> None:
         arrays = ("time", "median", "lower", "upper", "frequencies_hz", "bands_hz", "expected")
@@ -317,6 +319,7 @@ def _banded(
         np.zeros((0, len(rig.sensors), 1 + len(bands))),
         name,
         tuple(notes),
+        found.unexplained,
     )
     return replace(prediction, expected=np.array([prediction.coverage(reading) for reading in readings]))
 

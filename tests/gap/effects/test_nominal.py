@@ -6,11 +6,12 @@ import numpy as np
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.nominal import NominalPrior, nominal_errors
+from workbench.gap.effects.nominal import IdentifiedPrior, NominalPrior, nominal_errors
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, shape_of
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
+from workbench.structure.plate import Plate
 from workbench.trials.plane_frame import Section, plane_frame
 
 
@@ -59,3 +60,36 @@ def test_an_uneven_stiffness_turns_modes_into_one_another_as_it_does_in_the_matr
     assert after < 0.2 * before and before > 0.01 * np.linalg.norm(true[:, lowest])
     mass = even.mass.toarray()
     np.testing.assert_allclose(turned.T @ mass @ turned, np.eye(8), atol=1e-9)
+
+
+def test_a_plate_that_is_a_little_off_has_the_modes_left_out_of_its_model():
+    """Navier: ω_ij = π² (i²/a² + j²/b²) sqrt(D / m); the errors are those of the modes kept, and of no other."""
+    a, b, stiffness, mass, kept, needed = 0.6, 0.4, 160.0, 8.0, 4, 9
+    plate = Plate(
+        length=(a, b),
+        mass_per_area=mass,
+        bending_stiffness=stiffness,
+        poisson_ratio=0.3,
+        edges="simply supported",
+        damping=ModalDamping(0.01),
+    )
+    rig = Rig(plate.modes(kept), (), (), structure=plate)
+    errors = nominal_errors(rig, NominalPrior(mass=0.02, frequency=0.005, damping=0.2))
+    errors = replace(errors, values={**errors.values, "mass_0": 0.01, "frequency_1": 0.02, "damping_1": 0.3})
+    more = Effect(kind_named("truncated_modes"), needed, {})
+    i, j = np.mgrid[1:9, 1:9]
+    navier = np.sort((np.pi**2 * ((i / a) ** 2 + (j / b) ** 2) * np.sqrt(stiffness / mass)).ravel())[:needed]
+    expected = navier * np.exp(np.r_[0.02, np.zeros(needed - 1)])
+    damping = 0.01 * np.exp(np.r_[0.3, np.zeros(needed - 1)])
+    for order in ((errors, more), (more, errors)):
+        modes = apply_all(rig, order).modes
+        np.testing.assert_allclose(modes.omega, expected, rtol=1e-9)
+        np.testing.assert_allclose(modes.zeta, damping, rtol=1e-9)
+
+
+def test_an_identified_structure_has_the_modes_left_out_of_its_model(hinged_rig):
+    rig = hinged_rig(n_modes=3)
+    prior = IdentifiedPrior(lambda errors: rig, np.eye(1))
+    off = apply_all(rig, (nominal_errors(rig, prior), Effect(kind_named("truncated_modes"), 6, {})))
+    ratio = off.modes.omega / rig.modes.omega[0]
+    np.testing.assert_allclose(ratio, np.arange(1, 7) ** 2, rtol=1e-5)

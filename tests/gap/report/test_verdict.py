@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from workbench.draw.gap import plot_budget
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.report.budget import budget_of, measure
+from workbench.study.pages.verdict_page import verdict_tables
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.006])
@@ -133,3 +135,48 @@ def test_what_is_closed_of_one_record_is_its_share_however_it_falls_into_blocks(
     inputs[:, -30:] *= 20.0
     closed = measure(rig, near, [record_of(real, inputs[:, :-7], rng, name="held out")])
     assert closed.overall == pytest.approx(closed.share["held out"], rel=1e-12)
+
+
+def test_errors_beside_a_gap_that_is_still_there_have_no_sizes(hinged_rig, record_of):
+    """The model lacks what is above its last mode, which no error of the two that it has takes away."""
+    rig, rng = hinged_rig(2), np.random.default_rng(5)
+    record = record_of(hinged_rig(4), np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),), workers=1, seconds=2.0)
+    assert any(re.search(r"of the gap lies above the last mode of the model \(3\.14\d? Hz\)", n) for n in found.notes)
+    shares = {"nominal": 0.16, "unexplained": 0.84, "noise": 0.0}
+    budget = replace(found.budget, **shares, errors={"damping_percent": 32.0})
+    sentence = replace(found, budget=budget, outcome="unknown", effects=()).sentence
+    assert sentence.endswith("explains the gap; 16 % may be errors of the model, 84 % remain unexplained.")
+
+
+def test_noise_that_was_not_stated_is_not_said_to_be(hinged_rig, record_of):
+    """And noise found at the bound of what any is taken for may be less."""
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    silent = replace(rig, sensors=(*rig.sensors[:3], replace(rig.sensors[3], noise_std=0.0)))
+    found = diagnose(silent, (record,), catalogue=(kind_named("actuator_gain"),), workers=1)
+    stated = found.budget.noise_stated
+    budget = replace(found.budget, noise_found=(stated[0], 3.0 * stated[1], 400.0 * stated[2], 1.2 * stated[3]))
+    told = replace(found, budget=budget).to_json()["noise"]
+    assert told["stated"] == [1e-5, 1e-5, 1e-5, None]
+    assert told["found_at_most"] == [False, True, True, False]
+
+
+def test_shares_of_a_set_that_enlarges_a_gap_are_drawn_beyond_the_whole(hinged_rig, record_of):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    gain = kind_named("actuator_gain")
+    real, wrong = (Effect(gain, rig.actuators[0].name, {"gain": value}) for value in (1.3, 0.7))
+    record = record_of(real.apply(rig), np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    budget = budget_of(rig, (wrong,), None, (record,), noise_found=np.full(4, 1e-5))
+    assert budget.by_record["high"].sum() == pytest.approx(4.0, rel=1e-3)  # twice the error
+    assert plot_budget(budget).axes[0].get_xlim()[1] == pytest.approx(400.0, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "title"),
+    [("point_mass", "Nearest effects: they do not explain the gap"), ("power_spring", "Effects")],
+)
+def test_a_nearest_set_is_headed_as_one_that_does_not_explain(kind, title):
+    content = {"effects": [], "nearest": [{"kind": kind, "parameters": {"mass": 1.0}}], "alternatives": []}
+    gap = {"before": {}, "after": {}, "floor": {}}
+    assert verdict_tables({**content, "gap": gap})[0][0] == title

@@ -13,7 +13,7 @@ from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.attribute import _as_it_stands, _settled, beside_identified
 from workbench.gap.search.fit import fit
 from workbench.gap.search.intervals import with_intervals
-from workbench.gap.search.search import Search
+from workbench.gap.search.search import Decision, Search, nearest
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -116,3 +116,24 @@ def test_a_speed_that_the_records_do_not_tell_from_none_is_not_stated(speed, sta
     search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
     (told,) = _settled(search, fit(nominal, (friction,), data)).effects
     assert ("smoothing_speed" in told.stated(nominal)) == stated
+
+
+def test_the_nearest_set_of_a_search_cut_short_is_the_one_that_leaves_least():
+    """A search that ends beside errors of the model has fitted a mass alone, which leaves next to nothing."""
+    nominal = identified(OMEGA)
+    real = apply_all(nominal, [Effect(kind_named("point_mass"), None, {"at": "y", "mass": 0.2}), GAIN])
+    record = simulate(real, np.random.default_rng(3).normal(size=(1, 600)), sample_time=0.05, name="test")
+    data = FitData((record,), np.array([NOISE]))
+    before = data.by_channel(data.residual(nominal))
+    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+    start, gain, mass = (
+        fit(nominal, effects, data)
+        for effects in ((), (GAIN,), (Effect(kind_named("point_mass"), None, {"at": "y", "mass": 0.1}),))
+    )
+    assert mass.cost < 0.2 * gain.cost
+    said = nearest(search, start, Decision("unknown", gain), [mass])
+    assert said.outcome == "part" and said.best is mass
+    kept = Decision("part", mass)
+    assert nearest(search, start, kept, [gain]) is kept and nearest(search, start, kept, []) is kept
+    explained = Decision("explained", gain)
+    assert nearest(search, start, explained, [mass]) is explained

@@ -251,6 +251,7 @@ class Kind:
         remark: effect, rig -> what the sentence says in brackets; None for its numbers.
         fixed_place: effect, rig -> its place where no parameter holds it, and what the sentence calls it.
         applied_first: whether it changes the nominal model itself, before any other effect acts on it.
+        adds_modes: whether it adds modes to the model, before errors of that: these may leave no structure to solve.
         applied_last: whether it acts on modes as all other effects have made them: where modes keep their damping
             ratios, a damper there before a mass would be of another strength.
     """
@@ -279,6 +280,7 @@ class Kind:
     second_channel: str = "with"
     conjunction: str = " and "
     applied_first: bool = False
+    adds_modes: bool = False
     applied_last: bool = False
     wider, alone, remainder = Renamed("more_general"), Renamed("exclusive"), Renamed("unpredictable")
     settled, stands = Renamed("without_negligible"), Renamed("fixed_place")
@@ -401,8 +403,8 @@ def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
 
 
 def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
-    """The rig with every effect in it, in order, errors of the nominal model before all others and dampers after."""
-    for effect in sorted(effects, key=lambda e: (e.kind.applied_last, not e.kind.applied_first)):
+    """The rig with every effect in it, in order: modes left out, errors of the nominal model, all others, dampers."""
+    for effect in sorted(effects, key=lambda e: (e.kind.applied_last, not e.kind.adds_modes, not e.kind.applied_first)):
         rig = effect.apply(rig)
     return rig
 

@@ -16,6 +16,7 @@ from workbench.gap.effects.structural import (
     MODULUS_ERROR,
     RESOLUTION,
     buckling_load,
+    modes_of,
     solved_once,
     stiffness_name,
 )
@@ -293,7 +294,10 @@ def _off(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, floa
     """The rig with the errors in its structure, modes and sensors, and between records."""
     if isinstance(prior, IdentifiedPrior):
         made = prior.make(prior.root @ np.array(list(values.values())))
-        return replace(rig, modes=made.modes, structure=made.structure, actuators=made.actuators)
+        modes, kept = made.modes, rig.modes.n_modes
+        if modes.n_modes < kept and made.structure is not None:  # modes left out of the nominal rig are there
+            modes = modes_of(made.structure, kept)
+        return replace(rig, modes=modes, structure=made.structure, actuators=made.actuators)
     rig = _solved(rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE})
     rig = differing(rig, prior.figure, deviations_of(values))
     ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)

@@ -434,6 +434,7 @@ TRUNCATED_MODES = Kind(
     simpler=_one_mode_fewer,
     more_general=_more_modes,
     exclusive=True,
+    adds_modes=True,
     numbers=lambda truncation, rig: {"kept": rig.modes.n_modes, "needed": truncation.target},
     remark=lambda truncation, rig: f"{truncation.target} are needed, {rig.modes.n_modes} are kept",
 )

@@ -1,7 +1,7 @@
 """Where a simulation and a test disagree: at what place, in which records, modes, bands, times, sensors and levels."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from workbench.arrays import Flags, Floats
 from workbench.gap.effects.effect import Effect
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_lines import Lines, screened
-from workbench.gap.prediction.residuals import FitData
+from workbench.identification.signal.distortion import distortion_of, period_of
 from workbench.records.record import Record
 from workbench.renamed import Renamed
 from workbench.rig.linear import held_response, modal_motion, modal_poles, straight_response
@@ -248,6 +248,13 @@ class WhereSettings:
     # nearly in the span of resonators close to the mode
     spread: tuple[float, ...] = (0.85, 0.93, 0.97, 0.99, 1.0, 1.01, 1.03, 1.07, 1.15)
     most_modes: int = 6  # that have resonators
+    above: float = 1.15  # of the frequency of the last mode: the end of its band
+    louder: float = 2.0  # of levels, gaps and floors: what is larger than others by less tells nothing of amplitude
+    linear: float = 0.9  # share of the gap's power that one linear reply explains, from which on the gap is linear
+    silent: float = 1e-3  # of the largest line of the inputs: a line that they do not have
+    distorted: float = 10.0  # power of the gap on such lines over that of its noise, from which on it is distortion
+    hum: int = 3  # such lines of an octave, the strongest, that mains hum may have: they do not count
+    periods: int = 3  # at the end of a record, the first of them before both that are compared
 
 
 WHERE = WhereSettings()
@@ -264,8 +271,9 @@ class Where:
     Attributes:
         path: "actuator", "structure", "sensor", "environment", or "none".
         modes: one-based numbers of the modes around whose frequencies at least a twentieth of the gap lies.
-        amplitude_dependent: whether the gap changes with level.
+        amplitude_dependent: whether the gap changes with level; None where the records do not establish it.
         mode_shares: (n_modes,) share of the gap in the band around each natural frequency.
+        share_above: of the gap, above the band of the last mode.
         band_edges_hz: (n_bands + 1,) of octaves down from half the sample rate, the lowest open to zero.
         band_shares: (n_bands,) share of the gap in each.
         sensor_shares: (n_outputs,).
@@ -274,13 +282,16 @@ class Where:
         record_floors: (n_records,) the same of the noise alone.
         input_levels: (n_records,) root mean square of the inputs.
         linear_share: of the gap's power, what one linear reply to the inputs explains.
+        distortions: (n_records, 2) power of the gap on odd and on even lines that periodic inputs do not have, over
+            that of noise and of motion that has not settled; zero where inputs do not repeat.
         place: of an unmodelled force at a point, whatever its law: `at` and `at_std`, m; and whether it is one force.
     """
 
     path: str
     modes: tuple[int, ...]
-    amplitude_dependent: bool
+    amplitude_dependent: bool | None
     mode_shares: np.ndarray
+    share_above: float
     band_edges_hz: np.ndarray
     band_shares: np.ndarray
     sensor_shares: np.ndarray
@@ -290,7 +301,13 @@ class Where:
     record_floors: np.ndarray
     input_levels: np.ndarray
     linear_share: float
+    distortions: np.ndarray
     place: ForceLocation
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether periodic inputs show a nonlinearity, before any law is assumed."""
+        return bool(self.distortions.max() > WHERE.distorted)
 
     @property
     def at(self) -> Any:
@@ -336,14 +353,22 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
     seen = [(data.counted[i], scaled[i]) for i in telling]
     frequencies = evidence.rig.modes.frequencies_hz
     between = np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0))
-    mode_shares = _shares_between(np.r_[0.0, between, np.inf], seen, data.noise)
+    top = WHERE.above * frequencies[-1] or np.inf  # of rigid modes alone nothing lies above
+    *by_mode, above = _shares_between(np.r_[0.0, between, top, np.inf], seen, data.noise)
+    mode_shares = np.array(by_mode)
     octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - WHERE.octaves, 1)]
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
+    share = linear_share(
+        evidence.rig, [data.counted[i] for i in telling], [evidence.residuals[i] for i in telling], mode_shares
+    )
+    each = zip(data.counted, evidence.residuals, strict=True)
+    distortions = np.array([_distortion(evidence.rig, record, residual) for record, residual in each])
     return Where(
         path=_path(evidence, excess, by_sensor, effects),
         modes=tuple(int(r) + 1 for r in np.flatnonzero(mode_shares > WHERE.mode_share)),
-        amplitude_dependent=_amplitude_dependent(effects, excess, data),
+        amplitude_dependent=_amplitude_dependent(effects, gaps, noise, levels, share, distortions),
         mode_shares=mode_shares,
+        share_above=float(above),
         band_edges_hz=octaves,
         band_shares=_shares_between(octaves, seen, data.noise),
         sensor_shares=by_sensor / max(by_sensor.sum(), 1e-300),
@@ -352,9 +377,8 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
         record_gaps=gaps,
         record_floors=noise,
         input_levels=levels,
-        linear_share=linear_share(
-            evidence.rig, [data.counted[i] for i in telling], [evidence.residuals[i] for i in telling], mode_shares
-        ),
+        linear_share=share,
+        distortions=distortions,
         place=place,
     )
 
@@ -400,12 +424,50 @@ def of_one_sensor(excess: np.ndarray) -> bool:
     return bool(excess.max() > WHERE.one_sensor * excess.sum())
 
 
-def _amplitude_dependent(effects: Sequence[Effect], excess: np.ndarray, data: FitData) -> bool:
+def _amplitude_dependent(
+    effects: Sequence[Effect], gaps: Floats, floors: Floats, levels: Floats, linear: float, distortions: Floats
+) -> bool | None:
+    """Whether the gap changes with level; None where that is not established."""
     if effects:
         return any(effect.kind.nonlinear for effect in effects)
-    gaps = np.sqrt(np.maximum(excess.mean(axis=1), 0.0))
-    floors = np.array([np.sqrt(((data.noise / r.outputs.std(axis=1)) ** 2).mean()) for r in data.counted])
-    return bool((gaps + floors).max() > 2.0 * (gaps + floors).min() and gaps.max() > 2.0 * floors.max())
+    above = np.sqrt(np.maximum(gaps**2 - floors**2, 0.0))
+    sizes = above + floors
+    grows = sizes.max() > WHERE.louder * sizes.min() and above.max() > WHERE.louder * floors.max()
+    if grows or distortions.max() > WHERE.distorted:
+        return True
+    is_linear = linear > WHERE.linear and levels.max() > WHERE.louder * levels.min()
+    return False if is_linear else None
+
+
+def _distortion(rig: Rig, record: Record, residual: Floats) -> Floats:
+    """Power of the gap on odd and on even lines that periodic inputs do not have, over noise and unsettled motion.
+
+    Motion that decays by exp(-a) a period stands on all lines, and the mean of two periods is 1 / tanh(a / 2) times
+    half of what they differ by. A drift of a sensor is taken off first.
+    """
+    period = period_of(record.inputs)
+    if period is None or record.n_samples < WHERE.periods * period:
+        return np.zeros(2)
+    last = slice(record.n_samples - WHERE.periods * period, None)
+    means = residual[:, last].reshape(residual.shape[0], WHERE.periods, period).mean(axis=2)
+    drift = (means[:, -1] - means[:, -2])[:, None] / period * np.arange(WHERE.periods * period)
+    try:
+        found = distortion_of(replace(record, inputs=record.inputs[:, last], outputs=residual[:, last] - drift))
+    except ValueError:  # these few periods do not repeat well enough
+        return np.zeros(2)
+    free = found.input_amplitudes < WHERE.silent * found.input_amplitudes.max()
+    octave = np.floor(np.log2(np.arange(1, free.size + 1)))  # noise of other bands may be far louder
+    decay = float((rig.modes.zeta * rig.modes.omega).min()) * period * record.sample_time
+    settled = np.tanh(0.5 * decay) ** 2
+    most = np.zeros(2)
+    for i, lines in enumerate((found.odd & free, found.even & free)):
+        for each in range(int(octave[-1]) + 1):
+            chosen = lines & (octave == each)
+            if chosen.sum() > WHERE.hum:
+                power = np.sort(found.amplitudes[:, chosen] ** 2, axis=1)[:, : -WHERE.hum].sum(axis=1)
+                noise = np.maximum((found.noise[:, chosen] ** 2).sum(axis=1), 1e-300)
+                most[i] = max(most[i], settled * float((power / noise).max()))
+    return most
 
 
 def linear_share(rig: Rig, records: Sequence[Record], residuals: Sequence[np.ndarray], shares: np.ndarray) -> float:

@@ -31,6 +31,7 @@ MOST = (
     ("place", 1.0),
     ("shape", 10.0),
 )
+MOSTLY = 0.5  # of the gap: where more is unexplained, errors that were fitted beside it have bent to that
 RUNAWAY = 1e30  # mean square of a motion that knows no bounds, in units of the signal's
 COMMON = 2.0  # times the scatter of delays: the mean from which on they are reported as one delay of all
 DRAWS = 400  # of blocks, for the interval of what is closed
@@ -156,6 +157,14 @@ class Budget:
         return float(np.median(np.array(self.noise_found) / np.array(self.noise_stated)))
 
     @property
+    def is_noise_at_bound(self) -> tuple[bool, ...]:
+        """Of each sensor, whether its noise was found as loud as any is taken for, or louder: it may be less."""
+        ratios = np.array(self.noise_found) / np.array(self.noise_stated)
+        bounds = JOINT.credible, JOINT.credible_guess
+        at_one = [np.abs(ratios / bound - 1.0) < 1.0 - AT_MOST for bound in bounds]
+        return tuple(bool(at) for at in np.any(at_one, axis=0) | (ratios > max(bounds)))
+
+    @property
     def noise_remark(self) -> str | None:
         """A remark where the noise found and the noise stated disagree."""
         ratio = self.noise_ratio
@@ -167,6 +176,11 @@ class Budget:
                 " that no effect and no small error describes."
             )
         return f"The noise of the sensors is {ratio:.2g} times the stated noise_std."
+
+    @property
+    def is_open(self) -> bool:
+        """Whether most of the gap is unexplained."""
+        return self.unexplained > MOSTLY
 
     @property
     def errors_are_small(self) -> bool:

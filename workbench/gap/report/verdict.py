@@ -199,7 +199,8 @@ class Verdict:
             share = _percent(self.budget.effects.get(differs.label, 0.0))
             parts.append(f"{share} are differences of {differs.figure} from record to record ({differs.words})")
         if self.budget.nominal >= SHOWN:
-            parts.append(f"{_percent(self.budget.nominal)} are {self._errors_named}")
+            are = "may be" if self._is_open else "are"
+            parts.append(f"{_percent(self.budget.nominal)} {are} {self._errors_named}")
         if self.budget.unexplained >= SHOWN:
             parts.append(f"{_percent(self.budget.unexplained)} remain unexplained")
         if self.budget.noise >= SHOWN:
@@ -213,8 +214,15 @@ class Verdict:
         return f"{how}. This causes {share} of the gap{self._rest}."
 
     @property
+    def _is_open(self) -> bool:
+        """Whether errors of the model were fitted beside a gap that is still there, to which they have bent."""
+        return self.outcome == "unknown" and self.budget.is_open
+
+    @property
     def _errors_named(self) -> str:
-        """Such as: small errors of the model (stiffness 0.4 %)."""
+        """Such as: small errors of the model (stiffness 0.4 %); without sizes where these are no findings."""
+        if self._is_open:
+            return "errors of the model"
         size = "small" if self.budget.errors_are_small else "implausibly large"
         return f"{size} errors of the model{self._errors_in_words}"
 
@@ -259,7 +267,7 @@ class Verdict:
         """The verdict as the case format asks for it, and what stands behind it."""
         known = self.outcome in ("none", "explained")
         effects = [effect_json(effect, self.nominal) for effect in self._named]
-        shrink = self.shrinkage
+        shrink, guessed = self.shrinkage, self.attribution.search.data.guessed
         return {
             "case": self.case,
             "units": asdict(self.units),
@@ -294,8 +302,9 @@ class Verdict:
             "nominal": _rounded_all(dict(self.budget.errors)),
             "record_to_record": None if self.record_to_record is None else self.record_to_record.to_json(),
             "noise": {
-                "stated": [_rounded(v) for v in self.budget.noise_stated],
+                "stated": [None if s.name in guessed else _rounded(s.noise_std) for s in self.nominal.sensors],
                 "found": [_rounded(v) for v in self.budget.noise_found],
+                "found_at_most": list(self.budget.is_noise_at_bound),
             },
             "notes": list(self.notes),
         }
@@ -337,6 +346,7 @@ def where_json(where: Where) -> dict[str, Any]:
         "modes": list(where.modes),
         "amplitude_dependent": where.amplitude_dependent,
         "linear_share": _rounded(where.linear_share),
+        "above_last_mode": _rounded(where.share_above),
         "point": {
             **_place_json(where.at),
             "at_std": _rounded(where.at_std),

@@ -26,7 +26,7 @@ from workbench.gap.search.nominal_figures import beside_modes, beside_records
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import are_common, common_as_errors, may_be_error
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
-from workbench.gap.search.search import Decision, Search, best_of_each_kind, most_informative, promise
+from workbench.gap.search.search import Decision, Search, best_of_each_kind, most_informative, nearest, promise
 from workbench.gap.search.settings import ATTRIBUTION, LAW, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
@@ -200,6 +200,7 @@ def attribute(
         decision = unless_another(search, alone, evidence) if alone else None
         decision = decision or _beside_one_sensor(search, start, evidence)
         decision = decision or _with_a_second(search, start, singles, ahead, screened, evidence, tolerance)
+        decision = nearest(search, start, decision, singles)
     outcome, best, random, rivals, noise, beside_inputs = decision
     is_cut = search.is_over
     within = beside_inputs or search
@@ -445,7 +446,7 @@ def _with_a_second(
         decision = pairs.decision(start)
         if not (are_common(decision.best.effects) and beside.is_nothing):
             return decision
-    decision = beside.decision()
+    decision = nearest(search, start, beside.decision(), pairs.found)
     if decision.outcome in ("explained", "none") or search.is_over:
         return decision
     random = random_beside(search, pairs.found[:1])

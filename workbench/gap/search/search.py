@@ -284,3 +284,14 @@ def unexplained(start: Fit, best: Fit, rivals: tuple[tuple[Fit, float], ...]) ->
     """
     closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
     return Decision("part" if closed > 0.5 else "unknown", best, rivals=rivals)
+
+
+def nearest(search: Search, start: Fit, decision: Decision, fits: Sequence[Fit]) -> Decision:
+    """The decision, or what is said of one of these fits where it is nearer than a set that does not explain the gap.
+
+    A search that its time has cut short may have found its nearest set before it looked beside errors of the model.
+    """
+    best = min(fits, key=lambda f: f.cost, default=start)
+    is_open = decision.outcome in ("part", "unknown")
+    is_nearer = is_open and best.cost < cost_of(search.rig, decision.best.effects, search.data)
+    return unexplained(start, best, ()) if is_nearer else decision

@@ -42,6 +42,7 @@ class Distortion:
         channels: of the outputs.
         n_periods: that were averaged.
         input_rms: of all inputs together.
+        input_amplitudes: (n_lines,) rms of each line of all inputs together.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Distortion:
     channels: tuple[Channel, ...]
     n_periods: int
     input_rms: float
+    input_amplitudes: np.ndarray
 
     @property
     def even(self) -> np.ndarray:
@@ -110,6 +112,7 @@ def distortion_of(record: Record) -> Distortion:
         channels=record.output_channels,
         n_periods=n_periods,
         input_rms=float(np.sqrt((record.inputs**2).mean())),
+        input_amplitudes=frozen(size),
     )
 
 

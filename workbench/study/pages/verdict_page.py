@@ -14,6 +14,7 @@ from workbench.draw.motion import ALONG, mode_motion
 from workbench.draw.spectra import plot_distortion
 from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import label_in_words
+from workbench.gap.effects.nonlinear import BEYOND
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.signal.distortion import Distortion, distortion_of
 from workbench.records.record import Record
@@ -104,6 +105,9 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
 
 def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     """Effects, gaps and rivals of a verdict as JSON: those of these tables that have a row."""
+    nearest = content.get("nearest", [])
+    beyond = {kind.name for kind in BEYOND}.issuperset(effect["kind"] for effect in nearest)
+    title = "Effects" if beyond else "Nearest effects: they do not explain the gap"
     effects = [
         [
             label_in_words(effect["kind"]),
@@ -112,7 +116,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
             effect.get("at", ""),
             effect.get("input", effect.get("output", "")),
         ]
-        for effect in [*content["effects"], *content.get("nearest", [])]
+        for effect in [*content["effects"], *nearest]
         for name, value in effect["parameters"].items()
     ]
     gap, closed = content["gap"], content.get("shrinkage", {})
@@ -125,7 +129,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
         [rival.get("words") or in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]
     ]
     tables = [
-        ("Effects", ("effect", "parameter", "value", "standard error", f"x [{length}]", "input or output"), effects),
+        (title, ("effect", "parameter", "value", "standard error", f"x [{length}]", "input or output"), effects),
         ("Gap (rms error / rms signal)", ("record", "before", "after", "floor", "share closed"), gaps),
         ("Alternatives that the records do not exclude", ("set of effects", "probability"), rivals),
     ]
