@@ -13,6 +13,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import (
     ForceFilter,
     SampledModel,
+    accumulated,
     colour_of,
     force_filter,
     log_likelihood,
@@ -37,7 +38,6 @@ class RandomForceSettings:
     tolerance: float = 1e-4  # shares and logarithms
     loss_tolerance: float = 0.1  # twice a log-likelihood
     evaluations: int = 160
-    doublings: int = 40  # of samples, at most, over which a force's memory of what drives it is summed
     families: int = 3  # of colours, likeliest first, that are fitted to two records before one is to all
     curved_over: float = 2e-3  # of the extent: half of the stretch over which the likelihood's curvature is taken
     # what may be one random force of the surroundings: by how much its level spreads between records, relative; how far
@@ -238,18 +238,10 @@ def _filter(model: SampledModel, rig: Rig, at: Where, rms: float, colour: Floats
 
 
 def _power(colour: Floats) -> float:
-    """Variance of a force per variance of what drives its colour: Σ (Aᵏ)₁ₙ², over twice as many samples each time.
-
-    Smith, SIAM J. Appl. Math. 16 (1968) 198. Stages in a row near a random walk are too much for a linear solution.
-    """
-    power, step = np.zeros_like(colour), colour
-    power[-1, -1] = 1.0
-    for _ in range(RANDOM_FORCE.doublings):
-        more = power + step @ power @ step.T
-        if np.array_equal(more, power):
-            break
-        power, step = more, step @ step
-    return float(power[0, 0])
+    """Variance of a force per variance of what drives its colour."""
+    drive = np.zeros_like(colour)
+    drive[-1, -1] = 1.0
+    return float(accumulated(colour, drive)[0, 0])
 
 
 def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from scipy.linalg import expm, solve_discrete_lyapunov, solve_triangular
+from scipy.linalg import expm, solve_triangular
 
 from workbench.arrays import Floats
 from workbench.rig.linear import integrated
@@ -20,6 +20,7 @@ from workbench.structure.modes import Modes
 RUNAWAY = 1e100
 WHITE = np.zeros((1, 1))  # colour of a force that no sample tells of the next
 TETHER = 1e-4  # radians a sample
+DOUBLINGS = 40  # of samples, at most, over which a memory is summed
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +205,21 @@ def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_varianc
     return covariance
 
 
+def accumulated(a: Floats, q: Floats) -> Floats:
+    """Σ Aᵏ Q (Aᵏ)ᵀ, (n, n), of a stable A, over twice as many k each time.
+
+    Smith, SIAM J. Appl. Math. 16 (1968) 198. States of sizes far apart, or stages in a row near a random walk, are too
+    much for a linear solution.
+    """
+    whole, step = q, a
+    for _ in range(DOUBLINGS):
+        more = whole + step @ whole @ step.T
+        if np.array_equal(more, whole):
+            break
+        whole, step = more, step @ step
+    return whole
+
+
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _carry_on(a: Floats, x: Floats) -> None:
     """Add a x_k to x_k+1, row after row of x (n_samples + 1, n_lanes); a (n_states, n_lanes)."""
@@ -277,6 +293,6 @@ def smoothed_covariance(filter_: ForceFilter) -> Floats:
     """
     h, p = filter_.h, filter_.covariance
     closed = filter_.a - filter_.gain @ h
-    adjoint = solve_discrete_lyapunov(closed.T, h.T @ np.linalg.solve(filter_.innovation, h))
+    adjoint = accumulated(closed.T, h.T @ np.linalg.solve(filter_.innovation, h))
     smoothed: Floats = p - p @ adjoint @ p
     return smoothed
