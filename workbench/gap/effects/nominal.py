@@ -39,7 +39,7 @@ JUST_LATE = 1e-3  # of a sample: later, an accelerometer reads what was before a
 SURE = 1e-9  # of the largest variance of errors, each in units of its own: less is no doubt
 LITTLE, STRONG = 0.25, 25.0  # radians by which a coupling of one turns two modes: less is none, more is no small error
 WIDEST = 8.0  # prior deviations: bounds, far outside of what a nominal model can be off by
-UNITS = 2.0  # as large as the largest size that errors are believed to have before any record
+PROFILE_LEAST = 0.02  # what errors of a profile are believed to be before any record
 
 
 @dataclass(frozen=True)
@@ -153,15 +153,17 @@ def _parameters(rig: Rig, prior: NominalPrior | IdentifiedPrior) -> tuple[Parame
 
 
 def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
+    along = isinstance(rig.structure, Structure)
+
     def believed(
         name: str, std: float, unit: float, low: float = -np.inf, high: float = np.inf, sensor: str = ""
     ) -> Parameter:
-        # a size that is learnt to be smaller than before leaves errors where they are
-        reach, unit = WIDEST * max(std, UNITS * unit), unit * weight_of(name, prior)
+        # a size that is learnt to be smaller than before leaves errors of a profile where they are
+        least = PROFILE_LEAST if along and group_of(name) in ("stiffness", "mass") else unit
+        reach, unit = WIDEST * max(std, least), unit * weight_of(name, prior)
         prior_std = max(std * weight_of(name, prior) / unit, 1e-6)
         return Parameter(name, "", max(low, -reach), min(high, reach), scale=unit, prior_std=prior_std, sensor=sensor)
 
-    along = isinstance(rig.structure, Structure)
     waves = prior.waves if along else 1
     if prior.stiffness and along:
         yield from (believed(f"stiffness_{k}", prior.stiffness, PROFILE_UNIT) for k in range(waves))
