@@ -45,17 +45,22 @@ def scores(found, omega, zeta):
     return np.r_[(modes.omega - omega) / found.omega_std, (modes.zeta - zeta) / found.zeta_std]
 
 
+def errors_of(seeds, remark, **excitation):
+    """The scores of all seeds, each with its modes, no other, and one remark."""
+    errors = []
+    for seed in seeds:
+        record, omega, zeta = record_of(seed, **excitation)
+        found = identify_driven(record)
+        assert found.modes.n_modes == omega.size
+        assert len(found.remarks) == 1 and remark in found.remarks[0]
+        errors.append(scores(found, omega, zeta))
+    return np.concatenate(errors)
+
+
 @pytest.mark.parametrize("band_limited", [True, False])
 @pytest.mark.parametrize("seeds", [(0, 4, 8), pytest.param(range(9, 40), marks=pytest.mark.slow)], ids=["few", "many"])
 def test_intervals_hold_without_false_modes(seeds, band_limited):
-    errors = []
-    for seed in seeds:
-        record, omega, zeta = record_of(seed, band_limited=band_limited)
-        found = identify_driven(record)
-        assert found.modes.n_modes == omega.size
-        assert len(found.remarks) == 1 and "standard errors allow for it" in found.remarks[0]
-        errors.append(scores(found, omega, zeta))
-    errors = np.concatenate(errors)
+    errors = errors_of(seeds, "standard errors allow for it", band_limited=band_limited)
     inside = (np.abs(errors) < 1.96).mean()
     assert inside >= 0.95 - 3.0 * np.sqrt(0.95 * 0.05 / errors.size)
     assert np.sqrt((errors**2).mean()) > 0.6  # nor are they too wide
@@ -75,12 +80,5 @@ def test_exact_inputs_have_no_such_remark():
 
 
 def test_intervals_allow_for_noise_within_blows():
-    errors = []
-    for seed in (0, 4, 8, 12):
-        record, omega, zeta = record_of(seed, blows=True)
-        found = identify_driven(record)
-        assert found.modes.n_modes == omega.size
-        assert len(found.remarks) == 1 and "force window" in found.remarks[0]
-        errors.append(scores(found, omega, zeta))
-    errors = np.concatenate(errors)
+    errors = errors_of((0, 4, 8, 12), "force window", blows=True)
     assert (np.abs(errors) < 1.96).mean() >= 0.95 - 3.0 * np.sqrt(0.95 * 0.05 / errors.size)

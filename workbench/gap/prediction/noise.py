@@ -42,7 +42,7 @@ class NoiseSettings:
 NOISE = NoiseSettings()
 
 
-def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
+def noise_found(residuals: Sequence[np.ndarray], coloured: np.ndarray | None = None) -> np.ndarray:
     """Standard deviation of each sensor's noise (n_outputs,), in the sensors' units.
 
     Noise is as strong in every record, while what a model lacks goes with the level; so the noise is at most the least
@@ -51,14 +51,16 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
 
     Args:
         residuals: (n_outputs, n_samples) measured less predicted, one per record.
+        coloured: (n_outputs,) of `are_coloured`, where that is known.
     """
+    coloured = are_coloured(residuals) if coloured is None else coloured
     whole = np.sort([(residual**2).mean(axis=1) for residual in residuals], axis=0)
     under = np.min([_under_peaks(residual) for residual in residuals], axis=0)
     # what is as strong in two records of unequal level is noise, of whatever colour
     alike = whole[1] < NOISE.alike * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
     same = whole < NOISE.same * whole[0]
     noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
-    power: Floats = np.where(alike | (under > NOISE.loud * whole[0]) | are_coloured(residuals), noise, under)
+    power: Floats = np.where(alike | (under > NOISE.loud * whole[0]) | coloured, noise, under)
     return np.sqrt(power)
 
 
@@ -100,23 +102,26 @@ def _levelled(residuals: Sequence[np.ndarray]) -> list[Floats]:
     return [r[:, 1:] - correlation * r[:, :-1] for r in residuals]
 
 
-def is_noise_alone(residuals: Sequence[np.ndarray], records: Sequence[Record]) -> bool:
+def is_noise_alone(
+    residuals: Sequence[np.ndarray], records: Sequence[Record], coloured: np.ndarray | None = None
+) -> bool:
     """Whether what is left is noise, however loud: without peaks, and as strong in records of other levels.
 
     Args:
         residuals: (n_outputs, n_samples) measured less predicted, one per record.
         records: what was measured.
+        coloured: (n_outputs,) of `are_coloured`, where that is known.
     """
     levels = [(record.outputs**2).mean() for record in records]
     if max(levels) <= NOISE.louder * min(levels):
         return False
-    coloured = are_coloured(residuals).all()
+    has_colour = bool((are_coloured(residuals) if coloured is None else coloured).all())
     # without its colour, a record holds as many samples of it as of white noise
-    power = np.array([(left**2).mean(axis=1) for left in (_levelled(residuals) if coloured else residuals)])
+    power = np.array([(left**2).mean(axis=1) for left in (_levelled(residuals) if has_colour else residuals)])
     if (power.max(axis=0) >= NOISE.alike * power.min(axis=0)).any():
         return False
     each = zip(residuals, power, strict=True)
-    return bool(coloured or all((_under_peaks(left) > NOISE.flat * own).all() for left, own in each))
+    return has_colour or all((_under_peaks(left) > NOISE.flat * own).all() for left, own in each)
 
 
 def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:

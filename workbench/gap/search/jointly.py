@@ -207,18 +207,19 @@ def measured(search: Search, found: Fit, substeps: int | None = None) -> Step:
     residuals = whole.differences(rig)
     with np.errstate(over="ignore", invalid="ignore"):  # of a motion that runs away
         by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
-        credible = np.inf if is_noise_alone(residuals, whole.counted) else _credible(whole, residuals)
-        sensor_noise = np.minimum(noise_found(residuals) / whole.noise, credible) ** 2
+        coloured = are_coloured(residuals)
+        credible = np.inf if is_noise_alone(residuals, whole.counted, coloured) else _credible(whole, coloured)
+        sensor_noise = np.minimum(noise_found(residuals, coloured) / whole.noise, credible) ** 2
     step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
     per_unit = search.logging_noise
     logged = logging_noise(by_channel, sensor_noise, per_unit)
     return Step(step, sensor_noise, logged, sensor_noise + logged**2 * per_unit)
 
 
-def _credible(data: FitData, residuals: Sequence[Floats]) -> Floats:
+def _credible(data: FitData, coloured: np.ndarray) -> Floats:
     """How many times the noise of each sensor (n_outputs,) that of the data may turn out to be."""
     guessed = np.array([name in data.guessed for name in data.records[0].output_names])
-    return np.where(guessed & are_coloured(residuals), JOINT.credible_guess, JOINT.credible)
+    return np.where(guessed & coloured, JOINT.credible_guess, JOINT.credible)
 
 
 def _next_sizes(errors: Effect) -> dict[str, float]:
