@@ -235,7 +235,8 @@ def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: fl
     """What was found, without effects that act on records held out and take nothing away there.
 
     A trifle that is left of a measured gap bends to any law, on the records that were fitted; and what makes
-    the gap of others larger, in a nearest set, corrects nothing.
+    the gap of others larger, in a nearest set, corrects nothing. What only errors that no careful model has would
+    do without stays.
     """
     effects = found.best.effects
     if found.outcome in ("part", "unknown") and not _unpredictable(found):
@@ -257,9 +258,16 @@ def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: fl
         # beside others that are fitted anew; first as they are, which shows of most effects that they count
         if _left_of(rig, rest, unseen, settle) < CLEAR * (after + trifle):
             without = found.without(effect)
+            if _errors_believed(effects) and not _errors_believed(without.best.effects):
+                continue
             if _left_of(rig, without.best.effects, unseen, settle) < after + trifle:
                 return _paid_for(rig, without, unseen, settle)
     return found
+
+
+def _errors_believed(effects: Sequence[Effect]) -> bool:
+    """Whether the errors beside effects are those of a careful model: larger ones stand in for what is left out."""
+    return not any(too_large(effect) for effect in effects if isinstance(effect.target, NominalPrior))
 
 
 def _left_of(rig: Rig, effects: Sequence[Effect], unseen: Sequence[Record], settle: float) -> float:

@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import fit
 from workbench.gap.search.intervals import with_intervals
@@ -42,6 +43,27 @@ def test_a_deviation_is_that_of_fits_that_leave_out_a_block_each(hinged_rig):
     assert found.values["gain"] == pytest.approx(slope, rel=1e-6)
     assert expected > 1.5 * noise[0] / np.sqrt(s @ s)  # white noise of that size would say less
     assert found.deviations["gain"] == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["actuator_gain", "sensor_gain"])
+def test_a_gain_is_known_no_better_than_calibrations_and_is_relative_to_that_of_the_model(hinged_rig, kind):
+    """Errors of calibration of 1 %, beside them a gain 1.8 times that of a model in newton per volt."""
+    rig = hinged_rig(n_modes=2)
+    rig = replace(rig, actuators=(replace(rig.actuators[0], gain=2e-3),), sensors=rig.sensors[:1])
+    port = rig.actuators[0] if kind == "actuator_gain" else rig.sensors[0]
+    gain = Effect(kind_named(kind), port.name, {"gain": 1.8})
+    real = apply_all(rig, (gain,))
+    assert [p.gain for p in (*real.actuators, *real.sensors)] == pytest.approx(
+        [3.6e-3, 1.0] if kind == "actuator_gain" else [2e-3, 1.8]
+    )
+    rng = np.random.default_rng(0)
+    record = simulate(real, np.repeat(rng.normal(size=120), 5)[None], sample_time=0.01)
+    data = FitData((record,), 1e-3 * record.outputs.std(axis=1))
+    start = replace(gain, values={"gain": 1.5})
+    found = fit(rig, (start, nominal_errors(rig, NominalPrior(gain=0.01))), data)
+    told = with_intervals(rig, found, data).effects[0]
+    assert told.values["gain"] == pytest.approx(1.8, rel=1e-3)
+    assert told.deviations["gain"] == pytest.approx(1.8 * 0.01 * np.sqrt(2.0), rel=0.05)  # of both ports
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_errors
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.fit import fit
-from workbench.gap.search.jointly import fit_jointly, surely_late
+from workbench.gap.search.fit import Fit, fit
+from workbench.gap.search.jointly import fit_jointly, size_of, surely_late
 from workbench.gap.search.plain import (
     _at_ports,
     common_as_errors,
@@ -23,6 +23,12 @@ from workbench.gap.search.plain import (
     other_causes,
 )
 from workbench.gap.search.search import Search
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.plate import Plate
 from workbench.trials.make import make_trial
 from workbench.trials.scoring import score_imperfect
 
@@ -63,6 +69,31 @@ def test_a_damper_stands_in_place_of_the_damping_of_every_mode(search):
     assert damper.values["coefficient"] == pytest.approx(0.06, rel=0.05)
     assert errors.values["stiffness_0"] == pytest.approx(np.log(1.008), rel=0.02)
     assert errors.values["damping_1"] == pytest.approx(np.log(1.12), rel=0.1)
+
+
+def test_what_is_common_to_all_modes_of_a_plate_is_an_error_of_each(search):
+    """A plate has no profile to vary: each of its frequencies and damping ratios is off by as much."""
+    plate = Plate(
+        length=(0.6, 0.4),
+        mass_per_area=8.0,
+        bending_stiffness=160.0,
+        poisson_ratio=0.3,
+        edges="simply supported",
+        damping=ModalDamping(0.01),
+    )
+    sensors = tuple(Sensor(f"w{i}", at, noise_std=1e-6) for i, at in enumerate(((0.1, 0.3), (0.45, 0.12))))
+    rig = Rig(plate.modes(5), (Actuator("F", (0.2, 0.15)),), sensors, structure=plate)
+    damper = Effect(DAMPER.kind, None, {"x": 0.4, "y": 0.3, "coefficient": 2.0})
+    effects = (damper, MODULUS, DAMPING)
+    found = Fit(effects, 1.0, np.ones((1, 2)), 5)
+    rng = np.random.default_rng(0)
+    record = simulate(apply_all(rig, effects), np.repeat(rng.normal(size=60), 5)[None], sample_time=1e-3)
+    one = replace(search(()), rig=rig, data=FitData((record,), np.full(2, 1e-6)))
+    again = common_as_errors(one, found)
+    assert [effect.kind for effect in again.effects] == [DAMPER.kind, NOMINAL_ERRORS]
+    assert size_of(again.effects[-1], "frequency") == pytest.approx(0.5 * np.log(1.008), rel=0.01)
+    left = one.data.residual(apply_all(rig, again.effects))
+    assert np.abs(left).max() < 1e-3 * np.abs(one.data.residual(rig)).max()
 
 
 def test_a_damper_is_found_beside_sensors_that_stand_and_read_a_little_otherwise(search):

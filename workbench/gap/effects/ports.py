@@ -26,6 +26,7 @@ OF_THE_CHANNEL = "sensor_quantisation"  # what stays where it is when wires are 
 OF_THE_SENSOR = "unit of the sensor"
 ALIKE = 0.05  # of a residual's mean square: what another sensor's reading explains of it, to be tried as cross-talk
 Starts = Callable[[Evidence, Any], Iterable[dict[str, Any]]]
+Apply = Callable[[Rig, Any, dict[str, Any]], Rig]
 
 SLOW = 0.1  # of the rms step between samples: faster, a reading does not come to rest
 OVERSTAYED = 6.0  # steps over their decrease: three times as long as free flight up and back
@@ -63,6 +64,12 @@ def _change_actuators(rig: Rig, target: str, **changes: Any) -> Rig:
 
 def _change_sensors(rig: Rig, target: str, **changes: Any) -> Rig:
     return replace(rig, sensors=tuple(replace(s, **changes) if target in (s.name, ALL) else s for s in rig.sensors))
+
+
+def _amplify(rig: Rig, side: str, target: str, gain: float) -> Rig:
+    """An actuator or a sensor with so many times the gain that it has: a calibration may be a little off besides."""
+    ports: Any = getattr(rig, side)
+    return replace(rig, **{side: tuple(replace(p, gain=gain * p.gain) if p.name == target else p for p in ports)})
 
 
 def _change_swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
@@ -139,9 +146,10 @@ def _actuator(
     attribute: str | None = None,
     neutral: float | None = None,
     size: Callable[[Rig], float] = lambda rig: 1.0,
+    apply: Apply | None = None,
     **options: Any,
 ) -> Kind:
-    """A kind that sets one number of an actuator, the attribute of that name unless another one is given.
+    """A kind with one number of an actuator, which it sets the attribute of that name to unless told otherwise.
 
     Its bounds are times a size that the rig has of itself.
     """
@@ -152,7 +160,7 @@ def _actuator(
         parameters=lambda rig, _: (
             Parameter(field, unit, low * size(rig), high * size(rig), logarithmic=log, scale=0.1, neutral=neutral),
         ),
-        apply=lambda rig, target, v: _change_actuators(rig, target, **{attribute: v[field]}),
+        apply=apply or (lambda rig, target, v: _change_actuators(rig, target, **{attribute: v[field]})),
         starts=starts,
         targets=targets,
         phrase=phrase,
@@ -167,6 +175,7 @@ ACTUATOR_GAIN = _actuator(
     "a wrong actuator gain",
     neutral=1.0,
     targets=each_actuator,
+    apply=lambda rig, target, v: _amplify(rig, "actuators", target, v["gain"]),
     low=-20.0,
     high=20.0,
     log=False,
@@ -373,7 +382,7 @@ def _size(evidence: Evidence, target: str) -> float:
 
 
 def _sensor(name: str, field: str, phrase: str, starts: Starts, unit: str = "", **options: Any) -> Kind:
-    """A kind that sets one figure of a sensor; its bounds are times a size that the rig has of itself."""
+    """A kind that sets one figure of a sensor, or is applied otherwise; bounds are times a size of the rig's own."""
     attribute = {"drift_over_record": "drift"}.get(field, field)
     log = options.pop("log", False)
     low, high = options.pop("low", -1e12), options.pop("high", 1e12)
@@ -391,7 +400,7 @@ def _sensor(name: str, field: str, phrase: str, starts: Starts, unit: str = "", 
         name=name,
         path="sensor",
         parameters=parameters,
-        apply=lambda rig, target, v: _change_sensors(rig, target, **{attribute: v[field]}),
+        apply=options.pop("apply", lambda rig, target, v: _change_sensors(rig, target, **{attribute: v[field]})),
         starts=starts,
         targets=options.pop("targets", each_sensor),
         phrase=phrase,
@@ -404,6 +413,7 @@ SENSOR_GAIN = _sensor(
     "gain",
     "a wrong sensor gain",
     lambda evidence, _: [{"gain": 0.9}],
+    apply=lambda rig, target, v: _amplify(rig, "sensors", target, v["gain"]),
     low=-100.0,
     high=100.0,
     signed=True,

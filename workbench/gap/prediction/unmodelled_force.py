@@ -44,10 +44,10 @@ class SampledModel:
 
 
 def _tethered(modes: Modes, sample_time: float) -> Modes:
-    """Modes that are all rigid, on a spring too soft to show: sensors of velocity see no displacement."""
-    if modes.omega[-1] > 0:
+    """Modes, the rigid ones on a spring too soft to show: sensors of velocity see no displacement of theirs."""
+    if modes.omega.all():
         return modes
-    return replace(modes, omega=np.full(modes.n_modes, TETHER / sample_time), damping=modes.damping)
+    return replace(modes, omega=np.where(modes.omega > 0, modes.omega, TETHER / sample_time), damping=modes.damping)
 
 
 def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, sample_time: float) -> SampledModel:

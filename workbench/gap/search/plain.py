@@ -85,14 +85,15 @@ def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
         or any(abs(size) >= most[name] for name, size in common.items())
     ):
         return found
-    if not isinstance(search.rig.structure, Structure) or (
-        late is not None and not set(late.target.groups) <= set(OF_PORTS)
-    ):
+    if late is not None and not set(late.target.groups) <= set(OF_PORTS):
         return found
     stiffness, damping = (common.get(kind.name, 0.0) for kind in COMMON)
+    if isinstance(search.rig.structure, Structure):
+        sizes = {"stiffness": stiffness, "damping": damping}
+    else:  # no profile is known: each frequency is off by as much
+        sizes = {"frequency": 0.5 * stiffness, "damping": damping}
     prior = NominalPrior(sample_time=search.data.records[0].sample_time) if late is None else late.target
-    errors = nominal_errors(search.rig, replace(prior, stiffness=abs(stiffness), damping=abs(damping), waves=1))
-    sizes = {"stiffness": stiffness, "damping": damping}
+    errors = nominal_errors(search.rig, replace(prior, **{name: abs(size) for name, size in sizes.items()}, waves=1))
     values = {name: sizes.get(group_of(name), 0.0) for name in errors.values}
     values.update({} if late is None else late.values)
     return replace(found, effects=(*named, replace(errors, values=values)), covariance=None)
