@@ -1,20 +1,21 @@
 """A structure to be updated: what was measured and what is known beforehand; and the updated one, with its errors."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.shapes.eigenfunctions import check_along
-from workbench.identification.signal.modal_estimates import Refined, normalised_shapes
+from workbench.identification.signal.modal_estimates import Refined, normalised_shapes, rounded
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
 from workbench.renamed import Renamed
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import mac
+from workbench.structure.printed import Printed, counted
 from workbench.structure.profile import Profile
 
 
@@ -25,6 +26,7 @@ class TaskSettings:
     trusted: float = 1e-8  # relative: no theory of bars and beams is better than this, however clean the record
     same_mode: float = 0.6  # least MAC with the nominal structure's mode that a measured one is taken for
     unlikely: float = 0.01  # chance that a structure is said not to explain modes that are its own
+    printed: int = 11  # places along a structure that its distributions are printed at
 
 
 TASK = TaskSettings()
@@ -153,17 +155,37 @@ def _unit(covariance: np.ndarray, least: float = 1e-12) -> np.ndarray:
     return np.asarray((vectors / np.sqrt(np.maximum(values, least * values.max()))).T)
 
 
-@dataclass(frozen=True, eq=False)
-class UncertainProfile:
+@dataclass(frozen=True, eq=False, repr=False)
+class UncertainProfile(Printed):
     """A distribution along the structure and how far it is to be trusted.
 
     Attributes:
         profile: the most likely one.
         others: x (n_points,) -> (n_draws, n_points), as likely as the measurement leaves them.
+        length: of the structure, m.
     """
 
     profile: Profile
-    others: Callable[[np.ndarray], np.ndarray] = field(repr=False)
+    others: Callable[[np.ndarray], np.ndarray]
+    length: float
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        low, high = self.extent
+        line = f"from {low:.4g} to {high:.4g} over {self.length:.4g} m"
+        return line, ("x [m]", "value", "±"), list(zip(*self.columns)), ()
+
+    @property
+    def columns(self) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
+        """What is printed: places, values there, and their standard errors."""
+        x = np.linspace(0.0, self.length, TASK.printed)
+        values, errors = zip(*(rounded(value, error) for value, error in zip(self(x), self.std(x), strict=True)))
+        return [f"{at:.4g}" for at in x], values, errors
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """The least and the largest value, of 101 places."""
+        values = self(np.linspace(0.0, self.length, 101))
+        return float(values.min()), float(values.max())
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Values at x, in the shape of x."""
@@ -180,8 +202,8 @@ class UncertainProfile:
         return lower, upper
 
 
-@dataclass(frozen=True, eq=False)
-class FittedStructure:
+@dataclass(frozen=True, eq=False, repr=False)
+class FittedStructure(Printed):
     """The structure whose own modes come nearest to the measured, in units of their standard errors.
 
     Attributes:
@@ -209,13 +231,52 @@ class FittedStructure:
     degrees_of_freedom: int
     criterion: float
     parameters: np.ndarray
-    covariance: np.ndarray = field(repr=False)
+    covariance: np.ndarray
     numbers: np.ndarray
     check: SelfCheck
 
     freedom = Renamed("degrees_of_freedom")
 
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        told = "explains" if self.explains else "does not explain"
+        line = (
+            f"mass in {counted(self.n_terms[0], 'term')} and stiffness in {counted(self.n_terms[1], 'term')}:"
+            f" {told} the {counted(self.numbers.size, 'mode')} measured (χ² {self.chi2:.4g}, at most {self.limit:.4g})"
+        )
+        k = "EI [N m²]" if isinstance(self.structure, Beam) else "EA [N]"
+        rows = list(zip(*self.mass.columns, *self.stiffness.columns[1:]))
+        return line, ("x [m]", "mass [kg/m]", "±", k, "±"), rows, self.remarks
+
+    @property
+    def limit(self) -> float:
+        """χ² that noise alone exceeds in one measurement of a hundred."""
+        return float(chi2_distribution.isf(TASK.unlikely, self.degrees_of_freedom))
+
     @property
     def explains(self) -> bool:
         """Whether noise alone would miss the measured modes by as much, in one measurement of a hundred or more."""
-        return bool(self.chi2 <= chi2_distribution.isf(TASK.unlikely, self.degrees_of_freedom))
+        return self.chi2 <= self.limit
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Why the distributions are not to be trusted; empty where they explain the modes."""
+        if self.explains:
+            return ()
+        (m, most_m), (k, most_k) = self.mass.extent, self.stiffness.extent
+        unit = "N m²" if isinstance(self.structure, Beam) else "N"
+        return (
+            f"{unexplained(self)}. The distributions make up for what they lack and may be wrong by any factor, their"
+            f" standard errors too small: mass {m:.4g} to {most_m:.4g} kg/m, stiffness {k:.4g} to {most_k:.4g} {unit}."
+            f" {LACKING}",
+        )
+
+
+LACKING = (
+    "Put point masses, springs and the true ends into the nominal structure, give a basis that jumps where the section"
+    " does, or more terms; else the standard errors of the modes are too small"
+)
+
+
+def unexplained(found: FittedStructure) -> str:
+    """That a structure does not explain its modes, with the figure and its limit."""
+    return f"the modes are not explained: χ² is {found.chi2:.4g}, and noise alone gives at most {found.limit:.4g}"
