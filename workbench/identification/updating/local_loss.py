@@ -49,7 +49,7 @@ class LossSettings:
     draws: int = 20_000  # of a loss as likely as the one found, for intervals
     # χ² / degrees of freedom up to which standard errors may be too small, here twofold, and a loss is told
     errors_wrong: float = 4.0
-    # share of the χ² without a loss that one may leave: true losses of the study leave 4e-5 at most, where a step or
+    # share of the χ² without a loss that one may leave: true losses of the study leave 7e-5 at most, where a step or
     # a mass that the nominal structure lacks passes for a loss, 5e-3 and more are left
     left: float = 1e-3
     mass_places: int = 40  # along the structure, where a point mass is looked for
