@@ -8,8 +8,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.shapes.eigenfunctions import check_along
-from workbench.identification.signal.modal_estimates import Refined, normalised_shapes, rounded
-from workbench.identification.updating.distributions import Basis
+from workbench.identification.signal.modal_estimates import Refined, normalised_shapes
+from workbench.identification.updating.distributions import Basis, columns
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
 from workbench.renamed import Renamed
@@ -26,7 +26,6 @@ class TaskSettings:
     trusted: float = 1e-8  # relative: no theory of bars and beams is better than this, however clean the record
     same_mode: float = 0.6  # least MAC with the nominal structure's mode that a measured one is taken for
     unlikely: float = 0.01  # chance that a structure is said not to explain modes that are its own
-    printed: int = 11  # places along a structure that its distributions are printed at
 
 
 TASK = TaskSettings()
@@ -172,14 +171,7 @@ class UncertainProfile(Printed):
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         low, high = self.extent
         line = f"from {low:.4g} to {high:.4g} over {self.length:.4g} m"
-        return line, ("x [m]", "value", "±"), list(zip(*self.columns)), ()
-
-    @property
-    def columns(self) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
-        """What is printed: places, values there, and their standard errors."""
-        x = np.linspace(0.0, self.length, TASK.printed)
-        values, errors = zip(*(rounded(value, error) for value, error in zip(self(x), self.std(x), strict=True)))
-        return [f"{at:.4g}" for at in x], values, errors
+        return line, ("x [m]", "value", "±"), list(zip(*columns(self, self.length))), ()
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -244,7 +236,8 @@ class FittedStructure(Printed):
             f" {told} the {counted(self.numbers.size, 'mode')} measured (χ² {self.chi2:.4g}, at most {self.limit:.4g})"
         )
         k = "EI [N m²]" if isinstance(self.structure, Beam) else "EA [N]"
-        rows = list(zip(*self.mass.columns, *self.stiffness.columns[1:]))
+        length = self.structure.length
+        rows = list(zip(*columns(self.mass, length), *columns(self.stiffness, length)[1:]))
         return line, ("x [m]", "mass [kg/m]", "±", k, "±"), rows, self.remarks
 
     @property
