@@ -164,8 +164,8 @@ class Distributions(Printed):
         if self.orthogonality > KNOWN:
             remarks.append(
                 f"two modes are orthogonal only to {self.orthogonality:.2g}, at most {KNOWN:g} where mass and shapes"
-                " agree: something that the relations do not have is attached, as a mass at a point, or the mass wants other"
-                " terms; use choose_structure with what is attached in the nominal structure"
+                " agree: something that the relations do not have is attached, as a mass at a point, or the mass wants"
+                " other terms; use choose_structure with what is attached in the nominal structure"
             )
         return tuple(remarks)
 

@@ -159,7 +159,8 @@ def update_model(
             lost = int(np.argmin(agreement.max(axis=1)))
             raise ValueError(
                 f"measured mode {lost + 1}, {target[lost] / (2 * np.pi):.4g} Hz, resembles no mode of the model: the"
-                f" best MAC is {agreement[lost].max():.2f}; let the model give more modes, or leave this one out"
+                f" best MAC is {agreement[lost].max():.2f}; start nearer, let the model give more modes, or leave this"
+                " one out"
             )
         quotients = modes.omega[columns]
         for r, s in enumerate(columns):

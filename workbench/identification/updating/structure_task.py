@@ -266,7 +266,8 @@ class FittedStructure(Printed):
 
 LACKING = (
     "Put point masses, springs and the true ends into the nominal structure, give a basis that jumps where the section"
-    " does, or more terms; else the standard errors of the modes are too small"
+    " does, or more terms, and see in `numbers` which modes the measured ones are; else their standard errors are too"
+    " small"
 )
 
 
