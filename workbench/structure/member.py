@@ -252,10 +252,15 @@ class _Member(Printed):
         return matrix
 
 
+def checked_places(breaks: tuple[float, ...], length: float) -> np.ndarray:
+    """Places (n_places,) where mass and stiffness with these breaks must be positive, m."""
+    nodes = _nodes(breaks, length)
+    return np.asarray((nodes[:-1, None] + np.diff(nodes)[:, None] * np.linspace(0.002, 0.998, 101)).ravel())
+
+
 @lru_cache(maxsize=64)  # one profile stays where another changes
 def _check_positive(name: str, profile: Profile, length: float) -> None:
-    nodes = _nodes(profile.breaks, length)
-    inside = (nodes[:-1, None] + np.diff(nodes)[:, None] * np.linspace(0.002, 0.998, 101)).ravel()
+    inside = checked_places(profile.breaks, length)
     values = profile(inside)
     if not np.isfinite(values).all() or (values <= 0).any():
         i = int(np.argmax(~(values > 0)))

@@ -1,9 +1,12 @@
 import numpy as np
 import pytest
 
+from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
 from workbench.identification.updating.distributions import Basis, mass_and_stiffness
 from workbench.identification.updating.self_check import choose_terms, self_check
 from workbench.structure.member import Bar, Beam
+from workbench.structure.modes import SampledModes
+from workbench.structure.supports import PointMass
 
 X = np.linspace(0.0, 2.0, 81)
 
@@ -122,15 +125,60 @@ def test_self_check_tells_a_wrong_answer(case):
         known_mass=[(1.0, 1.3)],
     )
     assert self_check(found, modes, **ends).worst > 1e-3
-    nowhere = mass_and_stiffness(
-        modes,
-        kind=ends["kind"],
-        mass_basis=Basis.polynomial(1),
-        stiffness_basis=Basis.polynomial(2),
-        known_mass=[(1.0, 1.3)],
-        prior_stiffness=lambda x: -50.0 * np.cos(9 * x),
-    )
+    with pytest.warns(UserWarning, match="the stiffness is uncertain by .* %, as single modes left out show"):
+        nowhere = mass_and_stiffness(
+            modes,
+            kind=ends["kind"],
+            mass_basis=Basis.polynomial(1),
+            stiffness_basis=Basis.polynomial(2),
+            known_mass=[(1.0, 1.3)],
+            prior_stiffness=lambda x: -50.0 * np.cos(9 * x),
+        )
     assert "must be positive" in self_check(nowhere, modes, **ends).refusal
+
+
+CLAMPED = BoundaryConditions.of("beam", length=2.0, left="clamped", right="free")
+
+
+def from_sensors(noise, seed, parts=()):
+    """Distributions of a cantilever from five modes at 15 sensors, in error by this share of each shape's largest."""
+    modes = Beam(
+        length=2.0, mass_per_length=mass, bending_stiffness=stiffness, left="clamped", right="free", attachments=parts
+    ).modes(5)
+    x, rng = np.arange(1, 16) / 7.5, np.random.default_rng(seed)
+    shapes = modes.phi(x)
+    shapes = shapes + noise * np.abs(shapes).max(axis=0) * rng.standard_normal(shapes.shape)
+    return eigenfunctions(
+        SampledModes(modes.omega, np.full(5, 0.01), shapes.astype(complex), x), length=2.0, ends=CLAMPED
+    )
+
+
+TERMS = {"kind": "beam", "mass_basis": Basis.polynomial(2), "stiffness_basis": Basis.polynomial(2)}
+
+
+@pytest.mark.filterwarnings("ignore:the stiffness is uncertain")
+def test_standard_errors_are_as_large_as_the_errors():
+    """Of noise in the shapes, over twelve measurements; two terms of stiffness are 2 % from the three true ones."""
+    runs = [mass_and_stiffness(from_sensors(2e-3, seed), known_mass=[(1.0, 1.3)], **TERMS) for seed in range(12)]
+    errors = np.array([run.stiffness(X) - stiffness(X) for run in runs])
+    told = np.array([run.stiffness.std(X) for run in runs])
+    assert 0.5 < np.sqrt((told**2).mean() / (errors**2).mean()) < 2.0
+
+
+def test_what_noisy_shapes_and_a_mass_at_a_point_leave_unknown_is_said():
+    known = {"known_mass": [(1.0, 1.3)]}
+    good = mass_and_stiffness(from_sensors(1e-5, 1), **known, **TERMS)
+    assert not good.remarks and "mass in 2 terms, stiffness in 2 terms from 5 modes, orthogonal to 1.2e-05" in str(good)
+    with pytest.warns(UserWarning, match="the stiffness is uncertain by .* choose_structure"):
+        mass_and_stiffness(from_sensors(1e-2, 1), **known, **TERMS)
+    heavy = from_sensors(1e-5, 1, (PointMass(2.0, 0.1),))
+    with pytest.warns(UserWarning, match=r"two modes are orthogonal only to 0.12, at most 0.1"):
+        mass_and_stiffness(heavy, **known, **TERMS)
+    with pytest.warns(UserWarning, match="two modes are orthogonal only to"):
+        chosen = choose_terms(heavy, kind="beam", left="clamped", right="free", terms=range(1, 3), **known)
+    assert "identified structure against measurement" in str(chosen)
+    with pytest.warns(UserWarning, match="the mass has no standard error, as no mode can be spared"):
+        mass_and_stiffness(from_sensors(1e-5, 1).select([0, 1]), **known, **TERMS)
 
 
 def test_refusals(case):

@@ -25,8 +25,9 @@ NOMINAL = {
 }
 
 
-def measured(kind, *, lost, centre):
-    """Six modes identified from 12 noisy sensors (40 dB) of a structure that scikit-fem solved."""
+def measured(kind, *, lost, centre, added=0.0, step=0.0):
+    """Six modes identified from 12 noisy sensors (40 dB) of a structure that scikit-fem solved, with a point mass at
+    0.6 or a mass that jumps there."""
     x = np.linspace(0.0, 1.0, 241)
     element = skfem.ElementLineHermite() if kind == "beam" else skfem.ElementLineP2()
     basis = skfem.Basis(skfem.MeshLine(x), element, intorder=8)
@@ -39,10 +40,13 @@ def measured(kind, *, lost, centre):
 
     @skfem.BilinearForm
     def mass(u, v, w):
-        return (1.1 - 0.2 * w.x[0]) * u * v
+        return (1.1 - 0.2 * w.x[0] + step * (w.x[0] > 0.6)) * u * v
 
     free = np.setdiff1d(np.arange(basis.N), basis.nodal_dofs[:, 0])
-    k, m = (form.assemble(basis).tocsc()[np.ix_(free, free)] for form in (stiff, mass))
+    k, m = stiff.assemble(basis), mass.assemble(basis).tolil()
+    at = basis.nodal_dofs[0, 144]
+    m[at, at] += added
+    k, m = (matrix.tocsc()[np.ix_(free, free)] for matrix in (k, m))
     values, vectors = eigsh(k, 6, m, sigma=0.0)
     shapes = np.zeros((basis.N, 6))
     shapes[free] = vectors
@@ -65,7 +69,8 @@ def test_a_fifth_of_the_stiffness_lost_over_a_tenth_of_the_length_is_found(kind,
         mass_terms=[2],
         stiffness_terms=[2, 3],
     )
-    assert found.detected and found.damaged.explains and not found.undamaged.explains
+    assert found.detected and found.damaged.explains and not found.undamaged.explains and not found.remarks
+    assert str(found).startswith("a loss of stiffness is detected") and "share" in str(found)
     assert abs(found.loss.centre - centre) < 0.005
     low, high = found.interval(0.999).T
     assert (low < [0.2, centre, 0.1]).all() and ([0.2, centre, 0.1] < high).all()
@@ -86,6 +91,37 @@ def test_nothing_is_found_where_nothing_is_lost(kind):
     )
     assert not found.detected and found.loss is None
     assert found.best is found.undamaged and found.undamaged.explains
+
+
+@pytest.mark.parametrize("added", [0.02, pytest.param(0.2, marks=pytest.mark.slow)])
+def test_a_point_mass_that_the_nominal_lacks_is_no_damage(added):
+    with pytest.warns(UserWarning, match="kg at 0.6 m, which the nominal structure lacks"):
+        found = locate_damage(
+            measured("beam", lost=0.0, centre=0.5, added=added),
+            NOMINAL["beam"],
+            known_mass=[(0.5, 1.0)],
+            mass_terms=[2],
+            stiffness_terms=[3],
+        )
+    assert found.statistic > found.threshold and not found.detected and found.loss is None
+    part = found.best.structure.attachments[-1]
+    assert (
+        found.best.explains and part.at == pytest.approx(0.6, abs=1e-3) and part.mass == pytest.approx(added, rel=0.01)
+    )
+    assert str(found).startswith("no loss of stiffness is detected")
+
+
+def test_what_a_loss_leaves_unexplained_is_not_told_as_damage():
+    with pytest.warns(UserWarning, match="the modes are not explained: χ² is .*: no proof of damage"):
+        found = locate_damage(
+            measured("beam", lost=0.0, centre=0.5, step=-0.4),
+            NOMINAL["beam"],
+            known_mass=[(0.5, 1.0)],
+            mass_terms=[1],
+            stiffness_terms=[1],
+        )
+    assert found.statistic > found.threshold and not found.detected
+    assert str(found).startswith("whether stiffness is lost is unknown")
 
 
 def test_the_first_look_points_at_the_place():

@@ -63,6 +63,56 @@ def turned(truth, angle, noise=0.0, seed=0):
     return {"omega": omega, "omega_std": std, "shapes": shapes, "places": CORNERS.names}
 
 
+def test_a_step_to_where_there_is_no_model_is_taken_back():
+    """ω ∝ √p, so that steps of Gauss and Newton in ln p go too far."""
+    refused = []
+
+    def build(p):
+        if p[0] > 0.90001:
+            refused.append(p[0])
+            raise ValueError("indefinite")
+        return tower([p[0], p[0]])
+
+    modes = turned([0.9, 0.9], 0.0)
+    found = update_model(build, [0.2], **modes)
+    assert refused and found.converged and not found.remarks
+    np.testing.assert_allclose(found.parameters, 0.9, rtol=1e-6)
+    with pytest.raises(ValueError, match="indefinite"):
+        update_model(build, [1.0], **modes)
+
+
+def row_of_floors(p, ground=0.0, floors=8):
+    """Floors of 1 kg, the top p[1] kg, on springs of 100 p[0], the lowest less by `ground`."""
+    stiffness = 100.0 * p[0] * (2.0 * np.eye(floors) - np.eye(floors, k=1) - np.eye(floors, k=-1))
+    stiffness[-1, -1] = 100.0 * p[0]
+    stiffness[0, 0] -= ground
+    mass = np.diag([1.0] * (floors - 1) + [p[1]])
+    return FiniteElements(mass, stiffness, nodes=NamedPoints(FLOORS)).modes(5)
+
+
+FLOORS = tuple(f"floor {i}" for i in range(8))
+
+
+@pytest.mark.parametrize(("top", "ground"), [(1.0, 60.0), (0.75, 67.0)])
+def test_parameters_that_cannot_make_the_truth_are_not_taken_for_it(top, ground):
+    """On a first storey as soft as 0.4 of the others: by the duality of a row of springs and masses, with all masses
+    alike, it has the frequencies of one whose top floor is 1 / 0.4 as heavy, but not the shapes."""
+    truth = row_of_floors([1.0, top], ground=ground)
+    omega, shapes = truth.omega[:4], truth.phi(FLOORS)[:, :4]
+    with pytest.warns(UserWarning) as warned:
+        found = update_model(
+            row_of_floors, [1.0, top], omega=omega, omega_std=1e-3 * omega, shapes=shapes, places=FLOORS
+        )
+    assert tuple(str(one.message) for one in warned) == found.remarks
+    assert "does not look like the model's (MAC 0." in str(found)
+    if top == 1.0:
+        np.testing.assert_allclose(found.parameters, [1.0, 2.5], rtol=1e-6)
+    else:  # the shapes are lost on the way
+        assert not found.converged and "not converged: beyond these parameters the model has no such modes" in str(
+            found
+        )
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.4])
 def test_modes_that_the_start_has_twice_are_told_apart_by_their_shapes(angle):
     """A tower as stiff in x as in y at the start. As ω ∝ √k, three modes each way give std(k) / k = 2 σ / √3."""

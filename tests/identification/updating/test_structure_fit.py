@@ -8,6 +8,7 @@ from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.ring_down import ring_down
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.identification.updating.distributions import Basis
+from workbench.identification.updating.sensitivity import SeriesStructure
 from workbench.identification.updating.structure_fit import choose_structure, fit_structure
 from workbench.identification.updating.structure_task import GaussianPrior
 from workbench.structure.damping import ModalDamping
@@ -75,14 +76,28 @@ def test_as_many_terms_as_there_are():
     found = choose_structure(noisy, structure("beam", 1.0, 1.0), known_mass=[(1.0, 1.8)])
     assert found.n_terms == (2, 3)
     assert found.explains
-    few = fit_structure(
-        noisy,
-        structure("beam", 1.0, 1.0),
-        mass=Basis.polynomial(1),
-        stiffness=Basis.polynomial(2),
-        known_mass=[(1.0, 1.8)],
-    )
+    assert "explains the 5 modes" in str(found) and len(str(found).splitlines()) == 13 and not found.remarks
+    assert repr(found.mass).startswith("<UncertainProfile: from 1.498 to 2.102")
+    with pytest.warns(UserWarning, match="the modes are not explained: χ² is .*mass 1.8 to 1.8 kg/m"):
+        few = fit_structure(
+            noisy,
+            structure("beam", 1.0, 1.0),
+            mass=Basis.polynomial(1),
+            stiffness=Basis.polynomial(2),
+            known_mass=[(1.0, 1.8)],
+        )
     assert not few.explains and few.criterion > found.criterion
+    assert "does not explain the 5 modes" in str(few) and str(few).splitlines()[-1] == few.remarks[0]
+
+
+def test_a_series_that_dips_between_the_points_of_integration_is_no_structure():
+    """A trough of one thousandth of the length, where a finished structure is checked."""
+    trough = Basis(lambda x: np.exp(-(((np.asarray(x)[:, None] - 2.0 * 0.98804) / 1e-3) ** 2)), 1)
+    series = SeriesStructure(structure("beam", 1.0, 1.0), Basis.polynomial(0), trough, SENSORS)
+    assert series.solve(np.zeros(0), np.array([-0.9]), n_modes=3) is not None
+    assert series.solve(np.zeros(0), np.array([-1.1]), n_modes=3) is None
+    with pytest.raises(ValueError, match="must be positive inside"):
+        structure("beam", 1.0, lambda x: 1.0 - 1.1 * trough.functions(np.ravel(x))[:, 0].reshape(np.shape(x)))
 
 
 @pytest.mark.slow
@@ -112,9 +127,10 @@ def test_a_prior_weighs_what_is_believed_against_what_is_measured():
     terms = {"mass": Basis.polynomial(0), "stiffness": Basis.splines(8, length=2.0)}
     nominal = structure("beam", stiffness=2.6)
     free = fit_structure(noisy, nominal, **terms)
-    loose, fair, sure = (
-        fit_structure(noisy, nominal, stiffness_prior=GaussianPrior(std, 0.5), **terms) for std in (1e3, 0.2, 1e-7)
-    )
+    with pytest.warns(UserWarning, match="stiffness 2.6 to 2.6 N m²"):  # of the one that is sure
+        loose, fair, sure = (
+            fit_structure(noisy, nominal, stiffness_prior=GaussianPrior(std, 0.5), **terms) for std in (1e3, 0.2, 1e-7)
+        )
     assert np.allclose(loose.stiffness(X), free.stiffness(X), atol=0.05 * free.stiffness.std(X).max())
     assert np.allclose(sure.stiffness(X), 2.6, rtol=1e-4)
     assert (fair.stiffness.std(X) < free.stiffness.std(X)).all()
@@ -180,6 +196,6 @@ def test_a_beam_on_springs_with_a_mass_from_its_ring_down():
     own = found.structure.modes(6).phi(X)
     assert np.abs(np.abs(own) - np.abs(truth.phi(X))).max() < 2e-3 * np.abs(own).max()
     hinged = known(1.5, 30.0, "hinged", "hinged")
-    assert not choose_structure(
-        told.refined, hinged, known_mass=[(0.1, 1.515)], mass_terms=[3], stiffness_terms=[4]
-    ).explains
+    with pytest.warns(UserWarning, match="Put point masses, springs and the true ends into the nominal structure"):
+        wrong = choose_structure(told.refined, hinged, known_mass=[(0.1, 1.515)], mass_terms=[3], stiffness_terms=[4])
+    assert not wrong.explains

@@ -9,22 +9,35 @@ relation only, the one with s = r, so these define a_r² and leave the relations
 the overall size: the mass must be known somewhere, and is held there exactly. All relations then serve to find e.
 
 The relations of the stiffness rest on integration by parts: no force or moment may do work at an end.
+
+Second derivatives of noisy shapes are poor, and modes of a structure with masses or springs that the relations lack
+are at odds with one another. Both show where one mode is left out at a time: how far the distributions move is their
+standard error (the jackknife, Efron & Stein, Ann. Statist. 9, 1981).
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from scipy.interpolate import BSpline
 from scipy.linalg import null_space
 
+from workbench.identification.signal.modal_estimates import rounded
 from workbench.structure.domain import gauss_between
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import Printed, counted
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.threads import one_blas_thread
 
 KNOWN_TOLERANCE = 1e-8
+# Mean standard error over mean value of what is taken for known, and what orthogonal modes may share (Ewins, Modal
+# Testing).
+KNOWN = 0.1
+PRINTED = 11  # places along a structure that its distributions are printed at
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +88,22 @@ class Distribution:
         basis: the functions they multiply.
         prior: m_0 or k_0.
         misfit: root mean square of the relations left over, relative to the terms in them; 0 for a perfect fit.
+        left_out: (n_modes, n_terms) coefficients that are found without each mode; None where too few modes are left.
     """
 
     coefficients: np.ndarray
     basis: Basis
     prior: Profile
     misfit: float
+    left_out: np.ndarray | None = None
+
+    def std(self, x: np.ndarray) -> np.ndarray:
+        """Standard error at each x (n_points,); not known, nan, without a mode more than the terms need."""
+        x = np.atleast_1d(np.asarray(x, float))
+        if self.left_out is None:
+            return np.full(x.size, np.nan)
+        values = self.basis.functions(x) @ self.left_out.T
+        return np.asarray(np.sqrt((values.shape[1] - 1) * values.var(axis=1)))
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Values at x, in the shape of x."""
@@ -94,19 +117,64 @@ class Distribution:
         return Profile(self.__call__, tuple(sorted({*self.basis.breaks, *self.prior.breaks})))
 
 
-@dataclass(frozen=True, eq=False)
-class Distributions:
+@dataclass(frozen=True, eq=False, repr=False)
+class Distributions(Printed):
     """The mass and stiffness of one structure, and the scale of its modes found with them.
 
     Attributes:
         mass: kg/m.
         stiffness: EA in N, or EI in N m².
         scales: (n_modes,) a_r = (∫ m φ_r² dx)^½; φ_r / a_r is mass-normalised.
+        length: of the structure, m.
+        orthogonality: largest |∫ m φ_r φ_s dx| / (a_r a_s) of two modes.
     """
 
     mass: Distribution
     stiffness: Distribution
     scales: np.ndarray
+    length: float
+    orthogonality: float
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        terms = (
+            f"{what} in {counted(one.basis.n_terms, 'term')}"
+            for what, one in (("mass", self.mass), ("stiffness", self.stiffness))
+        )
+        rows = zip(*columns(self.mass, self.length), *columns(self.stiffness, self.length)[1:])
+        line = f"{', '.join(terms)} from {counted(self.scales.size, 'mode')},"
+        line += f" orthogonal to {self.orthogonality:.2g}"
+        return line, ("x [m]", "mass [kg/m]", "±", "stiffness", "±"), list(rows), self.remarks
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Which distribution is not to be trusted, and what else to try."""
+        x, remarks = np.linspace(0.0, self.length, 101), []
+        for what, one in (("mass", self.mass), ("stiffness", self.stiffness)):
+            error = one.std(x).mean() / np.abs(one(x)).mean()
+            if np.isnan(error):
+                told = "has no standard error, as no mode can be spared: use more modes"
+            elif error > KNOWN:
+                told = (
+                    f"is uncertain by {100 * error:.2g} %, as single modes left out show; up to {100 * KNOWN:g} % it is"
+                    " taken for known. Derivatives of noisy shapes are poor: use more sensors"
+                )
+            else:
+                continue
+            remarks.append(f"the {what} {told}, fewer terms, or choose_structure")
+        if self.orthogonality > KNOWN:
+            remarks.append(
+                f"two modes are orthogonal only to {self.orthogonality:.2g}, at most {KNOWN:g} where mass and shapes"
+                " agree: something that the relations do not have is attached, as a mass at a point, or the mass wants"
+                " other terms; use choose_structure with what is attached in the nominal structure"
+            )
+        return tuple(remarks)
+
+
+def columns(of: Any, length: float) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
+    """What is printed of a distribution with a `std`: places, values there, and their standard errors."""
+    x = np.linspace(0.0, length, PRINTED)
+    values, errors = zip(*(rounded(value, error) for value, error in zip(of(x), of.std(x), strict=True)))
+    return [f"{at:.4g}" for at in x], values, errors
 
 
 @one_blas_thread
@@ -131,22 +199,75 @@ def mass_and_stiffness(
 
     Raises:
         ValueError: no known mass, more terms than relations, known values that the series cannot take.
+        UserWarning: the mass or the stiffness is uncertain by more than a tenth or by what cannot be told; modes that
+            are not orthogonal.
     """
+    found = distributions_of(
+        modes,
+        kind=kind,
+        mass_basis=mass_basis,
+        stiffness_basis=stiffness_basis,
+        known_mass=known_mass,
+        prior_mass=prior_mass,
+        prior_stiffness=prior_stiffness,
+    )
+    for remark in found.remarks:
+        warnings.warn(remark, stacklevel=3)
+    return found
+
+
+def distributions_of(
+    modes: Modes,
+    *,
+    kind: str,
+    mass_basis: Basis,
+    stiffness_basis: Basis,
+    known_mass: Sequence[tuple[float, float]],
+    prior_mass: ProfileLike = 0.0,
+    prior_stiffness: ProfileLike = 0.0,
+) -> Distributions:
+    """`mass_and_stiffness` without its warnings."""
     if kind not in ("bar", "beam"):
         raise ValueError(f"mass and stiffness are those of a bar or a beam; got {kind!r}")
-    prior_mass, prior_stiffness = as_profile(prior_mass), as_profile(prior_stiffness)
     unit, scale = _unit_mean_square(modes)
-    mass = _mass(unit, mass_basis, prior_mass, known_mass)
+    found = partial(
+        _found,
+        order=1 if kind == "bar" else 2,
+        bases=(mass_basis, stiffness_basis),
+        known=known_mass,
+        priors=(as_profile(prior_mass), as_profile(prior_stiffness)),
+    )
+    mass, stiffness, gram = found(unit)
+    scales = np.sqrt(np.diag(gram))
+    orthogonality = float(np.abs(gram / np.outer(scales, scales) - np.eye(scales.size)).max())
+    try:
+        others = [found(unit.select([s for s in range(modes.n_modes) if s != r])) for r in range(modes.n_modes)]
+        mass = replace(mass, left_out=frozen(np.array([other[0].coefficients for other in others])))
+        stiffness = replace(stiffness, left_out=frozen(np.array([other[1].coefficients for other in others])))
+    except ValueError:
+        pass  # too few relations without one of the modes
+    return Distributions(mass, stiffness, frozen(scales / scale), modes.length, orthogonality)
+
+
+def _found(
+    unit: Modes,
+    *,
+    order: int,
+    bases: tuple[Basis, Basis],
+    known: Sequence[tuple[float, float]],
+    priors: tuple[Profile, Profile],
+) -> tuple[Distribution, Distribution, np.ndarray]:
+    """Mass, stiffness, and ∫ m φ_r φ_s dx (n_modes, n_modes) of modes of mean square 1."""
+    mass = _mass(unit, bases[0], priors[0], known)
     shapes, weights, x = _sampled(unit, 0, mass.profile.breaks)
-    a_squared = (weights * mass(x)) @ shapes**2
+    gram = (shapes.T * (weights * mass(x))) @ shapes
+    a_squared = np.diag(gram)
     if (a_squared <= 0).any():
         raise ValueError(
             "the identified mass is negative over so much of the structure that a mode has no positive scale; use"
             " fewer terms, more sensors, or a prior estimate"
         )
-    order = 1 if kind == "bar" else 2
-    stiffness = _stiffness(unit, order, a_squared, stiffness_basis, prior_stiffness)
-    return Distributions(mass, stiffness, frozen(np.sqrt(a_squared) / scale))
+    return mass, _stiffness(unit, order, a_squared, bases[1], priors[1]), gram
 
 
 def _mass(modes: Modes, basis: Basis, prior: Profile, known: Sequence[tuple[float, float]]) -> Distribution:

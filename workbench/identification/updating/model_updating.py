@@ -6,12 +6,14 @@ shape is compared with the span of them, and its frequency with Rayleigh's quoti
 were measured as repeated stay so where the model takes them apart: their shapes say nothing of how they are turned.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
+from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.shapes.mode_pairing import assigned, repeated_modes
 from workbench.identification.signal.modal_estimates import rounded
@@ -24,6 +26,9 @@ class UpdatingSettings:
     """Constants of model updating."""
 
     least_mac: float = 0.5  # below it a measured mode is no mode of the model
+    doubtful_mac: float = 0.9  # below it the shapes are said to differ, as Ewins takes correlated modes to be above
+    unlikely: float = 0.01  # chance that frequencies are said not to be explained that are
+    at_edge: float = 0.01  # of χ²: what it would still fall by, to first order, where a search ends short of a minimum
     # of frequency, between modes that count as repeated: small imperfections mix closer ones
     repeated: float = 0.01
     step: float = 1e-4  # of the logarithm of a parameter, for central differences
@@ -32,6 +37,7 @@ class UpdatingSettings:
 
 
 UPDATING = UpdatingSettings()
+NO_MODEL = 1e8  # residual, in standard errors, of a trial step that has no such modes: it is taken back
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,9 +73,31 @@ class UpdatedModel(Printed):
         remarks = (
             f"measured modes are those of the model (MAC): {pairs}",
             f"frequencies off by {np.abs(self.residuals).max():.2g} standard errors at most",
-            *(() if self.converged else (f"not converged: {self.reason}",)),
+            *self.remarks,
         )
         return f"{counted(len(rows), 'parameter')} updated", ("parameter", "value", "±"), rows, remarks
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Why the parameters are not to be trusted: no minimum, frequencies or shapes that the model does not have."""
+        remarks, freedom = [], self.residuals.size - self.parameters.size
+        if not self.converged:
+            remarks.append(f"not converged: {self.reason}")
+        chi2, limit = float(self.residuals @ self.residuals), float(chi2_distribution.isf(UPDATING.unlikely, freedom))
+        if freedom and chi2 > limit:
+            remarks.append(
+                f"the frequencies are not explained: χ² is {chi2:.4g}, and noise alone gives at most {limit:.4g}; the"
+                " standard errors hold for a model of the right form only. Choose other or more parameters, or another"
+                " start; else the standard errors of the frequencies are too small"
+            )
+        worst = int(np.argmin(self.mac))
+        if self.mac[worst] < UPDATING.doubtful_mac:
+            remarks.append(
+                f"measured mode {worst + 1} does not look like the model's (MAC {self.mac[worst]:.2f}, at least"
+                f" {UPDATING.doubtful_mac:g} where they agree): wrong parameters may give the right frequencies; choose"
+                " those that change the shapes too"
+            )
+        return tuple(remarks)
 
     @property
     def std(self) -> np.ndarray:
@@ -103,6 +131,7 @@ def update_model(
         ValueError: numbers that are not positive, sizes that do not fit, more parameters than frequencies, a `build`
             that returns no modes, a measured mode that no mode of the model resembles, parameters that the measurements
             cannot distinguish.
+        UserWarning: no minimum was reached, or the model at it has not the frequencies or the shapes measured.
     """
     first, target = np.atleast_1d(np.asarray(start, float)), np.asarray(omega, float)
     deviation, measured = np.asarray(omega_std, float), np.asarray(shapes)
@@ -130,7 +159,8 @@ def update_model(
             lost = int(np.argmin(agreement.max(axis=1)))
             raise ValueError(
                 f"measured mode {lost + 1}, {target[lost] / (2 * np.pi):.4g} Hz, resembles no mode of the model: the"
-                f" best MAC is {agreement[lost].max():.2f}; let the model give more modes, or leave this one out"
+                f" best MAC is {agreement[lost].max():.2f}; start nearer, let the model give more modes, or leave this"
+                " one out"
             )
         quotients = modes.omega[columns]
         for r, s in enumerate(columns):
@@ -140,14 +170,31 @@ def update_model(
                 quotients[r] = np.sqrt(share @ modes.omega[alike] ** 2 / share.sum())
         return columns, agreement[rows, columns], quotients
 
+    refused: list[str] = []  # why trial steps of the search are no model: bad steps, not bad data
+
+    def at(logarithms: np.ndarray) -> np.ndarray | None:
+        try:
+            return np.asarray((paired(build(first * np.exp(logarithms)))[2] - target) / deviation)
+        except ValueError as error:
+            refused.append(str(error))
+            return None
+
     def residuals(logarithms: np.ndarray) -> np.ndarray:
-        return np.asarray((paired(build(first * np.exp(logarithms)))[2] - target) / deviation)
+        missed = at(logarithms)
+        return np.full(target.size, NO_MODEL) if missed is None else missed
 
     def jacobian(logarithms: np.ndarray) -> np.ndarray:
-        steps = UPDATING.step * np.eye(first.size)
-        columns = [residuals(logarithms + step) - residuals(logarithms - step) for step in steps]
-        return np.column_stack(columns) / (2.0 * UPDATING.step)
+        columns = []
+        for step in UPDATING.step * np.eye(first.size):
+            both = [(side, at(logarithms + side * step)) for side in (-1.0, 1.0)]
+            there = [(side, missed) for side, missed in both if missed is not None]
+            if len(there) < 2:  # beside the edge of where the model has such modes
+                there.append((0.0, residuals(logarithms)))
+            (before, low), (after, high) = there[0], there[-1]
+            columns.append((high - low) / ((after - before or 1.0) * UPDATING.step))
+        return np.column_stack(columns)
 
+    paired(build(first))  # a start without such modes is the user's to change
     found = least_squares(residuals, np.zeros(first.size), jac=jacobian, method="lm")
     parameters = first * np.exp(found.x)
     singular = np.linalg.svd(found.jac, compute_uv=False)
@@ -159,9 +206,14 @@ def update_model(
     modes = build(parameters)
     columns, agreement, _ = paired(modes)
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.outer(parameters, parameters)
-    return UpdatedModel(
-        parameters, covariance, modes, columns, agreement, found.fun, bool(found.success), str(found.message)
-    )
+    converged, reason = bool(found.success), str(found.message)
+    if refused and ((np.linalg.qr(found.jac)[0].T @ found.fun) ** 2).sum() > UPDATING.at_edge:
+        converged = False
+        reason = f"beyond these parameters the model has no such modes ({refused[-1]}); choose other parameters"
+    updated = UpdatedModel(parameters, covariance, modes, columns, agreement, found.fun, converged, reason)
+    for remark in updated.remarks:
+        warnings.warn(remark, stacklevel=2)
+    return updated
 
 
 def _joined(cluster: np.ndarray, own: np.ndarray, measured: np.ndarray, omega: np.ndarray) -> np.ndarray:

@@ -1,12 +1,13 @@
 """The check of section 4.3: does the structure that was identified have the modes it was identified from?"""
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from workbench.identification.updating.distributions import Basis, Distributions, mass_and_stiffness
+from workbench.identification.updating.distributions import Basis, Distributions, distributions_of
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import Modes, mac
 from workbench.structure.printed import Printed
@@ -44,14 +45,18 @@ class SelfCheck(Printed):
         return float(np.abs(self.frequency_errors).max())
 
 
-@dataclass(frozen=True, eq=False)
-class Identified:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identified(Printed):
     """A structure identified with the number of terms that passed the self-check best."""
 
     distributions: Distributions
     n_terms: tuple[int, int]
     check: SelfCheck
     tried: tuple[tuple[int, int, float], ...] = field(default=())
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        line, headings, rows, remarks = self.distributions._printed()
+        return line, headings, rows, [self.check._printed()[0], *remarks]
 
 
 def structure_of(found: Distributions, *, kind: str, length: float, left: str | End, right: str | End) -> Bar | Beam:
@@ -118,6 +123,7 @@ def choose_terms(
 
     Raises:
         ValueError: no pair of numbers gives a structure; the last reason is given.
+        UserWarning: as `mass_and_stiffness`.
     """
     ends: dict[str, Any] = {"kind": kind, "left": left, "right": right, "first_mode": first_mode}
     best, tried, reason = None, [], "no number of terms was given"
@@ -125,7 +131,7 @@ def choose_terms(
     pairs = sorted(((a, b) for a in terms for b in terms), key=lambda pair: (sum(pair), pair))
     for n_mass, n_stiffness in pairs:
         try:
-            found = mass_and_stiffness(
+            found = distributions_of(
                 measured,
                 kind=kind,
                 mass_basis=basis(n_mass),
@@ -145,6 +151,8 @@ def choose_terms(
             best = (found, check, (n_mass, n_stiffness))
     if best is None:
         raise ValueError(f"no number of terms gives a structure: {reason}")
+    for remark in best[0].remarks:
+        warnings.warn(remark, stacklevel=3)
     return Identified(best[0], best[2], best[1], tuple(tried))
 
 

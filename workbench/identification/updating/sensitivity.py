@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from workbench.identification.updating.distributions import Basis
-from workbench.structure.member import Bar, Beam
+from workbench.structure.member import Bar, Beam, checked_places
 from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile
 from workbench.structure.supports import HELD, PointDamper, PointMass
@@ -107,6 +107,9 @@ class SeriesStructure:
         mass = mesh.nominal_mass * (1.0 + mesh.mass_terms @ d)
         stiffness = mesh.nominal_stiffness * (1.0 + mesh.stiffness_terms @ e)
         if (mass <= 0).any() or (stiffness <= 0).any() or (loss is not None and loss.share >= 1):
+            return None
+        # a series of many terms may dip between the points of integration
+        if (1.0 + mesh.checked_mass @ d <= 0).any() or (1.0 + mesh.checked_stiffness @ e <= 0).any():
             return None
         left = stiffness if loss is None else stiffness * np.where(mesh.inside(loss), 1.0 - loss.share, 1.0)
         m = mesh.fixed_mass + (mesh.values.T * (mesh.weights * mass)) @ mesh.values
@@ -204,6 +207,8 @@ class _Mesh:
     nominal_stiffness: np.ndarray
     mass_terms: np.ndarray  # (n_points, n_terms)
     stiffness_terms: np.ndarray
+    checked_mass: np.ndarray  # (n_places, n_terms) where a finished structure is checked
+    checked_stiffness: np.ndarray
     fixed_mass: np.ndarray
     fixed_stiffness: np.ndarray
     free: np.ndarray
@@ -226,7 +231,12 @@ class _Mesh:
         if isinstance(nominal, Beam) and nominal.tension:
             fixed_stiffness += nominal.tension * (slopes.T * weights) @ slopes
         terms = series.mass.functions(x), series.stiffness.functions(x)
-        return cls(segments, x, weights, values, strains, m(x), k(x), *terms, fixed_mass, fixed_stiffness, free)
+        of_mass = checked_places((*m.breaks, *series.mass.breaks), nominal.length)
+        of_stiffness = checked_places((*k.breaks, *series.stiffness.breaks, *edges), nominal.length)
+        checked = series.mass.functions(of_mass), series.stiffness.functions(of_stiffness)
+        return cls(
+            segments, x, weights, values, strains, m(x), k(x), *terms, *checked, fixed_mass, fixed_stiffness, free
+        )
 
 
 def _nodes(places: Sequence[float], length: float) -> np.ndarray:

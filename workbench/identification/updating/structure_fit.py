@@ -4,6 +4,7 @@ distinguished from the measured.
 Schwarz's criterion χ² + n_terms ln n_data (Ann. Statist. 6, 1978) is not lowered by a term that is not needed.
 """
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -49,9 +50,10 @@ def fit_structure(
     Raises:
         ValueError: overall size unknown, more terms than data, known values the series cannot take, unplaced sensors,
             a measured mode that looks like none of the nominal structure.
+        UserWarning: the structure does not explain the modes, so that its distributions may be far from the truth.
     """
     task = Task.of(measured, nominal, known_mass, known_stiffness, mass_prior, stiffness_prior, numbers)
-    return Problem.of(task, mass, stiffness).fit()
+    return _warned(Problem.of(task, mass, stiffness).fit())
 
 
 @one_blas_thread
@@ -73,10 +75,18 @@ def choose_structure(
         known: `known_mass`, `known_stiffness`, `mass_prior`, `stiffness_prior`, `numbers` of `fit_structure`.
 
     Raises:
-        ValueError: as `fit_structure`.
+        ValueError, UserWarning: as `fit_structure`.
     """
     task = Task.of(measured, nominal, **known)
-    return choose(task, basis, sorted(mass_terms), sorted(stiffness_terms), lambda problem, near: problem.fit(near))
+    terms = sorted(mass_terms), sorted(stiffness_terms)
+    return _warned(choose(task, basis, *terms, lambda problem, near: problem.fit(near)))
+
+
+def _warned(found: FittedStructure) -> FittedStructure:
+    """The same, with a warning where it does not explain the modes."""
+    for remark in found.remarks:
+        warnings.warn(remark, stacklevel=4)
+    return found
 
 
 def choose(

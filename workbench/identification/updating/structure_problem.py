@@ -98,6 +98,8 @@ class Problem:
             z[-3:] = np.clip(z[-3:], *(0.999 * low[-3:] + 0.001 * high[-3:], 0.001 * low[-3:] + 0.999 * high[-3:]))
         if z.size == 0:
             return self.report(z)
+        if near is not None and not self.misses(z)[1].any():
+            z[: self.n_free] = self._start()  # in other terms the one found before may be no structure
         memory: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
         def at(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,9 +194,10 @@ class Problem:
         normal = np.random.default_rng(0).standard_normal((PROBLEM.draws, parameters.size))
         draws = parameters + size * (normal @ root.T)
         n, m = d.size, d.size + e.size
-        mass = _uncertain(task.nominal.mass_per_length, series.mass, d, draws[:, :n])
+        length = task.nominal.length
+        mass = _uncertain(task.nominal.mass_per_length, series.mass, d, draws[:, :n], length=length)
         stiffness = _uncertain(
-            series.nominal_stiffness, series.stiffness, e, draws[:, n:m], loss, draws[:, m:], task.nominal.length
+            series.nominal_stiffness, series.stiffness, e, draws[:, n:m], loss, draws[:, m:], length=length
         )
         name = "bending_stiffness" if isinstance(task.nominal, Beam) else "axial_stiffness"
         changes: dict[str, Any] = {"mass_per_length": mass.profile, name: stiffness.profile}
@@ -327,7 +330,8 @@ def _uncertain(
     draws: np.ndarray,
     loss: LocalLoss | None = None,
     loss_draws: np.ndarray | None = None,
-    length: float = 0.0,
+    *,
+    length: float,
 ) -> UncertainProfile:
     """nominal (1 + series) (1 - loss), and as many others as there are draws."""
 
@@ -344,4 +348,4 @@ def _uncertain(
         tuple(sorted({*nominal.breaks, *basis.breaks})),
     )
     profile = smooth if loss is None else loss.of(smooth, length)
-    return UncertainProfile(profile, lambda x: values(x, draws, None if loss is None else loss_draws))
+    return UncertainProfile(profile, lambda x: values(x, draws, None if loss is None else loss_draws), length)

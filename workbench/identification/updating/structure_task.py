@@ -1,7 +1,7 @@
 """A structure to be updated: what was measured and what is known beforehand; and the updated one, with its errors."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -9,12 +9,13 @@ from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.shapes.eigenfunctions import check_along
 from workbench.identification.signal.modal_estimates import Refined, normalised_shapes
-from workbench.identification.updating.distributions import Basis
+from workbench.identification.updating.distributions import Basis, columns
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
 from workbench.renamed import Renamed
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import mac
+from workbench.structure.printed import Printed, counted
 from workbench.structure.profile import Profile
 
 
@@ -153,17 +154,30 @@ def _unit(covariance: np.ndarray, least: float = 1e-12) -> np.ndarray:
     return np.asarray((vectors / np.sqrt(np.maximum(values, least * values.max()))).T)
 
 
-@dataclass(frozen=True, eq=False)
-class UncertainProfile:
+@dataclass(frozen=True, eq=False, repr=False)
+class UncertainProfile(Printed):
     """A distribution along the structure and how far it is to be trusted.
 
     Attributes:
         profile: the most likely one.
         others: x (n_points,) -> (n_draws, n_points), as likely as the measurement leaves them.
+        length: of the structure, m.
     """
 
     profile: Profile
-    others: Callable[[np.ndarray], np.ndarray] = field(repr=False)
+    others: Callable[[np.ndarray], np.ndarray]
+    length: float
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        low, high = self.extent
+        line = f"from {low:.4g} to {high:.4g} over {self.length:.4g} m"
+        return line, ("x [m]", "value", "±"), list(zip(*columns(self, self.length))), ()
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """The least and the largest value, of 101 places."""
+        values = self(np.linspace(0.0, self.length, 101))
+        return float(values.min()), float(values.max())
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Values at x, in the shape of x."""
@@ -180,8 +194,8 @@ class UncertainProfile:
         return lower, upper
 
 
-@dataclass(frozen=True, eq=False)
-class FittedStructure:
+@dataclass(frozen=True, eq=False, repr=False)
+class FittedStructure(Printed):
     """The structure whose own modes come nearest to the measured, in units of their standard errors.
 
     Attributes:
@@ -209,13 +223,54 @@ class FittedStructure:
     degrees_of_freedom: int
     criterion: float
     parameters: np.ndarray
-    covariance: np.ndarray = field(repr=False)
+    covariance: np.ndarray
     numbers: np.ndarray
     check: SelfCheck
 
     freedom = Renamed("degrees_of_freedom")
 
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        told = "explains" if self.explains else "does not explain"
+        line = (
+            f"mass in {counted(self.n_terms[0], 'term')} and stiffness in {counted(self.n_terms[1], 'term')}:"
+            f" {told} the {counted(self.numbers.size, 'mode')} measured (χ² {self.chi2:.4g}, at most {self.limit:.4g})"
+        )
+        k = "EI [N m²]" if isinstance(self.structure, Beam) else "EA [N]"
+        length = self.structure.length
+        rows = list(zip(*columns(self.mass, length), *columns(self.stiffness, length)[1:]))
+        return line, ("x [m]", "mass [kg/m]", "±", k, "±"), rows, self.remarks
+
+    @property
+    def limit(self) -> float:
+        """χ² that noise alone exceeds in one measurement of a hundred."""
+        return float(chi2_distribution.isf(TASK.unlikely, self.degrees_of_freedom))
+
     @property
     def explains(self) -> bool:
         """Whether noise alone would miss the measured modes by as much, in one measurement of a hundred or more."""
-        return bool(self.chi2 <= chi2_distribution.isf(TASK.unlikely, self.degrees_of_freedom))
+        return self.chi2 <= self.limit
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Why the distributions are not to be trusted; empty where they explain the modes."""
+        if self.explains:
+            return ()
+        (m, most_m), (k, most_k) = self.mass.extent, self.stiffness.extent
+        unit = "N m²" if isinstance(self.structure, Beam) else "N"
+        return (
+            f"{unexplained(self)}. The distributions make up for what they lack and may be wrong by any factor, their"
+            f" standard errors too small: mass {m:.4g} to {most_m:.4g} kg/m, stiffness {k:.4g} to {most_k:.4g} {unit}."
+            f" {LACKING}",
+        )
+
+
+LACKING = (
+    "Put point masses, springs and the true ends into the nominal structure, give a basis that jumps where the section"
+    " does, or more terms, and see in `numbers` which modes the measured ones are; else their standard errors are too"
+    " small"
+)
+
+
+def unexplained(found: FittedStructure) -> str:
+    """That a structure does not explain its modes, with the figure and its limit."""
+    return f"the modes are not explained: χ² is {found.chi2:.4g}, and noise alone gives at most {found.limit:.4g}"
