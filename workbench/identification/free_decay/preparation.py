@@ -72,7 +72,7 @@ def decay_start(record: Record) -> float:
         return float(record.start_time)
     left = np.cumsum(np.einsum("jt,jt->t", signals, signals)[::-1])[::-1]
     matters = left >= START.least_left * left[0]
-    starts = np.zeros(1, int)
+    starts = np.zeros(0, int)
     step = 1
     while n > START.most_samples * step:
         step *= START.coarser
@@ -92,7 +92,7 @@ def decay_start(record: Record) -> float:
         known = ((starts >= broken[:, None]) & (starts <= broken[:, None] + 2 * window.size)).any(axis=1)
         starts = np.r_[starts, broken[~known] + window.size // 2 + 1]
         step *= START.coarser
-    return float(record.start_time + record.sample_time * min(starts.max(), n - 1))
+    return float(record.start_time + record.sample_time * min(starts.max(initial=0), n - 1))
 
 
 def _scaled(record: Record) -> tuple[np.ndarray, float]:
@@ -123,15 +123,15 @@ def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
     ridge = np.sqrt(max(rounding, 1e-24 * energy[0] / n)) * np.eye(order, order + 1)
     factor = np.zeros((0, order + 1))
     ratio, level, weight = np.zeros(n), 0.0, 0.0
-    for t in range(n - order, block - 1, -block):
-        at = np.arange(t - block, t)
+    for t in range(n - order, 0, -block):
+        at = np.arange(max(t - block, 0), t)
         after = y[:, at[:, None] + np.arange(1, order + 1)].reshape(-1, order)
         here = y[:, at].reshape(-1)
         if n - t >= 3 * order:
             # Rounding enters as a ridge, and as the least level.
             r = _triangular(np.vstack([factor, ridge]))
             c = dtrtrs(r[:order, :order], r[:order, order])[0]
-            error = ((here - after @ c).reshape(m, block) ** 2).mean(axis=0)
+            error = ((here - after @ c).reshape(m, -1) ** 2).mean(axis=0)
             if n - t >= (3 + START.level_memory) * order:
                 ratio[at] = error / max(level / weight, rounding * (1.0 + c @ c), 1e-300)
             level, weight = forget_level * level + error.mean(), forget_level * weight + 1.0
