@@ -122,7 +122,7 @@ def _segments(
     edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
     figures = np.full((5, stretches, modes.n_modes), np.nan)
     apart = np.abs(np.subtract.outer(modes.omega, modes.omega))
-    lost = [(at, at + (count - 1) * record.sample_time) for _, at, count in dropouts(record)]
+    lost = [(at, at + (count - 1) * record.sample_time) for _, at, count, _ in dropouts(record)]
     beats = np.where(np.eye(modes.n_modes, dtype=bool), np.inf, apart).min(axis=1)
     for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
         span, decay = (last - first) * record.sample_time, -modes.poles.real

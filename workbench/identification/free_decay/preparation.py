@@ -45,6 +45,10 @@ class StartSettings:
     rounds: int = 4  # of them, each about the best of the one before
     fastest: float = 0.1  # of these, times a sample
     least_left: float = 0.01  # of the record's energy, that must follow a break for the decay to begin there
+    most_spikes: int = 10  # lone samples that are replaced
+    neighbours: int = 8  # on either side, from which they are
+    about: int = 200  # samples on either side, from which is learnt how
+    leaps: float = 6.0  # times the error of that, of a lone sample that is wrong
 
 
 START = StartSettings()
@@ -93,6 +97,48 @@ def decay_start(record: Record) -> float:
         starts = np.r_[starts, broken[~known] + window.size // 2 + 1]
         step *= START.coarser
     return float(record.start_time + record.sample_time * min(starts.max(initial=0), n - 1))
+
+
+def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
+    """A record whose free decay goes on about lone samples that are wrong, when it begins in s, and remarks.
+
+    A sample that ends the search for the start is replaced by what its neighbours on both sides say, y_t = Σ_k c_k
+    (y_{t-k} + y_{t+k}), where the decay then begins earlier: a blow, too, leaves another motion than was before.
+    """
+    start, remarks = decay_start(record), []
+    for _ in range(START.most_spikes):
+        at = round((start - record.start_time) / record.sample_time) - 1
+        repaired = record.outputs.copy()
+        wrong = [j for j, row in enumerate(repaired) if _repair(row, at)]
+        if not wrong:
+            break
+        other = replace(record, outputs=repaired)
+        earlier = decay_start(other)
+        if earlier > start - START.order * record.sample_time:
+            break
+        names = ", ".join(repr(record.output_names[j]) for j in wrong)
+        remarks.append(
+            f"output {names} leaps at {record.time[at]:.6g} s for one sample, replaced by what its neighbours say"
+        )
+        record, start = other, earlier
+    return record, start, tuple(remarks)
+
+
+def _repair(row: np.ndarray, at: int) -> bool:
+    """Replace a sample that its neighbours do not expect, in place; whether it was."""
+    k, near = START.neighbours, START.about
+    if at < START.order or at + START.order >= row.size:
+        return False
+    part, centre = row[max(at - near, 0) : at + near + 1], min(at, near) - k
+    windows = np.lib.stride_tricks.sliding_window_view(part - part.mean(), 2 * k + 1)
+    both = windows[:, :k] + windows[:, :k:-1]
+    others = np.abs(np.arange(len(windows)) - centre) > k
+    c = np.linalg.lstsq(both[others], windows[others, k], rcond=None)[0]
+    error = windows[:, k] - both @ c
+    if np.abs(error[centre]) <= START.leaps * error[others].std():
+        return False
+    row[at] -= error[centre]
+    return True
 
 
 def _scaled(record: Record) -> tuple[np.ndarray, float]:

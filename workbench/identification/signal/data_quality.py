@@ -30,6 +30,7 @@ class DataSettings:
     noise_free: float = 1e-9  # innovation over the signal: below, sensors of one mode are alike without being copies
     fewest_equal: int = 4  # samples in a row: of so many a lost message is told from a turning point
     about: int = 32  # samples on either side of them, which show how the output moves
+    straight: float = 1e-9  # of the range of an output, by which samples on a straight line lie off it by rounding
     moves: float = 100.0  # resolutions of the output that it moves there from sample to sample
     block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
 
@@ -143,27 +144,55 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
     return records
 
 
-def dropouts(record: Record) -> tuple[tuple[str, float, int], ...]:
-    """Where an output stays at one value amid motion, as lost messages of a wireless sensor leave it.
+def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
+    """Where an output stays at one value or runs straight amid motion, as lost messages of a wireless sensor leave it.
 
     At an end of its range an output is clipped, and that is another fault.
 
     Returns:
-        name of the output, time of the first such sample in s, number of samples; in order of outputs and time.
+        name of the output, time of the first such sample in s, number of samples, and what it does there; in order of
+        outputs and time.
     """
     found = []
     for name, row in zip(record.output_names, record.outputs, strict=True):
-        still = np.flatnonzero(np.diff(row) == 0.0)
-        if still.size < DATA.fewest_equal - 1:
-            continue
-        resolution, ends = np.diff(np.unique(row)).min(initial=np.inf), (row.min(), row.max())
-        for run in np.split(still, np.flatnonzero(np.diff(still) > 1) + 1):
-            first, last = int(run[0]), int(run[-1]) + 1
-            beside = row[max(first - DATA.about, 0) : first + 1], row[last : last + DATA.about + 1]
-            moves = min(float(np.median(np.abs(np.diff(part)))) if part.size > 2 else 0.0 for part in beside)
-            if run.size >= DATA.fewest_equal - 1 and moves > DATA.moves * resolution and row[first] not in ends:
-                found.append((name, float(record.time[first]), run.size + 1))
+        rounding, ends = DATA.straight * np.ptp(row), (row.min(), row.max())
+        resolution, taken, lost = 0.0, np.zeros(row.size, bool), []
+        for order, how in ((1, "stays at one value"), (2, "runs straight")):
+            moves = np.abs(np.diff(row, order))
+            still = np.flatnonzero(moves <= rounding)
+            if still.size < DATA.fewest_equal - 1:
+                continue
+            resolution = resolution or max(np.diff(np.unique(row)).min(initial=np.inf), rounding)
+            for run in np.split(still, np.flatnonzero(np.diff(still) > 1) + 1):
+                if run.size < DATA.fewest_equal - 1:
+                    continue
+                first, last = int(run[0]), int(run[-1]) + order
+                about = moves[max(first - DATA.about, 0) : first], moves[last : last + DATA.about]
+                moving = min(float(np.median(part)) if part.size > 1 else 0.0 for part in about)
+                if moving > DATA.moves * resolution and row[first] not in ends and not taken[first : last + 1].any():
+                    taken[first : last + 1] = True
+                    lost.append((name, float(record.time[first]), last - first + 1, how))
+        found += sorted(lost)
     return tuple(found)
+
+
+def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tuple[str, ...]:
+    """A remark where outputs stay at one value, or run straight, amid motion; empty where none does.
+
+    Args:
+        record: looked at.
+        after: what follows from it, and the way out.
+        before: s, what begins later does not count.
+    """
+    found = [lost for lost in dropouts(record) if lost[1] < before]
+    if not found:
+        return ()
+    name, at, count, how = found[0]
+    more = f" (and {len(found) - 1} more like that)" if len(found) > 1 else ""
+    return (
+        f"in record {record.name!r} output {name!r} {how} for {count} samples from {at:.6g} s on{more}: lost data?"
+        f" {after}",
+    )
 
 
 def _dead(record: Record) -> Iterator[DataFault]:
