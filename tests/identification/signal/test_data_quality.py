@@ -126,6 +126,7 @@ def test_a_clipped_input_is_said_and_not_refused(sound, force, said):
         np.repeat(np.append(NOISE[:40], 3.0), 20)[:800], np.r_[0.0, np.ones(799)], np.zeros(800),
         np.sin(2.0 * np.pi * 0.013 * np.arange(800)), np.round(30 * np.sin(2.0 * np.pi * 0.013 * np.arange(800))),
         np.maximum(np.sin(2.0 * np.pi * 0.013 * np.arange(800)), 0.0),
+        2.5 * np.sin(2.0 * np.pi * np.cumsum(np.repeat(np.arange(4.0, 12.0), 100)) / 200.0),
     ],
 )  # fmt: skip
 def test_inputs_as_they_are_sent_are_not_clipped(sound, force):

@@ -21,6 +21,7 @@ class DataSettings:
     # likewise of an input, of which a blow has few: sines and pulses that are rounded have more in 3 of a thousand
     least_piled_input: int = 4
     piled_input: float = 4.0
+    turning: float = 1e-6  # of a signal's range, by which samples beside a turning point of a sine differ by rounding
     held: float = 0.5  # of an input's samples in the outer half of its range, that repeat: from there on it has levels
     fewest_changes: int = 16  # of an output, from which a rate at which it was held can be read
     slowest: int = 64  # samples between changes: what changes less often rests
@@ -84,7 +85,7 @@ def input_faults(record: Record) -> tuple[DataFault, ...]:
         stops = [
             at
             for at in _piled(row).values()
-            if row[at[0]] and _ends(row, at, DATA.least_piled_input, DATA.piled_input) and not _has_levels(row, at)
+            if at.size and row[at[0]] and _ends(row, at, DATA.least_piled_input, DATA.piled_input) and not _has_levels(row, at)
         ]
         if stops:
             ends, count = " and ".join(f"{row[at[0]]:g}" for at in stops), sum(at.size for at in stops)
@@ -266,8 +267,11 @@ def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
 
 
 def _piled(row: np.ndarray) -> dict[str, np.ndarray]:
-    """The samples at each end of a signal's range."""
-    return {"above": np.flatnonzero(row == row.max()), "below": np.flatnonzero(row == row.min())}
+    """The samples at each end of a signal's range, less turning points of sines, which are alike on both sides."""
+    padded = np.pad(row, 1, constant_values=np.nan)
+    before, after = padded[:-2], padded[2:]
+    turns = (np.abs(before - after) <= DATA.turning * np.ptp(row)) & (before != row)
+    return {name: np.flatnonzero((row == end) & ~turns) for name, end in (("above", row.max()), ("below", row.min()))}
 
 
 def _ends(row: np.ndarray, at: np.ndarray, least: int, ratio: float) -> bool:
@@ -284,7 +288,7 @@ def _has_levels(row: np.ndarray, at: np.ndarray) -> bool:
 
 def _beside(row: np.ndarray, at: np.ndarray) -> int:
     """Samples that have the value next to that of the samples `at`."""
-    others = np.delete(row, at)
+    others = row[row != row[at[0]]]
     return int(np.count_nonzero(others == others[np.argmin(np.abs(others - row[at[0]]))]))
 
 
