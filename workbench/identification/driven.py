@@ -495,7 +495,7 @@ def _selected(
     how["budget"] = budget
     start = _start(data, **how) if strongest is None else strongest.fit
     sure = sure_modes(data, start, how["false_alarm"], budget)
-    noise = input_noise(data, sure)
+    noise = None if budget.spent("search for noise of the inputs") else input_noise(data, sure)
     if noise is not None:
         (data, start), strongest = with_white_noise(data, sure, noise, how["false_alarm"], budget), None
     strongest = _strongest(data, start, **how) if strongest is None else strongest

@@ -85,7 +85,10 @@ def input_faults(record: Record) -> tuple[DataFault, ...]:
         stops = [
             at
             for at in _piled(row).values()
-            if at.size and row[at[0]] and _ends(row, at, DATA.least_piled_input, DATA.piled_input) and not _has_levels(row, at)
+            if at.size
+            and row[at[0]]
+            and _ends(row, at, DATA.least_piled_input, DATA.piled_input)
+            and not _has_levels(row, at)
         ]
         if stops:
             ends, count = " and ".join(f"{row[at[0]]:g}" for at in stops), sum(at.size for at in stops)
