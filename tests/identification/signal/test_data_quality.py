@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.identification.free_decay.order import identify
-from workbench.identification.signal.data_quality import check_data_quality, data_faults
+from workbench.identification.signal.data_quality import check_data_quality, data_faults, steps
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -153,3 +153,8 @@ def test_a_record_given_twice_is_refused(sound):
     """Its errors would be too small by the root of two."""
     with pytest.raises(ValueError, match="'one' and 'again' hold the same measurement"):
         identify([replace(sound, name="one"), replace(sound, name="again")])
+
+
+def test_the_step_of_a_rounded_output_is_read_from_it(sound):
+    rounded = with_row(sound, 1, 0.3 + 0.02 * np.round(sound.outputs[1] / 0.02))
+    np.testing.assert_allclose(steps(rounded), [0.0, 0.02, 0.0, 0.0], rtol=1e-9)

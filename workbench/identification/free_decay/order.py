@@ -23,7 +23,7 @@ from workbench.identification.free_decay.backbone import are_two, band_about
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.preparation import decay_start
 from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
-from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors
+from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors, steps
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import differ, project, variances, whitened
 from workbench.identification.signal.searches import (
@@ -210,6 +210,7 @@ class _FreeDecay:
         self.grids = [_Grid(record, longest) for record in records]
         # Residuals of round-off say nothing of one sensor beside another.
         self.round_off = FIT.round_off * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
+        self.round_off = np.maximum(self.round_off, [m.n_samples * steps(m) ** 2 / 12.0 for m in measured])
         cells = self.grids[0].n_cells
         signals = 2 * sum(r.n_outputs for r in records)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))

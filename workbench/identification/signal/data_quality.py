@@ -23,6 +23,7 @@ class DataSettings:
     piled_input: float = 4.0
     turning: float = 1e-6  # of a signal's range, by which samples beside a turning point of a sine differ by rounding
     held: float = 0.5  # of an input's samples in the outer half of its range, that repeat: from there on it has levels
+    whole: float = 1e-3  # of a step, by which readings that are rounded to it lie off its multiples
     fewest_changes: int = 16  # of an output, from which a rate at which it was held can be read
     slowest: int = 64  # samples between changes: what changes less often rests
     copied: float = 1e-2  # of the innovation, what its past does not predict: signals that differ by less are one
@@ -197,6 +198,21 @@ def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tup
         f"in record {record.name!r} output {name!r} {how} for {count} samples from {at:.6g} s on{more}: lost data?"
         f" {after}",
     )
+
+
+def steps(record: Record) -> np.ndarray:
+    """The step that the readings of each output are whole multiples of, apart from a constant, (n_outputs,); 0 of those
+    that have none.
+
+    Rounding to it is noise of a standard deviation of step/√12 at least, as long as the output moves by steps.
+    """
+    found = np.zeros(record.n_outputs)
+    for j, row in enumerate(record.outputs):
+        apart = np.diff(np.unique(row))
+        step = float(apart.min(initial=np.inf))
+        if np.isfinite(step) and np.abs(apart / step - np.round(apart / step)).max() < DATA.whole:
+            found[j] = step
+    return found
 
 
 def _dead(record: Record) -> Iterator[DataFault]:
