@@ -185,6 +185,20 @@ def test_lost_samples_are_named_and_are_no_dependence_on_amplitude(which):
     assert not [note for note in ring_down(record).notes if "stays" in note]
 
 
+@pytest.mark.parametrize("level", [0.0, 0.1])
+def test_a_decay_that_forces_drive_throughout_is_remarked(level):
+    """One mode, struck and shaken by white noise: of the answer to that, parts look like modes without damping."""
+    pole = np.exp(2.0 * np.pi * 0.1 * (-0.01 + 1j))
+    force = level * np.random.default_rng(5).standard_normal(4000)
+    force[0] += 10.0
+    moves = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], force)
+    moves += 1e-3 * np.random.default_rng(6).standard_normal(4000)
+    told = ring_down(Record(0.02, moves[None], (Channel("a", "displacement"),)))
+    assert any("crowd about mode" in note and "drive this decay throughout" in note for note in told.notes) == (
+        level > 0
+    )
+
+
 def test_lone_wrong_samples_are_replaced_and_named():
     """As the record without them, to half a standard error."""
     record = decay()

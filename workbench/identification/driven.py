@@ -116,12 +116,6 @@ class Driven(ParticipatingModes):
     evidence, limit = Renamed("statistic"), Renamed("threshold")
 
     @property
-    def participation_std(self) -> np.ndarray:
-        """Standard error of participation factors (n_modes, n_inputs), rms of real and imaginary part."""
-        real, imaginary = np.split(self._vector_std[:, self.modes.n_outputs :], 2, axis=1)
-        return np.asarray(np.sqrt(0.5 * (real**2 + imaginary**2)))
-
-    @property
     def noise_std(self) -> np.ndarray:
         """Of each output (n_outputs,), root mean square over the records."""
         return np.asarray(np.sqrt((self.noise**2).mean(axis=0)))

@@ -51,6 +51,8 @@ class RingDownSettings:
     uncorrelated: float = 3.0  # correlation of noise, times the root of its samples, is 1; more is an oscillation
     residual_share: float = 0.1  # share of the energy about the modes that the residual may have
     most_left: float = 0.25  # likewise of all, if it is not white
+    about: float = 0.05  # of the frequency of a sure mode, within which so many others
+    crowd: int = 2  # of no sure damping are the work of forces
     stands_out: float = 5.0  # times the residual beside them that it may stand out by
     band: int = 6  # bins about a mode
     beside: int = 60  # bins beside it
@@ -158,6 +160,7 @@ def ring_down(
             *more,
             *budget.remarks,
             *_goes_on(found.refined, cut),
+            *_shaken(found.refined, doubts),
             *shape_remarks(found.refined, cut[0].output_names, sure),
             *doubtful,
             *coloured,
@@ -355,6 +358,21 @@ def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
         f"{100 * share:.0f} % of the motion does not decay within the record: harmonic excitation? Then leave these"
         " modes out, or cut the record to where it ends",
     )
+
+
+def _shaken(refined: Refined, doubts: Sequence[str]) -> tuple[str, ...]:
+    """A remark where modes of no sure damping crowd about a sure one, as ambient forces make them."""
+    f, sure = refined.modes.frequencies_hz, np.array([not doubt for doubt in doubts])
+    undamped = refined.modes.zeta < SURE * refined.zeta_std
+    for r in np.flatnonzero(sure):
+        about = np.flatnonzero(undamped & ~sure & (np.abs(f - f[r]) < RING_DOWN.about * f[r]))
+        if about.size >= RING_DOWN.crowd:
+            which = ", ".join(str(k + 1) for k in about)
+            return (
+                f"modes {which} crowd about mode {r + 1} and have no sure damping: forces drive this decay throughout,"
+                f" and frequencies and damping are less sure than they are said to be. {WAY_OUT}",
+            )
+    return ()
 
 
 def _coloured_residual(records: list[Record], left: list[np.ndarray]) -> tuple[str, ...]:
