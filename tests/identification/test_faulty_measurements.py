@@ -230,3 +230,29 @@ def test_a_repeated_root_is_remarked():
     np.testing.assert_allclose(found.modes.frequencies_hz, hz, rtol=1e-3)
     (remark,) = found.remarks
     assert remark.startswith("modes 1 and 2 (21 Hz) may be one repeated root")
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    force, few = np.random.default_rng(11).standard_normal(2000), [0, 3]
+    moves = response(force, 1000, HZ[few], DAMPING[few], SHAPES[:, few])
+    return record(force, noisy(moves, 1e-2, 12), 1000)
+
+
+def test_a_sound_record_has_no_burst(shaken):
+    assert not identify_driven(shaken).remarks
+
+
+def test_samples_that_all_channels_lost_are_remarked(shaken):
+    kept = np.r_[0:1000, 1040:2000]
+    seam = replace(shaken, outputs=shaken.outputs[:, kept], inputs=shaken.inputs[:, kept])
+    (remark,) = (line for line in identify_driven(seam).remarks if "of what the modes leave" in line)
+    begins, ends = (float(word) for word in remark.split(" lies from ")[1].split(" s:")[0].split(" to "))
+    assert begins <= 1.0 <= ends and ends - begins < 0.2
+
+
+def test_outputs_that_stay_amid_forced_motion_are_named(shaken):
+    outputs = shaken.outputs.copy()
+    outputs[2, 1000:1060] = outputs[2, 999]
+    found = identify_driven(replace(shaken, outputs=outputs))
+    assert any("output 'a3' stays at one value for 61 samples from 0.999 s on" in line for line in found.remarks)

@@ -185,6 +185,47 @@ def test_lost_samples_are_named_and_are_no_dependence_on_amplitude(which):
     assert not [note for note in ring_down(record).notes if "stays" in note]
 
 
+@pytest.mark.parametrize("level", [0.0, 0.1])
+def test_a_decay_that_forces_drive_throughout_is_remarked(level):
+    """One mode, struck and shaken by white noise: of the answer to that, parts look like modes without damping."""
+    pole = np.exp(2.0 * np.pi * 0.1 * (-0.01 + 1j))
+    force = level * np.random.default_rng(5).standard_normal(4000)
+    force[0] += 10.0
+    moves = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], force)
+    moves += 1e-3 * np.random.default_rng(6).standard_normal(4000)
+    told = ring_down(Record(0.02, moves[None], (Channel("a", "displacement"),)))
+    assert any("crowd about mode" in note and "drive this decay throughout" in note for note in told.notes) == (
+        level > 0
+    )
+
+
+def test_lone_wrong_samples_are_replaced_and_named():
+    """As the record without them, to half a standard error."""
+    record = decay()
+    outputs = record.outputs.copy()
+    outputs[0, 300] += outputs[0].std()
+    outputs[1, 420] -= outputs[1].std()
+    told, plain = ring_down(replace(record, outputs=outputs)), ring_down(record)
+    assert told.notes == tuple(
+        f"output {name!r} leaps at {at:g} s for one sample, replaced by what its neighbours say"
+        for name, at in (("y2", 420 * 0.02), ("y1", 300 * 0.02))
+    )
+    assert told.records[0].n_samples == record.n_samples and not plain.notes
+    assert (np.abs(told.modes.omega - plain.modes.omega) < 0.5 * plain.omega_std).all()
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_lost_samples_that_end_the_search_for_the_start_are_named(straight):
+    record = decay(noise=0.001)
+    outputs = record.outputs.copy()
+    last = outputs[1, 360] if straight else outputs[1, 299]
+    outputs[1, 299:361] = np.linspace(outputs[1, 299], last, 62)
+    told = ring_down(replace(record, outputs=outputs))
+    how = "runs straight for 62" if straight else "stays at one value for 62"
+    assert any(f"'y2' {how} samples from 5.98 s on: lost data? Only what follows" in note for note in told.notes)
+    assert found_within_errors(told)
+
+
 def test_a_coarse_sensor_loses_no_samples():
     """Rounded to a hundredth of the motion, an output repeats itself where it turns back and where it ends."""
     record = decay(noise=0.002)

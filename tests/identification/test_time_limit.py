@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import workbench as wb
+from workbench.identification.input_output import modal_fit
 from workbench.identification.signal.modal_estimates import Identified, Refined, credible
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
@@ -96,3 +97,17 @@ def test_results_print_as_the_table_of_modes():
     assert head.split() == ["mode", "frequency", "[Hz]", "±", "damping", "[%]", "±", "phase", "collinearity"]
     assert [float(row.split()[1]) for row in rows] == pytest.approx(found.modes.frequencies_hz, rel=1e-3)
     assert repr(found) == "Identified(2 modes: 3.183, 7.958 Hz)" and found._repr_html_().count("<tr>") == 3
+
+
+def test_no_fit_of_known_inputs_begins_once_the_time_is_up(monkeypatch):
+    """Of a long record each takes seconds: but for the first mode, which is worth the wait, none follows."""
+    force, noise = np.random.default_rng(0).standard_normal((2, 400))
+    t = 0.01 * np.arange(400)
+    moves = np.convolve(force, np.exp(-t) * (np.sin(60.0 * t) + np.sin(110.0 * t)))[:400] + 0.01 * noise
+    driven = Record(0.01, moves[None], (Channel("v", "velocity"),), force[None], (Channel("f", "force"),))
+    searched = []
+    search = modal_fit.search
+    monkeypatch.setattr(modal_fit, "search", lambda *args, **how: searched.append(args) or search(*args, **how))
+    found = wb.identify_driven(driven, seconds=1e-6)
+    assert len(searched) <= 1 and "stopped after" in found.remarks[-1]
+    np.testing.assert_allclose(found.modes.omega[:1], 60.0, rtol=0.01)

@@ -44,6 +44,7 @@ from workbench.identification.input_output.model_order import (
 )
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.peak_shape import overlap_remarks
+from workbench.identification.input_output.residual_bursts import burst_remarks
 from workbench.identification.input_output.sensor_drift import beside_drift
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
@@ -113,12 +114,6 @@ class Driven(ParticipatingModes):
     input_channels: tuple[Channel, ...]
 
     evidence, limit = Renamed("statistic"), Renamed("threshold")
-
-    @property
-    def participation_std(self) -> np.ndarray:
-        """Standard error of participation factors (n_modes, n_inputs), rms of real and imaginary part."""
-        real, imaginary = np.split(self._vector_std[:, self.modes.n_outputs :], 2, axis=1)
-        return np.asarray(np.sqrt(0.5 * (real**2 + imaginary**2)))
 
     @property
     def noise_std(self) -> np.ndarray:
@@ -292,6 +287,7 @@ def identify_driven(
     fit = joined(data, selected.fit, budget)
     selected = selected if fit is selected.fit else selected.refitted(fit)
     holds = hold_remarks(data, selected.fit, selected.limit, budget)
+    bursts = burst_remarks(logged, data.left(fit), fit.noise)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     late = budget.spent("check of modes that change within the record")
     in_decay = by_amplitude.among(fit.poles)
@@ -304,7 +300,7 @@ def identify_driven(
         records,
         data,
         selected,
-        (*clipped, *windowed, *drift, *holds, *remarks, *overlap, *changes, *budget.remarks),
+        (*clipped, *bursts, *windowed, *drift, *holds, *remarks, *overlap, *changes, *budget.remarks),
     )
     deviation = found.modes.omega * found.zeta_std + 1j * found.omega_std
     decays = by_amplitude.remarks(fit.poles, _sizes(data, fit), deviation)
@@ -493,7 +489,7 @@ def _selected(
     how["budget"] = budget
     start = _start(data, **how) if strongest is None else strongest.fit
     sure = sure_modes(data, start, how["false_alarm"], budget)
-    noise = input_noise(data, sure)
+    noise = None if budget.spent("search for noise of the inputs") else input_noise(data, sure)
     if noise is not None:
         (data, start), strongest = with_white_noise(data, sure, noise, how["false_alarm"], budget), None
     strongest = _strongest(data, start, **how) if strongest is None else strongest

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from workbench.arrays import symmetric_root
 from workbench.identification.driven import Driven
-from workbench.identification.signal.clocks import CLOCKS, far_from_real
+from workbench.identification.signal.clocks import are_far, far_from_real, shape_errors
 from workbench.identification.signal.modal_estimates import normalised_shapes, set_up_remarks
 from workbench.identification.transfer import TransferModes
 from workbench.records.record import Channel
@@ -144,7 +144,8 @@ def _of_residues(
     residues = _residues(modes, modes.shapes, identified.participation)
     sizes = np.linalg.svd(residues.real, compute_uv=False)
     cost = np.sqrt(np.maximum(1.0 - sizes[:, 0] ** 2 / np.sum(np.abs(residues) ** 2, axis=(1, 2)), 0.0))
-    _warn_of_complex(modes, cost, "residues")
+    turned = np.linalg.norm(identified.participation_std, axis=1) / np.linalg.norm(identified.participation, axis=1)
+    _warn_of_complex(modes, cost, np.hypot(shape_errors(identified), turned), "residues")
     for remark in set_up_remarks(identified):
         warnings.warn(remark, stacklevel=4)
     pair = _pair(out, into, driving_point)
@@ -269,7 +270,8 @@ def _of_shapes(identified: Any, out: tuple[Channel, ...], modal_masses: ArrayLik
         raise ValueError(
             "no input was measured, so the shapes have no scale; give modal_masses= for shapes whose largest entry is 1"
         )
-    _warn_of_complex(modes, far_from_real(modes), "shape")
+    known = hasattr(identified, "shape_covariance")
+    _warn_of_complex(modes, far_from_real(modes), shape_errors(identified) if known else np.zeros(1), "shape")
     real = normalised_shapes(modes.shapes).real
     largest = real[np.argmax(np.abs(real), axis=0), np.arange(modes.n_modes)]
     root = np.sqrt(_masses(modal_masses, modes.n_modes))
@@ -286,9 +288,9 @@ def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:
     return masses
 
 
-def _warn_of_complex(modes: SampledModes, cost: np.ndarray, what: str) -> None:
-    """Warn of modes of which the nearest real one leaves a share, (n_modes,), that is not small."""
-    for r in np.flatnonzero(cost > CLOCKS.far):
+def _warn_of_complex(modes: SampledModes, cost: np.ndarray, error: np.ndarray, what: str) -> None:
+    """Warn of modes of which the nearest real one leaves a share, (n_modes,), that is neither small nor their error."""
+    for r in are_far(cost, error):
         warnings.warn(
             f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz is complex: the nearest real mode leaves"
             f" {100 * cost[r]:.0f} % of its {what}",

@@ -14,10 +14,20 @@ from workbench.identification.free_decay.assumptions import (
 )
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes, stacked_delays
 from workbench.identification.free_decay.order import identify_within
-from workbench.identification.free_decay.preparation import Drift, decay_start, without_drift, without_polynomial
+from workbench.identification.free_decay.preparation import (
+    Drift,
+    without_drift,
+    without_polynomial,
+    without_spikes,
+)
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
 from workbench.identification.signal.clocks import shape_remarks
-from workbench.identification.signal.data_quality import check_data_quality, data_faults, dropouts, of_same_sensors
+from workbench.identification.signal.data_quality import (
+    check_data_quality,
+    data_faults,
+    dropout_remark,
+    of_same_sensors,
+)
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.overtones import multiple_of
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
@@ -41,6 +51,8 @@ class RingDownSettings:
     uncorrelated: float = 3.0  # correlation of noise, times the root of its samples, is 1; more is an oscillation
     residual_share: float = 0.1  # share of the energy about the modes that the residual may have
     most_left: float = 0.25  # likewise of all, if it is not white
+    about: float = 0.05  # of the frequency of a sure mode, within which so many others
+    crowd: int = 2  # of no sure damping are the work of forces
     stands_out: float = 5.0  # times the residual beside them that it may stand out by
     band: int = 6  # bins about a mode
     beside: int = 60  # bins beside it
@@ -113,11 +125,13 @@ def ring_down(
     records = of_same_sensors(records)
     cut, notes = [], []
     for record in records:
-        begins, notes_here = (start, []) if start is not None else _start(record)
-        cut.append(record.between(begins))
+        decay, notes_here = _decay(record, start)
+        cut.append(decay)
         notes += notes_here if len(records) == 1 else [f"{record.name}: {note}" for note in notes_here]
-        check_data_quality(cut[-1])
-        notes += _dropouts(cut[-1])
+        check_data_quality(decay)
+        notes += dropout_remark(
+            decay, "Frequencies by amplitude are not compared there; leave it out, or cut the record"
+        )
         _check_undriven(cut[-1])
     try:
         found, cut, more = _without_drift(cut, n_modes, budget)
@@ -146,6 +160,7 @@ def ring_down(
             *more,
             *budget.remarks,
             *_goes_on(found.refined, cut),
+            *_shaken(found.refined, doubts),
             *shape_remarks(found.refined, cut[0].output_names, sure),
             *doubtful,
             *coloured,
@@ -153,17 +168,22 @@ def ring_down(
     )
 
 
-def _start(record: Record) -> tuple[float, list[str]]:
-    """Where free decay begins and nothing is clipped any more, with remarks."""
-    start, notes = decay_start(record), []
+def _decay(record: Record, start: float | None) -> tuple[Record, list[str]]:
+    """From where free decay begins and nothing is clipped any more, less lone samples that are wrong, with remarks."""
+    if start is not None:
+        record, _, spikes = without_spikes(record.between(start))
+        return record, list(spikes)
+    record, start, spikes = without_spikes(record)
+    notes = list(spikes)
     if start > record.start_time:
         notes.append(f"free decay from {start:.6g} s on; --start sets another time")
+        notes += dropout_remark(record, "Only what follows is used; leave the output out to use all", before=start)
     clipped = [a for a in data_faults(record.between(start)) if a.until is not None]
     behind = max((a.until or start for a in clipped), default=start) + record.sample_time
     if clipped and behind - start < 0.5 * (record.start_time + record.sample_time * (record.n_samples - 1) - start):
         notes.append(f"output {clipped[0].outputs[0]!r} is clipped: used from {behind:.6g} s on")
         start = behind
-    return start, notes
+    return record.between(start), notes
 
 
 def _without_drift(
@@ -201,19 +221,6 @@ def _without_drift(
     i, j = np.unravel_index(int(np.argmax(in_noise)), in_noise.shape)
     name, drift = records[0].output_names[j], taken[int(i)]
     return found, cleared, [f"{drift.words} of {drift.size[j]:.3g} was removed from output {name!r}"]
-
-
-def _dropouts(record: Record) -> list[str]:
-    """A remark where outputs stay at one value amid motion."""
-    found = dropouts(record)
-    if not found:
-        return []
-    name, at, count = found[0]
-    more = f" (and {len(found) - 1} more like that)" if len(found) > 1 else ""
-    return [
-        f"in record {record.name!r} output {name!r} stays at one value for {count} samples from {at:.6g} s on{more}:"
-        " lost data? Frequencies by amplitude are not compared there; leave it out, or cut the record"
-    ]
 
 
 def _is_swing(drift: Drift) -> bool:
@@ -351,6 +358,21 @@ def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
         f"{100 * share:.0f} % of the motion does not decay within the record: harmonic excitation? Then leave these"
         " modes out, or cut the record to where it ends",
     )
+
+
+def _shaken(refined: Refined, doubts: Sequence[str]) -> tuple[str, ...]:
+    """A remark where modes of no sure damping crowd about a sure one, as ambient forces make them."""
+    f, sure = refined.modes.frequencies_hz, np.array([not doubt for doubt in doubts])
+    undamped = refined.modes.zeta < SURE * refined.zeta_std
+    for r in np.flatnonzero(sure):
+        about = np.flatnonzero(undamped & ~sure & (np.abs(f - f[r]) < RING_DOWN.about * f[r]))
+        if about.size >= RING_DOWN.crowd:
+            which = ", ".join(str(k + 1) for k in about)
+            return (
+                f"modes {which} crowd about mode {r + 1} and have no sure damping: forces drive this decay throughout,"
+                f" and frequencies and damping are less sure than they are said to be. {WAY_OUT}",
+            )
+    return ()
 
 
 def _coloured_residual(records: list[Record], left: list[np.ndarray]) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.preparation import decay_start
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
@@ -93,6 +94,21 @@ def test_free_decay_from_the_first_sample_is_kept_whole():
         noise = clean.outputs.std() * 10 ** rng.uniform(-4, -1) * rng.standard_normal(clean.outputs.shape)
         record = Record(0.01, clean.outputs + 5.0 + noise, clean.output_channels, start_time=3.0)
         assert decay_start(record) == 3.0, draw
+
+
+@pytest.mark.parametrize("n", [800, 801, 802, 803])
+def test_a_sample_at_rest_before_the_blow_is_left_out(n):
+    """As of a blow held over one sample: the motion is free from the next on, whatever the length of the record."""
+    forces = np.zeros((N, LENGTH))
+    forces[2, 0] = 1.0 / DT
+    rng = np.random.default_rng(n)
+    velocity = stepped(forces, np.zeros(2 * N))[[N + 2, N + 3], :n]
+    read = velocity + 1e-3 * velocity.std() * rng.standard_normal(velocity.shape)
+    record = Record(DT, read, (Channel("a", "velocity"), Channel("b", "velocity")))
+    assert decay_start(record) == DT
+    if n == 803:
+        assert "free decay from 0.005 s on only" in identify(record).remarks[0]
+        assert not identify(record.between(DT)).remarks
 
 
 def test_what_a_few_samples_or_silence_allow():

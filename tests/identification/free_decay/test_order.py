@@ -186,3 +186,16 @@ def test_modes_that_drift_in_time_are_all_found(seed):
     channels = tuple(Channel(f"y{i}", "acceleration") for i in range(3))
     found = identify(Record(0.002, motion + noise, channels)).modes.omega
     assert all((np.abs(found / true - 1.0) < 0.005).any() for true in omega), found
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_rounding_makes_no_modes(seed):
+    """Eight bits: what rounding adds goes with the motion, and made 35 and 20 modes of three."""
+    rng = np.random.default_rng(seed)
+    omega, zeta = 2.0 * np.pi * np.sort(rng.uniform(2.0, 60.0, 3)), rng.uniform(0.003, 0.02, 3)
+    modes = SampledModes(omega, zeta, rng.standard_normal((3, 3)), np.linspace(0.0, 1.0, 3))
+    clean = free_decay(modes, sample_time=0.005, n_samples=1500, quantity="acceleration")
+    step = np.abs(clean.outputs).max(axis=1, keepdims=True) / 128.0
+    found = identify(replace(clean, outputs=step * np.round(clean.outputs / step)))
+    assert found.modes.n_modes == 3 and (np.abs(found.modes.omega - omega) < 3.5 * found.omega_std).all()
+    assert not [remark for remark in found.remarks if "depends on amplitude" in remark]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.identification.free_decay.order import identify
-from workbench.identification.signal.data_quality import check_data_quality, data_faults
+from workbench.identification.signal.data_quality import check_data_quality, data_faults, steps
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -126,6 +126,7 @@ def test_a_clipped_input_is_said_and_not_refused(sound, force, said):
         np.repeat(np.append(NOISE[:40], 3.0), 20)[:800], np.r_[0.0, np.ones(799)], np.zeros(800),
         np.sin(2.0 * np.pi * 0.013 * np.arange(800)), np.round(30 * np.sin(2.0 * np.pi * 0.013 * np.arange(800))),
         np.maximum(np.sin(2.0 * np.pi * 0.013 * np.arange(800)), 0.0),
+        2.5 * np.sin(2.0 * np.pi * np.cumsum(np.repeat(np.arange(4.0, 12.0), 100)) / 200.0),
     ],
 )  # fmt: skip
 def test_inputs_as_they_are_sent_are_not_clipped(sound, force):
@@ -152,3 +153,8 @@ def test_a_record_given_twice_is_refused(sound):
     """Its errors would be too small by the root of two."""
     with pytest.raises(ValueError, match="'one' and 'again' hold the same measurement"):
         identify([replace(sound, name="one"), replace(sound, name="again")])
+
+
+def test_the_step_of_a_rounded_output_is_read_from_it(sound):
+    rounded = with_row(sound, 1, 0.3 + 0.02 * np.round(sound.outputs[1] / 0.02))
+    np.testing.assert_allclose(steps(rounded), [0.0, 0.02, 0.0, 0.0], rtol=1e-9)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine
-from workbench.identification.signal.data_quality import dropouts
+from workbench.identification.signal.data_quality import dropouts, steps
 from workbench.identification.signal.modal_estimates import Refined
 from workbench.records.record import Record, as_records
 from workbench.renamed import Renamed
@@ -29,6 +29,7 @@ class AssumptionsSettings:
     least_statistic: float = 100.0  # χ² of a mode in a segment, for its frequency there to mean something
     least_cycles: float = 3.0  # likewise
     least_sure: float = 0.01  # relative standard error of a frequency up to which a segment counts
+    rounded: float = 3.0  # steps of an output, that its rms in a segment has at least
     shown: tuple[float, float] = (1e-5, 1e-3)  # of a frequency, a damping ratio: less is not seen in their figures
     chance: float = 1e-3  # that a linear structure is said to depend on amplitude
 
@@ -122,7 +123,8 @@ def _segments(
     edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
     figures = np.full((5, stretches, modes.n_modes), np.nan)
     apart = np.abs(np.subtract.outer(modes.omega, modes.omega))
-    lost = [(at, at + (count - 1) * record.sample_time) for _, at, count in dropouts(record)]
+    lost = [(at, at + (count - 1) * record.sample_time) for _, at, count, _ in dropouts(record)]
+    coarse = ASSUMPTIONS.rounded * steps(record)
     beats = np.where(np.eye(modes.n_modes, dtype=bool), np.inf, apart).min(axis=1)
     for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
         span, decay = (last - first) * record.sample_time, -modes.poles.real
@@ -136,8 +138,10 @@ def _segments(
             continue
         if any(since <= ends and until >= begins for since, until in lost):  # would look like a change of the modes
             continue
+        stretch = record.between(begins, ends)
+        if (stretch.outputs.std(axis=1) < coarse).any():  # what rounding leaves of so little is not the motion
+            continue
         try:
-            stretch = record.between(begins, ends)
             found = in_coloured_noise(refine(stretch, modes.select(list(there)), offset=True), stretch)
         except np.linalg.LinAlgError:
             continue

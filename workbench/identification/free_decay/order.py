@@ -21,8 +21,9 @@ from workbench.arrays import Complexes, Floats
 from workbench.identification.free_decay.assumptions import amplitude_dependence
 from workbench.identification.free_decay.backbone import are_two, band_about
 from workbench.identification.free_decay.long_records import identify_long
+from workbench.identification.free_decay.preparation import decay_start
 from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
-from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors
+from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors, steps
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import differ, project, variances, whitened
 from workbench.identification.signal.searches import (
@@ -103,7 +104,19 @@ def identify(
     records = of_same_sensors(records)
     found = identify_within(records, Budget(seconds, progress), max_modes=max_modes, false_alarm=false_alarm)
     found = found.without_artefacts(np.pi / records[0].sample_time)
-    return replace(found, remarks=(*found.remarks, *amplitude_dependence(records, found.refined).remarks))
+    begun = tuple(remark for record in records for remark in _begins_later(record))
+    return replace(found, remarks=(*begun, *found.remarks, *amplitude_dependence(records, found.refined).remarks))
+
+
+def _begins_later(record: Record) -> tuple[str, ...]:
+    """A remark where samples before the free decay were taken for part of it."""
+    start = decay_start(record)
+    if start == record.start_time:
+        return ()
+    return (
+        f"record {record.name!r} is free decay from {start:.6g} s on only: what comes before would be read as modes;"
+        f" cut it, `record.between({start:.6g})`, or give it to `ring_down`",
+    )
 
 
 def identify_within(
@@ -197,6 +210,7 @@ class _FreeDecay:
         self.grids = [_Grid(record, longest) for record in records]
         # Residuals of round-off say nothing of one sensor beside another.
         self.round_off = FIT.round_off * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
+        self.round_off = np.maximum(self.round_off, [m.n_samples * steps(m) ** 2 / 12.0 for m in measured])
         cells = self.grids[0].n_cells
         signals = 2 * sum(r.n_outputs for r in records)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))

@@ -45,6 +45,10 @@ class StartSettings:
     rounds: int = 4  # of them, each about the best of the one before
     fastest: float = 0.1  # of these, times a sample
     least_left: float = 0.01  # of the record's energy, that must follow a break for the decay to begin there
+    most_spikes: int = 10  # lone samples that are replaced
+    neighbours: int = 8  # on either side, from which they are
+    about: int = 200  # samples on either side, from which is learnt how
+    leaps: float = 6.0  # times the error of that, of a lone sample that is wrong
 
 
 START = StartSettings()
@@ -72,7 +76,7 @@ def decay_start(record: Record) -> float:
         return float(record.start_time)
     left = np.cumsum(np.einsum("jt,jt->t", signals, signals)[::-1])[::-1]
     matters = left >= START.least_left * left[0]
-    starts = np.zeros(1, int)
+    starts = np.zeros(0, int)
     step = 1
     while n > START.most_samples * step:
         step *= START.coarser
@@ -92,7 +96,49 @@ def decay_start(record: Record) -> float:
         known = ((starts >= broken[:, None]) & (starts <= broken[:, None] + 2 * window.size)).any(axis=1)
         starts = np.r_[starts, broken[~known] + window.size // 2 + 1]
         step *= START.coarser
-    return float(record.start_time + record.sample_time * min(starts.max(), n - 1))
+    return float(record.start_time + record.sample_time * min(starts.max(initial=0), n - 1))
+
+
+def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
+    """A record whose free decay goes on about lone samples that are wrong, when it begins in s, and remarks.
+
+    A sample that ends the search for the start is replaced by what its neighbours on both sides say, y_t = Σ_k c_k
+    (y_{t-k} + y_{t+k}), where the decay then begins earlier: a blow, too, leaves another motion than was before.
+    """
+    start, remarks = decay_start(record), []
+    for _ in range(START.most_spikes):
+        at = round((start - record.start_time) / record.sample_time) - 1
+        repaired = record.outputs.copy()
+        wrong = [j for j, row in enumerate(repaired) if _repair(row, at)]
+        if not wrong:
+            break
+        other = replace(record, outputs=repaired)
+        earlier = decay_start(other)
+        if earlier > start - START.order * record.sample_time:
+            break
+        names = ", ".join(repr(record.output_names[j]) for j in wrong)
+        remarks.append(
+            f"output {names} leaps at {record.time[at]:.6g} s for one sample, replaced by what its neighbours say"
+        )
+        record, start = other, earlier
+    return record, start, tuple(remarks)
+
+
+def _repair(row: np.ndarray, at: int) -> bool:
+    """Replace a sample that its neighbours do not expect, in place; whether it was."""
+    k, near = START.neighbours, START.about
+    if at < START.order or at + START.order >= row.size:
+        return False
+    part, centre = row[max(at - near, 0) : at + near + 1], min(at, near) - k
+    windows = np.lib.stride_tricks.sliding_window_view(part - part.mean(), 2 * k + 1)
+    both = windows[:, :k] + windows[:, :k:-1]
+    others = np.abs(np.arange(len(windows)) - centre) > k
+    c = np.linalg.lstsq(both[others], windows[others, k], rcond=None)[0]
+    error = windows[:, k] - both @ c
+    if np.abs(error[centre]) <= START.leaps * error[others].std():
+        return False
+    row[at] -= error[centre]
+    return True
 
 
 def _scaled(record: Record) -> tuple[np.ndarray, float]:
@@ -123,15 +169,15 @@ def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
     ridge = np.sqrt(max(rounding, 1e-24 * energy[0] / n)) * np.eye(order, order + 1)
     factor = np.zeros((0, order + 1))
     ratio, level, weight = np.zeros(n), 0.0, 0.0
-    for t in range(n - order, block - 1, -block):
-        at = np.arange(t - block, t)
+    for t in range(n - order, 0, -block):
+        at = np.arange(max(t - block, 0), t)
         after = y[:, at[:, None] + np.arange(1, order + 1)].reshape(-1, order)
         here = y[:, at].reshape(-1)
         if n - t >= 3 * order:
             # Rounding enters as a ridge, and as the least level.
             r = _triangular(np.vstack([factor, ridge]))
             c = dtrtrs(r[:order, :order], r[:order, order])[0]
-            error = ((here - after @ c).reshape(m, block) ** 2).mean(axis=0)
+            error = ((here - after @ c).reshape(m, -1) ** 2).mean(axis=0)
             if n - t >= (3 + START.level_memory) * order:
                 ratio[at] = error / max(level / weight, rounding * (1.0 + c @ c), 1e-300)
             level, weight = forget_level * level + error.mean(), forget_level * weight + 1.0

@@ -302,9 +302,9 @@ def settled(
     budget: Budget | None = None,
     negligible: float = FIT.negligible,
 ) -> Fit:
-    """Searched, weighted by the noise found, and searched again."""
-    if fit.poles.size == 0:
-        return fit
+    """Searched, weighted by the noise found, and searched again; as it is where the time is up."""
     for _ in range(2):
+        if fit.poles.size == 0 or (budget is not None and budget.spent("refinement")):
+            break
         fit = search(data, fit.poles, fit.participation, fit.noise, most_steps, budget, negligible)
     return fit

@@ -34,6 +34,17 @@ def far_from_real(modes: SampledModes) -> np.ndarray:
     return np.sqrt(0.5 * np.maximum(1.0 - np.sqrt(modes.phase_collinearity), 0.0))
 
 
+def shape_errors(found: ShapeEstimates) -> np.ndarray:
+    """Standard error of each shape's real part over its size, (n_modes,)."""
+    trace = np.trace(found.shape_covariance, axis1=1, axis2=2)
+    return np.asarray(np.sqrt(trace) / np.linalg.norm(found.modes.shapes, axis=0))
+
+
+def are_far(far: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Modes, from 0, of which the nearest real one leaves a share, (n_modes,), beyond what errors (n_modes,) make."""
+    return np.flatnonzero(far > np.maximum(CLOCKS.far, SURE * error))
+
+
 def shape_remarks(found: ShapeEstimates, names: Sequence[str], only: Sequence[int]) -> tuple[str, ...]:
     """A remark where shapes are far from real, beyond their errors; it names the sensor that is late, if one is.
 
@@ -42,9 +53,8 @@ def shape_remarks(found: ShapeEstimates, names: Sequence[str], only: Sequence[in
         names: (n_outputs,) of the sensors.
         only: the modes to look at, from 0.
     """
-    far, error = far_from_real(found.modes), np.sqrt(np.trace(found.shape_covariance, axis1=1, axis2=2))
-    error = error / np.linalg.norm(found.modes.shapes, axis=0)
-    which = [r for r in only if far[r] > max(CLOCKS.far, SURE * error[r])]
+    far = far_from_real(found.modes)
+    which = np.intersect1d(only, are_far(far, shape_errors(found))).tolist()
     if not which:
         return ()
     late = _late(found.modes.select(list(only)))

@@ -21,7 +21,9 @@ class DataSettings:
     # likewise of an input, of which a blow has few: sines and pulses that are rounded have more in 3 of a thousand
     least_piled_input: int = 4
     piled_input: float = 4.0
+    turning: float = 1e-6  # of a signal's range, by which samples beside a turning point of a sine differ by rounding
     held: float = 0.5  # of an input's samples in the outer half of its range, that repeat: from there on it has levels
+    whole: float = 1e-3  # of a step, by which readings that are rounded to it lie off its multiples
     fewest_changes: int = 16  # of an output, from which a rate at which it was held can be read
     slowest: int = 64  # samples between changes: what changes less often rests
     copied: float = 1e-2  # of the innovation, what its past does not predict: signals that differ by less are one
@@ -30,6 +32,7 @@ class DataSettings:
     noise_free: float = 1e-9  # innovation over the signal: below, sensors of one mode are alike without being copies
     fewest_equal: int = 4  # samples in a row: of so many a lost message is told from a turning point
     about: int = 32  # samples on either side of them, which show how the output moves
+    straight: float = 1e-9  # of the range of an output, by which samples on a straight line lie off it by rounding
     moves: float = 100.0  # resolutions of the output that it moves there from sample to sample
     block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
 
@@ -83,7 +86,10 @@ def input_faults(record: Record) -> tuple[DataFault, ...]:
         stops = [
             at
             for at in _piled(row).values()
-            if row[at[0]] and _ends(row, at, DATA.least_piled_input, DATA.piled_input) and not _has_levels(row, at)
+            if at.size
+            and row[at[0]]
+            and _ends(row, at, DATA.least_piled_input, DATA.piled_input)
+            and not _has_levels(row, at)
         ]
         if stops:
             ends, count = " and ".join(f"{row[at[0]]:g}" for at in stops), sum(at.size for at in stops)
@@ -143,27 +149,70 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
     return records
 
 
-def dropouts(record: Record) -> tuple[tuple[str, float, int], ...]:
-    """Where an output stays at one value amid motion, as lost messages of a wireless sensor leave it.
+def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
+    """Where an output stays at one value or runs straight amid motion, as lost messages of a wireless sensor leave it.
 
     At an end of its range an output is clipped, and that is another fault.
 
     Returns:
-        name of the output, time of the first such sample in s, number of samples; in order of outputs and time.
+        name of the output, time of the first such sample in s, number of samples, and what it does there; in order of
+        outputs and time.
     """
     found = []
     for name, row in zip(record.output_names, record.outputs, strict=True):
-        still = np.flatnonzero(np.diff(row) == 0.0)
-        if still.size < DATA.fewest_equal - 1:
-            continue
-        resolution, ends = np.diff(np.unique(row)).min(initial=np.inf), (row.min(), row.max())
-        for run in np.split(still, np.flatnonzero(np.diff(still) > 1) + 1):
-            first, last = int(run[0]), int(run[-1]) + 1
-            beside = row[max(first - DATA.about, 0) : first + 1], row[last : last + DATA.about + 1]
-            moves = min(float(np.median(np.abs(np.diff(part)))) if part.size > 2 else 0.0 for part in beside)
-            if run.size >= DATA.fewest_equal - 1 and moves > DATA.moves * resolution and row[first] not in ends:
-                found.append((name, float(record.time[first]), run.size + 1))
+        rounding, ends = DATA.straight * np.ptp(row), (row.min(), row.max())
+        resolution, taken, lost = 0.0, np.zeros(row.size, bool), []
+        for order, how in ((1, "stays at one value"), (2, "runs straight")):
+            moves = np.abs(np.diff(row, order))
+            still = np.flatnonzero(moves <= rounding)
+            if still.size < DATA.fewest_equal - 1:
+                continue
+            resolution = resolution or max(np.diff(np.unique(row)).min(initial=np.inf), rounding)
+            for run in np.split(still, np.flatnonzero(np.diff(still) > 1) + 1):
+                if run.size < DATA.fewest_equal - 1:
+                    continue
+                first, last = int(run[0]), int(run[-1]) + order
+                about = moves[max(first - DATA.about, 0) : first], moves[last : last + DATA.about]
+                moving = min(float(np.median(part)) if part.size > 1 else 0.0 for part in about)
+                if moving > DATA.moves * resolution and row[first] not in ends and not taken[first : last + 1].any():
+                    taken[first : last + 1] = True
+                    lost.append((name, float(record.time[first]), last - first + 1, how))
+        found += sorted(lost)
     return tuple(found)
+
+
+def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tuple[str, ...]:
+    """A remark where outputs stay at one value, or run straight, amid motion; empty where none does.
+
+    Args:
+        record: looked at.
+        after: what follows from it, and the way out.
+        before: s, what begins later does not count.
+    """
+    found = [lost for lost in dropouts(record) if lost[1] < before]
+    if not found:
+        return ()
+    name, at, count, how = found[0]
+    more = f" (and {len(found) - 1} more like that)" if len(found) > 1 else ""
+    return (
+        f"in record {record.name!r} output {name!r} {how} for {count} samples from {at:.6g} s on{more}: lost data?"
+        f" {after}",
+    )
+
+
+def steps(record: Record) -> np.ndarray:
+    """The step that the readings of each output are whole multiples of, apart from a constant, (n_outputs,); 0 of those
+    that have none.
+
+    Rounding to it is noise of a standard deviation of step/√12 at least, as long as the output moves by steps.
+    """
+    found = np.zeros(record.n_outputs)
+    for j, row in enumerate(record.outputs):
+        apart = np.diff(np.unique(row))
+        step = float(apart.min(initial=np.inf))
+        if np.isfinite(step) and np.abs(apart / step - np.round(apart / step)).max() < DATA.whole:
+            found[j] = step
+    return found
 
 
 def _dead(record: Record) -> Iterator[DataFault]:
@@ -237,8 +286,11 @@ def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
 
 
 def _piled(row: np.ndarray) -> dict[str, np.ndarray]:
-    """The samples at each end of a signal's range."""
-    return {"above": np.flatnonzero(row == row.max()), "below": np.flatnonzero(row == row.min())}
+    """The samples at each end of a signal's range, less turning points of sines, which are alike on both sides."""
+    padded = np.pad(row, 1, constant_values=np.nan)
+    before, after = padded[:-2], padded[2:]
+    turns = (np.abs(before - after) <= DATA.turning * np.ptp(row)) & (before != row)
+    return {name: np.flatnonzero((row == end) & ~turns) for name, end in (("above", row.max()), ("below", row.min()))}
 
 
 def _ends(row: np.ndarray, at: np.ndarray, least: int, ratio: float) -> bool:
@@ -255,7 +307,7 @@ def _has_levels(row: np.ndarray, at: np.ndarray) -> bool:
 
 def _beside(row: np.ndarray, at: np.ndarray) -> int:
     """Samples that have the value next to that of the samples `at`."""
-    others = np.delete(row, at)
+    others = row[row != row[at[0]]]
     return int(np.count_nonzero(others == others[np.argmin(np.abs(others - row[at[0]]))]))
 
 

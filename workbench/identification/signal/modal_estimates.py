@@ -95,6 +95,12 @@ class ParticipatingModes(ModalEstimates):
         return self._vector_std[:, : self.modes.n_outputs].T
 
     @property
+    def participation_std(self) -> np.ndarray:
+        """Standard error of participation factors (n_modes, n_inputs), rms of real and imaginary part."""
+        real, imaginary = np.split(self._vector_std[:, self.modes.n_outputs :], 2, axis=1)
+        return np.asarray(np.sqrt(0.5 * (real**2 + imaginary**2)))
+
+    @property
     def _vector_std(self) -> np.ndarray:
         return np.asarray(np.sqrt(np.diagonal(self.vector_covariance, axis1=1, axis2=2)))
 

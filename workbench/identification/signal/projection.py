@@ -315,7 +315,7 @@ def _median_correlation(left: Sequence[np.ndarray]) -> Floats:
     # real and imaginary parts beside each other: the real part of a product with a conjugate is their scalar product
     bands = [np.ascontiguousarray(each).view(float) for each in left]
     bands = [each[:, : each.shape[1] // band * band].reshape(m, -1, band).transpose(1, 0, 2) for each in bands]
-    own = [np.sqrt(np.einsum("bjk,bjk->bj", each, each)) + 1e-300 for each in bands]
+    own = [np.sqrt(np.einsum("bjk,bjk->bj", each, each)) + 1e-150 for each in bands]
     median, n_bands = np.zeros((m, m)), sum(map(len, bands))
     some = max(PROJECTION.at_once // (n_bands * m), 1)  # a few outputs beside all, in all bands
     for start in range(0, m, some):
