@@ -68,8 +68,9 @@ def _change_sensors(rig: Rig, target: str, **changes: Any) -> Rig:
 
 def _amplify(rig: Rig, side: str, target: str, gain: float) -> Rig:
     """An actuator or a sensor with so many times the gain that it has: a calibration may be a little off besides."""
-    ports: Any = getattr(rig, side)
-    return replace(rig, **{side: tuple(replace(p, gain=gain * p.gain) if p.name == target else p for p in ports)})
+    ports = (replace(p, gain=gain * p.gain) if p.name == target else p for p in getattr(rig, side))
+    changes: Any = {side: tuple(ports)}
+    return replace(rig, **changes)
 
 
 def _change_swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
