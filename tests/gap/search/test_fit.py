@@ -15,7 +15,7 @@ from workbench.gap.prediction.random_force import tonal
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import force_filter, sampled_model, whiten
 from workbench.gap.report.budget import Shrinkage
-from workbench.gap.search.fit import _Problem, cost_of, fit, slopes
+from workbench.gap.search.fit import Chord, _Problem, cost_of, fit, slopes
 from workbench.rig.elements import CubicSpring, PeriodicForce
 from workbench.rig.simulate import simulate
 
@@ -216,7 +216,7 @@ def test_numbers_of_different_sensors_are_moved_at_once_where_each_alters_its_ow
 def test_slopes_along_believed_numbers_are_kept_and_others_taken_anew(rig, measured):
     data = measured(rig)
     effects = (Effect(CUBIC, None, {"at": 0.8, "stiffness": 400.0}), nominal_errors(rig, NominalPrior(gain=0.01)))
-    chord = _Problem(rig, effects, data, chord=True)
+    chord = _Problem(rig, effects, data, chord=Chord())
     residual = chord.residual(chord.start)
     first = chord.jacobian(chord.start, residual, False, _of(chord)).copy()
     np.testing.assert_allclose(chord.normal(first), first.T @ first)
@@ -225,3 +225,21 @@ def test_slopes_along_believed_numbers_are_kept_and_others_taken_anew(rig, measu
     np.testing.assert_array_equal(second[:, chord.believed], first[:, chord.believed])
     assert np.abs(second[:, :2] - first[:, :2]).max() > 1e-6 * np.abs(first[:, :2]).max()
     np.testing.assert_allclose(chord.normal(second), second.T @ second, rtol=1e-9, atol=1e-6)
+
+
+def test_a_fit_keeps_the_slopes_along_believed_numbers_of_the_one_before(rig, measured):
+    """Of residuals that are weighed otherwise too; the next fit asks for fewer, and comes to the same."""
+    data = measured(rig).tempered(4.0)
+    effects = (Effect(CUBIC, None, {"at": 0.8, "stiffness": 400.0}), nominal_errors(rig, NominalPrior(gain=0.01)))
+    chord = Chord()
+    fit(rig, effects, data, iterations=1, chord=chord)
+    _, along = slopes(rig, effects, data.tempered(1.0))
+    np.testing.assert_allclose(chord.columns, along[:, 2:], atol=1e-4 * np.abs(along).max())
+    problem = _Problem(rig, effects, data, chord=chord)
+    residual, moves = problem.residual(problem.start), []
+    share = _of(problem)
+    kept = problem.jacobian(problem.start, residual, False, lambda each: moves.extend(each) or share(each)).copy()
+    assert sorted(j for move in moves for j in move.numbers) == [0, 1]
+    fresh = _Problem(rig, effects, data)
+    taken = fresh.jacobian(fresh.start, residual, False, _of(fresh))
+    np.testing.assert_allclose(kept, taken, atol=1e-4 * np.abs(taken).max())

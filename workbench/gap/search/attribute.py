@@ -20,7 +20,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.beside_random import decide_on_random, random_beside, random_beside_errors
 from workbench.gap.search.finish import best_of_each, finished, ranked, relocated, simplest, widened
-from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.nominal_figures import beside_modes, beside_records
 from workbench.gap.search.pairs import Pairs
@@ -249,7 +249,7 @@ def attribute(
 def _anew(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
     """The effects fitted to all records, from where they are near."""
     finely = data.finely(SELECTION.fine)
-    return fit(search.rig, effects, finely, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
+    return fit(search.rig, effects, finely, iterations=ATTRIBUTION.together, workers=search.workers, chord=Chord())
 
 
 def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:

@@ -18,7 +18,7 @@ from workbench.gap.effects.effect import (
     with_one_simpler,
 )
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit
+from workbench.gap.search.fit import Chord, Fit, cost_of, finite_residual, fit
 from workbench.gap.search.search import Search, promise
 from workbench.gap.search.settings import FINISH, SEARCH, SELECTION
 from workbench.rig.simulate import is_stepped
@@ -75,7 +75,7 @@ def widened(search: Search, found: Fit) -> Fit:
     cost = cost_of(search.rig, found.effects, data)
 
     def anew(effects: Sequence[Effect]) -> Fit:
-        return fit(search.rig, effects, data, iterations=FINISH.widening, workers=search.workers, chord=True)
+        return fit(search.rig, effects, data, iterations=FINISH.widening, workers=search.workers, chord=Chord())
 
     for effects in sets:
         trial = anew(effects)

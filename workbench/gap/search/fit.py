@@ -118,6 +118,17 @@ class Attempt:
 Shared = Callable[[Sequence[Move | Attempt]], list[Any]]
 
 
+@dataclass(eq=False)
+class Chord:
+    """Slopes along believed values that fits of the same records keep: small errors move a residual all but linearly.
+
+    Attributes:
+        columns: (n_values, n_believed), in units of the noise; None until a fit has taken them.
+    """
+
+    columns: Floats | None = None
+
+
 class _Problem:
     """The residual as a function of the free coordinates of all parameters of all effects."""
 
@@ -128,10 +139,9 @@ class _Problem:
         data: FitData,
         held: Sequence[Effect] = (),
         workers: Workers = ALONE,
-        known: np.ndarray | None = None,
-        chord: bool = False,
+        chord: Chord | None = None,
     ):
-        self.workers, self.known, self.chord = workers, known, chord
+        self.workers, self.chord = workers, chord
         self.rig, self.data, self.effects, self.held = rig, data, tuple(effects), tuple(held)
         self.coarse = data.stepped(min(FIT.slope_substeps, data.substeps))
         self.parameters = parameters_of(rig, self.effects)
@@ -149,7 +159,8 @@ class _Problem:
         # a believed value is one more measurement: of itself, by its own standard deviation
         self.believed = [j for j, (_, p) in enumerate(self.parameters) if p.prior_std is not None]
         self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.believed])
-        self.is_known = known is not None  # whether the slopes along believed values stay as they are
+        # whether the slopes along believed values stay as they are
+        self.is_known = chord is not None and chord.columns is not None
         # a row a number, of what it does to each value, and one of the residual beside which it does
         self._columns = np.zeros((len(self.parameters) + 1, 0))
         self._normal: Floats | None = None
@@ -260,9 +271,9 @@ class _Problem:
         """Differences from the residual that `near` gives; the next call overwrites them."""
         if self._columns.shape[1] != residual.size:  # before helpers are forked, which write into them
             self._columns = self.workers.array(len(self.parameters) + 1, residual.size)
-            if self.known is not None:
-                self._columns[self.believed, : len(self.known)] = self.known.T
-                self._columns[self.believed, len(self.known) :] = 0.0
+            if self.chord is not None and self.chord.columns is not None:
+                self._columns[self.believed, : self.data.n_values] = self.chord.columns.T / np.sqrt(self.data.heat)
+                self._columns[self.believed, self.data.n_values :] = 0.0
         jacobian = self._columns[:-1].T
         fresh = [j for j in range(len(self.parameters)) if not self.is_known or j not in self.believed]
         groups = self._of_sensors_alone(fresh)
@@ -280,8 +291,14 @@ class _Problem:
         share([Move(free, 2.0 * free - move.to, move.numbers, coarsely) for move in failed])
         if self.is_known:
             jacobian[residual.size - len(self.believed) :, self.believed] = np.diag(1.0 / self.prior_std)
-        self.is_known = self.is_known or self.chord
+        self.is_known = self.is_known or self.chord is not None
         return jacobian
+
+    def keep(self) -> None:
+        """Hand on the slopes along believed values, where they are to be kept and are not yet."""
+        chord, columns = self.chord, self._columns[self.believed, : self.data.n_values]
+        if chord is not None and chord.columns is None and self.is_known:
+            chord.columns = np.sqrt(self.data.heat) * columns.T
 
     def end(self) -> None:
         """No slope is asked for any more."""
@@ -356,8 +373,7 @@ def fit(
     iterations: int = 25,
     tolerance: float = 1e-5,
     workers: Workers = ALONE,
-    known: np.ndarray | None = None,
-    chord: bool = False,
+    chord: Chord | None = None,
     damping: float = FIT.damping,
 ) -> Fit:
     """Levenberg-Marquardt over all parameters of the effects, from the values they carry.
@@ -370,17 +386,18 @@ def fit(
         iterations: at most.
         tolerance: relative decrease of the cost at which to stop.
         workers: processes that share the sensitivities, where they are many.
-        known: (n_values, n_believed) sensitivities to parameters with priors, where they are at hand.
-        chord: keep those of the first iteration; small errors move the residual all but linearly.
+        chord: slopes along parameters with priors that are kept, those of the first iteration where none are yet;
+            None to take them anew.
         damping: of the first step, as a share of the diagonal of Jᵀ J.
     """
-    problem = _Problem(rig, effects, data, held, workers, known, chord)
+    problem = _Problem(rig, effects, data, held, workers, chord)
     residual = problem.residual(problem.start)
     if residual is None:
         shape = (len(data.records), data.noise.size)
         return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), problem.start.size)
     with workers.standing(problem.done) as share:
         found = _descended(problem, share, residual, iterations, tolerance, damping)
+    problem.keep()
     problem.end()
     return found
 

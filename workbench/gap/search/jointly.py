@@ -17,7 +17,7 @@ from workbench.gap.prediction.noise import (
     noise_found,
 )
 from workbench.gap.prediction.residuals import FitData
-from workbench.gap.search.fit import Fit, fit, parameters_of
+from workbench.gap.search.fit import Chord, Fit, fit, parameters_of
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import INPUTS, JOINT, SELECTION
 from workbench.rig.rig import Rig
@@ -122,7 +122,7 @@ def fit_jointly(
         errors = replace(errors, target=replace(errors.target, waves=JOINT.last_waves))
     if known is None:
         errors = opened(search, errors)
-    i = counted = 0
+    i, counted, chord = 0, 0, Chord(known)
     while counted < rounds and i < JOINT.most_rounds:
         # the two most telling records lead the way
         quickly = known is not None or (i == 0 and not to_the_end)
@@ -130,7 +130,10 @@ def fit_jointly(
         level = _level(search.rig, (*effects, errors), data)
         if level > (1.0 - (JOINT.last_settled if to_the_end else JOINT.settled)) * before:
             break
-        counted += level > JOINT.falling * before or not np.isfinite(before)
+        falls = level < JOINT.falling * before
+        counted += not falls or not np.isfinite(before)
+        if known is None and (falls or to_the_end):  # far from where the slopes were taken, or as exact as can be
+            chord = Chord()
         before = level if known is not None or not quickly else np.inf
         i += 1
         found = fit(
@@ -140,8 +143,7 @@ def fit_jointly(
             iterations=JOINT.last_iterations if to_the_end else JOINT.iterations,
             tolerance=JOINT.last_tolerance if to_the_end else JOINT.tolerance,
             workers=search.workers,
-            known=None if known is None else known / np.sqrt(level),
-            chord=True,
+            chord=chord,
         )
         *effects, errors = found.effects
         errors = _sized(errors, _next_sizes(errors))
@@ -150,7 +152,7 @@ def fit_jointly(
     moving = measured(search, replace(found, effects=(*effects, _closed(errors))), whole.substeps)
     # of what is far from noise the sizes say little
     near = moving.excess(moving.noise_power) < JOINT.near * float(moving.noise_power.mean())
-    resting = _at_rest(search, found, whole) if known is None and near else found
+    resting = _at_rest(search, found, whole, chord) if known is None and near else found
     if resting is found:
         return moving
     *effects, errors = resting.effects
@@ -159,10 +161,16 @@ def fit_jointly(
     return min((rested, moving), key=lambda step: step.description(rested.noise_power))
 
 
-def _at_rest(search: Search, found: Fit, data: FitData) -> Fit:
+def _at_rest(search: Search, found: Fit, data: FitData, chord: Chord) -> Fit:
     """The fit with the sizes of errors where they come to rest, which the records may be slow to lead to.
 
     Where they hardly tell errors apart, the cost does not change on the way.
+
+    Args:
+        search: with its records.
+        found: effects and errors.
+        data: all records.
+        chord: slopes of them along the errors.
     """
     for _ in range(JOINT.rests):
         errors = found.effects[-1]
@@ -178,7 +186,7 @@ def _at_rest(search: Search, found: Fit, data: FitData) -> Fit:
             iterations=JOINT.iterations,
             tolerance=JOINT.tolerance,
             workers=search.workers,
-            chord=True,
+            chord=chord,
             damping=JOINT.undamped,
         )
     return found

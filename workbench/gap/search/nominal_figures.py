@@ -141,6 +141,8 @@ def beside_modes(before: Stepwise) -> Stepwise | None:
         before: what holds without, its likeliest single effects tried.
     """
     nearest = before.nearest
+    if before.at_first.prior.shape:  # asked from the start
+        return None
     if nearest.excess(nearest.noise_power) > STEPWISE.of_modes * float(before.search.nominal.mean()):
         return None
     before.search.report("errors of each mode", 0.5)

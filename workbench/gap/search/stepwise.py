@@ -26,7 +26,7 @@ from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.noise import LEAST_LOGGED
 from workbench.gap.search.finish import other_places
-from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of, slopes
+from workbench.gap.search.fit import Chord, Fit, cost_of, fit, parameters_of, slopes
 from workbench.gap.search.jointly import (
     Step,
     are_plausible,
@@ -650,7 +650,9 @@ class Stepwise:
         search = self.search
 
         def on(sets: Sequence[Effect]) -> Fit:
-            return fit(search.rig, sets, search.ahead, iterations=JOINT.iterations, workers=search.workers, chord=True)
+            return fit(
+                search.rig, sets, search.ahead, iterations=JOINT.iterations, workers=search.workers, chord=Chord()
+            )
 
         found = on((*effects, errors))
         for _ in range(JOINT.anew - 1):
