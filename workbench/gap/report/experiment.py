@@ -76,7 +76,7 @@ def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Wor
 def _shortest(rig: Rig, sample_time: float) -> float:
     """Seconds that an experiment lasts at least."""
     elastic = rig.modes.frequencies_hz[rig.modes.frequencies_hz > 0]
-    return max([LEAST_SAMPLES * sample_time, *PERIODS / elastic[:1]])
+    return float(max([LEAST_SAMPLES * sample_time, *PERIODS / elastic[:1]]))
 
 
 def _choices(record: Record) -> list[tuple[str, ...]]:
