@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from workbench.cases.case import Case
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.gap.report.levels import steady_remainder
 from workbench.rig.actuators import Actuator
+from workbench.study.pages.verdict_page import verdict_page
 
 LOGGED, HIDDEN = Actuator("F", 0.45), (Actuator("H1", 0.4), Actuator("H2", 0.9), Actuator("H3", 1.3))
 
@@ -53,7 +55,7 @@ def test_what_no_input_drives_is_as_large_at_every_level(rig, shaken, levels, hi
         assert "does not grow with the inputs" in remark and "record '1'" in remark and "times as large" in remark
 
 
-def test_an_unexplained_gap_that_does_not_grow_is_remarked_and_what_is_closed_has_its_measure(rig, shaken):
+def test_an_unexplained_gap_that_does_not_grow_is_remarked_and_what_is_closed_has_its_measure(rig, shaken, tmp_path):
     *fit, check = shaken((1.0, 4.0, 2.0), hidden=1.0, gain=1.1)
     gain = (kind_named("actuator_gain"),)
     verdict = diagnose(rig, fit, validation=[check], catalogue=gain, workers=1, seconds=0.3)
@@ -62,3 +64,6 @@ def test_an_unexplained_gap_that_does_not_grow_is_remarked_and_what_is_closed_ha
     nearest = Effect(gain[0], "F", {"gain": 1.1}, {"gain": 0.01})
     near = replace(verdict, effects=(nearest,), shrinkage=replace(verdict.shrinkage, overall=0.29))
     assert near.sentence.endswith("would close 29 % of its rms.")
+    assert verdict.where.place.is_single_force is False  # three forces have no place that one could be drawn at
+    page = verdict_page(near, Case("three", rig, tuple(fit), (check,)), tmp_path / "three.html")
+    assert "single unknown force" in page.read_text() and "reconstructed" not in page.read_text()
