@@ -17,6 +17,15 @@ def test_logarithmic_axes_have_plain_numbers_where_they_are_few(low, high, expec
         assert expected in texts and not any("10^" in text or "times" in text for text in texts)
 
 
+def test_numbers_of_a_logarithmic_axis_within_a_decade_reach_along_it():
+    figure, ax = new_figure()
+    ax.semilogy([0.0, 1.0], [0.13, 0.26])
+    ax.set_ylim(0.13, 0.26)
+    plain_ticks(figure).draw_without_rendering()
+    shown = [float(mark.label1.get_text() or "nan") for mark in ax.yaxis.get_minor_ticks()]
+    assert min(value for value in shown if value > 0.13) < 0.16
+
+
 @pytest.mark.parametrize("extent", [2.5, 2.95, 4.0, 9.0])
 @pytest.mark.parametrize(
     "low", [0.0101, *(pytest.param(low, marks=pytest.mark.slow) for low in (0.01, 0.0301, 0.051, 0.0701))]

@@ -87,8 +87,8 @@ def test_a_hardening_spring_is_named_at_the_input_where_it_stands(case):
     assert verdict.effects[0].values["stiffness"] == pytest.approx(CUBIC, rel=1e-3)
     assert verdict.shrinkage.overall > 0.99
     assert " at F " in verdict.sentence and "x =" not in verdict.sentence
-    labels = [text.get_text() for text in plot_where(verdict).axes[5].get_xticklabels()]
-    assert labels == ["F", "w"]
+    alone = plot_where(verdict).axes[5]  # one sensor places nothing
+    assert not alone.axison and [text.get_text() for text in alone.texts] == ["no place of a force can be identified"]
     left, right = plot_unmodelled_force(verdict, length="V", force="V").axes
     assert "at F" in left.get_xlabel()
     assert left.get_xlabel() == "displacement at F [V]" and right.get_xlabel() == "velocity at F [V/s]"
@@ -160,10 +160,21 @@ def test_shapes_that_are_off_by_themselves_are_no_effect(spacecraft):
 def test_a_limit_and_a_gain_are_found_beside_shapes_that_are_off(spacecraft):
     rig, records = spacecraft
     *fit, check = records(limit=25.0, gain=1.12)
-    limit, gain, _ = diagnose(rig, fit, validation=[check], workers=1).effects
+    verdict = diagnose(rig, fit, validation=[check], workers=1)
+    limit, gain, _ = verdict.effects
     assert (limit.label, gain.label) == ("actuator_saturation[T1]", "sensor_gain[a1]")
     assert limit.values["limit"] == pytest.approx(25.0, abs=3.0 * limit.deviations["limit"])
     assert gain.values["gain"] == pytest.approx(1.12, abs=0.03)  # the shapes at it are off by 1.4 % in the mean
+    axes, place = plot_where(verdict).axes, verdict.where.place
+    shares = [bar.get_height() for bar in axes[0].patches]
+    assert shares[0] == pytest.approx(100.0 * verdict.where.band_shares[0], abs=1.0)  # below 0.34 Hz: what drifts
+    assert axes[0].get_xticklabels()[0].get_text() == "rigid, 1 to 2" and sum(shares) == pytest.approx(100.0, abs=0.5)
+    below, names = (
+        [bar.get_width() for bar in axes[5].patches],
+        [label.get_text() for label in axes[5].get_yticklabels()],
+    )
+    assert below == sorted(below) and below[0] == 0.0 and axes[5].texts[0].get_text() == "likeliest"
+    assert names[0] == place.at and len(names) == len(place.places)
 
 
 @pytest.mark.parametrize("place", ["left", "across"])

@@ -1,13 +1,14 @@
 """Figures of a diagnosis."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from workbench.arrays import Floats
-from workbench.draw.style import COLOURS, GREY, in_units, new_figure, plain_ticks
+from workbench.draw.style import COLOURS, GREY, few_ticks, in_units, new_figure, plain_ticks
 from workbench.gap.effects.effect import Effect, apply_all, label_in_words
 from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.evidence import Evidence
@@ -18,7 +19,7 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
 
-MOST_BARS, FEW_BARS = 16, 6  # of named points: the likeliest are shown, and few have their names level
+MOST_BARS, FEW_BARS = 16, 6  # of named points: the likeliest are shown; of sensors: few have their names level
 SHOWN = 0.005  # of the gap: a bar that is lower is not seen
 
 
@@ -85,18 +86,14 @@ def plot_where(verdict: Verdict) -> Figure:
     """The gap taken apart: by mode, band, sensor, level and time, and the likelihood of a place."""
     where = verdict.where
     figure, axes = new_figure(3, 2, width=10, height=9.2)
-    n_modes = where.mode_shares.size
-    axes[0, 0].bar(np.arange(1, n_modes + 1), 100 * where.mode_shares, color=COLOURS[0])
-    if where.share_above > SHOWN:
-        axes[0, 0].bar(n_modes + 1, 100 * where.share_above, color=GREY, label="above the last")
-        axes[0, 0].legend()
-    axes[0, 0].set(title="by mode: the band around each frequency", xlabel="mode", ylabel="share of the gap [%]")
+    _plot_modes(axes[0, 0], verdict)
     tops = [f"{top:.3g}" if top < 1000.0 else f"{top:.0f}" for top in where.band_edges_hz[1:]]
     axes[0, 1].bar(tops, 100 * where.band_shares, color=COLOURS[0])
     axes[0, 1].set(title="by octave", xlabel="up to [Hz]", ylabel="share of the gap [%]")
     names = [s.name for s in verdict.nominal.sensors]
     axes[1, 0].bar(names, 100 * where.sensor_shares, color=COLOURS[2])
     axes[1, 0].set(title="by sensor", ylabel="share of the gap [%]")
+    axes[1, 0].tick_params(axis="x", rotation=90 if len(names) > FEW_BARS else 0)
     order = np.argsort(where.input_levels)
     axes[1, 1].plot(where.input_levels[order], where.record_gaps[order], "o-", color=COLOURS[1])
     axes[1, 1].margins(0.15)
@@ -119,32 +116,77 @@ def plot_where(verdict: Verdict) -> Figure:
     return plain_ticks(figure)
 
 
+def _plot_modes(ax: Axes, verdict: Verdict) -> None:
+    """Shares of the gap by mode; rigid modes, which no frequency tells apart, have one bar."""
+    where, frequencies = verdict.where, verdict.nominal.modes.frequencies_hz
+    rigid = int((frequencies == 0).sum())
+    numbers = np.arange(rigid, frequencies.size) + 1
+    shares = {str(r): share for r, share in zip(numbers, where.mode_shares[rigid:], strict=True)}
+    if rigid:
+        shares = {f"rigid, 1 to {rigid}" if rigid > 1 else "rigid, 1": float(where.mode_shares[:rigid].sum()), **shares}
+    if where.share_above > SHOWN:
+        shares["above"] = where.share_above
+    bars = ax.bar(range(len(shares)), 100.0 * np.array([*shares.values()]), color=COLOURS[0])
+    if where.share_above > SHOWN:
+        bars[-1].set_color(GREY)
+    shown = few_ticks(np.arange(len(shares)))
+    ax.set_xticks(shown, [[*shares][i] for i in shown])
+    ax.set(title="by mode: the band around each frequency", xlabel="mode", ylabel="share of the gap [%]")
+
+
 def _plot_places(ax: Axes, verdict: Verdict) -> None:
     """How likely each place is for one unmodelled force: a curve along the structure, or bars at named places."""
     place = verdict.where.place
     profile = place.profile
-    title = {
-        True: "place of one unmodelled force",
-        False: "no single point force: where one fits best",
-        None: "no place of a force can be identified",
-    }
-    ax.set(title=title[place.is_single_force], ylabel="log-likelihood below its maximum")
+    if place.is_single_force is None:
+        ax.set_axis_off()
+        ax.text(0.5, 0.5, "no place of a force can be identified", ha="center", va="center", transform=ax.transAxes)
+        return
+    single = "place of one unmodelled force" if place.is_single_force else "no single point force: where one fits best"
+    ax.set(title=single)
     domain = verdict.nominal.modes.domain
     if isinstance(domain, Rectangle):
         _map(ax, verdict, domain)
         return
     if isinstance(domain, NamedPoints):
-        shown = np.sort(np.argsort(-profile, kind="stable")[:MOST_BARS])
-        ax.bar([_short(place.places[i]) for i in shown], profile[shown], color=COLOURS[3])
-        ax.tick_params(axis="x", rotation=90 if shown.size > FEW_BARS else 0)
+        _rank(ax, verdict)
         return
     ax.plot(place.places, profile, color=COLOURS[3])
-    ax.axvline(place.at, color=GREY, linestyle=":")
-    for effect in verdict.effects:
-        if effect.at is not None and effect.kind.path in ("structure", "environment"):
-            ax.axvline(effect.at, color=COLOURS[0])
+    ax.axvline(place.at, color=GREY, linestyle=":", label="likeliest")
+    acting, called = _acting(verdict)
+    for i, at in enumerate(acting):
+        ax.axvline(at, color=COLOURS[0], label="" if i else called)
     low = _lowest(profile)
-    ax.set(xlabel=f"x [{verdict.units.length}]", ylim=(low, -0.06 * low))
+    ax.set(xlabel=f"x [{verdict.units.length}]", ylabel="log-likelihood below its maximum", ylim=(low, -0.06 * low))
+    ax.legend()
+
+
+def _rank(ax: Axes, verdict: Verdict) -> None:
+    """Named places, the likeliest first, by how much less likely each is; where effects act that are named is told."""
+    place, separation = verdict.where.place, verdict.nominal.modes.domain.separation
+    shown = [place.places[i] for i in np.argsort(-place.profile, kind="stable")[:MOST_BARS]]
+    below = place.profile.max() - np.sort(place.profile)[::-1][:MOST_BARS]
+    acting, called = _acting(verdict)
+    is_acting = [any(separation(at, other) == 0 for other in acting) for at in shown]
+    ax.barh(range(len(shown)), below, color=[COLOURS[0] if named else COLOURS[3] for named in is_acting])
+    names = [_short(at) + f" ({called})" * named for at, named in zip(shown, is_acting, strict=True)]
+    ax.set_yticks(range(len(shown)), names, fontsize=8)
+    ax.invert_yaxis()
+    ax.set_xscale("symlog", linthresh=1.0, linscale=0.5)
+    top = int(np.ceil(np.log10(max(below.max(), 10.0))))
+    ax.set_xticks([0.0, *10.0 ** np.arange(0, top + 1, 1 + top // 6)])
+    ax.set(xlim=(0.0, 10.0**top), xlabel="log-likelihood below that of the likeliest")
+    ax.annotate("likeliest", (0.0, 0), (4, 0), textcoords="offset points", va="center", fontsize=8)
+    unseen = [_short(at) for at in acting if all(separation(at, other) > 0 for other in shown)]
+    if unseen:
+        told = f"{called}, not among these: {', '.join(unseen)}"
+        ax.text(1.0, 0, told, transform=ax.get_yaxis_transform(), ha="right", va="center", fontsize=8)
+
+
+def _acting(verdict: Verdict) -> tuple[list[Any], str]:
+    """Where the effects act that the verdict names, and what it calls them."""
+    acting = [e.at for e in verdict.effects if e.at is not None and e.kind.path in ("structure", "environment")]
+    return acting, "named" if verdict.outcome == "explained" else "nearest"
 
 
 def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
@@ -153,9 +195,8 @@ def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
     x, y = np.array(place.places).T
     ax.tricontourf(x, y, np.maximum(place.profile, _lowest(place.profile)), levels=12, cmap="Blues")
     ax.plot(*place.at, "+", color=GREY, markersize=12)
-    for effect in verdict.effects:
-        if effect.at is not None and effect.kind.path in ("structure", "environment"):
-            ax.plot(*effect.at, "o", color=COLOURS[0], fillstyle="none", markersize=9)
+    for at in _acting(verdict)[0]:
+        ax.plot(*at, "o", color=COLOURS[0], fillstyle="none", markersize=9)
     a, b = domain.length
     m = verdict.units.length
     ax.set(xlabel=f"x [{m}]", ylabel=f"y [{m}]", xlim=(0.0, a), ylim=(0.0, b), aspect="equal")

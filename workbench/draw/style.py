@@ -73,8 +73,9 @@ def plain_ticks(figure: Figure) -> Figure:
 
 def _plain_minor(extent: float) -> FuncFormatter:
     """Numbers between the decades: as few as there is room for, but at least two with those of the decades."""
-    shown = "2357" if extent > FEWER_NUMBERS else "23456789"
-    return FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in shown else "")
+    if extent <= FEWER_NUMBERS:  # 0.14, 0.16 and so on, where no decade is near
+        return FuncFormatter(lambda value, _: f"{value:g}")
+    return FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "2357" else "")
 
 
 def envelope(y: np.ndarray) -> np.ndarray:

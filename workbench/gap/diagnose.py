@@ -34,6 +34,7 @@ from workbench.gap.report.budget import (
 )
 from workbench.gap.report.data_faults import data_faults
 from workbench.gap.report.experiment import Experiment, next_experiment
+from workbench.gap.report.levels import steady_remainder
 from workbench.gap.report.record_checks import check_modes, check_records, detectability
 from workbench.gap.report.setup_faults import check_disjoint, setup_faults
 from workbench.gap.report.verdict import Verdict
@@ -210,6 +211,7 @@ def diagnose(
                 *in_unseen,
                 *([OVER_FITTING] if outcome == "part" != attribution.outcome and not (in_unseen or of_setup) else []),
                 *([] if sound or disagreeing else _of_gap(outcome, where, budget, rig, units)),
+                *([] if sound else filter(None, [steady_remainder(corrected, (*records, *validation), settle=settle)])),
                 *_notes(attribution, budget, seconds, silent, sound),
                 *(_hiding(errors) if outcome == "explained" else ()),
             ),

@@ -12,9 +12,15 @@ from workbench.gap.localisation.force_lines import lines_of
 from workbench.gap.localisation.where import locate, locate_force
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model
+from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import AirDrag, Clearance, CoulombFriction, CubicSpring, LinearDamper, PeriodicForce
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes, PointShapes
 
 DT, SAMPLES, NOISE = 0.01, 2000, 1e-5
 
@@ -208,6 +214,20 @@ def test_a_gap_above_the_last_mode_is_of_no_mode(hinged_rig, measured):
     """Modes 3 and 4 of the real beam stand at 9 and 16 times the first, the model has two."""
     found = where(hinged_rig(2), [measured(hinged_rig(4), str(level), level, 3) for level in (0.1, 1.0)])
     assert found.share_above > 0.9
+    assert found.mode_shares.sum() + found.share_above == pytest.approx(1.0)
+
+
+def test_a_drift_of_a_free_structure_is_of_its_rigid_modes():
+    """Of two rigid modes and one of 2 Hz: a force of 0.1 Hz that is a fifth larger moves the rigid ones alone."""
+    shapes, omega = np.array([[1.0, -1.0, 0.2], [1.0, 0.3, -0.3], [1.0, 1.0, 0.2]]), 2.0 * np.pi * np.array([0, 0, 2.0])
+    modes = Modes(omega, np.array([0.0, 0.0, 0.02]), PointShapes(shapes), NamedPoints(("a", "b", "c")))
+    sensors = tuple(Sensor(f"d{at}", at, noise_std=NOISE) for at in "abc")
+    rig = Rig(modes, (Actuator("F", "a"),), sensors)
+    inputs = np.sin(2.0 * np.pi * 0.1 * DT * np.arange(SAMPLES))[None]
+    outputs = simulate(replace(rig, actuators=(Actuator("F", "a", gain=1.2),)), inputs, sample_time=DT).outputs
+    channels = tuple(Channel(s.name, s.quantity) for s in sensors)
+    found = where(rig, [Record(DT, outputs, channels, inputs, (Channel("F"),), name="slow")])
+    assert found.modes == (1, 2) and found.mode_shares[0] == found.mode_shares[1] > 0.49
     assert found.mode_shares.sum() + found.share_above == pytest.approx(1.0)
 
 

@@ -248,6 +248,7 @@ class WhereSettings:
     # nearly in the span of resonators close to the mode
     spread: tuple[float, ...] = (0.85, 0.93, 0.97, 0.99, 1.0, 1.01, 1.03, 1.07, 1.15)
     most_modes: int = 6  # that have resonators
+    rigid: float = 0.5  # of the frequency of the first elastic mode: the end of the band of rigid modes
     above: float = 1.15  # of the frequency of the last mode: the end of its band
     louder: float = 2.0  # of levels, gaps and floors: what is larger than others by less tells nothing of amplitude
     linear: float = 0.9  # share of the gap's power that one linear reply explains, from which on the gap is linear
@@ -270,9 +271,11 @@ class Where:
 
     Attributes:
         path: "actuator", "structure", "sensor", "environment", or "none".
-        modes: one-based numbers of the modes around whose frequencies at least a twentieth of the gap lies.
+        modes: one-based numbers of the modes around whose frequencies at least a twentieth of the gap lies; of rigid
+            modes, which share one band, all or none.
         amplitude_dependent: whether the gap changes with level; None where the records do not establish it.
-        mode_shares: (n_modes,) share of the gap in the band around each natural frequency.
+        mode_shares: (n_modes,) share of the gap in the band around each natural frequency; each rigid mode has an equal
+            part of what lies below half the first elastic one.
         share_above: of the gap, above the band of the last mode.
         band_edges_hz: (n_bands + 1,) of octaves down from half the sample rate, the lowest open to zero.
         band_shares: (n_bands,) share of the gap in each.
@@ -352,10 +355,8 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
     by_sensor = np.maximum(excess[telling], 0.0).sum(axis=0)
     seen = [(data.counted[i], scaled[i]) for i in telling]
     frequencies = evidence.rig.modes.frequencies_hz
-    between = np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0))
-    top = WHERE.above * frequencies[-1] or np.inf  # of rigid modes alone nothing lies above
-    *by_mode, above = _shares_between(np.r_[0.0, between, top, np.inf], seen, data.noise)
-    mode_shares = np.array(by_mode)
+    mode_shares, above = _by_mode(frequencies, seen, data.noise)
+    in_band = np.where(frequencies > 0, mode_shares, mode_shares[frequencies == 0].sum())
     octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - WHERE.octaves, 1)]
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
     share = linear_share(
@@ -365,10 +366,10 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
     distortions = np.array([_distortion(evidence.rig, record, residual) for record, residual in each])
     return Where(
         path=_path(evidence, excess, by_sensor, effects),
-        modes=tuple(int(r) + 1 for r in np.flatnonzero(mode_shares > WHERE.mode_share)),
+        modes=tuple(int(r) + 1 for r in np.flatnonzero(in_band > WHERE.mode_share)),
         amplitude_dependent=_amplitude_dependent(effects, gaps, noise, levels, share, distortions),
         mode_shares=mode_shares,
-        share_above=float(above),
+        share_above=above,
         band_edges_hz=octaves,
         band_shares=_shares_between(octaves, seen, data.noise),
         sensor_shares=by_sensor / max(by_sensor.sum(), 1e-300),
@@ -381,6 +382,20 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
         distortions=distortions,
         place=place,
     )
+
+
+def _by_mode(frequencies: Floats, scaled: Sequence[tuple[Record, Floats]], noise: Floats) -> tuple[Floats, float]:
+    """Share of the residuals' power in the band of each mode (n_modes,), and above that of the last.
+
+    Rigid modes, which no frequency tells apart, have one band, in equal parts.
+    """
+    elastic = frequencies[frequencies > 0]
+    n_rigid = frequencies.size - elastic.size
+    first = WHERE.rigid * elastic[:1] * (n_rigid > 0)
+    between, top = np.sqrt(elastic[1:] * elastic[:-1]), WHERE.above * elastic[-1:]
+    rigid, *others = _shares_between(np.r_[0.0, first, between, top, np.inf], scaled, noise)
+    above = others.pop() if others else 0.0  # of rigid modes alone nothing lies above
+    return np.r_[np.full(n_rigid, rigid / max(n_rigid, 1)), others], float(above)
 
 
 def _shares_between(edges: np.ndarray, scaled: Sequence[tuple[Record, Floats]], noise: Floats) -> np.ndarray:

@@ -8,12 +8,14 @@ from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
+from workbench.gap.report.record_checks import LEAST_SAMPLES
 from workbench.gap.search.fit import Fit
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 LEVELS = (0.3, 1.0, 3.0)
 SEPARATED = 25.0
+PERIODS = 3.0  # of the first elastic mode: the shortest experiment, which a structure needs to answer
 LONGEST = 1e3  # times the length of the record: what would take longer is seen in rounding, not in a measurement
 
 
@@ -25,8 +27,9 @@ class Experiment:
         like: name of the record whose input it repeats.
         inputs: names of the inputs that are driven; the others rest.
         level: factor on that record's input.
-        seconds: length at which the rivals differ by five standard deviations; inf where they never would, or would
-            in a thousand times the length of the record.
+        seconds: length at which the rivals differ by five standard deviations, no shorter than a record must be and
+            than three periods of the first elastic mode; inf where they never would, or would in a thousand times the
+            length of the record.
         rivals: labels of the two explanations it separates.
         time: name of the unit of time.
     """
@@ -46,7 +49,7 @@ class Experiment:
             return f"No experiment on this rig separates {one} from {other}."
         return (
             f"To separate {one} from {other}: drive {' and '.join(self.inputs)} as in record"
-            f" {self.like} at {self.level:g} times its level, for {max(self.seconds, 0.0):.3g} {self.time}."
+            f" {self.like} at {self.level:g} times its level, for {self.seconds:.3g} {self.time}."
         )
 
 
@@ -61,12 +64,19 @@ def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Wor
     def experiment(record: Record, inputs: tuple[str, ...], level: float) -> Experiment:
         rate = _separation(rig, best, rival, replace(data, records=(_varied(record, inputs, level),)))
         separates = rate * LONGEST * record.n_samples * record.sample_time > SEPARATED
-        return Experiment(record.name, inputs, level, SEPARATED / rate if separates else np.inf, names)
+        seconds = max(SEPARATED / rate, _shortest(rig, record.sample_time)) if separates else np.inf
+        return Experiment(record.name, inputs, level, seconds, names)
 
     choices = [(record, inputs, level) for record in data.records for inputs in _choices(record) for level in LEVELS]
     tried = workers.map(lambda choice: experiment(*choice), choices)
     soonest = min(tried, key=lambda each: each.seconds)
     return soonest if np.isfinite(soonest.seconds) else Experiment("", (), 1.0, np.inf, names)
+
+
+def _shortest(rig: Rig, sample_time: float) -> float:
+    """Seconds that an experiment lasts at least."""
+    elastic = rig.modes.frequencies_hz[rig.modes.frequencies_hz > 0]
+    return float(max([LEAST_SAMPLES * sample_time, *PERIODS / elastic[:1]]))
 
 
 def _choices(record: Record) -> list[tuple[str, ...]]:

@@ -124,7 +124,7 @@ class Verdict:
             return self._of_no_gap
         named = [_described(effect, self.nominal, self.units) for effect in self._named]
         words = joined_in_words(named)
-        closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
+        closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of its rms"
         if self.outcome == "explained":
             shares = [self._share_of(effect) for effect in self._named]
             if len(named) == 1:
@@ -143,14 +143,14 @@ class Verdict:
                 near = words and (self.shrinkage is None or self.shrinkage.overall >= NEAR)
                 beside = f" beside {self._errors_named}" if self.budget.nominal >= SHOWN else ""
                 text += (
-                    f"; the nearest, {words}{beside}, would close {closed or 'part of '}it."
+                    f"; the nearest, {words}{beside}, would close {closed or 'part of it'}."
                     if near
                     else f"{self._rest}."
                 )
             elif self.alternatives:
-                text += f" as likely as {words}, which explains {closed}it{self._not_excluded}"
+                text += f" as likely as {words}, which explains {closed or 'it'}{self._not_excluded}"
             else:
-                text += f"; {words} explains {closed}it."
+                text += f"; {words} explains {closed or 'it'}."
         return text[0].upper() + text[1:]
 
     @property

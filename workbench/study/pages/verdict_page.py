@@ -66,11 +66,11 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
                 "Where the gap is: its power above the noise, by sensor, mode and record; and the likelihood of a"
                 " single unknown force at each place, no law assumed.",
             ),
-            (
-                plot_unmodelled_force(verdict),
-                "The unmodelled force reconstructed from the records, over the motion at its place.",
-            ),
         ]
+        acting = any(effect.at is not None and effect.kind.path == "structure" for effect in verdict.effects)
+        if acting or verdict.where.place.is_single_force is not False:  # else a force there is what no force is
+            made = "The unmodelled force reconstructed from the records, over the motion at its place."
+            figures.append((plot_unmodelled_force(verdict), made))
         if verdict.attribution.singles:  # none were tried where errors of the model were fitted from the first
             each = "Residual with each effect alone, without errors of the model: at the noise floor, it explains all."
             figures.append((plot_single_effects(verdict), each))
