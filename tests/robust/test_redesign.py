@@ -15,6 +15,7 @@ from workbench.design.laws.on_off import on_off
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
+from workbench.records.units import Units
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.robust.on_rig import default_estimator, fitted, impulse_test, tuned
@@ -353,7 +354,20 @@ def test_moving_the_actuators_is_offered_where_it_pays(rig):
     moved = found.relocation
     assert moved is not None and 0.0 < moved.gain < 1.0
     assert moved.moved.effort <= 1.001 * moved.present.effort
+    assert " mm instead of 0.45, 1.2 mm would" in replace(moved, units=Units("mm", "t")).sentence
     assert found.to_json()["placement"]["residual_work"][1] < found.to_json()["placement"]["residual_work"][0]
+
+
+def test_a_case_in_millimetres_and_tonnes_is_told_in_these(rig, controller, tmp_path):
+    late = uncertain(rig, effect("actuator_dead_zone", "all", width=0.3))
+    found = redesign(
+        late, controller, sample_time=DT, impulse_at=0.8, draws=2, placement=False, units=Units("mm", "t", "s", "kN")
+    )
+    assert "dead zone 0.3 kN" in " ".join(step.what for step in found.steps)
+    found.export(tmp_path / "law.c")
+    header = (tmp_path / "law.h").read_text(encoding="utf-8")
+    assert ", mm\n" in header and ", kN\n" in header and ", t^0.5 mm/s\n" in header
+    assert not re.search(r", (kg\S* )?(m|N)\b", header)
 
 
 def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, controller):
