@@ -261,7 +261,7 @@ def placement_task(
 
     Raises:
         DesignError: no residual mode, damping that couples the modes, an impulse that moves nothing, probabilities that
-            are none, or a time that is not positive.
+            are none, a time that is not positive, or an actuator with a delay or a lag.
     """
     if not 1 <= n_controlled < modes.n_modes:
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
@@ -280,6 +280,12 @@ def placement_task(
         raise DesignError(
             f"actuator {actuator.name} acts between two places; such are placed along an interval only: place forces or"
             " moments, or compare pairs of points one by one"
+        )
+    if actuator is not None and (actuator.delay or actuator.time_constant):
+        late = "delay" if actuator.delay else "time_constant"
+        raise DesignError(
+            f"actuator {actuator.name} has {late} = {getattr(actuator, late):g}, and the best places are known for"
+            " forces that follow at once: place it without, and see by close_loop or export what the law does with it"
         )
     n = n_controlled
     omega = modes.omega[:n]
