@@ -234,7 +234,8 @@ def frame_net(domain: Domain) -> Net:
         return np.moveaxis(see(found), 2, 1)
 
     def spot(place: Any) -> np.ndarray:
-        return see(np.asarray(domain.positions)[domain.locate(place)[0]])
+        index = domain.nodes.index(place) if place in domain.nodes else domain.locate(place)[0]
+        return see(np.asarray(domain.positions)[index])
 
     return Net(see(at), _neighbours(at), moves, spot)
 

@@ -14,8 +14,8 @@ from workbench.draw.style import COLOURS, new_figure
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
 from workbench.robust.redesign import Redesign
-from workbench.robust.verification import Verification, interval
-from workbench.structure.domain import NamedPoints, Where
+from workbench.robust.verification import Verification, displacement_at, interval
+from workbench.structure.domain import NamedPoints
 from workbench.study.pages.page import PageContent, Table, block, write_page
 from workbench.study.pages.verdict_page import case_inputs
 from workbench.study.runs.outcome import Shown
@@ -176,15 +176,13 @@ def _readings(found: Redesign, record: Record, responses: dict[str, Response]) -
     n = next(iter(responses.values())).time.size
     if seen:
         i, sensor = max(seen, key=lambda one: float(np.abs(record.outputs[one[0], :n]).max()))
-        at: Where = sensor.at
-        name = sensor.name
+        shape, name = rig.modes.phi_at(sensor.at, direction=sensor.direction), sensor.name
         ax.plot(
             record.time[:n], record.outputs[i, :n], color="#8a8a8a", linewidth=0.8, label="measured, without control"
         )
     else:
-        at, name = rig.actuators[0].at, f"at {rig.actuators[0].name}"
+        shape, name = displacement_at(rig.modes, rig.actuators[0]), f"at {rig.actuators[0].name}"
     for (label, response), colour in zip(responses.items(), (COLOURS[1], COLOURS[0]), strict=True):
-        shape = response.modes.phi_at(at)
         ax.plot(
             response.time, shape @ response.modal[: response.modes.n_modes], color=colour, linewidth=1.0, label=label
         )
