@@ -323,7 +323,8 @@ class Redesign:
         less = 1.0 - self._over[0]
         if self._sooner and self._sooner_by >= less:  # of the two gains the larger one is the reason
             return f"{self._settles(new)} where the present one {self._settles(old)}"
-        return f"takes {_percent(abs(less))} {'less' if less > 0 else 'more'} vibration and effort than the present one"
+        parts = (_times(getattr(new, part), getattr(old, part)) + f" {part}" for part in ("vibration", "effort"))
+        return f"{'lowers' if less > 0 else 'raises'} the cost J by {_percent(abs(less))}, with {' and '.join(parts)}"
 
     def _settles(self, verification: Verification, what: str = "") -> str:
         """How soon it settles, in the median of the draws, in words."""
