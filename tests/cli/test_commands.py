@@ -211,6 +211,23 @@ def test_place_does_better_than_even_places(rig, tmp_path):
     assert best["effort"] <= 1.5 * even["effort"] * (1 + 1e-6)
 
 
+def test_patches_on_a_beam_are_placed_beside_each_other(tmp_path):
+    inputs = "".join(
+        f'[[input]]\nname = "P{i}"\nkind = "actuator"\nquantity = "moment"\nat = {at}\npatch = 0.4\n'
+        for i, at in enumerate((0.3, 0.8))
+    )
+    path, found = tmp_path / "beam.toml", tmp_path / "places.json"
+    path.write_text(
+        '[structure]\nkind = "beam"\nlength = 1.2\nmass_per_length = 0.62\nbending_stiffness = 14.0\nleft = "clamped"\n'
+        f'right = "free"\nmodes = 6\ndamping_ratio = 0.004\n{inputs}[[input]]\nname = "hammer"\nkind = "hammer"\n'
+        'at = 0.9\n[[output]]\nname = "y"\nquantity = "displacement"\nat = 0.4\nnoise_std = 1e-6\n'
+    )
+    result = run("place", path, "--control", 2, "--effort", 3, "--json", found)
+    assert result.exit_code == 0, result.output
+    first, second = json.loads(found.read_text())["placements"][0]["positions"]
+    assert second - first >= 0.4 - 1e-6 and "overlap" not in result.output
+
+
 @pytest.mark.slow
 def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
     found = tmp_path / "places.json"

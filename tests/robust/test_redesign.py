@@ -15,6 +15,7 @@ from workbench.design.laws.on_off import on_off
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
+from workbench.records.units import Units
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.robust.on_rig import default_estimator, fitted, impulse_test, tuned
@@ -248,7 +249,10 @@ def test_a_gain_of_nothing_is_no_reason_to_change_the_controller(rig, controller
     ]
     assert [one.advice.split(":")[0] for one in found] == ["Either controller does", "Use the redesigned controller"]
     # of a settling time that is shorter by a part in a thousand nobody is told where the cost falls by more
-    for less, said in ((0.02, "it takes 2 % less vibration and effort"), (0.0, "Either controller does")):
+    for less, said in (
+        (0.02, "it lowers the cost J by 2 %, with 0.98 times the vibration and"),
+        (0.0, "Either controller does"),
+    ):
         verification = told([True, True], [1.0 - less] * 2, [-1.0, -1.0], settling=np.full(2, 0.998))
         assert said in replace(sure, present_verification=present, verification=verification, weight=0.0).advice
 
@@ -353,7 +357,20 @@ def test_moving_the_actuators_is_offered_where_it_pays(rig):
     moved = found.relocation
     assert moved is not None and 0.0 < moved.gain < 1.0
     assert moved.moved.effort <= 1.001 * moved.present.effort
+    assert " mm instead of 0.45, 1.2 mm would" in replace(moved, units=Units("mm", "t")).sentence
     assert found.to_json()["placement"]["residual_work"][1] < found.to_json()["placement"]["residual_work"][0]
+
+
+def test_a_case_in_millimetres_and_tonnes_is_told_in_these(rig, controller, tmp_path):
+    late = uncertain(rig, effect("actuator_dead_zone", "all", width=0.3))
+    found = redesign(
+        late, controller, sample_time=DT, impulse_at=0.8, draws=2, placement=False, units=Units("mm", "t", "s", "kN")
+    )
+    assert "dead zone 0.3 kN" in " ".join(step.what for step in found.steps)
+    found.export(tmp_path / "law.c")
+    header = (tmp_path / "law.h").read_text(encoding="utf-8")
+    assert ", mm\n" in header and ", kN\n" in header and ", t^0.5 mm/s\n" in header
+    assert not re.search(r", (kg\S* )?(m|N)\b", header)
 
 
 def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, controller):

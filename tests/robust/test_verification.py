@@ -8,11 +8,18 @@ import pytest
 from workbench.design.estimation.digital import sampled
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.imsc import imsc
-from workbench.design.loop.rig_loop import LoopTest
+from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import LinearSpring, PeriodicForce
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.robust.on_rig import impulse_test
+from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.verification import verify
+from workbench.structure.domain import NamedPoints, Patch
+from workbench.structure.modes import Modes, PointShapes
+from workbench.structure.plate import Plate
 
 
 def test_what_no_loop_can_be_made_of_is_refused(rig):
@@ -75,3 +82,38 @@ def test_forces_neither_hide_growth_nor_pass_for_it(rig):
         assert verify([rig], controller, LoopTest(n, 0.01, forces=force, ports=port)).stable.all()
     hummed = replace(rig, elements=(PeriodicForce(0.83, rig.modes.omega[3] / (2 * np.pi), 1.0, 0.0),))
     assert verify([hummed], controller, LoopTest(n, 0.01)).stable.all()
+
+
+def patched_plate():
+    plate = Plate(
+        length=(1.0, 0.8), mass_per_area=5.0, bending_stiffness=60.0, poisson_ratio=0.3, edges="simply supported"
+    )
+    patches = [Actuator(f"P{i}", Patch(x, 0.3, 0.1, 0.1), kind="moment") for i, x in enumerate((0.25, 0.6))]
+    return plate.modes(4), patches, [(0.25, 0.3), (0.6, 0.3)]
+
+
+def frame_of_two_nodes():
+    """Its first actuator by node and direction, as a case gives it; both drive x."""
+    names, nodes, directions = ("ax", "ay", "bx", "by"), ("a", "a", "b", "b"), ("x", "y") * 2
+    shapes = np.array([[0.6, 0.5, 0.3], [0.1, 0.2, 0.6], [0.7, -0.6, 0.1], [0.2, 0.3, -0.5]])
+    modes = Modes(np.array([10.0, 25.0, 60.0]), 0.01, PointShapes(shapes), NamedPoints(names, None, directions, nodes))
+    return modes, [Actuator("A", "a", direction="x"), Actuator("B", "bx")], ["ax", "bx"]
+
+
+@pytest.mark.parametrize("structure", [patched_plate, frame_of_two_nodes])
+@pytest.mark.parametrize("kind", ["poles", "on-off"])
+def test_patches_and_directions_are_controlled_and_their_stroke_is_that_of_the_place(structure, kind):
+    modes, actuators, places = structure()
+    sensors = [Sensor(f"y{i}", at, noise_std=1e-6) for i, at in enumerate(places)]
+    rig = Rig(modes, tuple(actuators), tuple(sensors))
+    law = plain_law(kind, rig, 2, damping=0.05)
+    dt = 0.05 / modes.omega[-1]
+    test = impulse_test(rig, (0, 1), dt)
+    if kind == "on-off":
+        assert all(relay.force > 0 for relay in law.relays)
+        return
+    controller = sampled(kalman(modes, law, sensors, disturbance=1.0, noise=1e-8), dt)
+    found = verify([rig], controller, test)
+    run = run_loop(rig, controller, test)
+    moved = modes.phi(places) @ run.response.modal[: modes.n_modes]
+    assert found.stroke[0] == pytest.approx(np.abs(moved).max(), rel=1e-12)

@@ -7,7 +7,7 @@ import typer
 from workbench.cli import options
 from workbench.cli.rig_file import impulse_place, read_structure_rig, toml_of
 from workbench.cli.terminal import check_target, guarded, say, show_table, write_json
-from workbench.structure.printed import command_headings, place_text
+from workbench.structure.printed import command_headings
 
 if TYPE_CHECKING:
     from workbench.design.spillover.explain import Explanation
@@ -139,5 +139,5 @@ def _limit(explained: "Explanation") -> tuple[str, str]:
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without it"
     return (
         f"mode {worst.mode + 1}: {pole}",
-        f"sensor at {place_text(worst.paths[0].sensor_at)} to {worst.paths[0].actuator}",
+        f"sensor at {worst.dominant.text}",
     )

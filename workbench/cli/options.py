@@ -57,7 +57,8 @@ Damping = Annotated[
 Disturbance = Annotated[
     float,
     typer.Option(
-        help="For the Kalman filter: intensity of white modal forces; the sensors' noise is noise_std of the outputs."
+        help="For the Kalman filter: intensity of white modal forces; less makes it slower. The sensors' noise is"
+        " noise_std of the outputs."
     ),
 ]
 RecordName = Annotated[

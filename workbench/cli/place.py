@@ -10,7 +10,7 @@ import typer
 from workbench.cli import options
 from workbench.cli.rig_file import impulse_place, place_in, read_structure_rig, toml_of, typed_place
 from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
-from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, listed, middle
+from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, listed, middle, reach
 from workbench.structure.printed import command_headings, place_text
 
 if TYPE_CHECKING:
@@ -34,7 +34,11 @@ def place(
         float, typer.Option(help="Effort limit, times that of evenly spaced actuators (beam), or of the rig's own.")
     ] = 1.5,
     spacing: Annotated[
-        float | None, typer.Option(help="Least distance between actuators, m; 1/20 of the size unless given.")
+        float | None,
+        typer.Option(
+            help="Least distance between middles of actuators, m; unless given 1/20 of the size, and of patches on a"
+            " beam their length. On a plate patches may overlap, which is told; their diagonal keeps them apart."
+        ),
     ] = None,
     peak_force: Annotated[
         float, typer.Option(help="Force limit of each actuator, N; moment limit of patches, N m (N m/m on a plate).")
@@ -72,7 +76,7 @@ def place(
     from workbench.design.placement.limits import Limits
     from workbench.design.placement.placement import nodes_of_mode, placement_task
     from workbench.design.placement.placement import place_actuators as least_work
-    from workbench.design.placement.task import patch_of
+    from workbench.design.placement.task import SPREAD, extent, patch_of
     from workbench.rig.actuators import command_unit
 
     check_target(json_path, picture)
@@ -98,7 +102,7 @@ def place(
                     "the rig's own actuators cannot control these modes (B is singular), so their effort is no measure"
                     " for --effort: move one off the nodal lines"
                 )
-        least = 0.0 if isinstance(domain, NamedPoints) else LEAST_SPACING * domain.size
+        least = 0.0 if isinstance(domain, NamedPoints) else max(LEAST_SPACING * domain.size, extent(task.actuator))
         limits = Limits(
             effort=effort * usual.effort,
             spacing=least if spacing is None else spacing,
@@ -124,9 +128,10 @@ def place(
 
             certificate = certify(task, limits, placement=best, gap=certified_gap, progress=proving)
     rows = [best, usual]
-    nodes = nodes_of_mode(modes, control) if isinstance(domain, Interval) else None
-    if nodes is not None and nodes.size == control:
-        rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
+    if isinstance(domain, Interval):
+        nodes, (first, last) = nodes_of_mode(modes, control), task.reach
+        if nodes.size == control and first <= nodes.min() and nodes.max() <= last:  # a patch may reach beyond the end
+            rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
     shown = []
     for row in rows:
         where = ("; " if isinstance(domain, Rectangle) else ", ").join(map(place_text, listed(row.positions)))
@@ -140,6 +145,9 @@ def place(
     unit = command_unit([task.actuator])
     told = map(units.named, (where, "W_R [J]", *command_headings(unit)))
     show_table((*told, "condition number of B", ""), shown)
+    if best.overlapping:
+        size = float(np.linalg.norm(2.0 * reach(domain, task.actuator.at)[0]))  # type: ignore[arg-type]
+        say(f"  patches overlap; {SPREAD}: --spacing {size:.3g}")
     if certificate is not None:
         say(f"  {certificate}")
     if picture is not None:

@@ -107,6 +107,7 @@ def redesign(
             criterion=criterion,
             more_cost=more_cost,
             more_work=more_work,
+            units=found.units,
             progress=lambda what, share: report(what, 0.7 + 0.3 * share),
         )
     say(f"{result.advice} {result.guarantee}".rstrip(), bold=True)

@@ -29,6 +29,7 @@ def response_motion(
     actuators: Sequence[Actuator] = (),
     sensors: Sequence[Sensor] = (),
     colours: Mapping[str, str] | None = None,
+    length: str = "m",
 ) -> dict[str, Any]:
     """Responses of one structure, moving on one picture: over each other along a beam, side by side as nets.
 
@@ -36,6 +37,7 @@ def response_motion(
         responses: by the name under which each is shown; all over the same times and of the same modes' number.
         actuators, sensors: marked at their places.
         colours: of responses by name; None for the first of several in grey.
+        length: the unit of x.
 
     Raises:
         ValueError: responses over different times, or at named points without positions.
@@ -67,7 +69,7 @@ def response_motion(
     x = np.linspace(0.0, first.modes.length, N_PLACES)
     for track, response in zip(tracks, responses.values(), strict=True):
         track["shapes"] = _numbers(response.modes.phi(x))
-    return shown | {"x": _numbers(x), "label": ALONG, **_places(actuators, sensors)}
+    return shown | {"x": _numbers(x), "label": f"x [{length}]", **_places(actuators, sensors)}
 
 
 def mode_motion(
@@ -232,7 +234,8 @@ def frame_net(domain: Domain) -> Net:
         return np.moveaxis(see(found), 2, 1)
 
     def spot(place: Any) -> np.ndarray:
-        return see(np.asarray(domain.positions)[domain.locate(place)[0]])
+        index = domain.nodes.index(place) if place in domain.nodes else domain.locate(place)[0]
+        return see(np.asarray(domain.positions)[index])
 
     return Net(see(at), _neighbours(at), moves, spot)
 

@@ -22,8 +22,9 @@ from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
 from workbench.robust.compensation import Loop, check_rate, without
+from workbench.robust.plain_law import struck_by
 from workbench.robust.small_motion import loop_poles
-from workbench.structure.domain import Patch, Where
+from workbench.structure.domain import Between, Domain, NamedPoints, Patch, Where
 from workbench.structure.modes import Modes, mac
 
 Design = Law | OnOffLaw | Controller | PlacementTask
@@ -112,7 +113,7 @@ def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> 
     shapes = np.abs(rig.modes.phi(places))
     at = given
     if at is None:
-        at = next((a for a in rig.actuators if a.direct), rig.actuators[0]).at
+        at = _place_of(rig.modes.domain, next((a for a in rig.actuators if a.direct), rig.actuators[0]))
     turns = isinstance(at, Patch)  # it has moments along its edges, and no displacement
     if not turns and np.abs(rig.modes.phi_at(at)[list(controlled)]).max() > UNMOVED * shapes.max():
         return at
@@ -124,6 +125,15 @@ def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> 
     moved = shapes[:, list(controlled)]
     most: Where = places[int((moved / np.maximum(moved.max(axis=0), 1e-300)).min(axis=1).argmax())]
     return most
+
+
+def _place_of(domain: Domain, port: Actuator) -> Where:
+    """Its place; of a node and a direction the point that moves so."""
+    if not isinstance(domain, NamedPoints) or port.direction is None:
+        return port.at
+    places = port.at if isinstance(port.at, Between) else (port.at,)
+    names, _, _ = domain.slope(list(places), int(port.kind == "moment"), port.direction)
+    return Between(*names) if isinstance(port.at, Between) else names[0]
 
 
 def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
@@ -171,8 +181,9 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
             " one that does"
         )
     index = list(law.controlled)
-    at = rig.actuators[0].at if test.impulse_at is None else test.impulse_at
-    speed = np.abs(test.impulse * rig.modes.phi_at(at)[index])
+    at = test.impulse_at
+    shape = struck_by(rig.modes, rig.actuators[0]) if at is None else rig.modes.phi_at(at)
+    speed = np.abs(test.impulse * shape[index])
     speed = np.maximum(speed, 0.1 * speed.max())
     push = speed**2 / (test.n_samples * test.sample_time)
     shapes = np.abs(output_matrix(rig.modes, sensors)[:, index])

@@ -1,6 +1,7 @@
 """A law from one number: the damping that its controlled modes should have."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -38,7 +39,7 @@ def plain_law(
         controlled: how many of the lowest modes, or which; as many as actuators unless given.
         damping: ζ wanted of controlled modes: poles give it, the weights of IMSC and coupled LQR come near it where it
             is small; on-off control takes none.
-        impulse_at, impulse: for which on-off forces are sized, N s.
+        impulse_at, impulse: for which on-off forces are sized, N s; by the first actuator itself unless given.
 
     Raises:
         DesignError: an unknown kind, no actuator, or a damping ratio out of range.
@@ -54,36 +55,42 @@ def plain_law(
     index = controlled_indices(modes, len(actuators) if controlled is None else controlled)
     if (modes.omega[list(index)] == 0).any():
         raise DesignError("a rigid mode has no damping ratio; design its law with a weight or poles of your own")
-    at = impulse_at if impulse_at is not None else actuators[0].at
-    return KINDS[kind](modes, index, actuators, damping, np.abs(impulse * modes.phi_at(at)[list(index)]))
+    if kind == "on-off":
+        shape = struck_by(modes, actuators[0]) if impulse_at is None else modes.phi_at(impulse_at)
+        return _on_off(modes, index, actuators, np.abs(impulse * shape[list(index)]))
+    return LINEAR[kind](modes, index, actuators, damping)
 
 
-Rule = Callable[[Modes, tuple[int, ...], list[Actuator], float, np.ndarray], Law | OnOffLaw]
+def struck_by(modes: Modes, actuator: Actuator) -> np.ndarray:
+    """Modal forces (n_modes,) of a unit force, or moment, by an actuator without losses and a gain of 1."""
+    return input_matrix(modes, [replace(actuator, gain=1.0)])[:, 0]
 
 
-def _imsc(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float, _: np.ndarray) -> Law:
+Rule = Callable[[Modes, tuple[int, ...], list[Actuator], float], Law]
+
+
+def _imsc(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float) -> Law:
     return imsc(modes, index, actuators, weight=0.5 / (ratio * modes.omega[list(index)]) ** 2)
 
 
-def _coupled(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float, _: np.ndarray) -> Law:
+def _coupled(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float) -> Law:
     reach = (input_matrix(modes, actuators)[list(index)] ** 2).sum(axis=1)
     return coupled_lqr(
         modes, index, actuators, weight=float(np.mean(0.5 * reach / (ratio * modes.omega[list(index)]) ** 2))
     )
 
 
-def _poles(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float, _: np.ndarray) -> Law:
+def _poles(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float) -> Law:
     poles = modes.omega[list(index)] * (-ratio + 1j * np.sqrt(1.0 - ratio**2))
     return coupled_poles(modes, index, actuators, poles=poles)
 
 
-def _on_off(
-    modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float, speed: np.ndarray
-) -> OnOffLaw:
+def _on_off(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], speed: np.ndarray) -> OnOffLaw:
     speed = np.maximum(speed, 0.1 * speed.max())
     # each period takes 4 k / ω² from the amplitude q'/ω
     force = speed * modes.omega[list(index)] / (4.0 * PERIODS)
     return on_off(modes, index, actuators, force=force, dead_band=BAND * speed)
 
 
-KINDS: Mapping[str, Rule] = {"imsc": _imsc, "coupled": _coupled, "poles": _poles, "on-off": _on_off}
+LINEAR: Mapping[str, Rule] = {"imsc": _imsc, "coupled": _coupled, "poles": _poles}
+KINDS = (*LINEAR, "on-off")

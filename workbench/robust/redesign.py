@@ -16,6 +16,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, named, run_loop
 from workbench.gap.report.verdict import Verdict
+from workbench.records.units import SI, Units
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction
@@ -105,6 +106,7 @@ class Redesign:
             present one.
         relocation: where the actuators should stand for the corrected structure; None where that is not known.
         notes: what else a reader should know.
+        units: by which numbers are told, and signals in a file of the controller.
     """
 
     uncertain_rig: UncertainRig
@@ -124,6 +126,7 @@ class Redesign:
     more_work: float = np.inf
     relocation: Relocation | None = None
     notes: tuple[str, ...] = ()
+    units: Units = SI
 
     pays, aim = Renamed("improves"), Renamed("criterion")
     promise, figures = Renamed("guarantee"), Renamed("comparison")
@@ -284,7 +287,7 @@ class Redesign:
             if not np.isfinite(high):
                 return self._settles(verification)
             ends = "the same in all samples" if f"{low:.3g}" == f"{high:.3g}" else f"{lead}{low:.3g} to {high:.3g}"
-            return f"{'settles in ' * named}{middle:.3g} s ({ends})"
+            return f"{'settles in ' * named}{middle:.3g} {self.units.time} ({ends})"
         ratios = _ratios(verification.damping[:, self.mode], lead)
         return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
 
@@ -301,7 +304,7 @@ class Redesign:
         forces = [
             interval(verification.peak_force)[0] for verification in (self.verification, self.present_verification)
         ]
-        after, before = (f"{force:.3g} N" for force in forces)
+        after, before = (f"{force:.3g} {self.units.force}" for force in forces)
         forced = f", with at most {after} instead of {before}" if np.isfinite(forces).all() and after != before else ""
         sure = f"it does better on {_of(self._better_on, self.verification.n_draws)} samples"
         return f"Use the redesigned controller: it {difference}{forced} (medians); {sure}."
@@ -320,12 +323,15 @@ class Redesign:
         less = 1.0 - self._over[0]
         if self._sooner and self._sooner_by >= less:  # of the two gains the larger one is the reason
             return f"{self._settles(new)} where the present one {self._settles(old)}"
-        return f"takes {_percent(abs(less))} {'less' if less > 0 else 'more'} vibration and effort than the present one"
+        parts = (_times(getattr(new, part), getattr(old, part)) + f" {part}" for part in ("vibration", "effort"))
+        return f"{'lowers' if less > 0 else 'raises'} the cost J by {_percent(abs(less))}, with {' and '.join(parts)}"
 
     def _settles(self, verification: Verification, what: str = "") -> str:
         """How soon it settles, in the median of the draws, in words."""
         time = interval(self._settling(verification))[0]
-        return f"settles{what} in {time:.3g} s" if np.isfinite(time) else f"does not settle{what} within the test"
+        if not np.isfinite(time):
+            return f"does not settle{what} within the test"
+        return f"settles{what} in {time:.3g} {self.units.time}"
 
     @property
     def left_undamped(self) -> str:
@@ -373,12 +379,12 @@ class Redesign:
         Raises:
             ValueError: an ending of another kind, or a name that C or Python cannot have.
         """
-        rig, used = self.uncertain_rig.rig, self.controller
+        rig, used, units = self.uncertain_rig.rig, self.controller, self.units
         return write_controller(
-            used,
+            replace(used, states=tuple(map(units.named, used.states))),
             path,
-            readings=reading_words(rig.modes.domain, [named(rig.sensors, name) for name in used.sensors]),
-            commands=command_words(rig.modes.domain, [named(rig.actuators, name) for name in used.actuators]),
+            readings=reading_words(rig.modes.domain, [named(rig.sensors, name) for name in used.sensors], units),
+            commands=command_words(rig.modes.domain, [named(rig.actuators, name) for name in used.actuators], units),
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -414,6 +420,7 @@ def redesign(
     criterion: str | None = None,
     more_cost: float = MORE_COST,
     more_work: float = np.inf,
+    units: Units | None = None,
     progress: Report = lambda text, share: None,
 ) -> Redesign:
     """A controller of the same kind, redesigned for the corrected rig, and both verified on the same samples of it.
@@ -436,6 +443,7 @@ def redesign(
             minimises it, and "settling" for one by poles or on-off.
         more_cost: share by which the redesigned controller may cost more than the present one where it settles sooner.
         more_work: share by which it may do more work, W = Σ_r |W_r|: as much as it takes, unless given.
+        units: by which results are told; those of the verdict unless given.
         progress: called with (what, share done).
 
     Raises:
@@ -454,6 +462,7 @@ def redesign(
         check_test(test)
     uncertain = verdict if isinstance(verdict, UncertainRig) else UncertainRig.of(verdict)
     nominal, corrected = uncertain.nominal, uncertain.rig
+    units = units or (verdict.units if isinstance(verdict, Verdict) else SI)
     if test is not None:
         sample_time = test.sample_time if sample_time is None else sample_time
     if sample_time is not None:
@@ -476,7 +485,7 @@ def redesign(
     for _ in range(2):  # elements are worth another stiffness in the smaller motion of the redesigned loop
         anew = designed_anew(loop, corrected, modes)
         wanted = criterion or ("cost" if _weighted(anew) else "settling")
-        redesigned, steps, anew, weight, judged = _compensated(corrected, anew, test, present, wanted)
+        redesigned, steps, anew, weight, judged = _compensated(corrected, anew, test, present, wanted, units)
         after = run_loop(corrected, redesigned, test)
         if not corrected.elements or not after.bounded:
             break
@@ -487,11 +496,11 @@ def redesign(
     progress("verification on the samples", 0.65)
     new = verify(rigs, redesigned, test, controlled=anew.law.controlled, margin_rig=corrected)
     progress("where actuators should stand", 0.9)
-    moved = relocated(anew, test) if placement else None
+    moved = relocated(anew, test, units) if placement else None
     progress("done", 1.0)
     return Redesign(
         uncertain, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight,
-        judged, more_cost, more_work, moved, _notes(uncertain, corrected, judged == wanted),
+        judged, more_cost, more_work, moved, _notes(uncertain, corrected, judged == wanted), units,
     )  # fmt: skip
 
 
@@ -524,7 +533,7 @@ def _silent(controller: DigitalController) -> DigitalController:
 
 
 def _compensated(
-    rig: Rig, loop: Loop, test: LoopTest, present: DigitalController, criterion: str
+    rig: Rig, loop: Loop, test: LoopTest, present: DigitalController, criterion: str, units: Units
 ) -> tuple[DigitalController, tuple[Step, ...], Loop, float, str]:
     """The redesigned controller: compensations one after the other, each kept where it helps; then sensors left out.
 
@@ -565,7 +574,7 @@ def _compensated(
     ]
     now, chosen = steps[-1], loop
     for name in STEPS:
-        what = _losses(rig, loop, name)
+        what = _losses(rig, loop, name, units)
         if not what:
             continue
         trial = compensated(rig, loop, test.sample_time, (*kept, name))
@@ -704,38 +713,51 @@ def _settling(run: LoopRun, controlled: Sequence[int]) -> float:
     return min(settling(energy, float(time[1] - time[0])), float(time[-1]))
 
 
-def _losses(rig: Rig, loop: Loop, step: str) -> str:
+def _losses(rig: Rig, loop: Loop, step: str, units: Units) -> str:
     """What a step takes out, in words; empty where there is nothing."""
-    words = []
+    words, newton = [], units.force
     for a in (named(rig.actuators, one.name) for one in loop.law.actuators):
         if step == "delay" and (a.delay or a.time_constant):
-            late = [f"delay {1e3 * a.delay:.3g} ms"] * (a.delay > 0) + [f"lag {1e3 * a.time_constant:.3g} ms"] * (
-                a.time_constant > 0
-            )
+            late = [
+                f"{what} {_short(value, units)}"
+                for what, value in (("delay", a.delay), ("lag", a.time_constant))
+                if value
+            ]
             words.append(f"{a.name}: {', '.join(late)}")
         elif step == "dead zone" and (a.dead_zone or a.bias):
-            lost = [f"dead zone {a.dead_zone:.3g} N"] * (a.dead_zone > 0) + [f"bias {a.bias:.3g} N"] * (a.bias != 0)
+            lost = [
+                f"{what} {value:.3g} {newton}"
+                for what, value in (("dead zone", a.dead_zone), ("bias", a.bias))
+                if value
+            ]
             words.append(f"{a.name}: {', '.join(lost)}")
         elif step == "saturation" and (np.isfinite(a.limit) or np.isfinite(a.rate_limit)):
             words.append(
-                f"{a.name}: limit {a.limit:.3g} N"
-                + (f", rate {a.rate_limit:.3g} N/s" if np.isfinite(a.rate_limit) else "")
+                f"{a.name}: limit {a.limit:.3g} {newton}"
+                + (f", rate {a.rate_limit:.3g} {newton}/{units.time}" if np.isfinite(a.rate_limit) else "")
             )
     if step == "sensors":
         for s in (named(rig.sensors, one.name) for one in loop.controller.sensors):
             faults = [
                 *([_gain(s.gain)] if s.gain != 1 else []),
                 *([f"offset {s.bias:.3g}"] if s.bias else []),
-                *([f"late by {1e3 * (s.delay + s.time_constant):.3g} ms"] if s.delay > 0 or s.time_constant else []),
+                *([f"late by {_short(s.delay + s.time_constant, units)}"] if s.delay > 0 or s.time_constant else []),
                 *(["cross-talk"] if s.crosstalk else []),
             ]
             if faults:
                 words.append(f"{s.name}: {', '.join(faults)}")
     if step == "friction":
         words += [
-            f"{e.force:.3g} N at {rig.modes.domain.text(e.at)}" for e in rig.elements if isinstance(e, CoulombFriction)
+            f"{e.force:.3g} {newton} at {rig.modes.domain.text(e.at)}"
+            for e in rig.elements
+            if isinstance(e, CoulombFriction)
         ]
     return "; ".join(words)
+
+
+def _short(time: float, units: Units) -> str:
+    """A short time in words."""
+    return f"{1e3 * time:.3g} ms" if units.time == "s" else f"{time:.3g} {units.time}"
 
 
 def _gain(gain: float) -> str:

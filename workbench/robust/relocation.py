@@ -11,6 +11,7 @@ from workbench.design.loop.rig_loop import LoopTest
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import place_actuators
 from workbench.design.placement.task import Placement, placement_task
+from workbench.records.units import SI, Units
 from workbench.robust.compensation import Loop
 from workbench.structure.domain import Interval, position
 
@@ -23,10 +24,12 @@ class Relocation:
 
     Attributes:
         present, moved: W_R, effort and peak force of each.
+        units: by which the places are told.
     """
 
     present: Placement
     moved: Placement
+    units: Units = SI
 
     @property
     def gain(self) -> float:
@@ -35,10 +38,11 @@ class Relocation:
 
     @property
     def sentence(self) -> str:
-        old, new = (", ".join(f"{x:.3g}" for x in p.positions) for p in (self.present, self.moved))
+        old, new = (", ".join(f"{x:.4g}" for x in p.positions) for p in (self.present, self.moved))
+        m = self.units.length
         return (
-            f"Actuators at x = {new} m instead of {old} m would spill {100 * self.gain:.0f} % less work into residual"
-            " modes, for no more effort."
+            f"Actuators at x = {new} {m} instead of {old} {m} would spill {100 * self.gain:.0f} % less work into"
+            " residual modes, for no more effort."
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -50,7 +54,7 @@ class Relocation:
         }
 
 
-def relocated(loop: Loop, test: LoopTest) -> Relocation | None:
+def relocated(loop: Loop, test: LoopTest, units: Units = SI) -> Relocation | None:
     """The best places for the law's actuators on its modes; None where they are better where they are, or not known.
 
     Known for IMSC of the lowest modes along an interval, by point forces of one kind, after an impulse.
@@ -73,4 +77,4 @@ def relocated(loop: Loop, test: LoopTest) -> Relocation | None:
         moved = place_actuators(task, limits, starts=STARTS)
     except DesignError:
         return None
-    return Relocation(present, moved) if moved.residual_work < present.residual_work else None
+    return Relocation(present, moved, units) if moved.residual_work < present.residual_work else None

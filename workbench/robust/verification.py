@@ -11,11 +11,13 @@ from workbench.arguments import whole
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, of_loops, run_loop
 from workbench.renamed import Renamed, former_arguments
+from workbench.rig.actuators import Actuator
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
-from workbench.structure.modes import frozen
+from workbench.structure.domain import NamedPoints, middle
+from workbench.structure.modes import Modes, frozen
 from workbench.threads import one_blas_thread
 
 SETTLED = 0.01  # of the largest energy: a tenth of the amplitude
@@ -325,7 +327,14 @@ def settling(energy: np.ndarray, sample_time: float) -> float:
     return np.inf if last == energy.size - 1 else float(sample_time * (last + 1))
 
 
+def displacement_at(modes: Modes, actuator: Actuator) -> np.ndarray:
+    """What each mode moves at an actuator (n_modes,): at the middle of a patch; at named points what it drives."""
+    if actuator.kind == "force" or isinstance(modes.domain, NamedPoints):
+        return modes.phi_at(actuator.at, int(actuator.kind == "moment"), direction=actuator.direction)
+    return np.asarray(modes.phi(middle(actuator.at))[0])
+
+
 def _stroke(rig: Rig, controller: DigitalController, run: LoopRun) -> float:
-    there = [a.at for a in rig.actuators if a.name in controller.actuators]
-    shapes = np.array([rig.modes.phi_at(at) for at in there])
+    there = [a for a in rig.actuators if a.name in controller.actuators]
+    shapes = np.array([displacement_at(rig.modes, a) for a in there])
     return float(np.abs(shapes @ run.response.modal[: rig.modes.n_modes]).max())

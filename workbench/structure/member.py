@@ -17,7 +17,17 @@ from workbench.structure.modes import Modes
 from workbench.structure.polynomials import Segments
 from workbench.structure.printed import Printed
 from workbench.structure.profile import Profile, ProfileLike, as_profile
-from workbench.structure.supports import HELD, NAMED_ENDS, Attachment, End, PointDamper, PointMass, PointSpring, as_end
+from workbench.structure.supports import (
+    HELD,
+    NAMED_ENDS,
+    Attachment,
+    End,
+    PointDamper,
+    PointMass,
+    PointSpring,
+    as_end,
+    masses_among,
+)
 from workbench.threads import one_blas_thread
 
 HIGHEST_DEGREE = 60
@@ -151,6 +161,7 @@ class _Member(Printed):
             shapes=shapes,
             domain=Interval(self.length),
             essential=essential,
+            masses=masses_among(self.attachments),
         )
 
     def _eigenpairs(

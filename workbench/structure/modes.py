@@ -24,6 +24,7 @@ from workbench.structure.domain import (
     position,
 )
 from workbench.structure.printed import Printed, counted
+from workbench.structure.supports import PointMass
 
 Shapes = Callable[[np.ndarray, Any], np.ndarray]
 HELD = 1e-9  # of the largest motion anywhere: what moves less is held by a support
@@ -61,7 +62,7 @@ def modal_state_matrix(stiffness: ArrayLike, damping: ArrayLike) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Modes(Printed):
-    """Mass-normalised modes, known all over their domain: ∫ m φ_r φ_s dx = δ_rs (2.5).
+    """Mass-normalised modes, known all over their domain: ∫ m φ_r φ_s dx = δ_rs (2.5), attached masses included.
 
     Each modal coordinate obeys q_r'' + Σ_s c_rs q_s' + ω_r² q_r = f_r (2.10).
 
@@ -77,6 +78,7 @@ class Modes(Printed):
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), where the modes were identified; None where computed.
         shape_covariance: (n_modes, n_points, n_points) of each mode's shape at named points, where identified, each
             mode by itself; None where computed, or where the identification gives none.
+        masses: attached at points, which the normalisation counts beside the mass per length or area.
 
     Raises:
         ValueError: negative or non-finite frequencies, mismatched shapes.
@@ -89,6 +91,7 @@ class Modes(Printed):
     essential: tuple[tuple[float, int], ...] = ()
     covariance: np.ndarray | None = None
     shape_covariance: np.ndarray | None = None
+    masses: tuple[PointMass, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "domain", as_domain(self.domain))
@@ -260,6 +263,7 @@ class Modes(Printed):
             essential=self.essential,
             covariance=covariance,
             shape_covariance=None if self.shape_covariance is None else self.shape_covariance[index],
+            masses=self.masses,
         )
 
 

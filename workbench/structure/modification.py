@@ -8,7 +8,7 @@ from scipy.linalg import LinAlgError, eigh
 from workbench.renamed import former_arguments
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
-from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
+from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring, masses_among
 
 OWN = 4  # modes that move on their own, for each that is asked for
 DIVERGES = 0.9  # of that ratio: from here on the flexibility at a point has no end in sight
@@ -62,7 +62,7 @@ def attach(
             if value:
                 shape = _moved(modes, part, derivative) @ vectors
                 damping = damping + value * shape.T @ shape
-    return _combined(modes, vectors, omega, damping)
+    return _combined(modes, vectors, omega, damping, attachments)
 
 
 def truncation_error(modes: Modes, attachments: tuple[Attachment, ...]) -> np.ndarray:
@@ -122,7 +122,7 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
         target = mass if isinstance(part, PointMass) else stiffness
         target += part.pair[0] * shapes.T @ shapes
     omega, vectors = _eigen(stiffness, mass, subset_by_index=[0, kept - 1])
-    changed = _combined(modes, basis @ vectors, omega, modes.zeta[:kept])
+    changed = _combined(modes, basis @ vectors, omega, modes.zeta[:kept], attachments)
     return attach(changed, tuple(part for part in attachments if isinstance(part, PointDamper)))
 
 
@@ -135,7 +135,13 @@ def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
     return modes.phi_at(part.at, derivative)[None, :]
 
 
-def _combined(modes: Modes, vectors: np.ndarray, omega: np.ndarray, damping: np.ndarray) -> Modes:
+def _combined(
+    modes: Modes,
+    vectors: np.ndarray,
+    omega: np.ndarray,
+    damping: np.ndarray,
+    attachments: tuple[Attachment, ...] = (),
+) -> Modes:
     """Modes whose shapes are the columns of `vectors` (n_modes, n_combined) in those at hand."""
     shapes = modes.shapes
     return Modes(
@@ -144,6 +150,7 @@ def _combined(modes: Modes, vectors: np.ndarray, omega: np.ndarray, damping: np.
         shapes=lambda located, derivative: shapes(located, derivative) @ vectors,
         domain=modes.domain,
         essential=modes.essential,
+        masses=modes.masses + masses_among(attachments),
     )
 
 

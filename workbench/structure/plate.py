@@ -1,7 +1,7 @@
 """Plates and membranes over a rectangle, and the modes they have."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,17 @@ from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes
 from workbench.structure.profile import Field, FieldLike, as_field
-from workbench.structure.supports import HELD, SIDES, Attachment, Edge, PointDamper, PointMass, PointSpring, as_edges
+from workbench.structure.supports import (
+    HELD,
+    SIDES,
+    Attachment,
+    Edge,
+    PointDamper,
+    PointMass,
+    PointSpring,
+    as_edges,
+    masses_among,
+)
 from workbench.structure.surface_basis import EdgeSpring, PointTerm, Square, SurfaceProblem
 from workbench.structure.surface_ritz import SurfaceModes, solve
 
@@ -290,7 +300,7 @@ class Plate(_Surface):
             if isinstance(part, PointDamper):
                 row = modes.phi(part.at)[0]
                 damping = damping + part.coefficient * np.outer(row, row)
-        return Modes(omega=modes.omega, damping=damping, shapes=modes.shapes, domain=modes.domain)
+        return replace(modes, damping=damping, masses=masses_among(self.attachments))
 
 
 def check_poisson_ratio(value: float) -> None:

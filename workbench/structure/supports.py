@@ -1,6 +1,6 @@
 """What holds a structure at its ends and what is attached to it in between."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,3 +139,8 @@ class PointDamper(_Attached):
 
 
 Attachment = PointMass | PointSpring | PointDamper
+
+
+def masses_among(attachments: Iterable[Attachment]) -> tuple[PointMass, ...]:
+    """The masses among what is attached."""
+    return tuple(part for part in attachments if isinstance(part, PointMass))

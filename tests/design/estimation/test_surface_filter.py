@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from workbench.design.estimation.controller import filtered
-from workbench.design.estimation.modal_filter import filter_on, surface_filter
+from workbench.design.estimation.modal_filter import filter_on, hermite_filter, surface_filter
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, close_with
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
+from workbench.structure.modification import attach
 from workbench.structure.plate import Plate
+from workbench.structure.supports import PointMass
 
 A, B = 1.2, 0.8
 RNG = np.random.default_rng(3)
@@ -57,6 +59,25 @@ def test_a_law_through_a_filter_of_many_sensors_is_nearly_that_of_exact_modes():
     loop, exact = close_with(modes, filtered(law, filter_)), close_loop(modes, law)
     np.testing.assert_allclose(np.sort(loop.poles.real)[:4], np.sort(exact.poles.real)[:4], rtol=0.02)
     np.testing.assert_allclose(loop.matrix, close_loop(modes, law, filter_).matrix, atol=1e-9)
+
+
+def test_attached_masses_and_inertias_are_part_of_the_mass_that_a_filter_integrates():
+    heavy = (PointMass(0.8, 0.4, 0.004), PointMass(1.2, 0.1))
+    beam = Beam(
+        length=1.2, mass_per_length=0.62, bending_stiffness=14.0, left="clamped", right="free", attachments=heavy
+    )
+    modes, places = beam.modes(5), np.linspace(0.05, 1.2, 24)
+    seen = filter_on(beam, modes, [0, 1], places).response_to(modes)
+    np.testing.assert_allclose(seen[:, :2], np.eye(2), atol=1e-3)  # by mass per length alone 0.4 off
+    np.testing.assert_allclose(seen, np.eye(2, 5), atol=0.03)  # slopes of higher modes are known less well
+    again = filter_on(beam, modes, [0, 1], places).designed_by(modes, [1, 0])
+    np.testing.assert_allclose(again.response_to(modes), seen[::-1], atol=1e-12)
+    both = hermite_filter(modes.select([0, 1]), np.linspace(0.0, 1.2, 24), 0.62).response_to(modes)
+    np.testing.assert_allclose(both, np.eye(2, 5), atol=0.03)
+    surface = plate("simply supported", attachments=(PointMass((0.4, 0.4), 3.0),))
+    for found in (surface.modes(6, tolerance=1e-3), attach(plate("simply supported").modes(60), surface.attachments)):
+        seen = filter_on(surface, found, [0, 1], scattered(150)).response_to(found)[:, :2]
+        np.testing.assert_allclose(seen, np.eye(2), atol=0.02)
 
 
 def test_a_filter_of_a_beam_takes_its_sensors_in_any_order():

@@ -278,7 +278,7 @@ def test_what_cannot_be_handed_over_is_refused_with_the_remedy(modes, observer, 
         sampled(observer, -0.01)
     fierce = imsc(modes, 2, ACTUATORS, weight=1e-4)
     unstable = luenberger(modes, fierce, SENSORS, poles=20 * modes.omega[:2] * (-0.3 + 1j))
-    with pytest.raises(DesignError, match="unstable in continuous time"):
+    with pytest.raises(DesignError, match=r"unstable in continuous time.*Kalman filter by less disturbance"):
         export(modes, unstable, sample_rate_hz=1e4)
 
 

@@ -100,6 +100,9 @@ def test_limits_that_conflict_are_named(task):
         place_actuators(task, Limits(effort=1.0, spacing=4.0))
     with pytest.raises(DesignError, match="effort limit"):
         place_actuators(task, Limits(effort=1e-3, spacing=0.5), starts=1)
+    late = Actuator("F", 1.0, time_constant=0.004)
+    with pytest.raises(DesignError, match=r"F has time_constant = 0[.]004, and the best"):
+        placement_task(task.modes, 4, impulse_at=6.3, weight=20.0, actuator=late)
     with pytest.raises(DesignError, match="no residual mode"):
         placement_task(task.modes, 9, impulse_at=6.3, weight=20.0)
 

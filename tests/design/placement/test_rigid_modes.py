@@ -4,8 +4,10 @@ import control
 import numpy as np
 import pytest
 
+from workbench.design.estimation.observers import kalman, luenberger
 from workbench.design.laws.coupled import coupled_lqr
-from workbench.design.laws.imsc import riccati_gains
+from workbench.design.laws.imsc import imsc, riccati_gains
+from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import impulse_state
 from workbench.design.placement.certificate import certify
 from workbench.design.placement.coupled_placement import coupled_batch, coupled_costs, place_coupled
@@ -13,6 +15,7 @@ from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import place_actuators, placement_task
 from workbench.design.spillover.spillover import distributed_cost, effort, modal_cost, spillover
 from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
 from workbench.structure.member import Beam
 
 AT, PLACES = 6.3, (0.5, 4.4, 6.8)
@@ -93,3 +96,18 @@ def test_coupled_lqr_is_the_limit_of_a_vanishing_weight_on_where_the_structure_r
     limits = Limits(effort=2.0 * found.effort, spacing=0.5)
     best = place_coupled(modes, 3, 3, impulse_at=AT, weight=10.0, limits=limits, starts=1)
     assert best.residual_work < found.residual_work and best.effort <= limits.effort
+
+
+def test_rigid_modes_take_as_many_displacements_and_actuators(modes):
+    law = imsc(modes, 2, [Actuator("a", 0.4), Actuator("b", 1.1)], weight=1.0)
+    pair = [Sensor("y", 0.75), Sensor("v", 1.2, "velocity")]
+    design = (
+        lambda sensors: luenberger(modes, law, sensors, poles=[-1 + 3j, -2 + 6j]),
+        lambda sensors: kalman(modes, law, sensors, disturbance=1e-4, noise=1e-8),
+    )
+    for one in design:
+        with pytest.raises(DesignError, match=r"2 rigid-body modes need as many displacements .* the sensors read 1"):
+            one(pair)
+        assert one([pair[0], Sensor("y2", 1.2)]).state.shape == (4, 4)
+    with pytest.raises(DesignError, match="2 rigid-body modes are controlled, and 1 actuator cannot move them"):
+        place_coupled(modes, 3, 1, impulse_at=0.6, weight=0.5, limits=Limits(effort=5.0, spacing=0.1))

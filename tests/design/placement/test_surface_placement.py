@@ -141,3 +141,17 @@ def test_what_has_no_room_or_no_place_is_refused(task):
         place_actuators(placement_task(sampled, 2, impulse_at="1y", weight=1.0), Limits(edge_distance=0.1))
     with pytest.raises(DesignError, match="acts between two places"):
         placement_task(sampled, 2, impulse_at="1y", weight=1.0, actuator=Actuator("P", Between("1y", "2y")))
+
+
+def test_patches_that_lie_over_each_other_are_told():
+    plate = Plate(
+        length=(0.6, 0.4), mass_per_area=5.4, bending_stiffness=50.0, poisson_ratio=0.3, edges="simply supported"
+    )
+    patch = piezo_patch("P", (0.3, 0.2), length=(0.2, 0.15))
+    task = placement_task(plate.modes(4), 2, impulse_at=(0.2, 0.3), weight=0.01, actuator=patch)
+    over, beside, above = (
+        task.placed(at, "")
+        for at in ([(0.198, 0.205), (0.368, 0.075)], [(0.15, 0.2), (0.35, 0.22)], [(0.2, 0.1), (0.3, 0.26)])
+    )
+    assert over.overlapping and "patches overlap; their length" in str(over)
+    assert not beside.overlapping and not above.overlapping and "overlap" not in str(beside)

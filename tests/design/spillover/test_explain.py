@@ -397,3 +397,20 @@ def test_a_marginally_stable_loop_needs_no_remedy():
     actuators = [Actuator("a", 0.1), Actuator("b", 1.3), Actuator("c", 1.9)]
     assert close_with(modes, redesign(actuators, [0.1, 1.3], 1.0)).stability == "marginally stable"
     assert spillover_remedies(modes, redesign, actuators, [0.1, 1.3]) == ()
+
+
+def test_the_dominant_path_of_a_pole_that_moves_left_is_what_moves_it():
+    modes = Beam(
+        length=1.2,
+        mass_per_length=0.62,
+        bending_stiffness=14.0,
+        left="clamped",
+        right="free",
+        damping=ModalDamping(0.004),
+    ).modes(6)
+    law = imsc(modes, 2, [Actuator("F1", 0.6575), Actuator("F2", 1.057)], weight=1.0)
+    sensors = [Sensor("y", 0.75), Sensor("v", 1.2, "velocity")]
+    controller = luenberger(modes, law, sensors, poles=modes.omega[:2] * (-0.3 + 1j))
+    third = next(shift for shift in explain_spillover(modes, controller).shifts if shift.mode == 2)
+    assert third.shift.real < 0.0
+    assert third.dominant.text == "1.2 to F1" and third.dominant.shift.real < 0.7 * third.shift.real

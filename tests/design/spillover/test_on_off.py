@@ -125,6 +125,27 @@ def test_the_motion_obeys_its_equation_and_work_accounts_for_energy(damping):
     np.testing.assert_allclose(work.by_mode - lost, gained, atol=1e-9 if damping == 0 else 1e-7)
 
 
+@pytest.mark.parametrize(
+    ("trait", "value"),
+    [
+        ("delay", 0.02),
+        ("time_constant", 0.02),
+        ("dead_zone", 0.01),
+        ("limit", 0.001),
+        ("rate_limit", 1.0),
+        ("bias", 0.1),
+    ],
+)
+def test_an_actuator_that_is_not_perfect_is_refused_not_left_out(trait, value):
+    modes, state = beam(4), impulse_state(beam(4), 6.3)
+    law = on_off(modes, 1, [Actuator("F", 2.0, **{trait: value})], force=0.02, dead_band=0.01)
+    for told in (lambda: respond_on_off(modes, law, state, [1.0]), lambda: on_off_work(modes, law, state, 1.0)):
+        with pytest.raises(DesignError, match=f"F has {trait} = {value:g}, which .* leaves out"):
+            told()
+    wide = on_off(modes, 1, [Actuator("F", 2.0, limit=1.0)], force=0.02, dead_band=0.01)
+    assert on_off_work(modes, wide, state, 1.0).by_mode[0] < 0.0
+
+
 def test_a_residual_mode_at_rest_can_only_gain():
     modes, state = beam(), impulse_state(beam(), 6.3)
     state[13:] = 0.0

@@ -13,6 +13,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import on_off
 from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state
+from workbench.design.loop.on_off_response import respond_on_off
 from workbench.design.spillover.performance import on_off_performance, performance
 from workbench.design.spillover.spillover import effort, quadratic_cost
 from workbench.rig.actuators import Actuator
@@ -73,6 +74,16 @@ def test_a_loop_that_is_unstable_has_no_figures():
     assert told.margin < 0 and np.isinf([told.cost, told.effort, told.spillover]).all()
     with pytest.raises(DesignError, match="final time must be positive and finite; got inf"):
         performance(close_loop(MODES, LAW), STATE, weight=1.0, final_time=np.inf)
+
+
+def test_effort_of_a_relay_is_that_of_its_stretches_over_a_long_time():
+    relay = on_off(MODES, 1, ACTUATORS[:1], force=0.002, dead_band=0.01)
+    told = on_off_performance(MODES, relay, STATE, weight=3.0, final_time=4000.0)
+    (stretches,) = respond_on_off(MODES, relay, STATE, [0.0, 4000.0]).stretches
+    each = [(s.end - s.start, s.steady, s.ramp) for s in stretches]
+    squared = sum(force**2 * t + force * ramp * t**2 + ramp**2 * t**3 / 3.0 for t, force, ramp in each)
+    assert len(stretches) > 20 and not any(s.fading for s in stretches)
+    assert told.effort == pytest.approx(squared / MODES.phi(3.0)[0, 0] ** 2, rel=1e-9)
 
 
 def test_an_idle_relay_leaves_the_energy_of_free_decay():

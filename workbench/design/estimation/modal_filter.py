@@ -1,7 +1,8 @@
 """Modal filters: from sensors to modal coordinates; weights computed once.
 
-Along a structure, dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors. At
-named points, between which there is nothing, w is what bends the structure least. Over a rectangle w is a thin-plate
+Along a structure, dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors;
+attached masses add M φ_r w and J φ_r' w' where they stand, since the modes are orthogonal only with them. At named
+points, between which there is nothing, w is what bends the structure least. Over a rectangle w is a thin-plate
 spline through sensors that stand anywhere on it.
 """
 
@@ -16,7 +17,7 @@ from scipy.interpolate import CubicHermiteSpline, RBFInterpolator, make_interp_s
 
 from workbench.arrays import Floats
 from workbench.renamed import Renamed
-from workbench.structure.domain import NamedPoints, Place, Rectangle, gauss_between, same_place
+from workbench.structure.domain import NamedPoints, Place, Rectangle, gauss_between, position, same_place
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.plate import Membrane, Plate
@@ -98,10 +99,11 @@ def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileL
         ValueError: fewer than two sensors, or positions that do not increase.
     """
     x = _checked(positions, 2)
-    at, density = _integrand(modes, as_profile(mass_per_length), x)
     one, none = np.eye(x.size), np.zeros((x.size, x.size))
-    displacement = density.T @ CubicHermiteSpline(x, one, none)(at)
-    slope = density.T @ CubicHermiteSpline(x, none, one)(at)
+    displacement, slope = (
+        _weights(modes, as_profile(mass_per_length), x, CubicHermiteSpline(x, *unit))
+        for unit in ((one, none), (none, one))
+    )
     again = partial(anew, hermite_filter, positions=x, mass_per_length=mass_per_length)
     return ModalFilter(x, displacement, slope, again)
 
@@ -127,8 +129,7 @@ def displacement_filter(
     degree = min(degree, nodes.size - 1)
     degree -= 1 - degree % 2
     splines = make_interp_spline(nodes, np.eye(nodes.size), k=degree)
-    at, density = _integrand(modes, as_profile(mass_per_length), np.unique(np.r_[0.0, splines.t, modes.length]))
-    weights = density.T @ splines(at)
+    weights = _weights(modes, as_profile(mass_per_length), np.unique(np.r_[0.0, splines.t, modes.length]), splines)
     again = partial(anew, displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
     return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)), again)
 
@@ -179,10 +180,20 @@ def anew(design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[in
     return design(modes.select(list(filtered)), **settings)
 
 
-def _integrand(modes: Modes, mass: Profile, nodes: np.ndarray) -> tuple[Floats, Floats]:
-    """Points of integration between nodes, and what w is multiplied by there, (n_points, n_modes): m φ_r dx."""
-    at, weights = gauss_between(nodes, GAUSS_POINTS)
-    return at, modes.phi(at) * (mass(at) * weights)[:, None]
+def _weights(modes: Modes, mass: Profile, nodes: np.ndarray, splines: Callable[[ArrayLike, int], Floats]) -> Floats:
+    """∫ m φ_r w dx and the share of attached masses, (n_modes, n_readings), w the splines (x, derivative) of readings.
+
+    Args:
+        nodes: from the first to the last it is integrated, piece by piece, m.
+    """
+    at, lengths = gauss_between(nodes, GAUSS_POINTS)
+    weights: Floats = (modes.phi(at) * (mass(at) * lengths)[:, None]).T @ splines(at, 0)
+    for part in modes.masses:
+        for derivative, value in enumerate(part.pair):
+            if value:
+                x = position(part.at)
+                weights = weights + value * np.outer(modes.phi(x, derivative), splines(x, derivative))
+    return weights
 
 
 def _checked(positions: ArrayLike, least: int) -> np.ndarray:
@@ -226,9 +237,11 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
     points, weights = domain.quadrature(QUADRATURE)
     density = weights * as_field(mass_per_area)(points[:, 0], points[:, 1])
     splines = RBFInterpolator(nodes, np.eye(len(nodes)), kernel="thin_plate_spline", degree=1)
-    spread: Floats = (modes.phi(points) * density[:, None]).T @ splines(points)[:, : len(at)]
+    spread: Floats = (modes.phi(points) * density[:, None]).T @ splines(points)
+    for part in modes.masses:
+        spread = spread + part.mass * modes.phi(part.at).T @ splines(domain.locate(part.at))
     again = partial(anew, surface_filter, places=at, mass_per_area=mass_per_area)
-    return ModalFilter(at, spread, np.zeros((modes.n_modes, 0)), again)
+    return ModalFilter(at, spread[:, : len(at)], np.zeros((modes.n_modes, 0)), again)
 
 
 def filter_on(

@@ -110,8 +110,15 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
         strength = max(np.abs(c[:, j]).max(), np.abs(c[:, n + j]).max())
         if strength <= UNSEEN * grid[j]:
             raise DesignError(f"mode {r + 1} is unobservable: all sensors stand at its nodes; move or add one")
-        if modes.omega[r] == 0 and np.abs(c[:, j]).max() <= UNSEEN * grid[j]:
-            raise DesignError(f"velocity alone leaves rigid-body mode {r + 1} unobservable; add a displacement sensor")
+    # where rigid modes stand is in displacements alone, and of all of them together
+    rigid = np.flatnonzero(own.omega == 0)
+    told = int(np.linalg.matrix_rank(c[:, rigid] / grid[rigid], tol=UNSEEN)) if rigid.size else 0
+    if told < rigid.size:
+        raise DesignError(
+            f"{rigid.size} rigid-body {'modes need' if rigid.size > 1 else 'mode needs'} as many displacements that"
+            f" distinguish them, and the sensors read {told}: velocity alone leaves them unobservable; add a"
+            " displacement sensor, at another place"
+        )
     a, b = controlled_plant(modes, index, law.actuators)
     return a, b, c
 

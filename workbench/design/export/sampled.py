@@ -161,8 +161,8 @@ def sample_design(
     if not before.stable:
         raise DesignError(
             f"{controller.name}: the loop of all {modes.n_modes} modes is unstable in continuous time, a pole at"
-            f" {-before.margin:+.3g} 1/s; explain_spillover(modes, controller) names the path, and"
-            " spillover_remedies a cure"
+            f" {-before.margin:+.3g} 1/s: make the observer slower (a Kalman filter by less disturbance), ask for less"
+            " damping, or control that mode too; explain_spillover or `workbench design` names the path"
         )
     highest = max(controller.law.controlled, key=lambda r: float(modes.omega[r]))
     fastest = float(modes.frequencies_hz[highest])

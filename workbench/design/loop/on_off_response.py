@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import Response, checked_times
 from workbench.design.loop.switching import Stretch, switch, travel
+from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
 
@@ -32,6 +34,7 @@ def respond_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, time: ArrayLi
     """The response from a state (2 n_modes,) at t = 0, exact at each of the times (n_times,), however far apart.
 
     Raises:
+        DesignError: an actuator with a delay, a lag, a dead zone, hysteresis, a bias or a limit that its command meets.
         ValueError: times that do not increase from zero or later.
     """
     time = checked_times(time)
@@ -40,11 +43,36 @@ def respond_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, time: ArrayLi
 
 
 def switchings(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> tuple[tuple[Stretch, ...], ...]:
-    """What each controlled mode does between its switchings, up to the final time."""
+    """What each controlled mode does between its switchings, up to the final time.
+
+    Raises:
+        DesignError: an actuator whose force is not its command times its gain.
+    """
+    for actuator, most in zip(law.actuators, np.abs(law.spread) @ [relay.force for relay in law.relays], strict=True):
+        _check_prompt(actuator, float(most))
     return tuple(
         switch(relay, state[r], state[modes.n_modes + r], final_time)
         for relay, r in zip(law.relays, law.controlled, strict=True)
     )
+
+
+def _check_prompt(actuator: Actuator, most: float) -> None:
+    """Refuse what the closed forms between switchings do not hold; a limit that no command reaches changes nothing."""
+    bends = {
+        "delay": actuator.delay,
+        "time_constant": actuator.time_constant,
+        "dead_zone": actuator.dead_zone,
+        "hysteresis_share": actuator.hysteresis_share,
+        "bias": actuator.bias,
+        "rate_limit": actuator.rate_limit if np.isfinite(actuator.rate_limit) else 0.0,
+        "limit": actuator.limit if actuator.limit < abs(actuator.gain) * most * (1.0 - 1e-12) else 0.0,
+    }
+    for name, value in bends.items():
+        if value:
+            raise DesignError(
+                f"actuator {actuator.name} has {name} = {value:g}, which the exact motion of on-off control leaves out:"
+                " verify or redesign simulates it once a sample; or leave it out of the actuator"
+            )
 
 
 def motion(

@@ -19,6 +19,7 @@ from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement, check_uncoupled
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, modal_state_matrix
+from workbench.structure.printed import counted
 from workbench.threads import one_blas_thread
 
 DRAWN, LOOKED_AT = 2_000, 300
@@ -47,12 +48,18 @@ def place_coupled(
         seed: of the draws.
 
     Raises:
-        DesignError: limits that no draw can meet.
+        DesignError: fewer actuators than rigid modes controlled, or limits that no draw can meet.
     """
     if not 1 <= n_controlled < modes.n_modes:
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
     if not weight > 0:
         raise DesignError(f"the control weight R must be positive; got {weight:g}")
+    rigid = int((modes.omega[:n_controlled] == 0).sum())
+    if n_actuators < rigid:
+        raise DesignError(
+            f"{rigid} rigid-body modes are controlled, and {counted(n_actuators, 'actuator')} cannot move them one by"
+            " one, wherever placed; place as many actuators"
+        )
     stretches = limits.intervals(n_actuators, modes.length)
 
     def look(positions: np.ndarray) -> tuple[float, Placement | None]:

@@ -22,7 +22,17 @@ from workbench.design.placement.places import as_places, coordinates, least_dist
 from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Between, Interval, NamedPoints, Patch, Rectangle, centred_at, listed, reach
+from workbench.structure.domain import (
+    Between,
+    Domain,
+    Interval,
+    NamedPoints,
+    Patch,
+    Rectangle,
+    centred_at,
+    listed,
+    reach,
+)
 from workbench.structure.modes import Modes, freeze, frozen, modal_state_matrix
 from workbench.structure.printed import Printed, place_text
 
@@ -31,6 +41,8 @@ SHOWN_INSTANTS = 240
 SETTLED = 1e-3
 NOTHING = 1e-7
 MOST_FORCES = 10_000_000
+APART = 1e-6  # of the size of a patch: what overlaps less than this touches
+SPREAD = "their length, on a plate their diagonal, as least spacing keeps them apart"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,6 +62,7 @@ class Placement(Printed):
         status: why the search stopped.
         local_optima: distinct local optima met from all starts, (positions, W_R), best first.
         spacing: least distance between two actuators, m; 0 where positions of named points are not known.
+        overlapping: whether two patches lie over each other: keep their middles farther apart by `Limits.spacing`.
     """
 
     positions: np.ndarray
@@ -62,6 +75,7 @@ class Placement(Printed):
     status: str
     local_optima: tuple[tuple[np.ndarray, float], ...] = ()
     spacing: float = np.inf
+    overlapping: bool = False
 
     def __post_init__(self) -> None:
         freeze(self, "positions", dtype=None)
@@ -80,6 +94,7 @@ class Placement(Printed):
             f"largest W_r = {self.by_mode[most]:.4g}, in mode {n_controlled + most + 1}; peak force"
             f" {self.peak_force:.4g}; condition of B {self.condition:.3g}",
             *((f"search: {self.status}",) if self.status else ()),
+            *((f"patches overlap; {SPREAD}",) if self.overlapping else ()),
         )
         named = self.positions.dtype == object
         return line, ("actuator", "at" if named else "x [m]" if self.positions.ndim == 1 else "x, y [m]"), rows, remarks
@@ -193,6 +208,7 @@ class PlacementTask(Printed):
             status=status,
             local_optima=tuple(optima),
             spacing=float(least_distances(coordinates(domain, positions)[None])[0]),
+            overlapping=overlap(domain, self.actuator, positions),
         )
 
     def tail_bound(self, positions: ArrayLike, *, growth: float) -> float:
@@ -261,7 +277,7 @@ def placement_task(
 
     Raises:
         DesignError: no residual mode, damping that couples the modes, an impulse that moves nothing, probabilities that
-            are none, or a time that is not positive.
+            are none, a time that is not positive, or an actuator with a delay or a lag.
     """
     if not 1 <= n_controlled < modes.n_modes:
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
@@ -280,6 +296,12 @@ def placement_task(
         raise DesignError(
             f"actuator {actuator.name} acts between two places; such are placed along an interval only: place forces or"
             " moments, or compare pairs of points one by one"
+        )
+    if actuator is not None and (actuator.delay or actuator.time_constant):
+        late = "delay" if actuator.delay else "time_constant"
+        raise DesignError(
+            f"actuator {actuator.name} has {late} = {getattr(actuator, late):g}, and the best places are known for"
+            " forces that follow at once: place it without, and see by close_loop or export what the law does with it"
         )
     n = n_controlled
     omega = modes.omega[:n]
@@ -366,6 +388,15 @@ def patch_of(rig: Rig) -> Actuator | None:
                 " and axis, or describe point forces"
             )
     return patch
+
+
+def overlap(domain: Domain, actuator: Actuator, positions: np.ndarray) -> bool:
+    """Whether two of the actuators with their middles at positions (n_actuators, ...) lie over each other."""
+    if isinstance(domain, NamedPoints):
+        return False
+    size, at = 2.0 * reach(domain, actuator.at)[0], positions.reshape(len(positions), -1)
+    near = (np.abs(at[:, None] - at) < size * (1.0 - APART)).all(axis=2)
+    return bool(np.triu(near, 1).any())
 
 
 def extent(actuator: Actuator) -> float:

@@ -50,6 +50,11 @@ class Path:
     shift: complex
     first_order: complex
 
+    @property
+    def text(self) -> str:
+        """From where to where, in words."""
+        return f"{place_text(self.sensor_at)} to {self.actuator}"
+
 
 @dataclass(frozen=True, eq=False)
 class PoleShift:
@@ -71,6 +76,11 @@ class PoleShift:
     def shift(self) -> complex:
         """Shift of the pole, rad/s."""
         return self.closed_pole - self.pole
+
+    @property
+    def dominant(self) -> Path:
+        """The path that shifts the pole most the way that it goes, to the left or to the right."""
+        return max(self.paths, key=lambda path: path.shift.real * np.sign(self.shift.real))
 
     @property
     def first_order(self) -> complex:
@@ -111,7 +121,7 @@ class Explanation(Printed):
                 f"{self.loop.modes.frequencies_hz[each.mode]:.4g}",
                 f"{each.pole.real:.4g}",
                 f"{each.closed_pole.real:.4g}",
-                f"{place_text(each.paths[0].sensor_at)} to {each.paths[0].actuator}",
+                each.dominant.text,
             )
             for each in self.shifts
         ]

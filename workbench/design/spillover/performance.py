@@ -8,13 +8,10 @@ from workbench.design.laws.law import DesignError
 from workbench.design.laws.moments import second_moments
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop
-from workbench.design.loop.on_off_response import respond_on_off
-from workbench.design.spillover.spillover import check_final_time, on_off_work
+from workbench.design.spillover.spillover import check_final_time, on_off_motion
 from workbench.renamed import Renamed
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
-
-INSTANTS = 20_001
 
 
 @dataclass(frozen=True)
@@ -65,16 +62,19 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
 def on_off_performance(
     modes: Modes, law: OnOffLaw, state: np.ndarray, *, weight: float, final_time: float
 ) -> Performance:
-    """The same of on-off control, whose motion is exact and whose integrals are sums over it."""
+    """The same of on-off control, whose motion is exact, by integrals from switching to switching.
+
+    Raises:
+        DesignError: an actuator that `respond_on_off` refuses.
+    """
     _check_weight(weight)
     check_final_time(final_time)
-    time = np.linspace(0.0, final_time, INSTANTS)
-    response = respond_on_off(modes, law, state, time).response
-    own = list(law.controlled)
-    effort = float(np.trapezoid((response.forces**2).sum(axis=0), time))
-    energy = float(np.trapezoid(2.0 * response.energy[own].sum(axis=0), time))
-    spillover = on_off_work(modes, law, state, final_time).residual_total
-    return Performance(energy + weight * effort, effort, spillover, np.nan)
+    response, instants = on_off_motion(modes, law, state, final_time)
+    effort = float((response.forces**2).sum(axis=0) @ instants)
+    energy = float(2.0 * response.energy[list(law.controlled)].sum(axis=0) @ instants)
+    rest = [r for r in range(modes.n_modes) if r not in law.controlled]
+    power = (input_matrix(modes, law.actuators)[rest] @ response.forces) * response.modal[modes.n_modes :][rest]
+    return Performance(energy + weight * effort, effort, float((power @ instants).sum()), np.nan)
 
 
 def _check_weight(weight: float) -> None:

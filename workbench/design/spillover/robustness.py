@@ -101,7 +101,7 @@ def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:
     omega = np.maximum(figures[:n], LEAST_OMEGA * modes.omega)
     c = np.diag(2.0 * figures[n:] * omega)
     blend = np.eye(n) + mixing
-    return Modes(omega, c, lambda x, d: modes.shapes(x, d) @ blend, modes.domain, modes.essential)
+    return Modes(omega, c, lambda x, d: modes.shapes(x, d) @ blend, modes.domain, modes.essential, masses=modes.masses)
 
 
 def perturbed_modes(modes: Modes, error: float, *, count: int = 100, seed: int = 0) -> list[Modes]:

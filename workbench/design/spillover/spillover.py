@@ -20,7 +20,7 @@ from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.moments import second_moments, settled_moments
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.loop.closed_loop import ClosedLoop, close_loop
+from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop
 from workbench.design.loop.on_off_response import motion, switchings
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import gauss_between
@@ -166,7 +166,18 @@ def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> 
 
 
 def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> Spillover:
-    """Work of the actuators in every mode up to a finite time, ∫ f_r q_r' dt, piece by piece between switchings."""
+    """Work of the actuators in every mode up to a finite time, ∫ f_r q_r' dt, piece by piece between switchings.
+
+    Raises:
+        DesignError: an actuator that `respond_on_off` refuses.
+    """
+    response, weights = on_off_motion(modes, law, state, final_time)
+    power = (input_matrix(modes, law.actuators) @ response.forces) * response.modal[modes.n_modes :]
+    return Spillover(power @ weights, law.controlled, final_time)
+
+
+def on_off_motion(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> tuple[Response, Floats]:
+    """The motion at instants (n_times,) up to a final time, and their weights (n_times,) in integrals over time, s."""
     stretches = switchings(modes, law, state, final_time)
     events = np.unique(np.r_[0.0, [s.end for mode in stretches for s in mode], final_time])
     pieces = np.maximum(1, np.ceil(np.diff(events) * modes.omega.max())).astype(int)
@@ -174,9 +185,7 @@ def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: floa
         [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(events[:-1], events[1:], pieces)] + [[final_time]]
     )
     at, weights = gauss_between(edges, GAUSS_POINTS)
-    response = motion(modes, law, state, at, stretches)
-    power = (input_matrix(modes, law.actuators) @ response.forces) * response.modal[modes.n_modes :]
-    return Spillover(power @ weights, law.controlled, final_time)
+    return motion(modes, law, state, at, stretches), weights
 
 
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:

@@ -195,6 +195,7 @@ def eigenfunctions(
         domain=Interval(length),
         essential=ends.essential,
         covariance=covariance,
+        masses=tuple(point_masses),
     )
 
 

@@ -14,8 +14,8 @@ from workbench.draw.style import COLOURS, new_figure
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
 from workbench.robust.redesign import Redesign
-from workbench.robust.verification import Verification, interval
-from workbench.structure.domain import NamedPoints, Where
+from workbench.robust.verification import Verification, displacement_at, interval
+from workbench.structure.domain import NamedPoints
 from workbench.study.pages.page import PageContent, Table, block, write_page
 from workbench.study.pages.verdict_page import case_inputs
 from workbench.study.runs.outcome import Shown
@@ -109,7 +109,7 @@ def _figures(found: Redesign) -> list[tuple[str, ...]]:
         cells = [
             _rounded(scale * getattr(p, name)) if k else "diverges" for p, k in zip((old, new), known, strict=True)
         ]
-        rows.append((words, *cells))
+        rows.append((found.units.named(words), *cells))
     rows.append(("output uncertainty tolerated (small gain) [%]", *(_margin(p) for p in (old, new))))
     return rows
 
@@ -163,7 +163,7 @@ def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict
     actuators = [a for a in found.uncertain_rig.rig.actuators if a.name in found.redesigned.actuators]
     sensors = [s for s in found.uncertain_rig.rig.sensors if s.name in found.redesigned.sensors]
     both, colours = {"present": limited, "redesigned": new}, {"present": OLD, "redesigned": NEW}
-    motion = response_motion(both, actuators=actuators, sensors=sensors, colours=colours)
+    motion = response_motion(both, actuators=actuators, sensors=sensors, colours=colours, length=found.units.length)
     grown = np.abs(old.modal[: old.modes.n_modes]).max() > limit
     cut = f" The present one diverges; its motion is cut off at {RUNS_AWAY:g} times the other's." if grown else ""
     return block(motion, f"{caption}: the corrected structure under the present and the redesigned controller.{cut}")
@@ -176,19 +176,18 @@ def _readings(found: Redesign, record: Record, responses: dict[str, Response]) -
     n = next(iter(responses.values())).time.size
     if seen:
         i, sensor = max(seen, key=lambda one: float(np.abs(record.outputs[one[0], :n]).max()))
-        at: Where = sensor.at
-        name = sensor.name
+        shape, name = rig.modes.phi_at(sensor.at, direction=sensor.direction), sensor.name
         ax.plot(
             record.time[:n], record.outputs[i, :n], color="#8a8a8a", linewidth=0.8, label="measured, without control"
         )
     else:
-        at, name = rig.actuators[0].at, f"at {rig.actuators[0].name}"
+        shape, name = displacement_at(rig.modes, rig.actuators[0]), f"at {rig.actuators[0].name}"
     for (label, response), colour in zip(responses.items(), (COLOURS[1], COLOURS[0]), strict=True):
-        shape = response.modes.phi_at(at)
         ax.plot(
             response.time, shape @ response.modal[: response.modes.n_modes], color=colour, linewidth=1.0, label=label
         )
     limit = 1.3 * max(float(np.abs(line.get_ydata()).max()) for line in ax.lines if line.get_label() != "present")
-    ax.set(xlabel="time [s]", ylabel=f"displacement, {name} [m]", ylim=(-limit, limit))
+    time, length = found.units.time, found.units.length
+    ax.set(xlabel=f"time [{time}]", ylabel=f"displacement, {name} [{length}]", ylim=(-limit, limit))
     ax.legend(fontsize=8, ncols=3)
     return figure
