@@ -11,7 +11,7 @@ from workbench.cases.case import Case
 from workbench.deadline import Deadline
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_in
-from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior, deviations_of
 from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.where import Where, locate, locate_force
 from workbench.gap.prediction.noise import noise_guessed
@@ -213,6 +213,7 @@ def diagnose(
                 *([] if sound or disagreeing else _of_gap(outcome, where, budget, rig, units)),
                 *([] if sound else filter(None, [steady_remainder(corrected, (*records, *validation), settle=settle)])),
                 *_notes(attribution, budget, seconds, silent, sound),
+                *_fitted_to_unseen(errors, attribution, validation),
                 *(_hiding(errors) if outcome == "explained" else ()),
             ),
         )
@@ -426,6 +427,17 @@ def _of_gap(outcome: str, where: Where, budget: Budget, rig: Rig, units: Units) 
         )
     if outcome == "unknown" and budget.is_open and budget.errors:
         yield "Most of the gap is unexplained: sizes of errors of the model, fitted beside it, are no findings."
+
+
+def _fitted_to_unseen(errors: Effect | None, found: Attribution, unseen: Sequence[Record]) -> Iterator[str]:
+    """A note that a figure which differs from record to record was fitted to records held out."""
+    fitted = set(deviations_of(errors.values)) if errors is not None else set()
+    own = [record.name for record in unseen if record.name in fitted - {r.name for r in found.search.data.records}]
+    if errors is not None and own and deviations_of(errors.values)[own[0]]:
+        yield (
+            f"The {errors.target.figure} of record{'s' if len(own) > 1 else ''} {joined_in_words(own)} was fitted to"
+            " the record itself for the budget; the share of the gap that closes is without it, as a prediction is."
+        )
 
 
 def _notes(

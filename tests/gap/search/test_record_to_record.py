@@ -7,7 +7,8 @@ import pytest
 
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.nominal import TENSION, NominalPrior, nominal_errors
+from workbench.gap.effects.effect import apply_all
+from workbench.gap.effects.nominal import TENSION, NominalPrior, group_of, nominal_errors
 from workbench.gap.effects.structural import buckling_load
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
@@ -16,6 +17,7 @@ from workbench.gap.search.nominal_figures import deviations
 from workbench.gap.search.search import Search
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
+from workbench.rig.simulate import simulate
 from workbench.trials.hidden import hide
 from workbench.trials.plant import Plant
 
@@ -109,6 +111,33 @@ def test_words_say_by_how_much_records_differ_and_which_two_most():
     found = RecordToRecord("stiffness", {"low": 0.004, "mid": -0.006, "high": 0.002})
     assert found.spread == pytest.approx(np.std([0.004, -0.006, 0.002], ddof=1))
     assert found.words == "0.53 %: record low is 1 % stiffer than record mid"
+
+
+@pytest.mark.slow
+def test_shapes_that_are_off_by_themselves_do_not_hide_a_stiffness_that_differs(hinged_rig):
+    """No profile has the shapes of such modes, and one that bends to them is off by more than any model."""
+    nominal = hinged_rig(n_modes=3)
+    rng, drawn = np.random.default_rng(2), np.random.default_rng(5)
+    prior = NominalPrior(frequency=0.005, shape=0.02, damping=0.2, by_mode=True)
+    none = nominal_errors(nominal, prior)
+    off = {name: getattr(prior, group_of(name)) * drawn.standard_normal() for name in none.values}
+    real = apply_all(nominal, (replace(none, values=off),))
+    factors = {"low": 1.0, "mid": 0.985, "high": 0.965, "other": 0.975}
+
+    def of(name):
+        inputs = LEVELS[name] * np.repeat(rng.normal(size=200), 5)[None]
+        stretched = replace(real, modes=replace(real.modes, omega=real.modes.omega * np.sqrt(factors[name])))
+        outputs = simulate(stretched, inputs, sample_time=0.01).outputs
+        noisy = outputs + NOISE * rng.normal(size=outputs.shape)
+        return nominal.record(inputs, noisy, sample_time=0.01, name=name)
+
+    records = [of(name) for name in factors]
+    verdict = diagnose(nominal, records[:3], validation=records[3:], workers=1)
+    found = verdict.record_to_record.values
+    assert verdict.outcome == "none" and found["low"] - found["high"] == pytest.approx(0.035, abs=0.001)
+    assert verdict.budget.effects["stiffness_record_to_record"] > 0.9 and "implausibly" not in verdict.sentence
+    assert verdict.budget.errors["shapes_percent"] > 0.5
+    assert any("record other was fitted to the record itself" in note for note in verdict.notes)
 
 
 @pytest.mark.slow
