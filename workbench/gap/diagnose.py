@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,7 @@ PAID = 0.02  # of what is left of records held out: what an effect that acts the
 TRIFLE = 0.0005  # of the gap there: likewise
 CLEAR = 10.0  # times that: what is left there without an effect that counts beyond doubt
 HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
+UNEXPLAINED = 0.05  # of the gap: a set that leaves more explains it in part
 CHANCE = 5.0  # standard deviations of the mean square of white noise: more than that is left of a record by no chance
 SECONDS = 120.0  # of processor time of this process and one beside it: twice what cases of a laboratory take at most
 SEARCH_SHARE = 0.8  # of that time; the rest is for intervals, budget and the next experiment
@@ -175,15 +177,19 @@ def diagnose(
         effects = named if outcome in ("none", "explained") else ()
         faulty = _faulty(attribution.best.effects)
         as_seen = faulty == _faulty(seen)
-        budget = budget_of(
+        taken_apart = partial(
+            budget_of,
             rig,
-            effects,
-            errors,
-            validation or records,
+            errors=errors,
+            records=validation or records,
             noise_found=attribution.noise,
             logged=attribution.logged,
             settle=settle,
         )
+        budget = taken_apart(effects)
+        if outcome == "explained" and _is_much(budget, _left_of(rig, (), validation or records, settle), tolerance):
+            outcome, effects, attribution = "part", (), replace(attribution, outcome="part")
+            budget = taken_apart(effects)
         sound = outcome in ("none", "explained")
         in_records = () if sound else data_faults(rig, records, settle=settle)
         in_unseen = () if sound else data_faults(rig, validation, settle=settle)
@@ -292,6 +298,15 @@ def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray
         return "unknown"
     fails = found.outcome == "explained" and _fails_unseen(found, shrinkage, beyond)
     return "part" if fails else found.outcome
+
+
+def _is_much(budget: Budget, power: float, tolerance: float) -> bool:
+    """Whether a set leaves too much of a gap unexplained to be called its explanation; power: mean square of the gap.
+
+    What is below the tolerance is not searched for.
+    """
+    least = max(UNEXPLAINED, LEFT * budget.noise)
+    return budget.unexplained > least and budget.unexplained * power > len(budget.by_record) * tolerance**2
 
 
 def _leaves_much(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray) -> bool:

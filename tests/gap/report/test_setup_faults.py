@@ -265,3 +265,18 @@ def test_records_of_one_name_are_refused(case):
         setup_faults(case.rig, [first, other])
     with pytest.raises(ValueError, match=f"2 records are called '{first.name}'"):
         diagnose(case.rig, [first], validation=[other], workers=1)
+
+
+@pytest.mark.parametrize("at", [0, -1])
+def test_a_fault_of_one_fit_record_alone_is_named_with_it(case, at):
+    (spoilt,) = change([case.fit[at]], outputs=diagonal(7, 2, -1.0))
+    fit = [spoilt if r.name == spoilt.name else r for r in case.fit]
+    (fault,) = setup_faults(case.rig, fit, case.validation)
+    assert fault.sentence in (
+        f"In record {spoilt.name}, the output a3 has the wrong sign: multiply by -1.",
+        f"The output a3 has the wrong sign: multiply by -1; not in "
+        f"{', '.join(r.name for r in (*case.fit, *case.validation) if r.name != spoilt.name)}.",
+    )
+    rig, again = without_faults([fault], case.rig, fit)
+    assert rig is case.rig
+    assert all(np.array_equal(a.outputs, b.outputs) for a, b in zip(again, case.fit, strict=True))

@@ -86,7 +86,7 @@ def setup_faults(
 ) -> tuple[SetupFault, ...]:
     """The faults of the test set-up that the records show against the nominal rig, in the order to correct them.
 
-    Each validation record is judged by itself: by each fault of the fit records, then by faults that it alone has.
+    Each record is judged by itself: by each fault of all fit records, then by faults that it alone has.
 
     Args:
         rig: nominal.
@@ -101,13 +101,15 @@ def setup_faults(
     found = [*_repeated(records), *_copied(rig, records)]
     seen_rig, seen = without_faults(found, rig, records)
     found += _by_rounds(seen_rig, seen, settle, WAYS)
-    held = tuple(validation)
+    fit, held = tuple(records), tuple(validation)
     for i, fault in enumerate(found):
         if fault.kind in OF_CHANNELS and fault.certain:
-            found[i] = fault = _judged_on(held, fault, rig, settle)
-        rig, held = without_faults([fault], rig, held)
-    for record in held:
-        found += [_of_one(record, fault) for fault in _by_rounds(rig, (record,), settle, WAYS_OF_ONE) if fault.certain]
+            found[i] = fault = _judged_on((*fit, *held), fault, rig, settle)
+        (_, fit), (rig, held) = [without_faults([fault], rig, these) for these in (fit, held)]
+    alone = [("record", record) for record in fit if len(fit) > 1]
+    for what, record in (*alone, *(("validation record", record) for record in held)):
+        of_it = _by_rounds(rig, (record,), settle, WAYS_OF_ONE)
+        found += [_of_one(what, record, fault) for fault in of_it if fault.certain]
     return tuple(found)
 
 
@@ -138,23 +140,25 @@ def _by_rounds(
     return found
 
 
-def _judged_on(held: Sequence[Record], fault: SetupFault, rig: Rig, settle: float) -> SetupFault:
-    """A fault of the fit records, with the validation records that agree better with the model by its correction."""
+def _judged_on(records: Sequence[Record], fault: SetupFault, rig: Rig, settle: float) -> SetupFault:
+    """A fault of all fit records, without those records that agree worse with the model by its correction.
+
+    What is silent in a record, or decayed there, says nothing of it.
+    """
 
     def left(of: Rig, these: Sequence[Record]) -> float:
         return float(np.minimum(_Gap.of(of, these, settle).before, WORST).sum())
 
-    showing = [r.name for r in held if left(*fault.correction(rig, (r,))) < left(rig, (r,))]
-    others = [r.name for r in held if r.name not in showing]
+    others = [r.name for r in records if left(*fault.correction(rig, (r,))) > left(rig, (r,)) + WIDE_GAP**2]
     sentence = f"{fault.sentence[:-1]}; not in {', '.join(others)}." if others else fault.sentence
-    return replace(fault, sentence=sentence, records=(*fault.records, *showing))
+    return replace(fault, sentence=sentence, records=tuple(r.name for r in records if r.name not in others))
 
 
-def _of_one(record: Record, fault: SetupFault) -> SetupFault:
-    """A fault of a validation record alone: the rig stays as it is."""
+def _of_one(what: str, record: Record, fault: SetupFault) -> SetupFault:
+    """A fault of one record alone: the rig stays as it is."""
     words = fault.sentence
     if fault.kind != "sample rate":  # that names its record
-        words = f"In validation record {record.name}, {words[0].lower()}{words[1:]}"
+        words = f"In {what} {record.name}, {words[0].lower()}{words[1:]}"
     return replace(fault, sentence=words, records=(record.name,), correction=partial(_records_alone, fault.correction))
 
 
