@@ -1,7 +1,8 @@
 """Faults of the test set-up, looked for before any effect: of wiring, of units and of bookkeeping.
 
 A fault is believed where its correction takes nearly all of the gap away on the channels that it concerns. Physics gone
-astray does not do that: no missing effect turns a sign, multiplies by 1000, or exchanges two channels.
+astray does not do that: no missing effect turns a sign, multiplies by 1000, or exchanges two channels. Beside a missing
+effect a turned sign is believed of a sensor that reads every mode turned, while others read them as predicted.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -27,6 +28,11 @@ WIDE_GAP = (
 # leaves 2, an exchange about 1.4, a factor of 2π at least 0.84
 LEFT = 0.15  # share of a channel's measured power that may remain beyond the noise: a prediction of nothing leaves all
 CLOSED = 0.9  # share of the closable power that a correction must take away, on the channels that it concerns
+ALIKE = 0.7  # correlation with the prediction of a sensor that reads as predicted beside an effect; less it, turned
+MODE_TURNED = (
+    -0.5
+)  # correlation in the band of one mode; a sensor beyond a node reads some modes turned, at 0.9 or more
+OF_MODE = 1e-3  # of a sensor's power: a mode with less is not asked
 NEAR = 0.15  # relative error of a gain that still is that factor: the least ratio of two of them is 1.56
 MOST_CHANNELS = 12  # pairs of inputs are simulated one by one: beyond, only neighbours are
 MOST_ROUNDS = 4  # faults that hide one another are found one after the other
@@ -352,9 +358,12 @@ def _scaled_outputs(gap: _Gap) -> list[SetupFault]:
     freely = gap.power([gains[:, None] * p for p in gap.predicted])
     n_samples = sum(y.shape[1] for y in gap.measured)
     factors: dict[tuple[float, bool], list[int]] = {}
+    turned = _turned(gap)
     for j in np.flatnonzero(gap.wide):
         factor = _factor(float(gains[j]))
-        if factor is not None:
+        if turned[j]:
+            factors.setdefault((-1.0, True), []).append(int(j))
+        elif factor is not None:
             left = gap.power([factor * p for p in gap.predicted])
             if gap.closed(left)[j] >= CLOSED:
                 certain = not _is_gain(
@@ -369,7 +378,8 @@ def _scaled_outputs(gap: _Gap) -> list[SetupFault]:
     faults = []
     for (factor, certain), outputs in factors.items():
         names = [rig.sensors[j].name for j in outputs]
-        closes = float(gap.closed(gap.power([factor * p for p in gap.predicted]))[outputs].min())
+        after = np.maximum(gap.power([factor * p for p in gap.predicted]) - gap.noise, 0.0)
+        closes = float((1.0 - after / (gap.before - gap.noise))[outputs].min())
         every = len(outputs) == len(rig.sensors)
         what, of_inputs = FACTORS[factor]
         if factor == 1.0 / G and {rig.sensors[j].quantity for j in outputs} == {"acceleration"}:
@@ -384,6 +394,35 @@ def _scaled_outputs(gap: _Gap) -> list[SetupFault]:
         correction = partial(_outputs_times, dict.fromkeys(names, 1.0 / factor))
         faults.append(SetupFault(kind, sentence, closes, correction, certain, gap.names))
     return faults
+
+
+def _turned(gap: _Gap) -> Flags:
+    """(n_outputs,) whether an output reads every mode with the wrong sign in every record, and as many others do not.
+
+    A resonance that is off in phase is so for every sensor, and a sensor at another place keeps the sign of some modes.
+    """
+    f = gap.rig.modes.frequencies_hz
+    edges = np.r_[0.0, (f[1:] + f[:-1]) / 2.0, np.inf]
+    sound, turned = np.ones((2, len(gap.rig.sensors)), bool)
+    several = ~turned
+    for record, y, p in zip(gap.records, gap.measured, gap.predicted, strict=True):
+        if not np.isfinite(p).all():
+            return np.zeros_like(turned)
+        window = np.hanning(y.shape[1])
+        of_y, of_p = (np.fft.rfft((a - a.mean(axis=1, keepdims=True)) * window) for a in (y, p))
+        band = np.digitize(np.fft.rfftfreq(y.shape[1], record.sample_time), edges) - 1
+        # (3, n_outputs, n_modes) of measured, predicted and both
+        products = (of_y * of_y.conj()).real, (of_p * of_p.conj()).real, (of_y * of_p.conj()).real
+        powers = np.array([[np.bincount(band, row, f.size) for row in product] for product in products])
+        measured, predicted, both = powers
+        alike = both / np.sqrt(np.maximum(measured * predicted, 1e-300))
+        over_all = both.sum(axis=1) / np.sqrt(np.maximum(measured.sum(axis=1) * predicted.sum(axis=1), 1e-300))
+        asked = measured > OF_MODE * measured.sum(axis=1, keepdims=True)
+        sound &= over_all > ALIKE
+        turned &= (over_all < -ALIKE) & (~asked | (alike < MODE_TURNED)).all(axis=1)
+        several |= asked.sum(axis=1) > 1
+    turned &= several
+    return np.asarray(turned & (sound.sum() >= turned.sum()))
 
 
 def _is_gain(gain: float, factor: float, left: float, freely: float, noise: float, n_samples: int) -> bool:
