@@ -104,7 +104,8 @@ def diagnose(
             at rest.
         uncertain_nominal: fit errors of the nominal model beside every effect from the first.
         tolerance: of the signal's rms: a gap beyond the noise that is smaller in every record is reported, and not
-            explained; nor is one below a tenth of the noise.
+            explained; nor is one below a tenth of the noise. What an explained gap leaves below it is not searched
+            either, and noted where it is more than the noise.
         identified: errors that the nominal rig has because it was itself identified: they are fitted beside the effects
             in the end, so that intervals allow for them. Those of a rig's modes where their covariance is known.
         units: names of the units of the rig and the records, in which the verdict states its numbers.
@@ -160,7 +161,8 @@ def diagnose(
             identified=identified or IdentifiedPrior.of_modes(rig),
         )
         if attribution.outcome == "explained" and attribution.random is None:
-            alike, search = ready().indistinguishable, attribution.search
+            # rivals are fitted to the records as the best set was, which is else at a disadvantage
+            alike, search = ready().indistinguishable, replace(attribution.search, data=attribution.weighed)
             rivals = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
             attribution = replace(attribution, alternatives=rivals)
         attribution = _paid_for(rig, attribution, validation, settle)
@@ -187,7 +189,8 @@ def diagnose(
             settle=settle,
         )
         budget = taken_apart(effects)
-        if outcome == "explained" and _is_much(budget, _left_of(rig, (), validation or records, settle), tolerance):
+        power = _left_of(rig, (), validation or records, settle) / len(validation or records)
+        if outcome == "explained" and _is_much(budget, power, tolerance):
             outcome, effects, attribution = "part", (), replace(attribution, outcome="part")
             budget = taken_apart(effects)
         sound = outcome in ("none", "explained")
@@ -218,6 +221,7 @@ def diagnose(
                 *([OVER_FITTING] if outcome == "part" != attribution.outcome and not (in_unseen or of_setup) else []),
                 *([] if sound or disagreeing else _of_gap(outcome, where, budget, rig, units)),
                 *([] if sound else filter(None, [steady_remainder(corrected, (*records, *validation), settle=settle)])),
+                *(_of_rest(budget, power, tolerance) if sound and attribution.best.effects else ()),
                 *_notes(attribution, budget, seconds, silent, sound),
                 *(_hiding(errors) if outcome == "explained" else ()),
             ),
@@ -306,7 +310,7 @@ def _is_much(budget: Budget, power: float, tolerance: float) -> bool:
     What is below the tolerance is not searched for.
     """
     least = max(UNEXPLAINED, LEFT * budget.noise)
-    return budget.unexplained > least and budget.unexplained * power > len(budget.by_record) * tolerance**2
+    return budget.unexplained > least and budget.unexplained * power > tolerance**2
 
 
 def _leaves_much(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray) -> bool:
@@ -441,6 +445,19 @@ def _of_gap(outcome: str, where: Where, budget: Budget, rig: Rig, units: Units) 
         )
     if outcome == "unknown" and budget.is_open and budget.errors:
         yield "Most of the gap is unexplained: sizes of errors of the model, fitted beside it, are no findings."
+
+
+def _of_rest(budget: Budget, power: float, tolerance: float) -> Iterator[str]:
+    """What is said of more than noise that an explained gap leaves; power: mean square of the gap."""
+    if budget.leaves_more_than_noise:
+        rest, times = np.sqrt(budget.unexplained * power), np.sqrt(budget.unexplained / budget.noise)
+        below = rest < tolerance
+        why = (
+            f"below the tolerance of {100 * tolerance:g} %, no cause of it was sought"
+            if below
+            else "something is missed"
+        )
+        yield f"Beyond the noise, {100 * rest:.2g} % of the signal is left, {times:.2g} times the noise: {why}."
 
 
 def _notes(
