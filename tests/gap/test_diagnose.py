@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.gap.diagnose import diagnose
+from workbench.gap.diagnose import _is_much, _of_rest, diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, Kind, Parameter, place_parameters
 from workbench.gap.effects.nonlinear import with_element
 from workbench.gap.prediction.residuals import FitData
+from workbench.gap.report.budget import Budget
 from workbench.gap.report.record_checks import RecordsError
 from workbench.gap.search.fit import fit
 from workbench.rig.elements import OneSidedStop, UserLaw
@@ -287,3 +288,26 @@ def test_a_fault_of_a_record_held_out_is_not_called_over_fitting(hinged_rig, rec
 def test_a_time_to_settle_that_no_record_has_is_refused(nothing_hidden, settle):
     with pytest.raises(ValueError, match="settle must be 0 or more and less than the shortest record"):
         diagnose(nothing_hidden.rig, nothing_hidden.fit, settle=settle, workers=1)
+
+
+@pytest.mark.parametrize(
+    ("unexplained", "noise", "power", "much"),
+    [(0.35, 0.0, 1.0, True), (0.03, 0.0, 1.0, False), (0.07, 0.9, 1.0, False), (0.35, 0.0, 2e-4, False)],
+)
+def test_a_set_that_leaves_more_than_a_few_per_cent_explains_the_gap_in_part(unexplained, noise, power, much):
+    """By chance a tenth of the noise may be left beside it, and what is below the tolerance is not searched for."""
+    shares = {"effects": {}, "nominal": 1.0 - unexplained - noise, "unexplained": unexplained, "noise": noise}
+    assert _is_much(Budget(**shares, by_record={"r": np.array([])}), power, 0.01) is much
+
+
+def test_a_rest_of_the_model_is_noted_with_its_size_and_not_called_noise():
+    """100 times the power of the noise is 10 times its rms; of a gap as large as the signal, 1e-5 are 0.32 % of it."""
+    noise = {"noise_stated": (1.0,), "noise_found": (1.8,)}
+    rest = Budget({}, 1.0 - 1.01e-5, 1e-5, 1e-7, {}, **noise)
+    assert [*_of_rest(rest, 1.0, 0.01)] == [
+        "Beyond the noise, 0.32 % of the signal is left, 10 times the noise: below the tolerance of 1 %, no cause of it"
+        " was sought."
+    ]
+    assert [note.endswith("something is missed.") for note in _of_rest(rest, 1.0, 0.001)] == [True]
+    assert rest.noise_remark.startswith("What looks like noise is 1.8 times the stated noise_std; part of it may be")
+    assert not [*_of_rest(Budget({}, 0.9, 0.04, 0.06, {}, **noise), 1.0, 0.01)]

@@ -17,8 +17,8 @@ COLUMNS = ("name", "node", "x", "y", "z", "direction")
 def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
     """Named points, and mode shapes (n_points, n_modes) there, from a CSV table.
 
-    Its columns are name, node, x, y, z (m), direction (x, y, z, rx, ry or rz; empty where not
-    known) and mode_1 to mode_n, mass-normalised.
+    Its columns are name, node, x, y, z (m; empty in every row where positions are not known), direction (x, y, z, rx,
+    ry or rz; empty where not known) and mode_1 to mode_n, mass-normalised.
 
     Raises:
         CaseError: naming the file, the line and the column, and what would be right.
@@ -39,34 +39,31 @@ def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
         raise CaseError(f"{path} cannot be read as CSV: {error}") from error
     if not 0 < len(rows) <= MOST_POINTS:
         raise CaseError(f"{path} must list 1 to {MOST_POINTS} points")
-    values = np.array([[_number(path, i, row, c) for c in (*"xyz", *columns[len(COLUMNS) :])] for i, row in rows])
+    known = any(row[c] for _, row in rows for c in "xyz")
+    numeric = [*("xyz" if known else ""), *columns[len(COLUMNS) :]]
+    values = np.array([[_number(path, i, row, c) for c in numeric] for i, row in rows])
     try:
         points = NamedPoints(
             names=tuple(_text(path, i, row, "name") for i, row in rows),
-            positions=values[:, :3],
+            positions=values[:, :3] if known else None,
             directions=tuple(_text(path, i, row, "direction", may_be_empty=True) for i, row in rows),
             nodes=tuple(_text(path, i, row, "node") for i, row in rows),
         )
     except ValueError as error:
         raise CaseError(f"{path}: {error}") from error
-    return points, values[:, 3:]
+    return points, values[:, -n_modes:]
 
 
 def write_points(path: Path, points: NamedPoints, values: np.ndarray) -> None:
-    """Write the table that `read_points` reads.
-
-    Raises:
-        ValueError: points without positions.
-    """
-    if points.positions is None:
-        raise ValueError("named points without positions cannot be written: the table asks for x, y and z")
+    """Write the table that `read_points` reads."""
+    places = [("", "", "")] * len(points.names) if points.positions is None else points.positions.tolist()
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*COLUMNS, *(f"mode_{r + 1}" for r in range(values.shape[1]))])
         for name, node, at, direction, row in zip(
-            points.names, points.nodes, points.positions, points.directions, values, strict=True
+            points.names, points.nodes, places, points.directions, values, strict=True
         ):
-            writer.writerow([name, node, *map(repr, at.tolist()), direction, *map(repr, row.tolist())])
+            writer.writerow([name, node, *at, direction, *map(repr, row.tolist())])
 
 
 def _number(path: Path, line: int, row: dict[str, Any], column: str) -> float:
@@ -77,7 +74,7 @@ def _number(path: Path, line: int, row: dict[str, Any], column: str) -> float:
     if not np.isfinite(value):
         remedy = ""
         if column in "xyz" and not row[column]:
-            remedy = "; say where the point stands, m, or give inputs and outputs their `shape` in place of a table"
+            remedy = "; say where the point stands, m, or leave x, y and z of every point empty"
         raise CaseError(
             f"{path}, line {line + 2}, column {column!r}: expected a finite number; got {shown(row[column])}{remedy}"
         )

@@ -11,7 +11,7 @@ from workbench.cases.case import Case, signals_of
 from workbench.cases.points import write_points
 from workbench.records.units import SI
 from workbench.rig.actuators import Actuator
-from workbench.rig.rig import Rig, shape_of
+from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, Patch, middle, position
@@ -30,8 +30,7 @@ Port = Actuator | Sensor
 def write_case(case: Case, folder: str | Path) -> Path:
     """Write a case as a folder, case.toml and records/NAME.npz, that `read_case` reads back.
 
-    A rig at named points is written with the table points.csv beside; where their positions are not known, with the
-    shapes at its inputs and outputs.
+    A rig at named points is written with the table points.csv beside.
 
     Raises:
         ValueError: what the format cannot say: profiles that are not linear between their breaks, a plate that varies,
@@ -67,16 +66,8 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
             "a case folder describes a beam, a rod, a plate, or modes at named points; this is a membrane, or a rig"
             " without its structure"
         )
-    if points.positions is not None:
-        write_points(folder / POINTS, points, rig.modes.phi(points.names))
-        return [_modal(rig.modes, points=POINTS), *_ports(rig, at=lambda port: {"point": port.at})]
-    unused = set(points.names) - {a.at for a in rig.actuators} - {s.at for s in rig.sensors}
-    if unused:
-        raise ValueError(
-            f"point {sorted(unused)[0]!r} has no position and is neither input nor output, so the format has no place"
-            " for it; give the points positions"
-        )
-    return [_modal(rig.modes), *_ports(rig, at=lambda port: {"shape": shape_of(rig.modes, port).tolist()})]
+    write_points(folder / POINTS, points, rig.modes.phi(points.names))
+    return [_modal(rig.modes, POINTS), *_ports(rig, at=lambda port: {"point": port.at})]
 
 
 def _member(member: Structure, n_modes: int) -> str:
@@ -117,7 +108,7 @@ def _plate(plate: Plate, n_modes: int) -> str:
     )
 
 
-def _modal(modes: Modes, **more: str) -> str:
+def _modal(modes: Modes, points: str) -> str:
     if not modes.proportional:
         raise ValueError("the case format knows no damping that couples modes; keep the diagonal of Modes.damping")
     rigid = modes.omega == 0
@@ -128,7 +119,7 @@ def _modal(modes: Modes, **more: str) -> str:
         natural_frequencies_hz=modes.frequencies_hz.tolist(),
         damping_ratios=modes.zeta.tolist(),
         **({"rigid_damping": rates} if any(rates) else {}),
-        **more,
+        points=points,
     )
 
 
@@ -172,7 +163,7 @@ def _check_ports(rig: Rig) -> None:
         raise ValueError(
             f"the case format knows no elements of the nominal rig; take {type(rig.elements[0]).__name__} out"
         )
-    moments = isinstance(rig.structure, Beam | Plate) or getattr(rig.modes.domain, "positions", None) is not None
+    moments = isinstance(rig.structure, Beam | Plate) or isinstance(rig.modes.domain, NamedPoints)
     ports: tuple[Port, ...] = (*rig.actuators, *rig.sensors)
     for port in ports:
         patch = isinstance(port, Actuator) and _is_patch(port, rig)

@@ -120,6 +120,8 @@ def diagnose(
     after, floor = shown["gap"]["after"], shown["gap"]["floor"]
     for name, before in shown["gap"]["before"].items():
         say(f"  {name:<10} gap {before:.4g} → {after[name]:.4g}, noise floor {floor[name]:.4g}")
+    if verdict.alternatives and verdict.outcome == "explained":
+        say(f"  named      probability {verdict.probability:.2g}, against")
     for words, probability in verdict.alternatives_in_words[:SHOWN_ALTERNATIVES]:
         say(f"  alternative {words} ({probability:.2g})")
     for note in verdict.notes:

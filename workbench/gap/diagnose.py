@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,7 @@ PAID = 0.02  # of what is left of records held out: what an effect that acts the
 TRIFLE = 0.0005  # of the gap there: likewise
 CLEAR = 10.0  # times that: what is left there without an effect that counts beyond doubt
 HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
+UNEXPLAINED = 0.05  # of the gap: a set that leaves more explains it in part
 CHANCE = 5.0  # standard deviations of the mean square of white noise: more than that is left of a record by no chance
 SECONDS = 120.0  # of processor time of this process and one beside it: twice what cases of a laboratory take at most
 SEARCH_SHARE = 0.8  # of that time; the rest is for intervals, budget and the next experiment
@@ -102,7 +104,8 @@ def diagnose(
             at rest.
         uncertain_nominal: fit errors of the nominal model beside every effect from the first.
         tolerance: of the signal's rms: a gap beyond the noise that is smaller in every record is reported, and not
-            explained; nor is one below a tenth of the noise.
+            explained; nor is one below a tenth of the noise. What an explained gap leaves below it is not searched
+            either, and noted where it is more than the noise.
         identified: errors that the nominal rig has because it was itself identified: they are fitted beside the effects
             in the end, so that intervals allow for them. Those of a rig's modes where their covariance is known.
         units: names of the units of the rig and the records, in which the verdict states its numbers.
@@ -158,7 +161,8 @@ def diagnose(
             identified=identified or IdentifiedPrior.of_modes(rig),
         )
         if attribution.outcome == "explained" and attribution.random is None:
-            alike, search = ready().indistinguishable, attribution.search
+            # rivals are fitted to the records as the best set was, which is else at a disadvantage
+            alike, search = ready().indistinguishable, replace(attribution.search, data=attribution.weighed)
             rivals = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
             attribution = replace(attribution, alternatives=rivals)
         attribution = _paid_for(rig, attribution, validation, settle)
@@ -175,15 +179,20 @@ def diagnose(
         effects = named if outcome in ("none", "explained") else ()
         faulty = _faulty(attribution.best.effects)
         as_seen = faulty == _faulty(seen)
-        budget = budget_of(
+        taken_apart = partial(
+            budget_of,
             rig,
-            effects,
-            errors,
-            validation or records,
+            errors=errors,
+            records=validation or records,
             noise_found=attribution.noise,
             logged=attribution.logged,
             settle=settle,
         )
+        budget = taken_apart(effects)
+        power = _left_of(rig, (), validation or records, settle) / len(validation or records)
+        if outcome == "explained" and _is_much(budget, power, tolerance):
+            outcome, effects, attribution = "part", (), replace(attribution, outcome="part")
+            budget = taken_apart(effects)
         sound = outcome in ("none", "explained")
         in_records = () if sound else data_faults(rig, records, settle=settle)
         in_unseen = () if sound else data_faults(rig, validation, settle=settle)
@@ -212,6 +221,7 @@ def diagnose(
                 *([OVER_FITTING] if outcome == "part" != attribution.outcome and not (in_unseen or of_setup) else []),
                 *([] if sound or disagreeing else _of_gap(outcome, where, budget, rig, units)),
                 *([] if sound else filter(None, [steady_remainder(corrected, (*records, *validation), settle=settle)])),
+                *(_of_rest(budget, power, tolerance) if sound and attribution.best.effects else ()),
                 *_notes(attribution, budget, seconds, silent, sound),
                 *_fitted_to_unseen(errors, attribution, validation),
                 *(_hiding(errors) if outcome == "explained" else ()),
@@ -293,6 +303,15 @@ def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray
         return "unknown"
     fails = found.outcome == "explained" and _fails_unseen(found, shrinkage, beyond)
     return "part" if fails else found.outcome
+
+
+def _is_much(budget: Budget, power: float, tolerance: float) -> bool:
+    """Whether a set leaves too much of a gap unexplained to be called its explanation; power: mean square of the gap.
+
+    What is below the tolerance is not searched for.
+    """
+    least = max(UNEXPLAINED, LEFT * budget.noise)
+    return budget.unexplained > least and budget.unexplained * power > tolerance**2
 
 
 def _leaves_much(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray) -> bool:
@@ -438,6 +457,17 @@ def _fitted_to_unseen(errors: Effect | None, found: Attribution, unseen: Sequenc
             f"The {errors.target.figure} of record{'s' if len(own) > 1 else ''} {joined_in_words(own)} was fitted to"
             " the record itself for the budget; the share of the gap that closes is without it, as a prediction is."
         )
+def _of_rest(budget: Budget, power: float, tolerance: float) -> Iterator[str]:
+    """What is said of more than noise that an explained gap leaves; power: mean square of the gap."""
+    if budget.leaves_more_than_noise:
+        rest, times = np.sqrt(budget.unexplained * power), np.sqrt(budget.unexplained / budget.noise)
+        below = rest < tolerance
+        why = (
+            f"below the tolerance of {100 * tolerance:g} %, no cause of it was sought"
+            if below
+            else "something is missed"
+        )
+        yield f"Beyond the noise, {100 * rest:.2g} % of the signal is left, {times:.2g} times the noise: {why}."
 
 
 def _notes(

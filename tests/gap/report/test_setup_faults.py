@@ -4,10 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import butter, cont2discrete, dlsim, lfilter
 
 from workbench.gap.diagnose import diagnose
 from workbench.gap.report.setup_faults import SetupFault, check_disjoint, setup_faults, without_faults
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import NamedPoints
+from workbench.structure.finite_elements import FiniteElements
 from workbench.trials.make import make_trial
 
 SEED = 899  # three actuators and a hammer, accelerometers and a velocity sensor, on a beam of slow modes
@@ -265,3 +271,59 @@ def test_records_of_one_name_are_refused(case):
         setup_faults(case.rig, [first, other])
     with pytest.raises(ValueError, match=f"2 records are called '{first.name}'"):
         diagnose(case.rig, [first], validation=[other], workers=1)
+
+
+@pytest.mark.parametrize("at", [0, -1])
+def test_a_fault_of_one_fit_record_alone_is_named_with_it(case, at):
+    (spoilt,) = change([case.fit[at]], outputs=diagonal(7, 2, -1.0))
+    fit = [spoilt if r.name == spoilt.name else r for r in case.fit]
+    (fault,) = setup_faults(case.rig, fit, case.validation)
+    assert fault.sentence in (
+        f"In record {spoilt.name}, the output a3 has the wrong sign: multiply by -1.",
+        f"The output a3 has the wrong sign: multiply by -1; not in "
+        f"{', '.join(r.name for r in (*case.fit, *case.validation) if r.name != spoilt.name)}.",
+    )
+    rig, again = without_faults([fault], case.rig, fit)
+    assert rig is case.rig
+    assert all(np.array_equal(a.outputs, b.outputs) for a, b in zip(again, case.fit, strict=True))
+
+
+def servo_with_a_heavier_load(seed):
+    """Two discs and a shaft by the matrix exponential; the load is 12 % heavier than its model, and its sign turned."""
+    rng, dt = np.random.default_rng(seed), 2e-3
+    motor, load, shaft = 2e-3, 5e-3, 40.0
+    stiffness = shaft * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    rotor = FiniteElements(
+        np.diag([motor, load]), stiffness, nodes=NamedPoints(("motor", "load")), damping=ModalDamping(0.01)
+    )
+    sensors = (
+        Sensor("encoder", "motor", "displacement", noise_std=1e-3),
+        Sensor("tacho", "load", "velocity", noise_std=1e-2),
+    )
+    rig = Rig(rotor.modes(2), (Actuator("torque", "motor"),), sensors)
+    inverse = np.diag([1.0 / motor, 1.0 / (load + 6e-4)])
+    zero, damping = np.zeros((2, 2)), 1e-4 * stiffness
+    a = np.block([[zero, np.eye(2)], [-inverse @ stiffness, -inverse @ damping]])
+    b = np.r_[0.0, 0.0, 1.0 / motor, 0.0][:, None]
+    c = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -1.0]])
+    held, records = cont2discrete((a, b, c, np.zeros((2, 1))), dt), []
+    for name in ("low", "high"):
+        torque = lfilter(*butter(4, 0.16), rng.standard_normal(1500))
+        y = dlsim(held, torque)[1].T + np.array([[1e-3], [1e-2]]) * rng.standard_normal((2, 1500))
+        records.append(rig.record(torque[None], y, sample_time=dt, name=name))
+    return rig, records
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_turned_sign_is_found_beside_a_missing_mass(seed):
+    rig, records = servo_with_a_heavier_load(seed)
+    (fault,) = setup_faults(rig, records)
+    assert fault.sentence == "The output tacho has the wrong sign: multiply by -1." and fault.closes > 0.5
+    assert setup_faults(*without_faults([fault], rig, records)) == ()
+
+
+@pytest.mark.slow
+def test_a_sensor_beyond_a_node_that_reads_some_modes_turned_has_no_wrong_sign():
+    """It stands where the second and the third mode are as strong and turned, the first is not."""
+    case, _ = make_trial(1016, kinds=("sensor_misplacement",))
+    assert setup_faults(case.rig, case.fit) == ()

@@ -180,3 +180,16 @@ def test_a_nearest_set_is_headed_as_one_that_does_not_explain(kind, title):
     content = {"effects": [], "nearest": [{"kind": kind, "parameters": {"mass": 1.0}}], "alternatives": []}
     gap = {"before": {}, "after": {}, "floor": {}}
     assert verdict_tables({**content, "gap": gap})[0][0] == title
+
+
+def test_the_probability_of_the_set_named_and_of_its_alternatives_sum_to_one(hinged_rig, record_of):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    found = diagnose(
+        rig, (record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high"),),
+        catalogue=(kind_named("actuator_gain"),),
+    )  # fmt: skip
+    search = replace(found.attribution, alternatives=((found.attribution.best, 0.4),))
+    shown = replace(found, outcome="explained", alternatives=(("a", 0.4),), attribution=search)
+    assert shown.probability == pytest.approx(0.6) and shown.to_json()["probability"] == 0.6
+    assert found.to_json()["probability"] is None
+    assert dict(verdict_tables(shown.to_json())[-1][2])["the set named"] == 0.6

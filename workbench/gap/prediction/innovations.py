@@ -76,7 +76,8 @@ class Observer:
             substeps: of a sample.
             motion: of the whole record, by these substeps, where it may be at hand.
         """
-        errors: Floats = self.whitening @ self._one_step_errors(rig, record, substeps, motion)
+        with np.errstate(over="ignore", invalid="ignore"):  # the motion of a rig that was tried may run away
+            errors: Floats = self.whitening @ self._one_step_errors(rig, record, substeps, motion)
         return errors
 
     def left(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:

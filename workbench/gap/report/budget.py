@@ -176,7 +176,14 @@ class Budget:
                 f"What is left is {ratio:.2g} times the stated noise_std or more: louder noise, or errors of the model"
                 " that no effect and no small error describes."
             )
+        if self.leaves_more_than_noise:
+            return f"What looks like noise is {ratio:.2g} times the stated noise_std; part of it may be of the model."
         return f"The noise of the sensors is {ratio:.2g} times the stated noise_std."
+
+    @property
+    def leaves_more_than_noise(self) -> bool:
+        """Whether more is unexplained than noise."""
+        return self.unexplained > self.noise > 0.0
 
     @property
     def is_open(self) -> bool:

@@ -1,7 +1,8 @@
 """Faults of the test set-up, looked for before any effect: of wiring, of units and of bookkeeping.
 
 A fault is believed where its correction takes nearly all of the gap away on the channels that it concerns. Physics gone
-astray does not do that: no missing effect turns a sign, multiplies by 1000, or exchanges two channels.
+astray does not do that: no missing effect turns a sign, multiplies by 1000, or exchanges two channels. Beside a missing
+effect a turned sign is believed of a sensor that reads every mode turned, while others read them as predicted.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -27,6 +28,11 @@ WIDE_GAP = (
 # leaves 2, an exchange about 1.4, a factor of 2π at least 0.84
 LEFT = 0.15  # share of a channel's measured power that may remain beyond the noise: a prediction of nothing leaves all
 CLOSED = 0.9  # share of the closable power that a correction must take away, on the channels that it concerns
+ALIKE = 0.7  # correlation with the prediction of a sensor that reads as predicted beside an effect; less it, turned
+MODE_TURNED = (
+    -0.5
+)  # correlation in the band of one mode; a sensor beyond a node reads some modes turned, at 0.9 or more
+OF_MODE = 1e-3  # of a sensor's power: a mode with less is not asked
 NEAR = 0.15  # relative error of a gain that still is that factor: the least ratio of two of them is 1.56
 MOST_CHANNELS = 12  # pairs of inputs are simulated one by one: beyond, only neighbours are
 MOST_ROUNDS = 4  # faults that hide one another are found one after the other
@@ -86,7 +92,7 @@ def setup_faults(
 ) -> tuple[SetupFault, ...]:
     """The faults of the test set-up that the records show against the nominal rig, in the order to correct them.
 
-    Each validation record is judged by itself: by each fault of the fit records, then by faults that it alone has.
+    Each record is judged by itself: by each fault of all fit records, then by faults that it alone has.
 
     Args:
         rig: nominal.
@@ -101,13 +107,15 @@ def setup_faults(
     found = [*_repeated(records), *_copied(rig, records)]
     seen_rig, seen = without_faults(found, rig, records)
     found += _by_rounds(seen_rig, seen, settle, WAYS)
-    held = tuple(validation)
+    fit, held = tuple(records), tuple(validation)
     for i, fault in enumerate(found):
         if fault.kind in OF_CHANNELS and fault.certain:
-            found[i] = fault = _judged_on(held, fault, rig, settle)
-        rig, held = without_faults([fault], rig, held)
-    for record in held:
-        found += [_of_one(record, fault) for fault in _by_rounds(rig, (record,), settle, WAYS_OF_ONE) if fault.certain]
+            found[i] = fault = _judged_on((*fit, *held), fault, rig, settle)
+        (_, fit), (rig, held) = [without_faults([fault], rig, these) for these in (fit, held)]
+    alone = [("record", record) for record in fit if len(fit) > 1]
+    for what, record in (*alone, *(("validation record", record) for record in held)):
+        of_it = _by_rounds(rig, (record,), settle, WAYS_OF_ONE)
+        found += [_of_one(what, record, fault) for fault in of_it if fault.certain]
     return tuple(found)
 
 
@@ -138,23 +146,25 @@ def _by_rounds(
     return found
 
 
-def _judged_on(held: Sequence[Record], fault: SetupFault, rig: Rig, settle: float) -> SetupFault:
-    """A fault of the fit records, with the validation records that agree better with the model by its correction."""
+def _judged_on(records: Sequence[Record], fault: SetupFault, rig: Rig, settle: float) -> SetupFault:
+    """A fault of all fit records, without those records that agree worse with the model by its correction.
+
+    What is silent in a record, or decayed there, says nothing of it.
+    """
 
     def left(of: Rig, these: Sequence[Record]) -> float:
         return float(np.minimum(_Gap.of(of, these, settle).before, WORST).sum())
 
-    showing = [r.name for r in held if left(*fault.correction(rig, (r,))) < left(rig, (r,))]
-    others = [r.name for r in held if r.name not in showing]
+    others = [r.name for r in records if left(*fault.correction(rig, (r,))) > left(rig, (r,)) + WIDE_GAP**2]
     sentence = f"{fault.sentence[:-1]}; not in {', '.join(others)}." if others else fault.sentence
-    return replace(fault, sentence=sentence, records=(*fault.records, *showing))
+    return replace(fault, sentence=sentence, records=tuple(r.name for r in records if r.name not in others))
 
 
-def _of_one(record: Record, fault: SetupFault) -> SetupFault:
-    """A fault of a validation record alone: the rig stays as it is."""
+def _of_one(what: str, record: Record, fault: SetupFault) -> SetupFault:
+    """A fault of one record alone: the rig stays as it is."""
     words = fault.sentence
     if fault.kind != "sample rate":  # that names its record
-        words = f"In validation record {record.name}, {words[0].lower()}{words[1:]}"
+        words = f"In {what} {record.name}, {words[0].lower()}{words[1:]}"
     return replace(fault, sentence=words, records=(record.name,), correction=partial(_records_alone, fault.correction))
 
 
@@ -348,9 +358,12 @@ def _scaled_outputs(gap: _Gap) -> list[SetupFault]:
     freely = gap.power([gains[:, None] * p for p in gap.predicted])
     n_samples = sum(y.shape[1] for y in gap.measured)
     factors: dict[tuple[float, bool], list[int]] = {}
+    turned = _turned(gap)
     for j in np.flatnonzero(gap.wide):
         factor = _factor(float(gains[j]))
-        if factor is not None:
+        if turned[j]:
+            factors.setdefault((-1.0, True), []).append(int(j))
+        elif factor is not None:
             left = gap.power([factor * p for p in gap.predicted])
             if gap.closed(left)[j] >= CLOSED:
                 certain = not _is_gain(
@@ -365,7 +378,8 @@ def _scaled_outputs(gap: _Gap) -> list[SetupFault]:
     faults = []
     for (factor, certain), outputs in factors.items():
         names = [rig.sensors[j].name for j in outputs]
-        closes = float(gap.closed(gap.power([factor * p for p in gap.predicted]))[outputs].min())
+        after = np.maximum(gap.power([factor * p for p in gap.predicted]) - gap.noise, 0.0)
+        closes = float((1.0 - after / (gap.before - gap.noise))[outputs].min())
         every = len(outputs) == len(rig.sensors)
         what, of_inputs = FACTORS[factor]
         if factor == 1.0 / G and {rig.sensors[j].quantity for j in outputs} == {"acceleration"}:
@@ -380,6 +394,35 @@ def _scaled_outputs(gap: _Gap) -> list[SetupFault]:
         correction = partial(_outputs_times, dict.fromkeys(names, 1.0 / factor))
         faults.append(SetupFault(kind, sentence, closes, correction, certain, gap.names))
     return faults
+
+
+def _turned(gap: _Gap) -> Flags:
+    """(n_outputs,) whether an output reads every mode with the wrong sign in every record, and as many others do not.
+
+    A resonance that is off in phase is so for every sensor, and a sensor at another place keeps the sign of some modes.
+    """
+    f = gap.rig.modes.frequencies_hz
+    edges = np.r_[0.0, (f[1:] + f[:-1]) / 2.0, np.inf]
+    sound, turned = np.ones((2, len(gap.rig.sensors)), bool)
+    several = ~turned
+    for record, y, p in zip(gap.records, gap.measured, gap.predicted, strict=True):
+        if not np.isfinite(p).all():
+            return np.zeros_like(turned)
+        window = np.hanning(y.shape[1])
+        of_y, of_p = (np.fft.rfft((a - a.mean(axis=1, keepdims=True)) * window) for a in (y, p))
+        band = np.digitize(np.fft.rfftfreq(y.shape[1], record.sample_time), edges) - 1
+        # (3, n_outputs, n_modes) of measured, predicted and both
+        products = (of_y * of_y.conj()).real, (of_p * of_p.conj()).real, (of_y * of_p.conj()).real
+        powers = np.array([[np.bincount(band, row, f.size) for row in product] for product in products])
+        measured, predicted, both = powers
+        alike = both / np.sqrt(np.maximum(measured * predicted, 1e-300))
+        over_all = both.sum(axis=1) / np.sqrt(np.maximum(measured.sum(axis=1) * predicted.sum(axis=1), 1e-300))
+        asked = measured > OF_MODE * measured.sum(axis=1, keepdims=True)
+        sound &= over_all > ALIKE
+        turned &= (over_all < -ALIKE) & (~asked | (alike < MODE_TURNED)).all(axis=1)
+        several |= asked.sum(axis=1) > 1
+    turned &= several
+    return np.asarray(turned & (sound.sum() >= turned.sum()))
 
 
 def _is_gain(gain: float, factor: float, left: float, freely: float, noise: float, n_samples: int) -> bool:

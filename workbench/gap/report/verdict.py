@@ -35,7 +35,8 @@ class Verdict:
         effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown"; errors of
             the nominal model among it, where they were fitted beside.
         budget: of the gap: shares of each effect, of errors of the nominal model, of noise and of what is unexplained.
-        alternatives: (label of another set that the records do not exclude, probability), likeliest first.
+        alternatives: (label of another set that the records do not exclude, probability), likeliest first; with
+            `probability`, that of the set named, these sum to one.
         where: the gap taken apart.
         shrinkage: on validation records; None without any.
         corrected: the rig with the effects in it.
@@ -74,6 +75,11 @@ class Verdict:
     def shows_gap(self) -> bool:
         """Whether the records that were fitted have a gap, so that where it is can be said."""
         return self.outcome != "none" and not self.disagreeing
+
+    @property
+    def probability(self) -> float:
+        """Of the set named against its alternatives; 1 without any."""
+        return max(1.0 - sum(probability for _, probability in self.alternatives), 0.0)
 
     @property
     def _named(self) -> tuple[Effect, ...]:
@@ -275,6 +281,7 @@ class Verdict:
             "sentence": self.sentence,
             "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
             "nearest": [] if known else effects,
+            "probability": _rounded(self.probability) if self.outcome == "explained" else None,
             "alternatives": [
                 {"kind": label, "words": words, "probability": _rounded(p)}
                 for (label, p), (words, _) in zip(self.alternatives, self.alternatives_in_words, strict=True)

@@ -241,15 +241,18 @@ def with_equals(
         alike: labels of two effects that the records could not distinguish, and how alike.
     """
     data = search.data.finely(SELECTION.fine)
-    enough = cost_of(search.rig, best.effects, data) + SEARCH.rival
     known = {best.key, *(f.key for f, _ in rivals)}
     sets = [s for s in _at_other_ports(search, best, evidence, alike) if key_of(s) not in known]
-    equals = [f for f in search.workers.map(lambda s: fit(search.rig, s, data), sets) if f.cost < enough]
+    if not sets:
+        return rivals
+    here, *each = search.workers.map(lambda s: fit(search.rig, s, data), [best.effects, *sets])
+    equals = [f for f in each if f.cost < here.cost + SEARCH.rival]
     if not equals:
         return rivals
-    here = fit(search.rig, best.effects, data, iterations=0)
     first, others = ranked(search, [here, *equals])
     of_each = {first.key: 1.0 - sum(p for _, p in others), **{f.key: p for f, p in others}}
+    if not search.explains(first):  # of what sets leave that all leave more than noise no law of chance is known
+        of_each = dict.fromkeys(of_each, 1.0 / len(of_each))
     rest = [(f, p * of_each[here.key]) for f, p in rivals]
     return tuple(sorted([*((f, of_each[f.key]) for f in equals), *rest], key=lambda each: -each[1]))
 

@@ -329,7 +329,8 @@ def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = (
     delays = np.array([*(-delay for delay in JOINT.delays), 0.0, JUST_LATE, *JOINT.delays])
     residuals = {float(delay): left(float(delay)) for delay in delays}
     before, at, after = left(-JUST_LATE), residuals[0.0], residuals[JUST_LATE]
-    step, smooth = (search.ahead.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
+    with np.errstate(invalid="ignore"):  # of a motion that runs away nothing is late
+        step, smooth = (search.ahead.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
     powers = np.array([search.ahead.by_channel(residual).sum(axis=0) for residual in residuals.values()])
     rows = [j for j, s in enumerate(search.rig.sensors) if s.name in jumping and step[j] > JOINT.jump * smooth[j]]
     sided = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}

@@ -128,6 +128,8 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     rivals = [
         [rival.get("words") or in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]
     ]
+    if rivals and content.get("probability") is not None:
+        rivals.insert(0, ["the set named", content["probability"]])
     tables = [
         (title, ("effect", "parameter", "value", "standard error", f"x [{length}]", "input or output"), effects),
         ("Gap (rms error / rms signal)", ("record", "before", "after", "floor", "share closed"), gaps),
