@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.changing_decay import beside_changing
-from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
+from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
 from workbench.identification.input_output.model_order import Selected, select_modes, statistic_of
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
@@ -81,6 +81,10 @@ class TransferModes(ParticipatingModes):
             residual is not noise there; modes are missing, or the points are inconsistent.
         fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
         frequencies_hz: (n_frequencies,) those lines.
+        lower_residual: (n_outputs, n_references) E, of displacement, 1/kg: a body that nothing holds, and elastic modes
+            far below the band. 0 where an output has no such term.
+        lower_residual_std: (n_outputs, n_references) standard errors.
+        upper_residual: (n_outputs, n_references) D, m/N: the flexibility of modes above the band.
         remarks: what is doubtful, and what was left undone where the time was up.
     """
 
@@ -92,6 +96,9 @@ class TransferModes(ParticipatingModes):
     order_limited_hz: tuple[tuple[float, float], ...]
     fitted: np.ndarray
     frequencies_hz: np.ndarray
+    lower_residual: np.ndarray
+    lower_residual_std: np.ndarray
+    upper_residual: np.ndarray
     remarks: tuple[str, ...] = ()
 
     parts_hz, full_hz = Renamed("cluster_hz"), Renamed("order_limited_hz")
@@ -292,6 +299,7 @@ def _modes_of(
     vectors = vector_covariance(fit, noise_ratio, derivative, inside, shapes, participation.shape[1])
     both = np.r_[inside, fit.poles.size + inside]
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
+    below, below_std, above = _residual_terms(lines, fit, noise_ratio, derivative[:, 0])
     return TransferModes(
         modes=SampledModes.of_poles(poles, shapes, _places(channels)),
         covariance=frozen(covariance[np.ix_(both, both)]),
@@ -305,8 +313,39 @@ def _modes_of(
         order_limited_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if selected.full else (),
         fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
         frequencies_hz=frozen(shown_hz),
+        lower_residual=frozen(below),
+        lower_residual_std=frozen(below_std),
+        upper_residual=frozen(above),
         remarks=(f"left out, as negatively damped or of unknown frequency: poles at {out} Hz",) if out else (),
     )
+
+
+def _residual_terms(
+    lines: Lines, fit: Fit, noise_ratio: Floats, derivative: np.ndarray
+) -> tuple[Floats, Floats, Floats]:
+    """E, its standard errors, and D, (n_outputs, n_references) each, whatever the outputs measure.
+
+    A mode's acceleration φ_j φ_i s² / (s² + ω²) is its pair of poles and φ_j φ_i, which E of the fit holds. A pole
+    below the band, at the lines a l / 2 (1/s + λ/s²) and its conjugate, is part of the residual term.
+    """
+    n, size = 2 * fit.poles.size, lines.refs * len(lines.powers)
+    scale = lines.omega[-1] ** -np.array(lines.powers, float)
+    std = fixed_std(fit, noise_ratio, np.ones((fit.coefficients.shape[0] - n, len(derivative))))
+    low = fit.poles.imag < lines.omega[0]
+    if low.any():  # of what these and E make together, not of either
+        weights = np.ones((len(lines.fixed), 1)) if lines.weights is None else lines.weights
+        std = fit.noise / np.sqrt((lines.fixed**2).T @ weights**2)
+    terms, errors = (x[:size].reshape(lines.refs, len(scale), -1) * scale[:, None] for x in (fit.coefficients[n:], std))
+    below, below_std, above = (np.zeros((len(derivative), lines.refs)) for _ in range(3))
+    # by order: what the pairs below the band have of s^(k - 2), less what those in it leave in E
+    beside = np.stack([fit.amplitudes * x for x in (low * fit.poles, low, (low - 1.0) / fit.poles)]) @ fit.participation
+    for j, order in enumerate(derivative):
+        if order in lines.powers:
+            above[j] = terms[:, lines.powers.index(order), j]
+        if order - 2 in lines.powers:
+            power = lines.powers.index(order - 2)
+            below[j], below_std[j] = terms[:, power, j] + beside[order, j].real, errors[:, power, j]
+    return below, below_std, above
 
 
 def _acausal(h: np.ndarray, f: np.ndarray) -> tuple[str, ...]:
@@ -387,6 +426,9 @@ def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> Tr
         order_limited_hz=tuple(full for band in found for full in band.order_limited_hz),
         fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
         frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
+        lower_residual=found[0].lower_residual,
+        lower_residual_std=found[0].lower_residual_std,
+        upper_residual=found[-1].upper_residual,
         remarks=tuple(remark for band in found for remark in band.remarks),
     )
 
