@@ -20,7 +20,7 @@ from workbench.identification.input_output.fit_errors import fixed_std, pole_cov
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
 from workbench.identification.input_output.model_order import Selected, select_modes, statistic_of
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
-from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
+from workbench.identification.input_output.spectral_lines import Lines, relative_noise
 from workbench.identification.signal.modal_estimates import (
     SURE,
     ParticipatingModes,
@@ -154,8 +154,9 @@ def identify_transfer(
         noise_std: standard error of real and imaginary part, one or of the shape of `transfer`: from repeated
             measurements, or by `coherence_noise`. It weighs the lines; how large it is as a whole is found from what is
             left, and remarked where that disagrees. Without it, noise is taken to be the same at all lines of an
-            output, or to go with its size in part where neighbouring lines differ so (`noise_with_size`), and standard
-            errors grow with the residual about each mode where that is larger than elsewhere.
+            output, or, where neighbouring lines differ so, to differ between references, along frequency, and with the
+            size of the lines (`relative_noise`), and standard errors grow with the residual about each mode where that
+            is larger than elsewhere.
         max_modes: of a band, where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
@@ -214,10 +215,10 @@ def _selected(
         return _beside_changing(lines, how)
     few = how | {"max_modes": min(TRANSFER.strongest, how["max_modes"])}
     selected = select_modes(lines, **few)
-    guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
+    guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
     if guessed is None:  # noise that goes with size is largest in the peaks, and looks like modes that change
         lines, selected = _beside_changing(lines, few, selected)
-        guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
+        guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
     left = lines.left(selected.fit)
     # What the modes miss of the response is smooth from line to line, noise is not: so second differences, Hann's
     # window of the impulse response, are asked. Among lines of all sizes a few large ones show any correlation.
@@ -230,7 +231,7 @@ def _selected(
     apart, selected = _in_noise(*_beside_changing(lines.of(mixed), few), how)
     lines = apart.of(h)
     fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
-    guessed = noise_with_size(lines.left(fit), lines.fitted(fit))
+    guessed = relative_noise(lines.left(fit), lines.fitted(fit), lines.omega)
     if guessed is not None:
         lines = lines.weighted_by(guessed)
         fit = settled(lines, projected(lines, fit.poles, fit.participation), budget=budget)
@@ -251,7 +252,7 @@ def _in_noise(lines: Lines, selected: Selected, how: dict[str, Any]) -> tuple[Li
     budget = how["budget"]
     before: np.ndarray | None = None
     for _ in range(TRANSFER.reweighted):
-        guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
+        guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
         if guessed is None or (
             before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < TRANSFER.alike  # but for size
         ):

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.stats import chi2, spearmanr
+from scipy.optimize import least_squares
+from scipy.stats import chi2, f, kruskal, spearmanr
 
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.model_order import bases_of, weights_of
@@ -22,6 +23,7 @@ class LinesSettings:
     louder: float = 0.01  # chance that noise of one level is taken for louder about a mode
     uneven: float = 1e-4  # chance that even noise is taken for uneven
     smoothed: int = 5  # lines of a running median
+    degree: int = 3  # of the polynomial of log ω that noise follows along frequency
 
 
 LINES = LinesSettings()
@@ -205,31 +207,78 @@ class Lines:
         return max(1.0, float(np.median(beside) / power.mean()))
 
 
-def noise_with_size(left: np.ndarray, fitted: np.ndarray) -> np.ndarray | None:
+def relative_noise(left: np.ndarray, fitted: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
     """Relative noise of every line, (n_outputs, n_references, n_lines); None where it may be the same at all.
 
-    s² = a² + b² |H|² of each output: its sensor's own noise, and that of the force or of too few averages. What a fit
-    has not yet found is smooth from line to line, noise is not: where lines are evenly spaced, r_k less the mean of
-    r_k-1 and r_k+1 is noise alone, 3/2 s² of it. H is the fit's own, for a measured H goes with its noise; where a mode
-    is not yet found it is the running median of the measured.
+    s = c g(ω) (a² + b² |H|²)^½: c of each output and reference, as far as references differ; g, of all of them, smooth
+    along frequency, as of accelerations that were integrated or of a force that falls; a the sensor's own noise, b of
+    each output, that of the force or of too few averages. What a fit has not yet found is smooth from line to line,
+    noise is not: where lines are evenly spaced, r_k less the mean of r_k-1 and r_k+1 is noise alone, 3/2 s² of it. H is
+    the fit's own, for a measured H goes with its noise; where a mode is not yet found it is the running median of the
+    measured. Of the orders in which g and b are found, that counts which leaves less.
 
     Args:
         left: the residual, complex, of that shape.
         fitted: the fit, of that shape.
+        omega: (n_lines,) rad/s.
     """
     inner = np.arange(1, left.shape[-1] - 1, 3)  # every third: no line counts twice
     rough = np.abs(left[..., inner] - 0.5 * (left[..., inner - 1] + left[..., inner + 1]))
     seen = median_filter(np.abs(fitted + left), (1, 1, LINES.smoothed))
-    size, found, uneven = np.maximum(np.abs(fitted), seen), np.ones(left.shape), False
-    for j, (each, of) in enumerate(zip(rough, size[..., inner], strict=True)):
+    size = np.maximum(np.abs(fitted), seen)
+    live = np.median(rough, axis=(1, 2)) > 0.0  # an output of zeros has no noise
+    if not live.any():
+        return None
+    if not live.all():
+        whole = np.ones(left.shape)
+        of_live = relative_noise(left[live], fitted[live], omega)
+        whole[live] = 1.0 if of_live is None else of_live
+        return None if of_live is None else whole
+    logs = np.log(np.maximum(rough, 1e-3 * np.median(rough, axis=-1, keepdims=True) + 1e-300))
+    levels = _of_references(logs)[..., None] * np.ones(left.shape[-1])
+    found, least = levels, np.inf
+    for order in ((_along, _with_size), (_with_size, _along)):
+        trial = levels
+        for part in order:
+            trial = trial + part(logs - trial[..., inner], size, omega, inner)
+        error = logs - trial[..., inner]
+        if (misfit := np.abs(error - np.median(error, axis=(1, 2), keepdims=True)).sum()) < least:
+            found, least = trial, misfit
+    return np.exp(found) if found.any() else None
+
+
+def _of_references(logs: np.ndarray) -> np.ndarray:
+    """Log of the level of each reference in that of its output, (n_outputs, n_references); 0 where they may be one."""
+    levels = np.median(logs, axis=-1)
+    levels -= levels.mean(axis=1, keepdims=True)
+    differ = [len(rows) > 1 and kruskal(*rows).pvalue < LINES.uneven for rows in logs]
+    return np.where(np.array(differ)[:, None], levels, 0.0)
+
+
+def _along(logs: np.ndarray, size: np.ndarray, omega: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """Log of the level along frequency, (n_lines,), a polynomial of log ω; 0 where it may be one."""
+    x = 2.0 * np.log(omega / omega[0]) / np.log(omega[-1] / omega[0]) - 1.0
+    y = np.mean(logs - np.median(logs, axis=-1, keepdims=True), axis=(0, 1))  # of outputs that may share their noise
+    powers, free = np.vander(x, LINES.degree + 1), inner.size - LINES.degree - 1
+    if free < 1:
+        return np.zeros(omega.size)
+    fit = least_squares(lambda c: powers[inner] @ c - y, np.zeros(LINES.degree + 1), loss="soft_l1", f_scale=y.std())
+    trend = powers @ fit.x
+    between, within = np.var(trend[inner]), np.var(y - trend[inner])
+    if f.sf(between / LINES.degree * free / max(within, 1e-300), LINES.degree, free) > LINES.uneven:
+        return np.zeros(omega.size)
+    return np.asarray(trend - trend.mean())
+
+
+def _with_size(logs: np.ndarray, size: np.ndarray, omega: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """Log of the level that goes with the size of the lines, of the shape of `size`; 0 where it may be one."""
+    found = np.zeros(size.shape)
+    for j, (each, of) in enumerate(zip(logs, size[..., inner], strict=True)):
         typical = float(np.median(of))
-        if typical <= 0.0 or np.median(each) <= 0.0:
-            continue
         if spearmanr(each.ravel(), of.ravel(), alternative="greater").pvalue > LINES.uneven:
             continue
         # Least absolute errors of log s: the few lines of a mode not yet found count little.
-        logs = [np.log(each) - 0.5 * np.log1p((share * of / typical) ** 2) for share in SHARES]
-        errors = [np.abs(log - np.median(log)).sum() for log in logs]
-        found[j] = np.sqrt(1.0 + (SHARES[int(np.argmin(errors))] * size[j] / typical) ** 2)
-        uneven = True
-    return found if uneven else None
+        rest = [each - 0.5 * np.log1p((share * of / typical) ** 2) for share in SHARES]
+        errors = [np.abs(log - np.median(log)).sum() for log in rest]
+        found[j] = 0.5 * np.log1p((SHARES[int(np.argmin(errors))] * size[j] / typical) ** 2)
+    return found
