@@ -140,6 +140,26 @@ def test_noise_of_other_references_and_along_frequency_makes_no_mode(how, seed):
     assert (np.abs(off) < 5.0 * found.omega_std).all()
 
 
+@pytest.mark.parametrize("tau", [2.0, 0.5])
+def test_an_exponential_window_makes_no_modes_and_is_remarked(tau):
+    """Of a hammer's test of 4 s, its noise as its response under exp(-t/τ): poles λ - 1/τ, by its closed form."""
+    rng, rate, n = np.random.default_rng(1), 1024.0, 4096
+    t = np.arange(n) / rate
+    omega, decay = 2.0 * np.pi * np.array([12.0, 33.0, 61.0, 97.0]), np.array([0.3, 0.6, 1.2, 1.8])
+    shapes = rng.normal(size=(4, 4))
+    y = (shapes * shapes[0]) @ (np.exp(-decay[:, None] * t) * np.sin(np.outer(omega, t)) * omega[:, None])
+    y = (y + 0.005 * y.std() * rng.normal(size=y.shape)) * np.exp(-t / tau)
+    hz = np.fft.rfftfreq(n, 1.0 / rate)
+    kept = (hz > 4.0) & (hz < 150.0)
+    channels = tuple(Channel(f"p{k}", "acceleration") for k in range(4))
+    found = identify_transfer(np.fft.rfft(y)[:, kept] / rate, hz[kept], channels=channels)
+    assert found.modes.n_modes == 4
+    np.testing.assert_allclose(-found.modes.poles.real, decay + 1.0 / tau, rtol=0.05)
+    (remark,) = [remark for remark in found.remarks if "exponential window" in remark]
+    told = float(remark.split(" of about ")[1].split(" s?")[0])
+    assert told == pytest.approx(tau, rel=0.15)
+
+
 def test_many_lines_are_fitted_band_after_band():
     """The same cantilever on 1600 lines: what the bands say together, with modes at their edges found once."""
     structure = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free")

@@ -20,7 +20,7 @@ from workbench.identification.input_output.fit_errors import fixed_std, pole_cov
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
 from workbench.identification.input_output.model_order import Selected, select_modes, statistic_of
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
-from workbench.identification.input_output.spectral_lines import Lines, relative_noise
+from workbench.identification.input_output.spectral_lines import Lines, relative_noise, window_rate
 from workbench.identification.signal.modal_estimates import (
     SURE,
     ParticipatingModes,
@@ -222,7 +222,9 @@ def _selected(
     left = lines.left(selected.fit)
     # What the modes miss of the response is smooth from line to line, noise is not: so second differences, Hann's
     # window of the impulse response, are asked. Among lines of all sizes a few large ones show any correlation.
-    rough = np.diff(left if guessed is None else left / guessed, 2)
+    even = left if guessed is None else left / guessed
+    lines.window_rate = window_rate(even, omega)
+    rough = np.diff(even, 2)
     mixing = mixing_of(correlation_of_lines([rough.reshape(len(h), -1)]))
     if mixing is None:
         return _in_noise(lines, selected, how)
@@ -317,7 +319,10 @@ def _modes_of(
         lower_residual=frozen(below),
         lower_residual_std=frozen(below_std),
         upper_residual=frozen(above),
-        remarks=(f"left out, as negatively damped or of unknown frequency: poles at {out} Hz",) if out else (),
+        remarks=(
+            *([f"left out, as negatively damped or of unknown frequency: poles at {out} Hz"] if out else []),
+            *_windowed(lines.window_rate),
+        ),
     )
 
 
@@ -361,6 +366,16 @@ def _acausal(h: np.ndarray, f: np.ndarray) -> tuple[str, ...]:
     return (
         "the impulse responses come before the impulse: these are transfer functions of e^(-iωt)? Then take their"
         " complex conjugates",
+    )
+
+
+def _windowed(rate: float) -> tuple[str, ...]:
+    """A remark where noise shows an exponential window."""
+    if rate == 0.0:
+        return ()
+    return (
+        f"an exponential window of a time constant τ of about {1.0 / rate:.2g} s? It adds 1/τ to the decay rate of"
+        " every mode, 1/(τ ω) to its damping ratio: take that off, by the τ that was set",
     )
 
 
@@ -430,7 +445,7 @@ def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> Tr
         lower_residual=found[0].lower_residual,
         lower_residual_std=found[0].lower_residual_std,
         upper_residual=found[-1].upper_residual,
-        remarks=tuple(remark for band in found for remark in band.remarks),
+        remarks=tuple(dict.fromkeys(remark for band in found for remark in band.remarks)),
     )
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
+from scipy.special import hyp2f1
 from scipy.stats import chi2, f, kruskal, spearmanr
 
 from workbench.identification.input_output.modal_fit import Fit
@@ -23,11 +24,16 @@ class LinesSettings:
     louder: float = 0.01  # chance that noise of one level is taken for louder about a mode
     uneven: float = 1e-4  # chance that even noise is taken for uneven
     smoothed: int = 5  # lines of a running median
+    lags: int = 3  # lines, over which noise that was windowed is seen to be correlated
+    instants: int = 2000  # of a record, by which that is reckoned
+    windowed: float = 5.0  # standard errors of one output's correlation from which on there was a window
+    explained: float = 0.3  # of what differs from noise without a window, at most left by the best one
     degree: int = 3  # of the polynomial of log ω that noise follows along frequency
 
 
 LINES = LinesSettings()
 DETUNED = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0])  # half-power bandwidths beside a mode
+WINDOWS = np.r_[0.0, np.geomspace(0.1, 30.0, 60)]  # length of a record, in time constants of its window
 SHARES = np.geomspace(1e-3, 1e3, 61)  # b |H| / a at the median line, from nothing to all
 
 
@@ -42,6 +48,7 @@ class Lines:
         guessed: whether it is known but for its size.
         beside: (n_rows, n_columns) fixed columns beside those of the residual terms.
         changing: of the modes that move along these, their pole and by how much their frequency scatters, rad/s.
+        window_rate: 1/τ of an exponential window, as far as noise shows one.
     """
 
     def __init__(
@@ -53,7 +60,9 @@ class Lines:
         guessed: bool = False,
         beside: np.ndarray | None = None,
         changing: tuple[tuple[complex, float], ...] = (),
+        window_rate: float = 0.0,
     ) -> None:
+        self.window_rate = window_rate
         self.h, self.powers, self.stated = h, powers, noise
         self.distorted: tuple[complex, ...] = ()
         self.free: tuple[complex, ...] = ()
@@ -75,21 +84,21 @@ class Lines:
 
     def of(self, h: np.ndarray) -> "Lines":
         """The same lines of other outputs, their noise not known."""
-        return Lines(h, self.omega, self.powers, None, False, self.beside, self.changing)
+        return Lines(h, self.omega, self.powers, None, False, self.beside, self.changing, self.window_rate)
 
     def weighted_by(self, guessed: np.ndarray) -> "Lines":
         """The same lines with their noise known but for its size."""
-        return Lines(self.h, self.omega, self.powers, guessed, True, self.beside, self.changing)
+        return Lines(self.h, self.omega, self.powers, guessed, True, self.beside, self.changing, self.window_rate)
 
     def with_columns(self, columns: np.ndarray, changing: tuple[complex, float]) -> "Lines":
         """The same lines with further fixed columns, those of a mode that changes."""
         beside = columns if self.beside is None else np.hstack([self.beside, columns])
         changed = (*self.changing, changing)
-        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, beside, changed)
+        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, beside, changed, self.window_rate)
 
     def without_columns(self) -> "Lines":
         """The same lines without what modes that change move."""
-        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed)
+        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, window_rate=self.window_rate)
 
     def only(self, which: np.ndarray, smooth: int) -> "Lines":
         """Some lines (n_lines,), beside polynomials up to a degree as well."""
@@ -97,7 +106,7 @@ class Lines:
         middle = 0.5 * (omega[0] + omega[-1])
         at = (omega - middle) / max(omega[-1] - middle, 1e-300)
         noise = None if self.stated is None else self.stated[..., which]
-        found = Lines(self.h[..., which], omega, self.powers, noise, self.guessed)
+        found = Lines(self.h[..., which], omega, self.powers, noise, self.guessed, window_rate=self.window_rate)
         further = [factor * at**k for k in range(smooth + 1) for factor in (1.0, 1j)]
         polynomials = found._stacked(np.array([found._of(i, x) for i in range(self.refs) for x in further]))
         beside = [] if self.beside is None else [self.beside[np.tile(which, 2 * self.refs)]]
@@ -204,7 +213,46 @@ class Lines:
         at = int(np.argmin(np.abs(self.omega - pole.imag)))
         beside = power[max(at - LINES.beside, 0) : at + LINES.beside + 1]
         # The median of a power of two degrees of freedom and more is at most its mean.
-        return max(1.0, float(np.median(beside) / power.mean()))
+        return max(1.0, float(np.median(beside) / power.mean())) * self._early(-pole.real)
+
+    def _early(self, rate: float) -> float:
+        """Power of windowed noise in the impulse response of a pole over that of noise that no window shortens."""
+        length = 2.0 * np.pi / self.resolution
+        window, own = 2.0 * self.window_rate * length, 2.0 * rate * length
+        return float(_mean_of_decay(window + own) / (_mean_of_decay(window) * _mean_of_decay(own)))
+
+
+def _mean_of_decay(total: float) -> float:
+    """Of e^(-at) over a record at the end of which it is e^(-total)."""
+    return float(-np.expm1(-total) / total) if abs(total) > 1e-9 else 1.0
+
+
+def window_rate(left: np.ndarray, omega: np.ndarray) -> float:
+    """1/τ of the exponential window exp(-t/τ) that correlates the noise of neighbouring lines, rad/s; 0 if none.
+
+    Second differences of the lines, which leave nothing of what is smooth, are noise that over the time t of the
+    impulse response has the power exp(-2t/τ) (2 - 2 cos(2πt/T))², and so are correlated as that transforms. Only their
+    phases count, so that a few loud lines do not; of normal z and w of the correlation r the mean of the product of
+    their phasors is π/4 r F(1/2, 1/2; 2; |r|²) (Middleton, Introduction to Statistical Communication Theory, ch. 9).
+
+    Args:
+        left: the residual in units of its noise, complex, lines last.
+        omega: (n_lines,).
+    """
+    step = np.diff(omega)
+    if np.ptp(step) > 1e-6 * step.max():
+        return 0.0
+    rough = np.diff(left, 2).reshape(-1, omega.size - 2)
+    phasors = rough / np.maximum(np.abs(rough), 1e-300)
+    lags = np.arange(1, LINES.lags + 1)
+    seen = np.array([(phasors[:, m:] * phasors[:, :-m].conj()).mean() for m in lags])
+    at = (np.arange(LINES.instants) + 0.5) / LINES.instants
+    power = np.exp(-2.0 * np.outer(WINDOWS, at)) * (2.0 - 2.0 * np.cos(2.0 * np.pi * at)) ** 2
+    r = power @ np.exp(-2j * np.pi * np.outer(at, lags)) / power.sum(axis=1, keepdims=True)
+    off = np.linalg.norm(seen - np.pi / 4.0 * r * hyp2f1(0.5, 0.5, 2.0, np.abs(r) ** 2), axis=1)
+    best = int(np.argmin(off))
+    sure = off[0] - off[best] > LINES.windowed / np.sqrt(omega.size) and off[best] < LINES.explained * off[0]
+    return float(WINDOWS[best] * step.mean() / (2.0 * np.pi)) if sure else 0.0
 
 
 def relative_noise(left: np.ndarray, fitted: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
