@@ -13,6 +13,7 @@ from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import projected
 from workbench.identification.input_output.model_order import statistic_of_each
 from workbench.identification.ring_down import ring_down
+from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel, Record
 
@@ -105,6 +106,19 @@ def test_a_rigid_body_that_is_pushed_away_does_not_drift():
                [Channel("F", "force")], input_hold="first")
     )  # fmt: skip
     assert not any("drift" in remark for remark in found.remarks)
+
+
+def test_a_weak_sine_in_random_motion_is_remarked_though_a_broad_mode_is_found_there():
+    """A line of two hundred times the power of those within ±2 |Re λ| of a pole at 8 Hz: what is there has no constant
+    envelope, but no mode makes it either."""
+    rate, n, rng = 40, 20_000, np.random.default_rng(3)
+    motion, pole = rng.standard_normal((3, n)), np.array([-0.7 + 2j * np.pi * 8.0])
+    sine = np.outer([0.2, 0.0, 0.0], np.sin(2.0 * np.pi * 8.002 / rate * np.arange(n)))
+    channels = tuple(Channel(f"a{k}", "acceleration") for k in range(3))
+    quiet, spoilt = (Record(1.0 / rate, y, channels) for y in (motion, motion + sine))
+    assert harmonic_remarks([quiet], pole, [0]) == ()
+    (remark,) = harmonic_remarks([spoilt], pole, [0])
+    assert "one line far above those beside it" in remark
 
 
 @pytest.mark.parametrize("driven", [True, False])

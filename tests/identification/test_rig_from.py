@@ -18,7 +18,7 @@ from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
-from workbench.rig.sensors import Sensor
+from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
@@ -155,6 +155,46 @@ def test_rigid_motion_that_cannot_be_placed_is_said_to_be_left_out():
     relabelled = [*record.output_channels[:3], Channel("a4", "displacement")]
     with pytest.warns(UserWarning, match="may be rigid motion, which outputs of other kinds do not show"):
         assert (rig_from(found, outputs=relabelled).modes.omega > 0).all()
+
+
+@pytest.mark.parametrize("quantity", ["displacement", "velocity", "acceleration"])
+@pytest.mark.parametrize("dashpot", [0.0, 15.0])
+def test_transfer_functions_of_a_free_structure_keep_its_rigid_mode(quantity, dashpot):
+    """Two masses and a spring, held by nothing but a dashpot: φ = 1 / (m_1 + m_2)^½ of the rigid mode."""
+    mass, stiffness = np.diag([1.0, 2.0]), 1e4 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    hz, order = np.arange(4.0, 60.0, 0.1), MEASURED[quantity][1]
+    s = 2j * np.pi * hz[:, None, None]
+    dynamic = s**2 * mass + s * (1e-4 * stiffness + np.diag([0.0, dashpot])) + stiffness
+    h = np.moveaxis(s**order * np.linalg.inv(dynamic), 0, 2)[:, :1]
+    noise = np.random.default_rng(0).normal(size=(2, *h.shape))
+    h = h + 1e-4 * np.abs(h).mean() * (noise[0] + 1j * noise[1])
+    channels = (Channel("a", quantity), Channel("b", quantity))
+    found = identify_transfer(h, hz, channels=channels)
+    with pytest.warns(UserWarning, match="a body that no spring holds"):
+        rig = rig_from(found, inputs=["a"], outputs=channels)
+    assert rig.modes.omega[0] == 0.0 and rig.modes.omega.size == 2
+    np.testing.assert_allclose(np.abs(rig.modes.phi(["a", "b"])[:, 0]), 3.0**-0.5, rtol=0.02)
+
+
+@pytest.mark.parametrize(("lowest", "stiff", "said"), [(2.0, 0.0, None), (30.0, 0.0, "modes below the lowest line"),
+                                                      (2.0, 0.1, "modes above 199.5 Hz")])  # fmt: skip
+def test_modes_beyond_the_band_are_said_to_be_left_out_where_they_matter(lowest, stiff, said):
+    """A hinged beam, its first mode at 7.3 Hz, by its closed form, and a flexibility of no mode of the band; none of
+    its modes is taken for a rigid one."""
+    hz, r = np.arange(lowest, 200.0, 0.5), np.arange(1, 20)
+    s, omega = 2j * np.pi * hz, 2.0 * np.pi * 7.3 * r[:, None] ** 2
+    phi = np.sqrt(2.0) * np.sin(np.pi * np.outer([0.11, 0.23, 0.37, 0.52], r))
+    h = (phi * phi[0]) @ (1.0 / (s**2 + 0.01 * omega * s + omega**2))
+    h = h + stiff * np.abs(h).max()
+    noise = np.random.default_rng(0).normal(size=(2, *h.shape))
+    h = h + 1e-3 * np.abs(h).mean(axis=1, keepdims=True) * (noise[0] + 1j * noise[1])
+    channels = tuple(Channel(f"p{k}", "displacement") for k in range(4))
+    found = identify_transfer(h, hz, channels=channels)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rig = rig_from(found, inputs=["p0"], outputs=channels)
+    assert (rig.modes.omega > 0).all()
+    assert [said in str(w.message) for w in caught] == [True] if said else not caught
 
 
 @pytest.mark.slow

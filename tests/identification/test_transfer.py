@@ -117,6 +117,49 @@ def test_noise_that_goes_with_the_size_needs_not_be_told():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("how", ["references", "integrated", "falling force"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_noise_of_other_references_and_along_frequency_makes_no_mode(how, seed):
+    """Noise of one reference ten times that of the other; of accelerations over -ω²; that rises tenfold in the band."""
+    rng = np.random.default_rng(300 + seed)
+    hz = np.arange(5.0, 120.0, 0.25)
+    s, omega = 2j * np.pi * hz, 2.0 * np.pi * np.array([20.0, 50.0, 62.0, 90.0])[:, None]
+    shapes = rng.normal(size=(6, 4))
+    modal = s**2 / (s**2 + 2.0 * np.array([[0.01], [0.008], [0.008], [0.01]]) * omega * s + omega**2)
+    h = np.einsum("jr,ir,rk->jik", shapes, shapes[: 2 if how == "references" else 1], modal)
+    noise = 0.01 * np.sqrt((np.abs(h) ** 2).mean(axis=(1, 2), keepdims=True)) * np.ones(h.shape)
+    if how == "references":
+        noise[:, 1] *= 10.0
+    if how == "falling force":
+        noise *= np.geomspace(0.3, 3.0, hz.size)
+    h = h + noise * (rng.normal(size=h.shape) + 1j * rng.normal(size=h.shape)) / np.sqrt(2.0)
+    quantity = "displacement" if how == "integrated" else "acceleration"
+    h = h / s**2 if how == "integrated" else h
+    found = identify_transfer(h, hz, channels=tuple(Channel(f"p{k}", quantity) for k in range(6)))
+    off = 2.0 * np.pi * found.modes.frequencies_hz - omega[:, 0]
+    assert (np.abs(off) < 5.0 * found.omega_std).all()
+
+
+@pytest.mark.parametrize("tau", [2.0, 0.5])
+def test_an_exponential_window_makes_no_modes_and_is_remarked(tau):
+    """Of a hammer's test of 4 s, its noise as its response under exp(-t/τ): poles λ - 1/τ, by its closed form."""
+    rng, rate, n = np.random.default_rng(1), 1024.0, 4096
+    t = np.arange(n) / rate
+    omega, decay = 2.0 * np.pi * np.array([12.0, 33.0, 61.0, 97.0]), np.array([0.3, 0.6, 1.2, 1.8])
+    shapes = rng.normal(size=(4, 4))
+    y = (shapes * shapes[0]) @ (np.exp(-decay[:, None] * t) * np.sin(np.outer(omega, t)) * omega[:, None])
+    y = (y + 0.005 * y.std() * rng.normal(size=y.shape)) * np.exp(-t / tau)
+    hz = np.fft.rfftfreq(n, 1.0 / rate)
+    kept = (hz > 4.0) & (hz < 150.0)
+    channels = tuple(Channel(f"p{k}", "acceleration") for k in range(4))
+    found = identify_transfer(np.fft.rfft(y)[:, kept] / rate, hz[kept], channels=channels)
+    assert found.modes.n_modes == 4
+    np.testing.assert_allclose(-found.modes.poles.real, decay + 1.0 / tau, rtol=0.05)
+    (remark,) = [remark for remark in found.remarks if "exponential window" in remark]
+    told = float(remark.split(" of about ")[1].split(" s?")[0])
+    assert told == pytest.approx(tau, rel=0.15)
+
+
 def test_many_lines_are_fitted_band_after_band():
     """The same cantilever on 1600 lines: what the bands say together, with modes at their edges found once."""
     structure = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free")

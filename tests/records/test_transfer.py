@@ -99,6 +99,28 @@ def test_lines_up_to_half_the_sample_rate(tmp_path):
         read_measured(bare)
 
 
+@pytest.mark.parametrize(("n_samples", "kept"), [(128, 65), (128, 64), (99, 50)])
+def test_lines_beside_a_sample_rate_alone(tmp_path, n_samples, kept):
+    """Those of a discrete Fourier transform, with or without that at half the rate; what was assumed is said."""
+    lines, rate = np.fft.rfftfreq(n_samples, 1.0 / 200.0), 200.0
+    h = np.fft.rfft(np.random.default_rng(0).normal(size=(2, n_samples)))[:, :kept]
+    told = {"npts": n_samples} if n_samples % 2 else {}
+    found = read_measured(save(tmp_path / "x.mat", {"H": h, "fs": rate, **told}))
+    np.testing.assert_allclose(found.frequencies_hz, lines[:kept], rtol=1e-12)
+    assert "lines taken from 0 to" in found.remarks[-1] and "not real" not in found.remarks[-1]
+    later = read_measured(save(tmp_path / "later.mat", {"H": h[:, 5:], "fs": rate}))
+    assert "the first is not real, as that at 0 Hz is" in later.remarks[-1]
+
+
+def test_lines_by_another_name_are_not_passed_over_for_a_sample_rate(tmp_path):
+    radians = {"H": SPECTRA, "frequency_rad_s": 2.0 * np.pi * LINES}
+    np.testing.assert_allclose(read_measured(save(tmp_path / "x.mat", radians)).frequencies_hz, LINES, rtol=1e-14)
+    with pytest.raises(RecordFileError, match="leave the sample rate out"):
+        read_measured(tmp_path / "x.mat", sample_rate_hz=200.0)
+    with pytest.raises(RecordFileError, match="'axis', which increases as frequencies do"):
+        read_measured(save(tmp_path / "y.mat", {"H": SPECTRA, "axis": LINES, "fs": 200.0}))
+
+
 @pytest.mark.parametrize(
     ("arrays", "match"),
     [
@@ -145,6 +167,21 @@ def test_a_table_of_two_parts_as_analysers_write_them(tmp_path, header):
     np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-14)
 
 
+@pytest.mark.parametrize("names", [
+    "a [g/lbf] real,a [g/lbf] imag", "a real [g/lbf],a imag [g/lbf]", "a [g/lbf] magnitude [dB],a [g/lbf] phase [deg]",
+])  # fmt: skip
+def test_units_of_a_table_are_brought_to_si(tmp_path, names):
+    """1 g / lbf = 9.80665 / 4.4482216152605 (m/s²) / N, by definition."""
+    h = SPECTRA[0, 0]
+    parts = [20.0 * np.log10(np.abs(h)), np.angle(h, deg=True)] if "dB" in names else [h.real, h.imag]
+    header = f"Frequency [Hz],{names}"
+    np.savetxt(tmp_path / "x.csv", np.column_stack([LINES, *parts]), delimiter=",", comments="", header=header)
+    found = read_measured(tmp_path / "x.csv")
+    np.testing.assert_allclose(found.values[0, 0], h * 9.80665 / 4.4482216152605, rtol=1e-12)
+    assert [(c.name, c.quantity, c.unit) for c in found.output_channels] == [("a", "acceleration", "m/s^2")]
+    assert found.remarks == ("a: g taken as 9.80665 m/s^2", "a: lbf taken as 4.44822 N")
+
+
 @pytest.mark.parametrize("names", ["a", "a real", "a real,b imag", "a real,a imag,coherence", "a real,a phase"])
 def test_a_table_of_frequencies_is_no_record(tmp_path, names):
     """It was told to lack a sample rate; with one it would have been taken for signals over time."""
@@ -154,14 +191,15 @@ def test_a_table_of_frequencies_is_no_record(tmp_path, names):
         read_measured(tmp_path / "x.csv", sample_rate_hz=100.0)
 
 
-def save_58(path, pairs, function=4):
+def save_58(path, pairs, function=4, lines=LINES, unit="NONE"):
     file = pyuff.UFF(str(path))
     for output, reference, values in pairs:
         file.write_sets(
             pyuff.prepare_58(binary=0, func_type=function, rsp_node=output, rsp_dir=3, ref_node=reference, ref_dir=3,
                              ordinate_spec_data_type=12, orddenom_spec_data_type=13, abscissa_spec_data_type=18,
-                             num_pts=LINES.size, abscissa_spacing=1, abscissa_min=LINES[0],
-                             abscissa_inc=LINES[1] - LINES[0], x=LINES, data=values, return_full_dict=False),
+                             abscissa_axis_units_lab=unit, num_pts=lines.size, abscissa_spacing=1,
+                             abscissa_min=lines[0], abscissa_inc=lines[1] - lines[0], x=lines, data=values,
+                             return_full_dict=False),
             mode="add",
         )  # fmt: skip
     return path
@@ -178,3 +216,19 @@ def test_universal_files_of_transfer_functions(tmp_path):
         read_measured(save_58(tmp_path / "less.uff", pairs[:-1]))
     with pytest.raises(RecordFileError, match="complex"):
         read_measured(save_58(tmp_path / "other.uff", pairs[:1], function=9))
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("rad/s", 2.0 * np.pi), ("rad/sec", 2.0 * np.pi), ("RPM", 60.0)])
+def test_lines_of_a_universal_file_are_brought_to_hertz(tmp_path, unit, factor):
+    found = read_measured(save_58(tmp_path / "x.uff", [(1, 1, SPECTRA[0, 0])], lines=factor * LINES, unit=unit))
+    np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-5)
+    with pytest.raises(RecordFileError, match="its abscissa is in 'orders', which is no unit of frequency"):
+        read_measured(save_58(tmp_path / "y.uff", [(1, 1, SPECTRA[0, 0])], unit="orders"))
+
+
+def test_half_of_a_symmetric_matrix_is_filled_by_reciprocity(tmp_path):
+    found = read_measured(save_58(tmp_path / "x.uff", [(j + 1, i + 1, SPECTRA[j, i]) for j in range(3) for i in range(2)
+                                                       if j >= i]))  # fmt: skip
+    np.testing.assert_allclose(found.values[1:], SPECTRA[1:], rtol=1e-6)
+    np.testing.assert_allclose(found.values[0], [SPECTRA[0, 0], SPECTRA[1, 0]], rtol=1e-6)
+    assert found.remarks == ("by reciprocity, those from node 2 direction 3 to node 1 direction 3",)

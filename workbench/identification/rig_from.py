@@ -22,6 +22,9 @@ from workbench.structure.modes import Modes, PointShapes, SampledModes
 
 # of the direct term of accelerations: what modes may leave of it, and standard errors of it, that are no rigid motion
 LEFT, SURE = 0.1, 5.0
+# of the response at the lowest line: what modes below it may make unsaid, and from what on they are rigid motion. Of a
+# free beam it makes 1 there; the first mode of one that is held 0.03, where lines begin at four times its frequency
+SLIGHT, MOST = 0.02, 0.5
 STEP = 1e-3  # of a standard error: of the differences that its propagation takes
 
 
@@ -39,7 +42,7 @@ def rig_from(
     nearest one is the largest singular value of Re A. The product is what a simulation needs. Its parts, to which
     masses and springs answer, follow from a driving point, where φ_i = φ_j, or from modal masses. What the modes leave
     of the direct term of accelerations, D - Σ_r φ_j φ_i, is the motion of a body that no spring holds: a mode at 0 Hz,
-    as far as the inputs move it.
+    as far as the inputs move it. Of transfer functions it is the residual term of modes below the band.
 
     Args:
         identified: of `identify_driven` or `identify_transfer`, or of `identify_ambient`, `ring_down` or `identify`,
@@ -61,7 +64,7 @@ def rig_from(
     Warns:
         UserWarning: modes far from real; modes that nothing scales, so that only responses to these inputs are right;
             several rigid modes, likewise; a direct term that is left out, as it is not of modes, or as not all outputs
-            are accelerations.
+            are accelerations; modes beyond the band of transfer functions that are left out, or taken as rigid.
 
     Source: Ewins, Modal Testing, 2nd ed., sections 2.4 and 4.4.
     """
@@ -132,6 +135,15 @@ class _Shapes:
     covariance: np.ndarray | None
 
 
+@dataclass(frozen=True, eq=False)
+class _Below:
+    """Σ φ_j φ_i of rigid modes and its standard errors, (n_outputs, n_inputs) each, and what of it is none."""
+
+    left: np.ndarray
+    error: np.ndarray
+    least: float
+
+
 def _of_residues(
     identified: Driven | TransferModes,
     out: tuple[Channel, ...],
@@ -169,16 +181,19 @@ def _of_residues(
     spread = _spread(identified, lambda residues: _scaled(residues.real, pair, masses)[:, kept])
     values = np.hstack([at_out, at_in])[:, kept]
     if isinstance(identified, Driven):
-        shape, error = _rigid(identified, out, pair, at_out.T @ at_in)
-        values = np.vstack([values, shape[:, kept]])
-        spread = np.concatenate([spread, [np.diag(row[kept] ** 2) for row in error]]) if len(error) else spread
+        below = _left_of_direct(identified, out, pair, at_out.T @ at_in)
+    else:
+        below = _below_the_band(identified, out, pair)
+    shape, error = _rigid(below, pair, len(out), len(into))
+    values = np.vstack([values, shape[:, kept]])
+    spread = np.concatenate([spread, [np.diag(row[kept] ** 2) for row in error]]) if len(error) else spread
     return _Shapes(values.T, _points([channel for channel, _ in rows.values()]), spread)
 
 
-def _rigid(
+def _left_of_direct(
     identified: Driven, out: tuple[Channel, ...], pair: tuple[int, int] | None, elastic: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Shapes of rigid modes, as far as the inputs move them, and standard errors, (n_rigid, n_outputs + n_inputs) each.
+) -> _Below | None:
+    """What the modes leave of the direct term of accelerations, where it is rigid motion.
 
     Args:
         identified: the modes and the direct term.
@@ -186,32 +201,79 @@ def _rigid(
         pair: indices of an output and the input at its place.
         elastic: (n_outputs, n_inputs) direct term of the accelerations of the other modes.
     """
-    m, q = elastic.shape
-    none = np.zeros((0, m + q))
     falls = np.array([channel.quantity == "acceleration" for channel in out])
     direct, error = identified.feedthrough[falls], identified.feedthrough_std[falls]
     left, least = direct - elastic[falls], max(LEFT * np.linalg.norm(direct), SURE * np.linalg.norm(error))
     if not direct.any() or np.linalg.norm(left) <= least:
-        return none, none
-    if not falls.all() or (pair is not None and left[pair] <= 0):
-        share = 100.0 * np.linalg.norm(left) / np.linalg.norm(direct)
-        why = "is not that of modes" if falls.all() else "may be rigid motion, which outputs of other kinds do not show"
+        return None
+    if falls.all() and (pair is None or left[pair] > 0):
+        return _Below(left, error, float(least))
+    share = 100.0 * np.linalg.norm(left) / np.linalg.norm(direct)
+    why = "is not that of modes" if falls.all() else "may be rigid motion, which outputs of other kinds do not show"
+    warnings.warn(
+        f"{share:.0f} % of the direct term of accelerations {why}, and is left out of the rig; simulate by"
+        " response() of what was identified, or identify from accelerations alone",
+        stacklevel=5,
+    )
+    return None
+
+
+def _below_the_band(identified: TransferModes, out: tuple[Channel, ...], pair: tuple[int, int] | None) -> _Below | None:
+    """The residual term of modes below the band, where it is rigid motion: where it makes most of the lowest line.
+
+    Args:
+        identified: the modes and the residual terms.
+        out: of the rig.
+        pair: indices of an output and the input at its place.
+    """
+    order, hz = np.array([MEASURED[channel.quantity][1] for channel in out])[:, None], identified.frequencies_hz
+    above = identified.upper_residual[:, :, None] * (2.0 * np.pi * hz) ** order[:, :, None]
+    if (share := np.linalg.norm(above) / np.linalg.norm(identified.fitted)) > LEFT:
         warnings.warn(
-            f"{share:.0f} % of the direct term of accelerations {why}, and is left out of the rig; simulate by"
-            " response() of what was identified, or identify from accelerations alone",
+            f"modes above {hz[-1]:.4g} Hz make {100.0 * share:.0f} % of the response, and are left out of the rig;"
+            " identify up to a higher line",
             stacklevel=5,
         )
-        return none, none
-    u, sizes, v = np.linalg.svd(left, full_matrices=False)
-    count = next(k for k in range(1, sizes.size + 1) if np.linalg.norm(sizes[k:]) <= least)
+    below, error = identified.lower_residual, identified.lower_residual_std
+    least = float(SURE * np.linalg.norm(error))
+    share = np.linalg.norm(below * (2.0 * np.pi * hz[0]) ** (order - 2)) / np.linalg.norm(identified.fitted[:, :, 0])
+    if np.linalg.norm(below) <= least or share <= SLIGHT:
+        return None
+    if share > MOST and (pair is None or below[pair] > 0):
+        warnings.warn(
+            f"what moves below the lowest line, {hz[0]:.4g} Hz, is taken for a body that no spring holds, a mode at"
+            " 0 Hz; if the structure is held, identify from a lower line",
+            stacklevel=5,
+        )
+        return _Below(below, error, max(least, LEFT * float(np.linalg.norm(below))))
+    warnings.warn(
+        f"modes below the lowest line, {hz[0]:.4g} Hz, rigid or elastic, make {100.0 * share:.0f} % of the response"
+        " there, and are left out of the rig; identify from a lower line",
+        stacklevel=5,
+    )
+    return None
+
+
+def _rigid(below: _Below | None, pair: tuple[int, int] | None, m: int, q: int) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes of rigid modes, as far as the inputs move them, and standard errors, (n_rigid, n_outputs + n_inputs) each.
+
+    Args:
+        below: what they make, if anything.
+        pair: indices of an output and the input at its place.
+        m, q: number of outputs and of inputs.
+    """
+    if below is None:
+        return np.zeros((0, m + q)), np.zeros((0, m + q))
+    u, sizes, v = np.linalg.svd(below.left, full_matrices=False)
+    count = next(k for k in range(1, sizes.size + 1) if np.linalg.norm(sizes[k:]) <= below.least)
     if count > 1:
         warnings.warn(
-            f"accelerations show {count} rigid modes: responses to these inputs are right, those to masses, springs or"
-            " forces elsewhere are not; for these take the rigid modes from the body's mass and inertia",
-            stacklevel=5,
+            f"the measurement shows {count} rigid modes: responses to these inputs are right, those to masses, springs"
+            " or forces elsewhere are not; for these take the rigid modes from the body's mass and inertia",
+            stacklevel=4,
         )
     shape = _scaled(np.einsum("jk,k,ki->kji", u, sizes, v)[:count], pair, None)
-    rms = np.sqrt((error**2).mean(axis=1)), np.sqrt((error**2).mean(axis=0))
+    rms = np.sqrt((below.error**2).mean(axis=1)), np.sqrt((below.error**2).mean(axis=0))
     norms = (np.linalg.norm(part, axis=1, keepdims=True) for part in (shape[:, m:], shape[:, :m]))
     return shape, np.hstack([own / norm for own, norm in zip(rms, norms)])
 

@@ -16,11 +16,11 @@ from scipy.linalg import block_diag
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.changing_decay import beside_changing
-from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
+from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
 from workbench.identification.input_output.model_order import Selected, select_modes, statistic_of
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
-from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
+from workbench.identification.input_output.spectral_lines import Lines, relative_noise, window_rate
 from workbench.identification.signal.modal_estimates import (
     SURE,
     ParticipatingModes,
@@ -81,6 +81,10 @@ class TransferModes(ParticipatingModes):
             residual is not noise there; modes are missing, or the points are inconsistent.
         fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
         frequencies_hz: (n_frequencies,) those lines.
+        lower_residual: (n_outputs, n_references) E, of displacement, 1/kg: a body that nothing holds, and elastic modes
+            far below the band. 0 where an output has no such term.
+        lower_residual_std: (n_outputs, n_references) standard errors.
+        upper_residual: (n_outputs, n_references) D, m/N: the flexibility of modes above the band.
         remarks: what is doubtful, and what was left undone where the time was up.
     """
 
@@ -92,6 +96,9 @@ class TransferModes(ParticipatingModes):
     order_limited_hz: tuple[tuple[float, float], ...]
     fitted: np.ndarray
     frequencies_hz: np.ndarray
+    lower_residual: np.ndarray
+    lower_residual_std: np.ndarray
+    upper_residual: np.ndarray
     remarks: tuple[str, ...] = ()
 
     parts_hz, full_hz = Renamed("cluster_hz"), Renamed("order_limited_hz")
@@ -147,8 +154,9 @@ def identify_transfer(
         noise_std: standard error of real and imaginary part, one or of the shape of `transfer`: from repeated
             measurements, or by `coherence_noise`. It weighs the lines; how large it is as a whole is found from what is
             left, and remarked where that disagrees. Without it, noise is taken to be the same at all lines of an
-            output, or to go with its size in part where neighbouring lines differ so (`noise_with_size`), and standard
-            errors grow with the residual about each mode where that is larger than elsewhere.
+            output, or, where neighbouring lines differ so, to differ between references, along frequency, and with the
+            size of the lines (`relative_noise`), and standard errors grow with the residual about each mode where that
+            is larger than elsewhere.
         max_modes: of a band, where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
@@ -207,14 +215,16 @@ def _selected(
         return _beside_changing(lines, how)
     few = how | {"max_modes": min(TRANSFER.strongest, how["max_modes"])}
     selected = select_modes(lines, **few)
-    guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
+    guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
     if guessed is None:  # noise that goes with size is largest in the peaks, and looks like modes that change
         lines, selected = _beside_changing(lines, few, selected)
-        guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
+        guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
     left = lines.left(selected.fit)
     # What the modes miss of the response is smooth from line to line, noise is not: so second differences, Hann's
     # window of the impulse response, are asked. Among lines of all sizes a few large ones show any correlation.
-    rough = np.diff(left if guessed is None else left / guessed, 2)
+    even = left if guessed is None else left / guessed
+    lines.window_rate = window_rate(even, omega)
+    rough = np.diff(even, 2)
     mixing = mixing_of(correlation_of_lines([rough.reshape(len(h), -1)]))
     if mixing is None:
         return _in_noise(lines, selected, how)
@@ -223,7 +233,7 @@ def _selected(
     apart, selected = _in_noise(*_beside_changing(lines.of(mixed), few), how)
     lines = apart.of(h)
     fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
-    guessed = noise_with_size(lines.left(fit), lines.fitted(fit))
+    guessed = relative_noise(lines.left(fit), lines.fitted(fit), lines.omega)
     if guessed is not None:
         lines = lines.weighted_by(guessed)
         fit = settled(lines, projected(lines, fit.poles, fit.participation), budget=budget)
@@ -244,7 +254,7 @@ def _in_noise(lines: Lines, selected: Selected, how: dict[str, Any]) -> tuple[Li
     budget = how["budget"]
     before: np.ndarray | None = None
     for _ in range(TRANSFER.reweighted):
-        guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
+        guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
         if guessed is None or (
             before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < TRANSFER.alike  # but for size
         ):
@@ -292,6 +302,7 @@ def _modes_of(
     vectors = vector_covariance(fit, noise_ratio, derivative, inside, shapes, participation.shape[1])
     both = np.r_[inside, fit.poles.size + inside]
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
+    below, below_std, above = _residual_terms(lines, fit, noise_ratio, derivative[:, 0])
     return TransferModes(
         modes=SampledModes.of_poles(poles, shapes, _places(channels)),
         covariance=frozen(covariance[np.ix_(both, both)]),
@@ -305,8 +316,42 @@ def _modes_of(
         order_limited_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if selected.full else (),
         fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
         frequencies_hz=frozen(shown_hz),
-        remarks=(f"left out, as negatively damped or of unknown frequency: poles at {out} Hz",) if out else (),
+        lower_residual=frozen(below),
+        lower_residual_std=frozen(below_std),
+        upper_residual=frozen(above),
+        remarks=(
+            *([f"left out, as negatively damped or of unknown frequency: poles at {out} Hz"] if out else []),
+            *_windowed(lines.window_rate),
+        ),
     )
+
+
+def _residual_terms(
+    lines: Lines, fit: Fit, noise_ratio: Floats, derivative: np.ndarray
+) -> tuple[Floats, Floats, Floats]:
+    """E, its standard errors, and D, (n_outputs, n_references) each, whatever the outputs measure.
+
+    A mode's acceleration φ_j φ_i s² / (s² + ω²) is its pair of poles and φ_j φ_i, which E of the fit holds. A pole
+    below the band, at the lines a l / 2 (1/s + λ/s²) and its conjugate, is part of the residual term.
+    """
+    n, size = 2 * fit.poles.size, lines.refs * len(lines.powers)
+    scale = lines.omega[-1] ** -np.array(lines.powers, float)
+    std = fixed_std(fit, noise_ratio, np.ones((fit.coefficients.shape[0] - n, len(derivative))))
+    low = fit.poles.imag < lines.omega[0]
+    if low.any():  # of what these and E make together, not of either
+        weights = np.ones((len(lines.fixed), 1)) if lines.weights is None else lines.weights
+        std = fit.noise / np.sqrt((lines.fixed**2).T @ weights**2)
+    terms, errors = (x[:size].reshape(lines.refs, len(scale), -1) * scale[:, None] for x in (fit.coefficients[n:], std))
+    below, below_std, above = (np.zeros((len(derivative), lines.refs)) for _ in range(3))
+    # by order: what the pairs below the band have of s^(k - 2), less what those in it leave in E
+    beside = np.stack([fit.amplitudes * x for x in (low * fit.poles, low, (low - 1.0) / fit.poles)]) @ fit.participation
+    for j, order in enumerate(derivative):
+        if order in lines.powers:
+            above[j] = terms[:, lines.powers.index(order), j]
+        if order - 2 in lines.powers:
+            power = lines.powers.index(order - 2)
+            below[j], below_std[j] = terms[:, power, j] + beside[order, j].real, errors[:, power, j]
+    return below, below_std, above
 
 
 def _acausal(h: np.ndarray, f: np.ndarray) -> tuple[str, ...]:
@@ -321,6 +366,16 @@ def _acausal(h: np.ndarray, f: np.ndarray) -> tuple[str, ...]:
     return (
         "the impulse responses come before the impulse: these are transfer functions of e^(-iωt)? Then take their"
         " complex conjugates",
+    )
+
+
+def _windowed(rate: float) -> tuple[str, ...]:
+    """A remark where noise shows an exponential window."""
+    if rate == 0.0:
+        return ()
+    return (
+        f"an exponential window of a time constant τ of about {1.0 / rate:.2g} s? It adds 1/τ to the decay rate of"
+        " every mode, 1/(τ ω) to its damping ratio: take that off, by the τ that was set",
     )
 
 
@@ -387,7 +442,10 @@ def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> Tr
         order_limited_hz=tuple(full for band in found for full in band.order_limited_hz),
         fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
         frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
-        remarks=tuple(remark for band in found for remark in band.remarks),
+        lower_residual=found[0].lower_residual,
+        lower_residual_std=found[0].lower_residual_std,
+        upper_residual=found[-1].upper_residual,
+        remarks=tuple(dict.fromkeys(remark for band in found for remark in band.remarks)),
     )
 
 

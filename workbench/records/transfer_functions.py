@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.records.assembly import legible
+from workbench.records.assembly import legible, unit_remark
 from workbench.records.confined import load_confined
 from workbench.records.limits import RecordFileError, check_file
 from workbench.records.record import Channel, Record
-from workbench.records.units import split_unit, unit_named
+from workbench.records.units import BRACKETED, split_unit, unit_named
 from workbench.renamed import Renamed
 from workbench.structure.modes import freeze
 from workbench.structure.printed import Printed, counted, place_text
@@ -22,7 +22,8 @@ from workbench.structure.printed import Printed, counted, place_text
 # Names, in small letters, under which programs keep the lines, the sample rate, and where the points are.
 HERTZ = ("f", "freq", "freqs", "frequency", "frequencies", "hz", "f_hz", "freq_hz", "frequency_hz", "frequencies_hz",
          "frequency [hz]", "f [hz]")  # fmt: skip
-RADIANS = ("w", "omega", "frequency [rad/s]", "omega [rad/s]")
+RADIANS = ("w", "omega", "w_rad_s", "omega_rad_s", "frequency_rad_s", "frequencies_rad_s",
+           "frequency [rad/s]", "omega [rad/s]")  # fmt: skip
 SURE_RATES = ("fs", "sample_rate", "sample_rate_hz")
 LIKELY_RATES = ("freq", "frequency", "rate")  # where the number of samples stands beside it
 SAMPLES = ("npts", "nfft", "n_samples")
@@ -33,6 +34,7 @@ COLUMN = re.compile(
 )
 DECIBEL = re.compile(r"(.+?)\s*[\[(]\s*dB\s*[\])]", re.IGNORECASE)
 DESCRIPTION = "transfer_header"
+REAL = 1e-6  # relative imaginary part, at most, of a line that is real
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,7 +114,8 @@ def holds_transfer(arrays: Mapping[str, np.ndarray]) -> bool:
 def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The columns of a table that begins with frequencies, the parts of each complex number put together; else none.
 
-    Parts are real and imaginary, or magnitude (which may be in dB) and phase (in rad or degrees).
+    Parts are real and imaginary, or magnitude (which may be in dB) and phase (in rad or degrees). A unit that is known
+    stands behind the name or the part, as in `a [g/N] real`: values are brought to SI by it.
 
     Raises:
         RecordFileError: frequencies, but a column beside them without its other part.
@@ -124,16 +127,27 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
     if not names or not (in_hertz or names[0].lower() in (*HERTZ, *RADIANS)):
         return {}
     parts: dict[str, dict[int, np.ndarray]] = {}
+    outputs: dict[str, dict[str, str]] = {}
+    remarks: dict[str, None] = {}
     for name in names[1:]:
         values, decibel = signals[name], DECIBEL.fullmatch(name)
-        bare, angle = split_unit(decibel[1] if decibel else name)
+        bare, *behind = _split_ratio(decibel[1] if decibel else name)
         column = COLUMN.fullmatch(bare)
         if column is None:
             break
-        measure = unit_named(angle)
-        scaled = 10.0 ** (values / 20.0) if decibel else values * (measure.factor if column[5] and measure else 1.0)
         which = next(i for i in range(2, 6) if column[i])
-        parts.setdefault(column[1] or "H", {})[which] = scaled
+        output, *before = _split_ratio(column[1] or "H")
+        scaled = 10.0 ** (values / 20.0) if decibel else values
+        if column[5]:
+            angle = unit_named(behind[0])
+            scaled = scaled * (angle.factor if angle else 1.0)
+        else:
+            written = behind if any(behind) else before
+            top, bottom = map(unit_named, written)
+            scaled = scaled * (top.factor if top else 1.0) / (bottom.factor if bottom else 1.0)
+            outputs[output] = {"quantity": top.quantity if top else "", "unit": top.si if top else ""}
+            remarks |= {unit_remark(output, text, one): None for text, one in zip(written, (top, bottom)) if one}
+        parts.setdefault(output, {})[which] = scaled
     pairs = [sorted(part) for part in parts.values()]
     if sum(map(len, pairs)) != len(names) - 1 or not all(pair in ([2, 3], [4, 5]) for pair in pairs):
         raise RecordFileError(
@@ -144,7 +158,26 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
     both = {
         name: part[2] + 1j * part[3] if 2 in part else part[4] * np.exp(1j * part[5]) for name, part in parts.items()
     }
-    return {"f" if in_hertz else names[0]: lines, **both}
+    arrays = {"f" if in_hertz else names[0]: lines, **both}
+    if not any(facts["unit"] for facts in outputs.values()):
+        return arrays
+    described = {
+        "outputs": [{"name": name, **outputs[name]} for name in both],
+        "references": ["input 1"],
+        "remarks": [*filter(None, remarks)],
+    }
+    return arrays | {DESCRIPTION: np.array(json.dumps(described))}
+
+
+def _split_ratio(name: str) -> tuple[str, str, str]:
+    """A column's name without its unit, and the units above and below as written: `a [g/N]` gives (a, g, N)."""
+    bare, text = split_unit(name)
+    found = BRACKETED.fullmatch(name.strip())
+    if text or not found:
+        return bare, text, ""
+    top, _, bottom = next(group for group in found.groups()[1:] if group is not None).rpartition("/")
+    top, bottom = top.strip("() "), bottom.strip("() ")
+    return (found[1], top, bottom) if unit_named(top) and unit_named(bottom) else (name, "", "")
 
 
 def transfer_of(
@@ -162,7 +195,7 @@ def transfer_of(
         RecordFileError: naming the file and the array, and what would be right.
     """
     found = {name: np.squeeze(v) for name, v in arrays.items() if v.dtype.kind == "c" and v.size > 1}
-    lines = _lines(path, arrays, found, sample_rate_hz)
+    lines, assumed = _lines(path, arrays, found, sample_rate_hz)
     spectra = {name: _frequency_last(path, name, values, lines.size) for name, values in found.items()}
     if len(spectra) > 1 and any(values.ndim > 1 for values in spectra.values()):
         shapes = ", ".join(f"{name} {values.shape}" for name, values in found.items())
@@ -173,13 +206,15 @@ def transfer_of(
     points = list(spectra) if len(spectra) > 1 else [f"{name} {i + 1}" for i in range(len(values))]
     channels, references, remarks = _points(path, arrays, points, values.shape[1])
     try:
-        return TransferFunctions(values, lines, channels, references, path.stem, remarks)
+        return TransferFunctions(values, lines, channels, references, path.stem, (*remarks, *assumed))
     except ValueError as error:
         raise RecordFileError(f"{path}: {error}") from error
 
 
-def _lines(path: Path, arrays: Mapping[str, Any], found: Mapping[str, Any], sample_rate_hz: float | None) -> np.ndarray:
-    """Hz."""
+def _lines(
+    path: Path, arrays: Mapping[str, Any], found: Mapping[str, Any], sample_rate_hz: float | None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Hz, and what was assumed of them."""
     real = {
         name: np.ravel(v) for name, v in arrays.items() if v.dtype.kind in "fiu" and max(v.shape, default=1) == v.size
     }
@@ -194,11 +229,12 @@ def _lines(path: Path, arrays: Mapping[str, Any], found: Mapping[str, Any], samp
     if vectors and sample_rate_hz is not None:
         raise RecordFileError(f"{path} holds its frequencies, {vectors[0][0]!r}; leave the sample rate out")
     if vectors:
-        return vectors[0][1]
+        return vectors[0][1], ()
     scalars = {name.lower(): float(values[0]) for name, values in real.items() if values.size == 1}
     longest = max(max(values.shape) for values in found.values())
-    whole = any(scalars.get(name) in (2 * longest - 2, 2 * longest - 1) for name in SAMPLES)
-    rates = [scalars[name] for name in (*SURE_RATES, *(LIKELY_RATES if whole else ())) if name in scalars]
+    likely = (2 * longest - 2, 2 * longest - 1, 2 * longest)
+    told = next((scalars[name] for name in SAMPLES if scalars.get(name) in likely), None)
+    rates = [scalars[name] for name in (*SURE_RATES, *(LIKELY_RATES if told else ())) if name in scalars]
     rate = sample_rate_hz if sample_rate_hz is not None else rates[0] if rates else None
     if rate is None:
         name = next(iter(found))
@@ -208,7 +244,24 @@ def _lines(path: Path, arrays: Mapping[str, Any], found: Mapping[str, Any], samp
         )
     if not 0 < rate < np.inf:
         raise RecordFileError(f"{path}: the sample rate must be positive; got {rate:g}")
-    return np.linspace(0.0, 0.5 * rate, longest)
+    for name, values in real.items():
+        if values.size == longest and (np.diff(values.astype(float)) > 0).all():
+            raise RecordFileError(
+                f"{path} holds a sample rate, and {name!r}, which increases as frequencies do; if it is the lines, call"
+                " it 'frequency_hz' or 'omega', else leave it out"
+            )
+    ends = np.concatenate([np.moveaxis(v, v.shape.index(longest), -1)[..., [0, -1]].reshape(-1, 2)
+                           for v in found.values() if longest in v.shape])  # fmt: skip
+    is_real = (np.abs(ends.imag) <= REAL * np.abs(ends)).all(axis=0)
+    # half the samples of a transform that is a power of two long: all lines but that at half the rate, which is real
+    short = told is None and longest & (longest - 1) == 0 and not is_real[1]
+    n_samples = told if told is not None else 2 * longest if short else 2 * longest - 2
+    doubt = "" if is_real[0] else "; but the first is not real, as that at 0 Hz is"
+    lines = rate / n_samples * np.arange(longest)
+    return lines, (
+        f"no frequencies beside a sample rate of {rate:g} Hz: the {longest} lines taken from 0 to {lines[-1]:g} Hz"
+        f"{doubt}; else add them as 'frequency_hz'",
+    )
 
 
 def _frequency_last(path: Path, name: str, values: np.ndarray, n_lines: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError
 from workbench.records.named_arrays import HEADER
 from workbench.records.transfer_functions import DESCRIPTION
-from workbench.records.units import BY_QUANTITY, unit_named
+from workbench.records.units import BY_QUANTITY, UNITS, unit_named
 
 # ordinate_spec_data_type of the format
 TYPES = {"displacement": 8, "velocity": 11, "acceleration": 12, "force": 13}
@@ -25,6 +25,7 @@ FUNCTIONS = {2: "auto spectrum", 3: "cross spectrum", 5: "transmissibility", 6: 
              9: "power spectral density", 10: "energy spectral density", 12: "spectrum"}  # fmt: skip
 OVER_TIME = (0, 1, 7, 8)  # general or unknown, time response, auto and cross correlation
 TIME = (0, 1, 17)  # abscissa_spec_data_type of the format: unknown, general, time
+TURNS = ("rpm", "cpm", "1/min")
 ALIKE = 1e-3  # relative, of factors of units as data sets 164 round them
 MARK = b"    -1"
 BINARY = re.compile(rb"^ +58b ", re.MULTILINE)
@@ -71,7 +72,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         record = facts.pop("record", record)
         if key in arrays:
             raise RecordFileError(f"{where}: a second channel is called {key.partition(':')[2]!r}")
-        time = _abscissa(entry, "time")
+        time = _abscissa(where, entry, "time")
         first = arrays.setdefault("t", time)
         if time.size != first.size or np.abs(time - first).max() > 1e-6 * max(np.abs(first).max(), 1e-300):
             raise RecordFileError(f"{where} ({key.partition(':')[2]}) has other sample instants than the first")
@@ -99,12 +100,13 @@ def _whole(data: bytes) -> bool:
 
 def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | None) -> dict[str, np.ndarray]:
     """All pairs of response and reference as one array, in SI, with their lines and names."""
-    lines = _abscissa(sets[0], "frequency")
+    lines = _abscissa(f"{path}, transfer function 1", sets[0], "frequency")
     found: dict[tuple[str, str], np.ndarray] = {}
     outputs: dict[str, dict[str, str]] = {}
     remarks: dict[str, None] = {}
     for number, entry in enumerate(sets, start=1):
-        where, x = f"{path}, transfer function {number}", _abscissa(entry, "frequency")
+        where = f"{path}, transfer function {number}"
+        x = _abscissa(where, entry, "frequency")
         data = np.asarray(entry["data"], complex)
         if x.shape != lines.shape or data.shape != lines.shape or np.abs(x - lines).max() > 1e-6 * np.abs(lines).max():
             raise RecordFileError(f"{where} has other lines than the first; keep those of one measurement")
@@ -121,11 +123,20 @@ def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | N
         remarks |= {unit_remark(name, text, unit): None
                     for name, text, unit in zip(pair, (output, reference), (top, bottom)) if unit}  # fmt: skip
     references = list(dict.fromkeys(pair[1] for pair in found))
-    for pair in ((output, reference) for output in outputs for reference in references):
-        if pair not in found:
+    mirrored = []
+    for output, reference in ((output, reference) for output in outputs for reference in references):
+        if (output, reference) in found:
+            continue
+        if (reference, output) not in found or outputs[reference] != outputs[output]:
             raise RecordFileError(
-                f"{path} lacks the transfer function from {pair[1]} to {pair[0]}; the others are there"
+                f"{path} lacks the transfer function from {reference} to {output}; export those of one reference, or of"
+                " all to every output"
             )
+        mirrored.append((output, reference))
+    if mirrored:
+        named = ", ".join(f"{reference} to {output}" for output, reference in mirrored)
+        remarks[f"by reciprocity, those from {named}"] = None
+        found |= {(output, reference): found[reference, output] for output, reference in mirrored}
     values = np.array([[found[output, reference] for reference in references] for output in outputs])
     described = {
         "outputs": [{"name": name, **facts} for name, facts in outputs.items()],
@@ -166,11 +177,24 @@ def _label(entry: dict[str, Any], axis: str) -> str:
     return "" if label.upper() == "NONE" else label
 
 
-def _abscissa(entry: dict[str, Any], quantity: str) -> np.ndarray:
-    """Instants in s, or lines in Hz."""
-    unit = unit_named(_label(entry, "abscissa"))
-    factor = unit.factor if unit is not None and unit.quantity == quantity else 1.0
-    return np.asarray(entry["x"], float) * factor
+def _abscissa(where: str, entry: dict[str, Any], quantity: str) -> np.ndarray:
+    """Instants in s, or lines in Hz.
+
+    Raises:
+        RecordFileError: a unit of another quantity, or that is not known.
+    """
+    label = _label(entry, "abscissa")
+    unit, x = unit_named(label), np.asarray(entry["x"], float)
+    if unit is not None and unit.quantity == quantity:
+        return x * unit.factor
+    if unit is not None and (quantity, unit.quantity) == ("frequency", "angular velocity"):
+        return x * (unit.factor / (2.0 * np.pi))
+    if quantity == "frequency" and label.lower() in TURNS:
+        return x / 60.0
+    if label:
+        known = ", ".join(name for name, one in UNITS.items() if one.quantity == quantity)
+        raise RecordFileError(f"{where}: its abscissa is in {label!r}, which is no unit of {quantity}; export {known}")
+    return x
 
 
 def _measured(where: str, entry: dict[str, Any], axis: str, system: dict[str, Any] | None) -> tuple[str, str]:

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.stats import chi2, spearmanr
+from scipy.optimize import least_squares
+from scipy.special import hyp2f1
+from scipy.stats import chi2, f, kruskal, spearmanr
 
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.model_order import bases_of, weights_of
@@ -22,10 +24,16 @@ class LinesSettings:
     louder: float = 0.01  # chance that noise of one level is taken for louder about a mode
     uneven: float = 1e-4  # chance that even noise is taken for uneven
     smoothed: int = 5  # lines of a running median
+    lags: int = 3  # lines, over which noise that was windowed is seen to be correlated
+    instants: int = 2000  # of a record, by which that is reckoned
+    windowed: float = 5.0  # standard errors of one output's correlation from which on there was a window
+    explained: float = 0.3  # of what differs from noise without a window, at most left by the best one
+    degree: int = 3  # of the polynomial of log ω that noise follows along frequency
 
 
 LINES = LinesSettings()
 DETUNED = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0])  # half-power bandwidths beside a mode
+WINDOWS = np.r_[0.0, np.geomspace(0.1, 30.0, 60)]  # length of a record, in time constants of its window
 SHARES = np.geomspace(1e-3, 1e3, 61)  # b |H| / a at the median line, from nothing to all
 
 
@@ -40,6 +48,7 @@ class Lines:
         guessed: whether it is known but for its size.
         beside: (n_rows, n_columns) fixed columns beside those of the residual terms.
         changing: of the modes that move along these, their pole and by how much their frequency scatters, rad/s.
+        window_rate: 1/τ of an exponential window, as far as noise shows one.
     """
 
     def __init__(
@@ -51,7 +60,9 @@ class Lines:
         guessed: bool = False,
         beside: np.ndarray | None = None,
         changing: tuple[tuple[complex, float], ...] = (),
+        window_rate: float = 0.0,
     ) -> None:
+        self.window_rate = window_rate
         self.h, self.powers, self.stated = h, powers, noise
         self.distorted: tuple[complex, ...] = ()
         self.free: tuple[complex, ...] = ()
@@ -73,21 +84,21 @@ class Lines:
 
     def of(self, h: np.ndarray) -> "Lines":
         """The same lines of other outputs, their noise not known."""
-        return Lines(h, self.omega, self.powers, None, False, self.beside, self.changing)
+        return Lines(h, self.omega, self.powers, None, False, self.beside, self.changing, self.window_rate)
 
     def weighted_by(self, guessed: np.ndarray) -> "Lines":
         """The same lines with their noise known but for its size."""
-        return Lines(self.h, self.omega, self.powers, guessed, True, self.beside, self.changing)
+        return Lines(self.h, self.omega, self.powers, guessed, True, self.beside, self.changing, self.window_rate)
 
     def with_columns(self, columns: np.ndarray, changing: tuple[complex, float]) -> "Lines":
         """The same lines with further fixed columns, those of a mode that changes."""
         beside = columns if self.beside is None else np.hstack([self.beside, columns])
         changed = (*self.changing, changing)
-        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, beside, changed)
+        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, beside, changed, self.window_rate)
 
     def without_columns(self) -> "Lines":
         """The same lines without what modes that change move."""
-        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed)
+        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, window_rate=self.window_rate)
 
     def only(self, which: np.ndarray, smooth: int) -> "Lines":
         """Some lines (n_lines,), beside polynomials up to a degree as well."""
@@ -95,7 +106,7 @@ class Lines:
         middle = 0.5 * (omega[0] + omega[-1])
         at = (omega - middle) / max(omega[-1] - middle, 1e-300)
         noise = None if self.stated is None else self.stated[..., which]
-        found = Lines(self.h[..., which], omega, self.powers, noise, self.guessed)
+        found = Lines(self.h[..., which], omega, self.powers, noise, self.guessed, window_rate=self.window_rate)
         further = [factor * at**k for k in range(smooth + 1) for factor in (1.0, 1j)]
         polynomials = found._stacked(np.array([found._of(i, x) for i in range(self.refs) for x in further]))
         beside = [] if self.beside is None else [self.beside[np.tile(which, 2 * self.refs)]]
@@ -202,34 +213,120 @@ class Lines:
         at = int(np.argmin(np.abs(self.omega - pole.imag)))
         beside = power[max(at - LINES.beside, 0) : at + LINES.beside + 1]
         # The median of a power of two degrees of freedom and more is at most its mean.
-        return max(1.0, float(np.median(beside) / power.mean()))
+        return max(1.0, float(np.median(beside) / power.mean())) * self._early(-pole.real)
+
+    def _early(self, rate: float) -> float:
+        """Power of windowed noise in the impulse response of a pole over that of noise that no window shortens."""
+        length = 2.0 * np.pi / self.resolution
+        window, own = 2.0 * self.window_rate * length, 2.0 * rate * length
+        return float(_mean_of_decay(window + own) / (_mean_of_decay(window) * _mean_of_decay(own)))
 
 
-def noise_with_size(left: np.ndarray, fitted: np.ndarray) -> np.ndarray | None:
+def _mean_of_decay(total: float) -> float:
+    """Of e^(-at) over a record at the end of which it is e^(-total)."""
+    return float(-np.expm1(-total) / total) if abs(total) > 1e-9 else 1.0
+
+
+def window_rate(left: np.ndarray, omega: np.ndarray) -> float:
+    """1/τ of the exponential window exp(-t/τ) that correlates the noise of neighbouring lines, rad/s; 0 if none.
+
+    Second differences of the lines, which leave nothing of what is smooth, are noise that over the time t of the
+    impulse response has the power exp(-2t/τ) (2 - 2 cos(2πt/T))², and so are correlated as that transforms. Only their
+    phases count, so that a few loud lines do not; of normal z and w of the correlation r the mean of the product of
+    their phasors is π/4 r F(1/2, 1/2; 2; |r|²) (Middleton, Introduction to Statistical Communication Theory, ch. 9).
+
+    Args:
+        left: the residual in units of its noise, complex, lines last.
+        omega: (n_lines,).
+    """
+    step = np.diff(omega)
+    if np.ptp(step) > 1e-6 * step.max():
+        return 0.0
+    rough = np.diff(left, 2).reshape(-1, omega.size - 2)
+    phasors = rough / np.maximum(np.abs(rough), 1e-300)
+    lags = np.arange(1, LINES.lags + 1)
+    seen = np.array([(phasors[:, m:] * phasors[:, :-m].conj()).mean() for m in lags])
+    at = (np.arange(LINES.instants) + 0.5) / LINES.instants
+    power = np.exp(-2.0 * np.outer(WINDOWS, at)) * (2.0 - 2.0 * np.cos(2.0 * np.pi * at)) ** 2
+    r = power @ np.exp(-2j * np.pi * np.outer(at, lags)) / power.sum(axis=1, keepdims=True)
+    off = np.linalg.norm(seen - np.pi / 4.0 * r * hyp2f1(0.5, 0.5, 2.0, np.abs(r) ** 2), axis=1)
+    best = int(np.argmin(off))
+    sure = off[0] - off[best] > LINES.windowed / np.sqrt(omega.size) and off[best] < LINES.explained * off[0]
+    return float(WINDOWS[best] * step.mean() / (2.0 * np.pi)) if sure else 0.0
+
+
+def relative_noise(left: np.ndarray, fitted: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
     """Relative noise of every line, (n_outputs, n_references, n_lines); None where it may be the same at all.
 
-    s² = a² + b² |H|² of each output: its sensor's own noise, and that of the force or of too few averages. What a fit
-    has not yet found is smooth from line to line, noise is not: where lines are evenly spaced, r_k less the mean of
-    r_k-1 and r_k+1 is noise alone, 3/2 s² of it. H is the fit's own, for a measured H goes with its noise; where a mode
-    is not yet found it is the running median of the measured.
+    s = c g(ω) (a² + b² |H|²)^½: c of each output and reference, as far as references differ; g, of all of them, smooth
+    along frequency, as of accelerations that were integrated or of a force that falls; a the sensor's own noise, b of
+    each output, that of the force or of too few averages. What a fit has not yet found is smooth from line to line,
+    noise is not: where lines are evenly spaced, r_k less the mean of r_k-1 and r_k+1 is noise alone, 3/2 s² of it. H is
+    the fit's own, for a measured H goes with its noise; where a mode is not yet found it is the running median of the
+    measured. Of the orders in which g and b are found, that counts which leaves less.
 
     Args:
         left: the residual, complex, of that shape.
         fitted: the fit, of that shape.
+        omega: (n_lines,) rad/s.
     """
     inner = np.arange(1, left.shape[-1] - 1, 3)  # every third: no line counts twice
     rough = np.abs(left[..., inner] - 0.5 * (left[..., inner - 1] + left[..., inner + 1]))
     seen = median_filter(np.abs(fitted + left), (1, 1, LINES.smoothed))
-    size, found, uneven = np.maximum(np.abs(fitted), seen), np.ones(left.shape), False
-    for j, (each, of) in enumerate(zip(rough, size[..., inner], strict=True)):
+    size = np.maximum(np.abs(fitted), seen)
+    live = np.median(rough, axis=(1, 2)) > 0.0  # an output of zeros has no noise
+    if not live.any():
+        return None
+    if not live.all():
+        whole = np.ones(left.shape)
+        of_live = relative_noise(left[live], fitted[live], omega)
+        whole[live] = 1.0 if of_live is None else of_live
+        return None if of_live is None else whole
+    logs = np.log(np.maximum(rough, 1e-3 * np.median(rough, axis=-1, keepdims=True) + 1e-300))
+    levels = _of_references(logs)[..., None] * np.ones(left.shape[-1])
+    found, least = levels, np.inf
+    for order in ((_along, _with_size), (_with_size, _along)):
+        trial = levels
+        for part in order:
+            trial = trial + part(logs - trial[..., inner], size, omega, inner)
+        error = logs - trial[..., inner]
+        if (misfit := np.abs(error - np.median(error, axis=(1, 2), keepdims=True)).sum()) < least:
+            found, least = trial, misfit
+    return np.exp(found) if found.any() else None
+
+
+def _of_references(logs: np.ndarray) -> np.ndarray:
+    """Log of the level of each reference in that of its output, (n_outputs, n_references); 0 where they may be one."""
+    levels = np.median(logs, axis=-1)
+    levels -= levels.mean(axis=1, keepdims=True)
+    differ = [len(rows) > 1 and kruskal(*rows).pvalue < LINES.uneven for rows in logs]
+    return np.where(np.array(differ)[:, None], levels, 0.0)
+
+
+def _along(logs: np.ndarray, size: np.ndarray, omega: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """Log of the level along frequency, (n_lines,), a polynomial of log ω; 0 where it may be one."""
+    x = 2.0 * np.log(omega / omega[0]) / np.log(omega[-1] / omega[0]) - 1.0
+    y = np.mean(logs - np.median(logs, axis=-1, keepdims=True), axis=(0, 1))  # of outputs that may share their noise
+    powers, free = np.vander(x, LINES.degree + 1), inner.size - LINES.degree - 1
+    if free < 1:
+        return np.zeros(omega.size)
+    fit = least_squares(lambda c: powers[inner] @ c - y, np.zeros(LINES.degree + 1), loss="soft_l1", f_scale=y.std())
+    trend = powers @ fit.x
+    between, within = np.var(trend[inner]), np.var(y - trend[inner])
+    if f.sf(between / LINES.degree * free / max(within, 1e-300), LINES.degree, free) > LINES.uneven:
+        return np.zeros(omega.size)
+    return np.asarray(trend - trend.mean())
+
+
+def _with_size(logs: np.ndarray, size: np.ndarray, omega: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """Log of the level that goes with the size of the lines, of the shape of `size`; 0 where it may be one."""
+    found = np.zeros(size.shape)
+    for j, (each, of) in enumerate(zip(logs, size[..., inner], strict=True)):
         typical = float(np.median(of))
-        if typical <= 0.0 or np.median(each) <= 0.0:
-            continue
         if spearmanr(each.ravel(), of.ravel(), alternative="greater").pvalue > LINES.uneven:
             continue
         # Least absolute errors of log s: the few lines of a mode not yet found count little.
-        logs = [np.log(each) - 0.5 * np.log1p((share * of / typical) ** 2) for share in SHARES]
-        errors = [np.abs(log - np.median(log)).sum() for log in logs]
-        found[j] = np.sqrt(1.0 + (SHARES[int(np.argmin(errors))] * size[j] / typical) ** 2)
-        uneven = True
-    return found if uneven else None
+        rest = [each - 0.5 * np.log1p((share * of / typical) ** 2) for share in SHARES]
+        errors = [np.abs(log - np.median(log)).sum() for log in rest]
+        found[j] = 0.5 * np.log1p((SHARES[int(np.argmin(errors))] * size[j] / typical) ** 2)
+    return found

@@ -22,6 +22,8 @@ class HarmonicSettings:
     # is below 1.42 in one of a thousand, of a sine with a tenth of its power in random motion about it 1.17
     steady: float = 1.3
     lines: int = 8  # to either side, at least, that the envelope is made of
+    chance: float = 1e-4  # that a line of random motion is taken for a sine
+    peaked: float = 5.0  # power of a mode's peak over the median within four of its half bandwidths: 1 + 2²
 
 
 HARMONICS = HarmonicSettings()
@@ -45,13 +47,16 @@ def harmonic_remarks(records: Sequence[Record], poles: Complexes, among: Sequenc
         return ()
     modes = ", ".join(mode_text(r, abs(poles[r]) / (2.0 * np.pi)) for r in steady)
     return (
-        f"harmonic excitation? the motion about {modes} has a constant amplitude, as mains hum and turning machines"
-        " make it; then it is no mode, and its standard errors do not hold",
+        f"harmonic excitation? the motion about {modes} has a constant amplitude, or one line far above those beside"
+        " it, as mains hum and turning machines make it; then it is no mode, and its standard errors do not hold",
     )
 
 
 def _is_steady(lines: Complexes, power: Floats, pole: complex) -> bool:
     """Whether the envelope stays the same in the output that holds most of what is about a pole, in lines.
+
+    Or, in any output, one line stands out of a broad peak: power of random motion is exponential, its median ln 2 of
+    its mean.
 
     Args:
         lines: (n_outputs, n_lines) of the transform.
@@ -63,5 +68,9 @@ def _is_steady(lines: Complexes, power: Floats, pole: complex) -> bool:
         return False
     inside = lines[:, first : last + 1]
     strongest = inside[np.argmax((np.abs(inside) ** 2).sum(axis=1) / power)]
+    each = np.abs(inside) ** 2
+    highest = HARMONICS.peaked * np.log(each.size / HARMONICS.chance) / np.log(2.0)
+    if abs(pole.real) >= HARMONICS.lines and (each.max(axis=1) > highest * np.median(each, axis=1)).any():
+        return True
     envelope = np.abs(np.fft.ifft(strongest, 4 * strongest.size)) ** 2
     return bool((envelope**2).mean() < HARMONICS.steady * envelope.mean() ** 2)
