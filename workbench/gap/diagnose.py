@@ -457,6 +457,8 @@ def _fitted_to_unseen(errors: Effect | None, found: Attribution, unseen: Sequenc
             f"The {errors.target.figure} of record{'s' if len(own) > 1 else ''} {joined_in_words(own)} was fitted to"
             " the record itself for the budget; the share of the gap that closes is without it, as a prediction is."
         )
+
+
 def _of_rest(budget: Budget, power: float, tolerance: float) -> Iterator[str]:
     """What is said of more than noise that an explained gap leaves; power: mean square of the gap."""
     if budget.leaves_more_than_noise:
