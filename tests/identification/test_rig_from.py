@@ -221,8 +221,9 @@ def test_the_spread_of_shapes_over_many_records_is_what_their_covariance_says(be
 
 def test_modes_that_nothing_scales_are_said_so(found):
     elsewhere = [Channel(c.name, c.quantity) for c in found.output_channels]
-    with pytest.warns(UserWarning, match="the shapes have no scale"):
+    with pytest.warns(UserWarning, match="the shapes have no scale") as told:
         rig_from(found, outputs=elsewhere)
+    assert told[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         scaled = rig_from(found)
@@ -268,8 +269,9 @@ def test_a_rig_of_output_only_modes_has_the_errors_of_shapes_and_warns_of_comple
     turned = SampledModes(modes.omega, modes.zeta, modes.shapes * [[1.0, 1.0], [1j, 1.0]], modes.positions)
     with pytest.warns(
         UserWarning, match=r"mode 1 at 1.273 Hz is complex: the nearest real mode leaves 29 % of its shape"
-    ):
+    ) as told:
         rig_from(AmbientModes(turned, np.eye(4), np.ones(2), 0.0, ()), outputs=record.output_channels, modal_masses=1.0)
+    assert told[0].filename == __file__
 
 
 def test_a_shape_that_may_be_complex_by_its_noise_is_not_warned_of():

@@ -8,6 +8,7 @@ from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import filter_on
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.structure.domain import NamedPoints
+from workbench.structure.printed import warns_of_remarks
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +72,17 @@ def test_a_notebook_shows_the_same_table_with_nothing_left_to_run():
     record = wb.Record(0.1, np.zeros((1, 5)), (wb.Channel("<script>"),))
     shown = record._repr_html_()
     assert "<table>" in shown and "<script>" not in shown
+
+
+def test_a_function_warns_its_caller_of_the_remarks_of_what_it_returns():
+    class Found:
+        remarks = ("one", "two")
+
+    @warns_of_remarks
+    def found_of(number: int) -> Found:
+        return Found()
+
+    with pytest.warns(UserWarning) as told:
+        assert isinstance(found_of(3), Found)
+    assert [(str(w.message), w.filename) for w in told] == [("one", __file__), ("two", __file__)]
+    assert found_of.__name__ == "found_of"

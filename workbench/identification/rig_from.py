@@ -159,7 +159,7 @@ def _of_residues(
     turned = np.linalg.norm(identified.participation_std, axis=1) / np.linalg.norm(identified.participation, axis=1)
     _warn_of_complex(modes, cost, np.hypot(shape_errors(identified), turned), "residues")
     for remark in set_up_remarks(identified):
-        warnings.warn(remark, stacklevel=4)
+        warnings.warn(remark, stacklevel=3)
     pair = _pair(out, into, driving_point)
     masses = None if modal_masses is None else _masses(modal_masses, modes.n_modes)
     at_out, at_in = np.split(_scaled(residues.real, pair, masses), [len(out)], axis=1)
@@ -174,7 +174,7 @@ def _of_residues(
             "no output stands where an input acts, so the shapes have no scale: responses to these inputs are right,"
             " those to masses, springs or forces elsewhere are not; name an input and the output at its place as the"
             " driving point (driving_point, --driving-point), or give modal_masses",
-            stacklevel=4,
+            stacklevel=3,
         )
     rows = {channel.name: (channel, i) for i, channel in enumerate((*into, *out), start=-len(into))}
     kept = [i % (len(out) + len(into)) for _, i in rows.values()]
@@ -213,7 +213,7 @@ def _left_of_direct(
     warnings.warn(
         f"{share:.0f} % of the direct term of accelerations {why}, and is left out of the rig; simulate by"
         " response() of what was identified, or identify from accelerations alone",
-        stacklevel=5,
+        stacklevel=4,
     )
     return None
 
@@ -232,7 +232,7 @@ def _below_the_band(identified: TransferModes, out: tuple[Channel, ...], pair: t
         warnings.warn(
             f"modes above {hz[-1]:.4g} Hz make {100.0 * share:.0f} % of the response, and are left out of the rig;"
             " identify up to a higher line",
-            stacklevel=5,
+            stacklevel=4,
         )
     below, error = identified.lower_residual, identified.lower_residual_std
     least = float(SURE * np.linalg.norm(error))
@@ -243,13 +243,13 @@ def _below_the_band(identified: TransferModes, out: tuple[Channel, ...], pair: t
         warnings.warn(
             f"what moves below the lowest line, {hz[0]:.4g} Hz, is taken for a body that no spring holds, a mode at"
             " 0 Hz; if the structure is held, identify from a lower line",
-            stacklevel=5,
+            stacklevel=4,
         )
         return _Below(below, error, max(least, LEFT * float(np.linalg.norm(below))))
     warnings.warn(
         f"modes below the lowest line, {hz[0]:.4g} Hz, rigid or elastic, make {100.0 * share:.0f} % of the response"
         " there, and are left out of the rig; identify from a lower line",
-        stacklevel=5,
+        stacklevel=4,
     )
     return None
 
@@ -270,7 +270,7 @@ def _rigid(below: _Below | None, pair: tuple[int, int] | None, m: int, q: int) -
         warnings.warn(
             f"the measurement shows {count} rigid modes: responses to these inputs are right, those to masses, springs"
             " or forces elsewhere are not; for these take the rigid modes from the body's mass and inertia",
-            stacklevel=4,
+            stacklevel=3,
         )
     shape = _scaled(np.einsum("jk,k,ki->kji", u, sizes, v)[:count], pair, None)
     rms = np.sqrt((below.error**2).mean(axis=1)), np.sqrt((below.error**2).mean(axis=0))
@@ -356,7 +356,7 @@ def _warn_of_complex(modes: SampledModes, cost: np.ndarray, error: np.ndarray, w
         warnings.warn(
             f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz is complex: the nearest real mode leaves"
             f" {100 * cost[r]:.0f} % of its {what}",
-            stacklevel=5,
+            stacklevel=4,
         )
 
 

@@ -1,9 +1,23 @@
 """How a result is printed: a line that sums it up and a short table, as text and in a notebook."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from html import escape
+from typing import ParamSpec, Protocol, TypeVar
+from warnings import warn
 
 from workbench.structure.domain import Patch
+
+
+class Remarked(Protocol):
+    """What has remarks of its own."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]: ...
+
+
+P = ParamSpec("P")
+R = TypeVar("R", bound=Remarked)
 
 
 class Printed:
@@ -30,6 +44,20 @@ class Printed:
         below = "".join(f"<p>{escape(remark)}</p>" for remark in remarks)
         table = f"<table><tr>{head}</tr>{body}</table>" if rows or not line else ""
         return f"{f'<p>{escape(line)}</p>' if line else ''}{table}{below}"
+
+
+def warns_of_remarks(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, its caller warned of the remarks of what it returns; the outermost decorator, so that the warning
+    names the caller's line."""
+
+    @wraps(function)
+    def warned(*args: P.args, **kwargs: P.kwargs) -> R:
+        found = function(*args, **kwargs)
+        for remark in found.remarks:
+            warn(remark, stacklevel=2)
+        return found
+
+    return warned
 
 
 def counted(number: int, word: str) -> str:

@@ -15,7 +15,6 @@ are at odds with one another. Both show where one mode is left out at a time: ho
 standard error (the jackknife, Efron & Stein, Ann. Statist. 9, 1981).
 """
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -29,7 +28,7 @@ from scipy.linalg import null_space
 from workbench.identification.signal.modal_estimates import rounded
 from workbench.structure.domain import gauss_between
 from workbench.structure.modes import Modes, frozen
-from workbench.structure.printed import Printed, counted
+from workbench.structure.printed import Printed, counted, warns_of_remarks
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.threads import one_blas_thread
 
@@ -177,6 +176,7 @@ def columns(of: Any, length: float) -> tuple[Sequence[str], Sequence[str], Seque
     return [f"{at:.4g}" for at in x], values, errors
 
 
+@warns_of_remarks
 @one_blas_thread
 def mass_and_stiffness(
     modes: Modes,
@@ -202,40 +202,26 @@ def mass_and_stiffness(
         UserWarning: the mass or the stiffness is uncertain by more than a tenth or by what cannot be told; modes that
             are not orthogonal.
     """
-    found = distributions_of(
-        modes,
-        kind=kind,
-        mass_basis=mass_basis,
-        stiffness_basis=stiffness_basis,
-        known_mass=known_mass,
-        prior_mass=prior_mass,
-        prior_stiffness=prior_stiffness,
-    )
-    for remark in found.remarks:
-        warnings.warn(remark, stacklevel=3)
-    return found
+    return distributions_of(modes, kind, (mass_basis, stiffness_basis), known_mass, (prior_mass, prior_stiffness))
 
 
 def distributions_of(
     modes: Modes,
-    *,
     kind: str,
-    mass_basis: Basis,
-    stiffness_basis: Basis,
-    known_mass: Sequence[tuple[float, float]],
-    prior_mass: ProfileLike = 0.0,
-    prior_stiffness: ProfileLike = 0.0,
+    bases: tuple[Basis, Basis],
+    known: Sequence[tuple[float, float]],
+    priors: tuple[ProfileLike, ProfileLike],
 ) -> Distributions:
-    """`mass_and_stiffness` without its warnings."""
+    """`mass_and_stiffness` without its warnings; bases and priors of mass and stiffness."""
     if kind not in ("bar", "beam"):
         raise ValueError(f"mass and stiffness are those of a bar or a beam; got {kind!r}")
     unit, scale = _unit_mean_square(modes)
     found = partial(
         _found,
         order=1 if kind == "bar" else 2,
-        bases=(mass_basis, stiffness_basis),
-        known=known_mass,
-        priors=(as_profile(prior_mass), as_profile(prior_stiffness)),
+        bases=bases,
+        known=known,
+        priors=(as_profile(priors[0]), as_profile(priors[1])),
     )
     mass, stiffness, gram = found(unit)
     scales = np.sqrt(np.diag(gram))

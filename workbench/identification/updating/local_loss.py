@@ -10,7 +10,6 @@ below that of the undamaged explanation by more than noise would lower χ² anyw
 probability of a false alarm. No measurement of the undamaged structure is needed.
 """
 
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,7 +28,7 @@ from workbench.identification.updating.structure_problem import PROBLEM, Problem
 from workbench.identification.updating.structure_task import LACKING, FittedStructure, Task, unexplained
 from workbench.renamed import Renamed
 from workbench.structure.member import Bar, Beam
-from workbench.structure.printed import Printed
+from workbench.structure.printed import Printed, warns_of_remarks
 from workbench.structure.supports import PointMass
 from workbench.threads import one_blas_thread
 
@@ -146,6 +145,7 @@ class LocatedDamage(Printed):
         return np.asarray(np.quantile([share, 0.5 * (begin + end), end - begin], [tail, 1.0 - tail], axis=1).T)
 
 
+@warns_of_remarks
 @one_blas_thread
 def locate_damage(
     measured: Refined,
@@ -197,16 +197,13 @@ def locate_damage(
             undamaged = _undamaged(task, basis, terms, damaged, limit)
             statistic = _statistic(task, undamaged, damaged)
     # modes that not even a loss explains err by more than their standard errors, and count for less
-    found = LocatedDamage(
+    return LocatedDamage(
         undamaged,
         damaged,
         statistic if damaged.explains else statistic * damaged.degrees_of_freedom / damaged.chi2,
         limit,
         None if undamaged.explains else _with_a_mass(task, basis, terms, damaged),
     )
-    for remark in found.remarks:
-        warnings.warn(remark, stacklevel=3)
-    return found
 
 
 def _statistic(task: Task, undamaged: FittedStructure, damaged: FittedStructure) -> float:

@@ -6,7 +6,6 @@ shape is compared with the span of them, and its frequency with Rayleigh's quoti
 were measured as repeated stay so where the model takes them apart: their shapes say nothing of how they are turned.
 """
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -18,7 +17,7 @@ from scipy.stats import chi2 as chi2_distribution
 from workbench.identification.shapes.mode_pairing import assigned, repeated_modes
 from workbench.identification.signal.modal_estimates import rounded
 from workbench.structure.modes import Modes, freeze
-from workbench.structure.printed import Printed, counted
+from workbench.structure.printed import Printed, counted, warns_of_remarks
 
 
 @dataclass(frozen=True)
@@ -105,6 +104,7 @@ class UpdatedModel(Printed):
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
+@warns_of_remarks
 def update_model(
     build: Callable[[np.ndarray], Modes],
     start: ArrayLike,
@@ -210,10 +210,7 @@ def update_model(
     if refused and ((np.linalg.qr(found.jac)[0].T @ found.fun) ** 2).sum() > UPDATING.at_edge:
         converged = False
         reason = f"beyond these parameters the model has no such modes ({refused[-1]}); choose other parameters"
-    updated = UpdatedModel(parameters, covariance, modes, columns, agreement, found.fun, converged, reason)
-    for remark in updated.remarks:
-        warnings.warn(remark, stacklevel=2)
-    return updated
+    return UpdatedModel(parameters, covariance, modes, columns, agreement, found.fun, converged, reason)
 
 
 def _joined(cluster: np.ndarray, own: np.ndarray, measured: np.ndarray, omega: np.ndarray) -> np.ndarray:

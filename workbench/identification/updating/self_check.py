@@ -1,6 +1,5 @@
 """The check of section 4.3: does the structure that was identified have the modes it was identified from?"""
 
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,7 +9,8 @@ import numpy as np
 from workbench.identification.updating.distributions import Basis, Distributions, distributions_of
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import Modes, mac
-from workbench.structure.printed import Printed
+from workbench.structure.printed import Printed, warns_of_remarks
+from workbench.structure.profile import ProfileLike
 from workbench.structure.supports import End
 from workbench.threads import one_blas_thread
 
@@ -58,6 +58,11 @@ class Identified(Printed):
         line, headings, rows, remarks = self.distributions._printed()
         return line, headings, rows, [self.check._printed()[0], *remarks]
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Those of the distributions."""
+        return self.distributions.remarks
+
 
 def structure_of(found: Distributions, *, kind: str, length: float, left: str | End, right: str | End) -> Bar | Beam:
     """The `Bar` or `Beam` that identified distributions describe.
@@ -96,6 +101,7 @@ def self_check(
     return SelfCheck(again.omega / measured.omega - 1.0, agreement)
 
 
+@warns_of_remarks
 def choose_terms(
     measured: Modes,
     *,
@@ -106,7 +112,8 @@ def choose_terms(
     terms: Iterable[int] = range(1, 7),
     basis: Callable[[int], Basis] = Basis.polynomial,
     first_mode: int = 0,
-    **priors: Any,
+    prior_mass: ProfileLike = 0.0,
+    prior_stiffness: ProfileLike = 0.0,
 ) -> Identified:
     """Identify with each pair of numbers of terms and keep the one whose own modes agree best with the measured.
 
@@ -119,7 +126,7 @@ def choose_terms(
         known_mass: ((x, kg/m), ...).
         terms: numbers of terms to try, for mass and stiffness alike.
         basis: number of terms -> `Basis`.
-        priors: `prior_mass`, `prior_stiffness` of `mass_and_stiffness`.
+        prior_mass, prior_stiffness: as `mass_and_stiffness`.
 
     Raises:
         ValueError: no pair of numbers gives a structure; the last reason is given.
@@ -131,14 +138,8 @@ def choose_terms(
     pairs = sorted(((a, b) for a in terms for b in terms), key=lambda pair: (sum(pair), pair))
     for n_mass, n_stiffness in pairs:
         try:
-            found = distributions_of(
-                measured,
-                kind=kind,
-                mass_basis=basis(n_mass),
-                stiffness_basis=basis(n_stiffness),
-                known_mass=known_mass,
-                **priors,
-            )
+            bases = basis(n_mass), basis(n_stiffness)
+            found = distributions_of(measured, kind, bases, known_mass, (prior_mass, prior_stiffness))
         except ValueError as error:
             reason = str(error)
             continue
@@ -151,8 +152,6 @@ def choose_terms(
             best = (found, check, (n_mass, n_stiffness))
     if best is None:
         raise ValueError(f"no number of terms gives a structure: {reason}")
-    for remark in best[0].remarks:
-        warnings.warn(remark, stacklevel=3)
     return Identified(best[0], best[2], best[1], tuple(tried))
 
 

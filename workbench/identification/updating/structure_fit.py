@@ -4,7 +4,6 @@ distinguished from the measured.
 Schwarz's criterion χ² + n_terms ln n_data (Ann. Statist. 6, 1978) is not lowered by a term that is not needed.
 """
 
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -15,12 +14,14 @@ from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.structure_problem import Problem
 from workbench.identification.updating.structure_task import FittedStructure, GaussianPrior, Task
 from workbench.structure.member import Bar, Beam
+from workbench.structure.printed import warns_of_remarks
 from workbench.threads import one_blas_thread
 
 MOST_TERMS = 8
 SPARE = 2  # terms next in line that bands leave free too
 
 
+@warns_of_remarks
 @one_blas_thread
 def fit_structure(
     measured: Refined,
@@ -53,9 +54,10 @@ def fit_structure(
         UserWarning: the structure does not explain the modes, so that its distributions may be far from the truth.
     """
     task = Task.of(measured, nominal, known_mass, known_stiffness, mass_prior, stiffness_prior, numbers)
-    return _warned(Problem.of(task, mass, stiffness).fit())
+    return Problem.of(task, mass, stiffness).fit()
 
 
+@warns_of_remarks
 @one_blas_thread
 def choose_structure(
     measured: Refined,
@@ -79,14 +81,7 @@ def choose_structure(
     """
     task = Task.of(measured, nominal, **known)
     terms = sorted(mass_terms), sorted(stiffness_terms)
-    return _warned(choose(task, basis, *terms, lambda problem, near: problem.fit(near)))
-
-
-def _warned(found: FittedStructure) -> FittedStructure:
-    """The same, with a warning where it does not explain the modes."""
-    for remark in found.remarks:
-        warnings.warn(remark, stacklevel=4)
-    return found
+    return choose(task, basis, *terms, lambda problem, near: problem.fit(near))
 
 
 def choose(
