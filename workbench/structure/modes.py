@@ -1,7 +1,7 @@
 """Modes: frequencies, damping and shapes, computed or identified, in one type."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -255,15 +255,13 @@ class Modes(Printed):
         if covariance is not None:
             both = np.r_[index, index + self.n_modes]
             covariance = covariance[np.ix_(both, both)]
-        return Modes(
+        return replace(
+            self,
             omega=self.omega[index],
             damping=self.damping[np.ix_(index, index)],
             shapes=lambda located, derivative: shapes(located, derivative)[:, index],
-            domain=self.domain,
-            essential=self.essential,
             covariance=covariance,
             shape_covariance=None if self.shape_covariance is None else self.shape_covariance[index],
-            masses=self.masses,
         )
 
 

@@ -1,5 +1,6 @@
 """Modes of a structure with something attached, from its modes alone."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -144,12 +145,13 @@ def _combined(
 ) -> Modes:
     """Modes whose shapes are the columns of `vectors` (n_modes, n_combined) in those at hand."""
     shapes = modes.shapes
-    return Modes(
+    return replace(
+        modes,
         omega=omega,
         damping=damping,
         shapes=lambda located, derivative: shapes(located, derivative) @ vectors,
-        domain=modes.domain,
-        essential=modes.essential,
+        covariance=None,
+        shape_covariance=None,
         masses=modes.masses + masses_among(attachments),
     )
 
