@@ -382,12 +382,25 @@ def _size(evidence: Evidence, target: str) -> float:
     return float(max(np.sqrt(np.mean(row**2)) for row in _read(evidence, target)))
 
 
-def _sensor(name: str, field: str, phrase: str, starts: Starts, unit: str = "", **options: Any) -> Kind:
-    """A kind that sets one figure of a sensor, or is applied otherwise; bounds are times a size of the rig's own."""
-    attribute = {"drift_over_record": "drift"}.get(field, field)
-    log = options.pop("log", False)
-    low, high = options.pop("low", -1e12), options.pop("high", 1e12)
-    neutral, size = options.pop("neutral", None), options.pop("size", lambda rig: 1.0)
+def _sensor(
+    name: str,
+    field: str,
+    phrase: str,
+    starts: Starts,
+    unit: str = "",
+    *,
+    targets: Callable[[Rig], tuple[str, ...]] = each_sensor,
+    low: float = -1e12,
+    high: float = 1e12,
+    log: bool = False,
+    attribute: str | None = None,
+    neutral: float | None = None,
+    size: Callable[[Rig], float] = lambda rig: 1.0,
+    apply: Apply | None = None,
+    **options: Any,
+) -> Kind:
+    """A kind with one number of a sensor, as `_actuator` of an actuator."""
+    attribute = attribute or field
 
     def parameters(rig: Rig, target: str) -> tuple[Parameter, ...]:
         noise = max((s.noise_std for s in rig.sensors if target in (s.name, ALL)), default=1.0)
@@ -401,9 +414,9 @@ def _sensor(name: str, field: str, phrase: str, starts: Starts, unit: str = "", 
         name=name,
         path="sensor",
         parameters=parameters,
-        apply=options.pop("apply", lambda rig, target, v: _change_sensors(rig, target, **{attribute: v[field]})),
+        apply=apply or (lambda rig, target, v: _change_sensors(rig, target, **{attribute: v[field]})),
         starts=starts,
-        targets=options.pop("targets", each_sensor),
+        targets=targets,
         phrase=phrase,
         **options,
     )
@@ -441,6 +454,7 @@ SENSOR_DRIFT = _sensor(
     "a sensor drift",
     lambda evidence, target: [{"drift_over_record": 2.0 * _mean_residual(evidence, target)}],
     OF_THE_SENSOR,
+    attribute="drift",
     signed=True,
 )
 
