@@ -389,13 +389,18 @@ def _by_mode(frequencies: Floats, scaled: Sequence[tuple[Record, Floats]], noise
 
     Rigid modes, which no frequency tells apart, have one band, in equal parts.
     """
-    elastic = frequencies[frequencies > 0]
-    n_rigid = frequencies.size - elastic.size
-    first = WHERE.rigid * elastic[:1] * (n_rigid > 0)
-    between, top = np.sqrt(elastic[1:] * elastic[:-1]), WHERE.above * elastic[-1:]
-    rigid, *others = _shares_between(np.r_[0.0, first, between, top, np.inf], scaled, noise)
+    rigid, *others = _shares_between(mode_bands(frequencies), scaled, noise)
     above = others.pop() if others else 0.0  # of rigid modes alone nothing lies above
+    n_rigid = frequencies.size - len(others)
     return np.r_[np.full(n_rigid, rigid / max(n_rigid, 1)), others], float(above)
+
+
+def mode_bands(frequencies: Floats) -> Floats:
+    """Edges, Hz, of the band of all rigid modes, empty where there are none, of each other mode, and above the last."""
+    elastic = frequencies[frequencies > 0]
+    first = WHERE.rigid * elastic[:1] * (elastic.size < frequencies.size)
+    edges: Floats = np.r_[0.0, first, np.sqrt(elastic[1:] * elastic[:-1]), WHERE.above * elastic[-1:], np.inf]
+    return edges
 
 
 def _shares_between(edges: np.ndarray, scaled: Sequence[tuple[Record, Floats]], noise: Floats) -> np.ndarray:

@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from workbench.arrays import Flags, Floats
+from workbench.gap.localisation.where import mode_bands
 from workbench.gap.prediction.residuals import lead_of
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -401,8 +402,8 @@ def _turned(gap: _Gap) -> Flags:
 
     A resonance that is off in phase is so for every sensor, and a sensor at another place keeps the sign of some modes.
     """
-    f = gap.rig.modes.frequencies_hz
-    edges = np.r_[0.0, (f[1:] + f[:-1]) / 2.0, np.inf]
+    edges = mode_bands(gap.rig.modes.frequencies_hz)
+    n_bands = 1 + np.count_nonzero(gap.rig.modes.omega)  # above the last mode's there is none to ask
     sound, turned = np.ones((2, len(gap.rig.sensors)), bool)
     several = ~turned
     for record, y, p in zip(gap.records, gap.measured, gap.predicted, strict=True):
@@ -411,9 +412,9 @@ def _turned(gap: _Gap) -> Flags:
         window = np.hanning(y.shape[1])
         of_y, of_p = (np.fft.rfft((a - a.mean(axis=1, keepdims=True)) * window) for a in (y, p))
         band = np.digitize(np.fft.rfftfreq(y.shape[1], record.sample_time), edges) - 1
-        # (3, n_outputs, n_modes) of measured, predicted and both
+        # (3, n_outputs, n_bands) of measured, predicted and both
         products = (of_y * of_y.conj()).real, (of_p * of_p.conj()).real, (of_y * of_p.conj()).real
-        powers = np.array([[np.bincount(band, row, f.size) for row in product] for product in products])
+        powers = np.array([[np.bincount(band, row, edges.size)[:n_bands] for row in product] for product in products])
         measured, predicted, both = powers
         alike = both / np.sqrt(np.maximum(measured * predicted, 1e-300))
         over_all = both.sum(axis=1) / np.sqrt(np.maximum(measured.sum(axis=1) * predicted.sum(axis=1), 1e-300))
