@@ -9,8 +9,8 @@ from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, contained
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search import attribute, screening
-from workbench.gap.search.finish import finished, simplest, widened
+from workbench.gap.search import attribute, finish, screening
+from workbench.gap.search.finish import finished, simplest, widened, with_equals
 from workbench.gap.search.fit import fit
 from workbench.gap.search.screening import on_whole_records
 from workbench.gap.search.search import Search
@@ -154,3 +154,16 @@ def test_a_drive_beside_friction_stands_in_for_a_second_direction_for_no_trifle_
     )
     found = widened(one, finished(one, fit(one.rig, start, one.data)))
     assert {effect.kind.name for effect in found.effects} == kinds
+
+
+def test_any_number_of_sets_may_explain_the_records_as_well(rig, search, monkeypatch):
+    """More than the six rivals that a ranking keeps: each has its share, and all shares are of one whole."""
+    one = search(rig)
+    gain = kind_named("actuator_gain")
+    here = fit(one.rig, (Effect(gain, "F", {"gain": 1.0}),), one.data)
+    others = [(Effect(kind_named("sensor_gain"), f"{k}", {"gain": 1.0}),) for k in range(8)]
+    monkeypatch.setattr(finish, "_at_other_ports", lambda *_: others)
+    monkeypatch.setattr(finish, "fit", lambda _, effects, __: replace(here, effects=effects))
+    found = with_equals(one, here, (), None, ())
+    assert len(found) == 8
+    assert [p for _, p in found] == pytest.approx([1.0 / 9.0] * 8)

@@ -214,14 +214,19 @@ def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, f
 
     The likelihood of tens of thousands of values is over-confident of small misfits, so its logarithm counts half.
     """
+    (best, _), *rivals = _weighted(search, fits)
+    return best, tuple(rivals[:6])
+
+
+def _weighted(search: Search, fits: Sequence[Fit]) -> list[tuple[Fit, float]]:
+    """The best fit of every set with its probability, the most likely first."""
     n = search.data.n_values
     fits = best_of_each(sorted(fits, key=lambda f: f.cost))
     score = np.array([n * f.cost + f.n_parameters * np.log(n) for f in fits])
     order = np.argsort(score)
     weights = np.exp(-0.25 * (score[order] - score[order[0]]))
     weights /= weights.sum()
-    rivals = tuple((fits[i], float(w)) for i, w in zip(order[1:], weights[1:], strict=True))
-    return fits[order[0]], rivals[:6]
+    return [(fits[i], float(w)) for i, w in zip(order, weights, strict=True)]
 
 
 def with_equals(
@@ -249,9 +254,11 @@ def with_equals(
     equals = [f for f in each if f.cost < here.cost + SEARCH.rival]
     if not equals:
         return rivals
-    first, others = ranked(search, [here, *equals])
-    of_each = {first.key: 1.0 - sum(p for _, p in others), **{f.key: p for f, p in others}}
-    if not search.explains(first):  # of what sets leave that all leave more than noise no law of chance is known
+    weighted = _weighted(search, [here, *equals])
+    of_each = {f.key: p for f, p in weighted}
+    if not search.explains(
+        weighted[0][0]
+    ):  # of what sets leave that all leave more than noise no law of chance is known
         of_each = dict.fromkeys(of_each, 1.0 / len(of_each))
     rest = [(f, p * of_each[here.key]) for f, p in rivals]
     return tuple(sorted([*((f, of_each[f.key]) for f in equals), *rest], key=lambda each: -each[1]))
