@@ -108,8 +108,17 @@ def test_lines_beside_a_sample_rate_alone(tmp_path, n_samples, kept):
     found = read_measured(save(tmp_path / "x.mat", {"H": h, "fs": rate, **told}))
     np.testing.assert_allclose(found.frequencies_hz, lines[:kept], rtol=1e-12)
     assert "lines taken from 0 to" in found.remarks[-1] and "not real" not in found.remarks[-1]
-    later = read_measured(save(tmp_path / "later.mat", {"H": h[:, 5:], "fs": rate}))
+    later = read_measured(save(tmp_path / "later.mat", {"H": h[:, 5:60], "fs": rate}))
     assert "the first is not real, as that at 0 Hz is" in later.remarks[-1]
+
+
+@pytest.mark.parametrize("told", [{}, {"npts": 128}])
+def test_lines_without_that_at_zero_beside_a_sample_rate_alone(tmp_path, told):
+    """Only the line at half the rate of a discrete Fourier transform is real then; the modes were a line too low."""
+    h = np.fft.rfft(np.random.default_rng(0).normal(size=(2, 128)))[:, 1:]
+    found = read_measured(save(tmp_path / "x.mat", {"H": h, "fs": 200.0, **told}))
+    np.testing.assert_allclose(found.frequencies_hz, np.fft.rfftfreq(128, 1.0 / 200.0)[1:], rtol=1e-12)
+    assert "lines taken from 1.5625 to 100 Hz, as the last is real and the first is not" in found.remarks[-1]
 
 
 def test_lines_by_another_name_are_not_passed_over_for_a_sample_rate(tmp_path):
@@ -180,6 +189,20 @@ def test_units_of_a_table_are_brought_to_si(tmp_path, names):
     np.testing.assert_allclose(found.values[0, 0], h * 9.80665 / 4.4482216152605, rtol=1e-12)
     assert [(c.name, c.quantity, c.unit) for c in found.output_channels] == [("a", "acceleration", "m/s^2")]
     assert found.remarks == ("a: g taken as 9.80665 m/s^2", "a: lbf taken as 4.44822 N")
+
+
+@pytest.mark.parametrize(("unit", "degrees"), [("", True), ("", False), (" [rad]", False)])
+def test_phases_beyond_a_turn_are_degrees_unless_a_unit_is_told(tmp_path, unit, degrees):
+    h = SPECTRA[0, 0]
+    phase = np.angle(h, deg=degrees) + (0.0 if degrees or not unit else 40.0 * np.pi)
+    header = f"Frequency [Hz],a magnitude,a phase{unit}"
+    np.savetxt(
+        tmp_path / "x.csv", np.column_stack([LINES, np.abs(h), phase]), delimiter=",", comments="", header=header
+    )
+    found = read_measured(tmp_path / "x.csv")
+    np.testing.assert_allclose(found.values[0, 0], h, rtol=1e-9)
+    said = ("a phase: beyond ±2π, so taken as degrees; else call it a phase [rad]",)
+    assert found.remarks == (said if degrees else ())
 
 
 @pytest.mark.parametrize("names", ["a", "a real", "a real,b imag", "a real,a imag,coherence", "a real,a phase"])

@@ -34,6 +34,7 @@ COLUMN = re.compile(
 )
 DECIBEL = re.compile(r"(.+?)\s*[\[(]\s*dB\s*[\])]", re.IGNORECASE)
 DESCRIPTION = "transfer_header"
+TURN = 2.0 * np.pi * (1.0 + 1e-6)  # rad: a phase beyond it is in degrees where no unit is told
 REAL = 1e-6  # relative imaginary part, at most, of a line that is real
 
 
@@ -140,6 +141,9 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
         scaled = 10.0 ** (values / 20.0) if decibel else values
         if column[5]:
             angle = unit_named(behind[0])
+            if not behind[0] and np.abs(values).max(initial=0.0) > TURN:
+                angle = unit_named("deg")
+                remarks[f"{name}: beyond ±2π, so taken as degrees; else call it {name} [rad]"] = None
             scaled = scaled * (angle.factor if angle else 1.0)
         else:
             written = behind if any(behind) else before
@@ -159,7 +163,7 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
         name: part[2] + 1j * part[3] if 2 in part else part[4] * np.exp(1j * part[5]) for name, part in parts.items()
     }
     arrays = {"f" if in_hertz else names[0]: lines, **both}
-    if not any(facts["unit"] for facts in outputs.values()):
+    if not remarks and not any(facts["unit"] for facts in outputs.values()):
         return arrays
     described = {
         "outputs": [{"name": name, **outputs[name]} for name in both],
@@ -253,6 +257,12 @@ def _lines(
     ends = np.concatenate([np.moveaxis(v, v.shape.index(longest), -1)[..., [0, -1]].reshape(-1, 2)
                            for v in found.values() if longest in v.shape])  # fmt: skip
     is_real = (np.abs(ends.imag) <= REAL * np.abs(ends)).all(axis=0)
+    if is_real[1] and not is_real[0] and told in (None, 2 * longest):  # all lines of a transform but that at 0 Hz
+        lines = rate / (2 * longest) * np.arange(1, longest + 1)
+        return lines, (
+            f"no frequencies beside a sample rate of {rate:g} Hz: the {longest} lines taken from {lines[0]:g} to"
+            f" {lines[-1]:g} Hz, as the last is real and the first is not; else add them as 'frequency_hz'",
+        )
     # half the samples of a transform that is a power of two long: all lines but that at half the rate, which is real
     short = told is None and longest & (longest - 1) == 0 and not is_real[1]
     n_samples = told if told is not None else 2 * longest if short else 2 * longest - 2
