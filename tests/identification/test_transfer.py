@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
+from workbench.identification.rig_from import rig_from
+from workbench.identification.signal.clocks import far_from_real
 from workbench.identification.transfer import coherence_noise, identify_transfer
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
@@ -383,3 +385,32 @@ def test_noise_that_goes_with_size_hides_no_mode_and_makes_none_change(relative,
     assert (np.abs(found.modes.omega - omega) < 4.0 * found.omega_std).all()
     assert (np.abs(found.modes.zeta - damping) < 4.0 * found.zeta_std).all()
     assert (found.omega_std < 0.02 * relative * omega).all()
+
+
+@pytest.mark.parametrize("quantity", ["displacement", "acceleration"])
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("late", [(0.004,) * 4, (0.0, 0.004, 0.0, 0.01)])
+def test_outputs_that_a_filter_delays_are_put_in_time(quantity, late):
+    """Put in time, the modes are real, and none beside them stand for what the delay makes of a direct term."""
+    modes, h, channels = beam(quantity)
+    h, turn = h[:, :1], np.exp(-2j * np.pi * F * np.array(late)[:, None, None])
+    rng = np.random.default_rng(4)
+    noise = 1e-3 * np.abs(h).max() * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+    found = identify_transfer(h * turn + noise, F, channels=channels)
+    np.testing.assert_allclose(found.delays, late, atol=2e-4)
+    np.testing.assert_allclose(found.modes.omega, modes.omega[1:4], rtol=1e-3)
+    assert far_from_real(found.modes).max() < 0.02
+    assert np.abs(found.fitted - h * turn).max() < 0.02 * np.abs(h).max()
+    assert "are late beside the inputs, by " in found.remarks[0] and "y1 0.00" in found.remarks[0]
+    assert [s.delay for s in rig_from(found, inputs=["h1"], outputs=channels).sensors] == list(found.delays)
+
+
+def test_phases_that_do_not_grow_with_frequency_are_no_delay():
+    """As a damper makes them."""
+    s, omega = 2j * np.pi * F, 2.0 * np.pi * np.array([5.0, 11.0, 19.0])
+    poles = omega * (-0.01 + 1j)
+    residues = np.array([[1.0, 0.5, -0.7], [0.3, -1.0, 1.0]]) * np.exp(1j * np.array([0.3, -0.4, 0.2])) / (2j * omega)
+    pairs = residues[:, :, None] / (s - poles[:, None]) + residues.conj()[:, :, None] / (s - poles.conj()[:, None])
+    channels = tuple(Channel(name, "displacement") for name in "ab")
+    h = noisy(pairs.sum(axis=1)[:, None], 0)[0]
+    assert not identify_transfer(h, F, channels=channels).delays.any()

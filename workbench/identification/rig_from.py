@@ -91,9 +91,10 @@ def rig_from(
         shapes.points.locate(names)
         actuators = tuple(Actuator(f"force at {name}", name) for name in names)
     noise = getattr(identified, "noise_std", [channel.noise_std or 0.0 for channel in out])
+    late = identified.delays if isinstance(identified, TransferModes) else np.zeros(len(out))
     sensors = tuple(
-        Sensor(c.name, c.name, quantity, noise_std=float(std))
-        for c, quantity, std in zip(out, measured, np.atleast_1d(noise), strict=True)
+        Sensor(c.name, c.name, quantity, noise_std=float(std), delay=float(delay))
+        for c, quantity, std, delay in zip(out, measured, np.atleast_1d(noise), late, strict=True)
     )
     n = modes.n_modes
     # rigid modes stand behind the others

@@ -1,9 +1,10 @@
 """Modes from measured transfer functions, between whatever lines they were measured.
 
-    H_ji(s) = Σ_r [c_jr l_ri / (s - λ_r) + conjugate] + s^k (D_ji + E_ji / s²)      at s = iω
+    H_ji(s) = e^{-sτ_j} (Σ_r [c_jr l_ri / (s - λ_r) + conjugate] + s^k (D_ji + E_ji / s²))      at s = iω
 
-for outputs that are the k-th time derivative of a displacement: D is the residual term of the
-modes above the band, E of those below it. Each mode has one shape and one participation factor a reference.
+for outputs that are the k-th time derivative of a displacement: D is the residual term of the modes above the band, E
+of those below it. Each mode has one shape and one participation factor a reference. A delay τ_j, that of a filter or of
+a clock, turns the residues of real modes by e^{-λ_r τ_j}: their phases grow with frequency, and tell it.
 """
 
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from workbench.identification.input_output.modal_fit import Fit, projected, scal
 from workbench.identification.input_output.model_order import Selected, select_modes, statistic_of
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, relative_noise, window_rate
+from workbench.identification.signal.clocks import CLOCKS, late_outputs
 from workbench.identification.signal.modal_estimates import (
     SURE,
     ParticipatingModes,
@@ -85,6 +87,8 @@ class TransferModes(ParticipatingModes):
             far below the band. 0 where an output has no such term.
         lower_residual_std: (n_outputs, n_references) standard errors.
         upper_residual: (n_outputs, n_references) D, m/N: the flexibility of modes above the band.
+        delays: (n_outputs,) s, τ by which each output is late beside the inputs; all but `fitted` is of outputs in
+            time.
         remarks: what is doubtful, and what was left undone where the time was up.
     """
 
@@ -99,6 +103,7 @@ class TransferModes(ParticipatingModes):
     lower_residual: np.ndarray
     lower_residual_std: np.ndarray
     upper_residual: np.ndarray
+    delays: np.ndarray
     remarks: tuple[str, ...] = ()
 
     parts_hz, full_hz = Renamed("cluster_hz"), Renamed("order_limited_hz")
@@ -143,7 +148,8 @@ def identify_transfer(
 ) -> TransferModes:
     """The modes of measured transfer functions, their number selected, each with its standard error.
 
-    More than 1500 lines are fitted band by band, with overlap.
+    More than 1500 lines are fitted band by band, with overlap. Outputs that the phases of the modes show to be late are
+    put in time, with a remark.
 
     Args:
         transfer: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
@@ -169,6 +175,47 @@ def identify_transfer(
     check_count("max_modes", max_modes)
     budget = Budget(seconds, progress)
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
+    how: dict[str, Any] = {"channels": channels, "noise": noise, "max_modes": max_modes, "false_alarm": false_alarm}
+    whole, s = _in_bands(h, f, budget, **how), 2j * np.pi * f
+    for least in (CLOCKS.phase, CLOCKS.refined):
+        late = _late(whole, channels, least)
+        if not late.any() or budget.spent("search for delays of the outputs"):
+            break
+        delays = whole.delays + late
+        whole = _in_bands(h * np.exp(s * delays[:, None, None]), f, budget, **how)
+        whole = replace(
+            whole, delays=frozen(delays), fitted=frozen(whole.fitted * np.exp(-s * delays[:, None, None]), complex)
+        )
+    overlap = overlap_remarks(whole.modes.poles, h.shape[0] * h.shape[1])
+    deviation = whole.modes.omega * whole.zeta_std + 1j * whole.omega_std
+    overtones = overtone_remarks(whole.modes.poles, np.sqrt(whole.statistic), 2.0 * np.pi * whole.scatter_hz, deviation)
+    about = (
+        *_acausal(h, f),
+        *_of_delays(whole.delays, channels),
+        *repeated_remarks(whole),
+        *set_up_remarks(whole),
+        *([] if noise is None else _of_stated_noise(whole.misfit)),
+    )
+    whole = replace(whole, remarks=(*about, *whole.remarks, *overlap, *_uneven(whole), *overtones, *budget.remarks))
+    if whole.modes.n_modes == 0:
+        raise ValueError(
+            f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
+            " averages"
+        )
+    return whole
+
+
+def _in_bands(
+    h: np.ndarray,
+    f: np.ndarray,
+    budget: Budget,
+    *,
+    channels: Sequence[Channel],
+    noise: np.ndarray | None,
+    max_modes: int,
+    false_alarm: float,
+) -> TransferModes:
+    """The modes of all lines, of more than are fitted together band by band."""
     n_bands, each_own = (
         (1, 3) if f.size <= TRANSFER.most_lines else (-(-f.size // TRANSFER.band), TRANSFER.lines_a_mode)
     )
@@ -187,23 +234,23 @@ def identify_transfer(
             false_alarm=false_alarm / n_bands,
         )
         found.append(_modes_of(*selected, channels, edges, f[first:last], own))
-    whole = _together(found, channels) if n_bands > 1 else found[0]
-    overlap = overlap_remarks(whole.modes.poles, h.shape[0] * h.shape[1])
-    deviation = whole.modes.omega * whole.zeta_std + 1j * whole.omega_std
-    overtones = overtone_remarks(whole.modes.poles, np.sqrt(whole.statistic), 2.0 * np.pi * whole.scatter_hz, deviation)
-    about = (
-        *_acausal(h, f),
-        *repeated_remarks(whole),
-        *set_up_remarks(whole),
-        *([] if noise is None else _of_stated_noise(whole.misfit)),
+    return _together(found, channels) if n_bands > 1 else found[0]
+
+
+def _late(found: TransferModes, channels: Sequence[Channel], least: float) -> Floats:
+    """By how much each output of a known quantity is late, (n_outputs,) s; see `late_outputs`."""
+    late, known = np.zeros(len(channels)), np.array([channel.quantity in MEASURED for channel in channels])
+    if known.any() and found.modes.n_modes:
+        residues = 1j * found.modes.shapes.T[:, known, None] * found.participation[:, None, :]
+        late[known] = late_outputs(residues, found.modes.poles, least)
+    return late
+
+
+def _of_delays(delays: Floats, channels: Sequence[Channel]) -> tuple[str, ...]:
+    late = [f"{c.name} {d:.3g} s" for c, d in zip(channels, delays, strict=True) if d]
+    return (
+        (f"outputs are late beside the inputs, by {', '.join(late)}: the modes are of outputs in time",) if late else ()
     )
-    whole = replace(whole, remarks=(*about, *whole.remarks, *overlap, *_uneven(whole), *overtones, *budget.remarks))
-    if whole.modes.n_modes == 0:
-        raise ValueError(
-            f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
-            " averages"
-        )
-    return whole
 
 
 def _selected(
@@ -319,6 +366,7 @@ def _modes_of(
         lower_residual=frozen(below),
         lower_residual_std=frozen(below_std),
         upper_residual=frozen(above),
+        delays=frozen(np.zeros(len(channels))),
         remarks=(
             *([f"left out, as negatively damped or of unknown frequency: poles at {out} Hz"] if out else []),
             *_windowed(lines.window_rate),
@@ -445,6 +493,7 @@ def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> Tr
         lower_residual=found[0].lower_residual,
         lower_residual_std=found[0].lower_residual_std,
         upper_residual=found[-1].upper_residual,
+        delays=found[0].delays,
         remarks=tuple(dict.fromkeys(remark for band in found for remark in band.remarks)),
     )
 

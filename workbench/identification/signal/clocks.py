@@ -1,4 +1,4 @@
-"""Complex shapes: how far each is from real, and the sensor whose own clock makes them so.
+"""Complex shapes: how far each is from real, and the outputs that are late, which makes them so.
 
 What a sensor records τ late has its entries of the shapes, s_jr, turned by e^{-λ_r τ}: the phase grows with frequency.
 """
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.identification.signal.modal_estimates import SURE, ShapeEstimates
 from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.structure.modes import SampledModes
@@ -21,6 +22,9 @@ class ClocksSettings:
     periods: float = 4.0  # of the fastest mode: the longest time that a sensor is taken to be late
     steps: int = 200  # of each period
     least: float = 0.1  # of a shape's size: an entry that has a phase
+    phase: float = 0.1  # rad rms: of residues, from which on they are not real
+    refined: float = 0.01  # rad rms: likewise, where outputs were found late before
+    left: float = 1.0 / 3.0  # of that phase, at most, once a late output is put in time
 
 
 CLOCKS = ClocksSettings()
@@ -79,8 +83,6 @@ def _late(modes: SampledModes) -> tuple[int, float] | None:
     them to choose from.
     """
     omega, poles, n_outputs = modes.poles.imag, modes.poles, modes.n_outputs
-    longest = CLOCKS.periods * 2.0 * np.pi / omega.max()
-    times = np.linspace(-longest, longest, int(2 * CLOCKS.periods * CLOCKS.steps) + 1)
     best: tuple[float, int, float] | None = None
     for j in range(n_outputs):
         own, others = modes.shapes[j], np.delete(modes.shapes, j, axis=0)
@@ -88,14 +90,8 @@ def _late(modes: SampledModes) -> tuple[int, float] | None:
         if np.count_nonzero(seen) < 2:
             continue
         turn = np.angle(own) - 0.5 * np.angle((others**2).sum(axis=0))
-
-        coarse = times[np.argmin(_disagreement(turn[seen], omega[seen], times))]
-        fine = coarse + np.linspace(-1.0, 1.0, 2 * CLOCKS.steps + 1) * (times[1] - times[0])
-        apart = _disagreement(turn[seen], omega[seen], fine)
-        seconds = float(fine[np.argmin(apart)])
-        delta = max(float(apart.min()), (fine[1] - fine[0]) * omega.max())
-        tries = n_outputs * (1.0 + abs(seconds) * omega.max() / delta)
-        chance = tries * (2.0 * delta / np.pi) ** np.count_nonzero(seen)
+        seconds, chance = _lateness(turn[seen], omega[seen], omega.max())
+        chance *= n_outputs
         if best is None or chance < best[0]:
             best = chance, j, seconds
     if best is None or best[0] > FALSE_ALARM:
@@ -106,6 +102,59 @@ def _late(modes: SampledModes) -> tuple[int, float] | None:
     if (far_from_real(SampledModes(modes.omega, modes.zeta, right, modes.positions)) > CLOCKS.far).any():
         return None
     return j, seconds
+
+
+def late_outputs(residues: np.ndarray, poles: np.ndarray, least: float = CLOCKS.phase) -> Floats:
+    """By how much each output is late beside the inputs, (n_outputs,) s; 0 where the phases of its modes do not tell.
+
+    One time for all outputs is looked for first, then one for each. Neighbours within a half-power bandwidth count as
+    one mode: what a delay leaves of a direct term is fitted by modes beside the true ones.
+
+    Args:
+        residues: (n_modes, n_outputs, n_inputs) of displacement, times i: real, of real modes in time.
+        poles: (n_modes,).
+        least: rad rms, phase of residues from which on an output may be late.
+    """
+    order = np.argsort(poles.imag)
+    width = -2.0 * np.minimum(poles.real[order][1:], poles.real[order][:-1])
+    first = np.flatnonzero(np.r_[True, np.diff(poles.imag[order]) > width])
+    omega = np.add.reduceat(poles.imag[order], first) / np.diff(np.r_[first, poles.size])
+    joined = np.add.reduceat(residues[order], first)
+    sizes = np.linalg.norm(joined, axis=2)
+    share = sizes / np.linalg.norm(sizes, axis=1, keepdims=True)
+    squares = (joined**2).sum(axis=2)  # of the phase twice that of a residue, whatever its sign
+
+    def late(which: np.ndarray, at: np.ndarray) -> float:
+        """That of the sum of some outputs, where all of them agree, by the modes `at` which it is asked."""
+        if np.count_nonzero(at) < 2:
+            return 0.0
+        turn = 0.5 * np.angle(squares[:, which].sum(axis=1))
+        seconds, chance = _lateness(turn[at], omega[at], omega.max())
+        off = np.angle(squares[:, which, None] * np.exp(2j * omega[:, None, None] * [0.0, seconds])) / 2.0
+        weights = share[:, which, None] ** 2 * at[:, None, None]
+        before, after = np.sqrt((weights * off**2).sum(axis=(0, 1)) / weights.sum())
+        told = chance * squares.shape[1] < FALSE_ALARM and before > least
+        return seconds if told and after < min(CLOCKS.phase, CLOCKS.left * before) else 0.0
+
+    each = np.arange(squares.shape[1])
+    together = late(each, np.ones(omega.size, bool))
+    return (
+        np.full(each.size, together)
+        if together
+        else np.array([late(each[j : j + 1], share[:, j] > CLOCKS.least) for j in each])
+    )
+
+
+def _lateness(turn: np.ndarray, omega: np.ndarray, fastest: float) -> tuple[float, float]:
+    """The time, s, that phases (n_modes,) modulo π are nearest to, and the chance that they are by chance."""
+    longest = CLOCKS.periods * 2.0 * np.pi / fastest
+    times = np.linspace(-longest, longest, int(2 * CLOCKS.periods * CLOCKS.steps) + 1)
+    coarse = times[np.argmin(_disagreement(turn, omega, times))]
+    fine = coarse + np.linspace(-1.0, 1.0, 2 * CLOCKS.steps + 1) * (times[1] - times[0])
+    apart = _disagreement(turn, omega, fine)
+    seconds = float(fine[np.argmin(apart)])
+    delta = max(float(apart.min()), (fine[1] - fine[0]) * fastest)
+    return seconds, (1.0 + abs(seconds) * fastest / delta) * (2.0 * delta / np.pi) ** turn.size
 
 
 def _disagreement(turn: np.ndarray, omega: np.ndarray, late: np.ndarray) -> np.ndarray:
