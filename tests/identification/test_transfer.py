@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.io import loadmat
+from scipy.signal import csd, lfilter, welch
 
 from workbench.identification.rig_from import rig_from
 from workbench.identification.signal.clocks import far_from_real
@@ -414,3 +415,16 @@ def test_phases_that_do_not_grow_with_frequency_are_no_delay():
     channels = tuple(Channel(name, "displacement") for name in "ab")
     h = noisy(pairs.sum(axis=1)[:, None], 0)[0]
     assert not identify_transfer(h, F, channels=channels).delays.any()
+
+
+def test_damping_that_hanns_window_makes_too_high_is_remarked():
+    """H1 by SciPy, of modes of 0.1 and 0.23 Hz half-power bandwidth at lines 0.25 Hz apart."""
+    rate, poles, rng = 256.0, 2.0 * np.pi * np.array([10.0, 23.0]) * (-0.005 + 1j), np.random.default_rng(0)
+    u = rng.normal(size=2**16)
+    coordinates = [lfilter([1.0], [1.0, -np.exp(pole / rate)], u).imag / pole.imag for pole in poles]
+    f, power = welch(u, rate, nperseg=1024)
+    h = np.array([csd(u, y, rate, nperseg=1024)[1] / power for y in [[1.0, 0.25], [0.3, -0.5]] @ np.array(coordinates)])
+    inside = (f > 4.0) & (f < 40.0)
+    found = identify_transfer(h[:, inside], f[inside], channels=(Channel("a", "displacement"), Channel("b")))
+    assert (found.modes.zeta > 1.3 * 0.005).all()
+    assert any("of modes 1, 2: if these are averages by Hann's window" in remark for remark in found.remarks)

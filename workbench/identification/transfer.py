@@ -55,6 +55,7 @@ class TransferSettings:
     reweighted: int = 2  # times that it is estimated
     acausal: float = 10.0  # energy of impulse responses before the impulse, times that after it
     disagrees: float = 1.5  # factor between the noise found and that stated, from which on it is remarked
+    resolved: float = 4.0  # lines in a half-power bandwidth, from which on Hann's window adds less than 5 % of damping
     alike: float = 0.2  # rms of the logarithm by which two estimates may differ and be one
 
 
@@ -444,9 +445,17 @@ def _uneven(whole: TransferModes) -> tuple[str, ...]:
     ]
     if not which:
         return ()
+    lines = 2.0 * whole.modes.zeta * whole.modes.frequencies_hz / np.diff(whole.frequencies_hz).min()
+    narrow = [str(r + 1) for r in np.flatnonzero((whole.scatter_hz > 0) & (lines < TRANSFER.resolved))]
+    leaks = (
+        f". Fewer than {TRANSFER.resolved:g} lines lie in the half-power bandwidth of mode{'s' * (len(narrow) > 1)}"
+        f" {', '.join(narrow)}: if"
+        " these are averages by Hann's window, its leakage makes that damping too high"
+    )
     return (
         f"frequencies scatter in the peaks of {', '.join(which)}: such a mode changes with time or amplitude, or a"
-        " window blurs it, and its figures are means; measure at one level, and longer segments",
+        " window blurs it, and its figures are means; measure at one level, and longer segments"
+        + (leaks if narrow else ""),
     )
 
 
