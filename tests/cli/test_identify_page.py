@@ -59,6 +59,7 @@ def test_the_page_of_transfer_functions_shows_the_band_that_was_fitted(run, tmp_
     found = run("identify", tmp_path / "frf.mat", "--band-hz", 5, 60, "--page", page)
     assert found.exit_code == 0, found.output
     panels = json.loads(page.with_suffix(".page.json").read_text())["blocks"][-1]["figure"]["panels"]
+    assert len(panels[0]["marks"]) == 2  # measured and fitted
     assert panels and all(5 <= min(m["x"]) and max(m["x"]) <= 60 for p in panels for m in p["marks"])
 
 

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter, welch
 
-from workbench.draw.spectra import plot_frf, power_spectrum
+from workbench.draw.plot import plot
+from workbench.draw.spectra import plot_frf, plot_transfer, power_spectrum
 from workbench.records.record import Channel, Record
+from workbench.records.transfer_functions import TransferFunctions
 
 
 def test_the_frequency_response_is_that_of_the_filter_between_input_and_output():
@@ -20,6 +22,24 @@ def test_the_frequency_response_is_that_of_the_filter_between_input_and_output()
     assert coherence.lines[0].get_ydata().min() > 0.99
     with pytest.raises(ValueError, match="needs one input; record 'record' has 0"):
         plot_frf(Record(1 / rate, u[None], (Channel("y"),)))
+
+
+def test_transfer_functions_are_drawn_by_magnitude_and_phase_with_what_was_fitted():
+    """Of one mode: 1 / c ω in size and -90° at its frequency."""
+    lines, omega, zeta = np.linspace(1.0, 40.0, 391), 2.0 * np.pi * 20.0, 0.02
+    h = 1.0 / (omega**2 - (2.0 * np.pi * lines) ** 2 + 4j * np.pi * zeta * omega * lines)
+    measured = TransferFunctions(h[None, None], lines, (Channel("y", "displacement", "m"),))
+    fitted = TransferFunctions(2.0 * h[None, None, 90:], lines[90:], measured.output_channels)
+    for figure in (plot(measured), plot_transfer(measured, fitted)):
+        magnitude, phase = figure.axes
+        assert magnitude.get_yscale() == "log" and phase.get_xlabel() == "frequency [Hz]"
+        assert magnitude.get_ylabel() == "|y|\n[m per input]"
+        at = np.argmin(np.abs(lines - 20.0))
+        assert magnitude.lines[0].get_ydata()[at] == pytest.approx(1.0 / (2.0 * zeta * omega**2))
+        assert phase.lines[0].get_ydata()[at] == pytest.approx(-90.0)
+    model = magnitude.lines[1]
+    assert model.get_linestyle() == "--" and model.get_label() == "input, fitted"
+    np.testing.assert_allclose(model.get_data(), [lines[90:], 2.0 * np.abs(h[90:])])
 
 
 @pytest.mark.parametrize("n", [1, 3, 100, 16385, 1_100_003])

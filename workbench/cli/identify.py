@@ -85,6 +85,6 @@ def identify(
         from workbench.study.pages.page import write_page
         from workbench.study.report import identification_page
 
-        shown = identification_page(found, read, made_by=as_typed(), band_hz=band_hz)
+        shown = identification_page(found, read, made_by=as_typed())
         say(f"  page {short(write_page(page, shown))}")
     write_json(json_path, {**found.content, "heading": found.heading, "lines": found.lines})

@@ -19,7 +19,7 @@ from workbench.draw.design import plot_controlled_mode_count, plot_motion, plot_
 from workbench.draw.gap import plot_where
 from workbench.draw.robust import plot_prediction, plot_redesign
 from workbench.draw.sensors import plot_sensor_placement
-from workbench.draw.spectra import plot_distortion
+from workbench.draw.spectra import plot_distortion, plot_transfer
 from workbench.draw.style import COLOURS, GREY, envelope, few_ticks, in_units, new_figure
 from workbench.draw.surface import (
     plot_point_modes,
@@ -33,6 +33,7 @@ from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.distortion import Distortion
 from workbench.identification.signal.modal_estimates import ModalEstimates, Refined
 from workbench.records.record import Record
+from workbench.records.transfer_functions import TransferFunctions
 from workbench.robust.prediction import Prediction
 from workbench.robust.redesign import Redesign
 from workbench.structure.domain import NamedPoints, Rectangle, listed
@@ -45,9 +46,9 @@ MOST_INSTANTS = 5
 
 @singledispatch
 def plot(result: object) -> Figure:
-    """A figure of a result: `Record`, `Modes`, `SampledModes`, estimates of modes, `Refined`, `Bands`, `Response`,
-    `Spillover`, `Explanation`, `ControlledModeCount`, `Placement`, `SensorPlacement`, `ModalFilter`, `Distortion`,
-    `Verdict`, `Redesign` or `Prediction`.
+    """A figure of a result: `Record`, `TransferFunctions`, `Modes`, `SampledModes`, estimates of modes, `Refined`,
+    `Bands`, `Response`, `Spillover`, `Explanation`, `ControlledModeCount`, `Placement`, `SensorPlacement`,
+    `ModalFilter`, `Distortion`, `Verdict`, `Redesign` or `Prediction`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -68,6 +69,11 @@ def _(result: Record) -> Figure:
     axes[0, 0].set_title(result.name)
     axes[-1, 0].set_xlabel("time [s]")
     return figure
+
+
+@plot.register
+def _(result: TransferFunctions) -> Figure:
+    return plot_transfer(result)
 
 
 @plot.register

@@ -57,18 +57,32 @@ def plot_spectra(record: Record) -> Figure:
     return figure
 
 
-def plot_transfer(measured: TransferFunctions) -> Figure:
-    """Magnitude of each output's transfer functions, all inputs in one panel."""
-    rows = list(zip(measured.output_channels, np.abs(measured.values)))[:MOST_PANELS]
-    figure, axes = new_figure(len(rows), 1, width=9, height=0.8 + 1.6 * len(rows), sharex=True, squeeze=False)
-    for ax, (channel, values) in zip(axes[:, 0], rows):
-        for reference, row in zip(measured.references, values):
-            ax.semilogy(measured.frequencies_hz, np.where(row > 0, row, np.nan), linewidth=0.9, label=reference)
-        ax.set_ylabel(f"|{channel.name}|")
-    if len(measured.references) > 1:
+def plot_transfer(measured: TransferFunctions, fitted: TransferFunctions | None = None) -> Figure:
+    """Magnitude and phase of each output's transfer functions, all inputs in one panel.
+
+    Args:
+        fitted: the same of a model, dashed; at lines of its own.
+    """
+    channels = measured.output_channels[:MOST_PANELS]
+    figure, axes = new_figure(len(channels), 2, width=10, height=0.8 + 1.6 * len(channels), sharex=True, squeeze=False)
+    for drawn in (measured, *([fitted] if fitted else [])):
+        how = {"linewidth": 0.9, "linestyle": "-"} if drawn is measured else {"linewidth": 1.2, "linestyle": "--"}
+        for (size, angle), values in zip(axes, drawn.values):
+            for i, (reference, row) in enumerate(zip(drawn.references, values, strict=True)):
+                colour = COLOURS[(2 * i + (drawn is not measured)) % len(COLOURS)]
+                label = reference if drawn is measured else f"{reference}, fitted"
+                seen = np.where(np.abs(row) > 0, row, np.nan)
+                size.semilogy(drawn.frequencies_hz, np.abs(seen), color=colour, label=label, **how)
+                angle.plot(drawn.frequencies_hz, np.degrees(np.angle(seen)), color=colour, **how)
+    for (size, angle), channel in zip(axes, channels, strict=True):
+        size.set_ylabel(in_units(f"|{channel.name}|", f"{channel.unit} per input" if channel.unit else ""), fontsize=8)
+        angle.set(ylabel="phase [°]", ylim=(-190.0, 190.0), yticks=(-180, -90, 0, 90, 180))
+    if fitted or len(measured.references) > 1:
         axes[0, 0].legend(fontsize=8)
-    axes[0, 0].set_title("magnitude of the transfer functions, output per input")
-    axes[-1, 0].set_xlabel("frequency [Hz]")
+    axes[0, 0].set_title("transfer functions: magnitude")
+    axes[0, 1].set_title("phase")
+    for ax in axes[-1]:
+        ax.set_xlabel("frequency [Hz]")
     return figure
 
 

@@ -334,11 +334,10 @@ def identification_page(
     measured: Sequence[Record | TransferFunctions],
     *,
     made_by: str,
-    band_hz: tuple[float, float] | None = None,
 ) -> PageContent:
     """The page of a report, and of the data that it is of; of transfer functions, the band that was fitted."""
     content = identified({**report.content, "heading": report.heading, "lines": list(report.lines)})
-    blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured[0], band_hz)]
+    blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured[0], report.fitted)]
     return PageContent(title="Identified modes", blocks=blocks, made_by=made_by, **content)
 
 
@@ -356,13 +355,12 @@ def _stabilisation(report: IdentificationReport) -> list[dict[str, Any]]:
     return [block(figure, STABLE)]
 
 
-def _response(measured: Record | TransferFunctions, band_hz: tuple[float, float] | None) -> list[dict[str, Any]]:
+def _response(measured: Record | TransferFunctions, fitted: TransferFunctions | None) -> list[dict[str, Any]]:
     if isinstance(measured, TransferFunctions):
-        if band_hz is not None:
-            lines = measured.frequencies_hz
-            kept = (lines >= band_hz[0]) & (lines <= band_hz[1])
-            measured = replace(measured, values=measured.values[..., kept], frequencies_hz=lines[kept])
-        return [block(plot_transfer(measured), "Magnitude of the transfer functions.")]
+        if fitted is not None:
+            kept = np.isin(measured.frequencies_hz, fitted.frequencies_hz)
+            measured = replace(measured, values=measured.values[..., kept], frequencies_hz=fitted.frequencies_hz)
+        return [block(plot_transfer(measured, fitted), "Transfer functions, measured and fitted (dashed).")]
     if measured.n_inputs == 1 and np.ptp(measured.inputs):
         return [block(plot_frf(measured), "Frequency response functions and coherence.")]
     return [block(plot_spectra(measured), f"Power spectral density of {measured.name}, by Welch's method.")]

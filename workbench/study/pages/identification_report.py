@@ -1,7 +1,7 @@
 """Identified modes as a table, remarks and JSON: what `workbench identify` reports."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ class IdentificationReport:
         lines: remarks.
         content: for JSON.
         decays: free decays that the modes are of, or correlation functions that decay alike; none of other data.
+        fitted: the model of transfer functions at the lines that were fitted; None of other data.
     """
 
     heading: str
@@ -42,6 +43,7 @@ class IdentificationReport:
     lines: tuple[str, ...]
     content: dict[str, Any]
     decays: tuple[Record, ...] = ()
+    fitted: TransferFunctions | None = None
 
 
 def identification_report(
@@ -214,7 +216,8 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
         "converged": found.converged,
     }
     rows = [row for row, doubt in zip(rows_of(found), doubtful) if not doubt]
-    return IdentificationReport(heading, tuple(rows), tuple(lines), content)
+    fitted = replace(measured, values=found.fitted, frequencies_hz=band)
+    return IdentificationReport(heading, tuple(rows), tuple(lines), content, fitted=fitted)
 
 
 def _report(

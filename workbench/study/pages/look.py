@@ -137,7 +137,7 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
         title=f"What {path.name} holds",
         lead=heading,
         lines=[*measured.remarks, f"Go on with: {_command(path, [])}"],
-        blocks=[block(plot_transfer(measured), "Magnitude of the transfer functions.")],
+        blocks=[block(plot_transfer(measured), "Magnitude and phase of the transfer functions.")],
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
     )
