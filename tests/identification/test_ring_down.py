@@ -29,6 +29,20 @@ def found_within_errors(told):
     return omega.shape == (2,) and (np.abs(omega - MODES.omega) < 4 * told.refined.omega_std).all()
 
 
+def test_two_modes_of_one_frequency_have_no_one_shape_in_several_decays():
+    """Modes (1, 2) and (2, 1) of a hinged square plate, sin iπx sin jπy, struck at three places; (1, 1) is one."""
+    x, y = np.array([[0.2, 0.15], [0.35, 0.6], [0.7, 0.25], [0.6, 0.8]]).T
+    one, two, three = (np.sin(i * np.pi * x) * np.sin(j * np.pi * y) for i, j in ((1, 1), (1, 2), (2, 1)))
+    records = []
+    for seed, (a, b) in enumerate(((1.0, 0.2), (-0.1, 1.0), (0.7, -0.6))):
+        shapes = np.column_stack([one, a * two + b * three])
+        modes = SampledModes([8.0, 20.0], [0.01, 0.01], shapes, np.arange(4.0))  # as i² + j²
+        records.append(free_decay(modes, sample_time=0.02, n_samples=1000, noise_std=0.005, seed=seed))
+    told = [note for note in ring_down(records).notes if "the records have no one shape of" in note]
+    assert len(told) == 1 and "no one shape of mode 2 (3.183 Hz, " in told[0] and "mode 1" not in told[0]
+    assert not any("no one shape" in note for note in ring_down(records[:1]).notes)
+
+
 def test_quiet_before_the_blow_and_a_drift_all_along():
     after = decay()
     outputs = np.hstack([0.005 * RNG.standard_normal((2, 300)), after.outputs])

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft
+from scipy.stats import chi2
 
 from workbench.identification.free_decay.assumptions import (
     AmplitudeDependence,
@@ -31,10 +32,11 @@ from workbench.identification.signal.data_quality import (
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.overtones import multiple_of
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
-from workbench.identification.signal.searches import SECONDS, SELECTION, Budget, Progress
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import Record, as_records
 from workbench.renamed import Renamed
 from workbench.structure.modes import SampledModes
+from workbench.structure.printed import mode_text
 from workbench.threads import one_blas_thread
 
 
@@ -53,6 +55,7 @@ class RingDownSettings:
     most_left: float = 0.25  # likewise of all, if it is not white
     about: float = 0.05  # of the frequency of a sure mode, within which so many others
     crowd: int = 2  # of no sure damping are the work of forces
+    other_shape: float = 0.1  # of a mode's motion in all records, what its best one shape leaves, to be remarked
     stands_out: float = 5.0  # times the residual beside them that it may stand out by
     band: int = 6  # bins about a mode
     beside: int = 60  # bins beside it
@@ -161,6 +164,7 @@ def ring_down(
             *budget.remarks,
             *_goes_on(found.refined, cut),
             *_shaken(found.refined, doubts),
+            *_of_other_shapes(found.refined, cut, sure),
             *shape_remarks(found.refined, cut[0].output_names, sure),
             *doubtful,
             *coloured,
@@ -344,6 +348,31 @@ def _energy(refined: Refined, records: list[Record]) -> np.ndarray:
         lasts = power_sums(np.exp(2.0 * record.sample_time * refined.modes.poles.real), record.n_samples)[0].real
         found += (np.abs(amplitudes / noise[:, None]) ** 2).sum(axis=0) * lasts
     return found
+
+
+def _of_other_shapes(refined: Refined, records: list[Record], only: Sequence[int]) -> tuple[str, ...]:
+    """A remark on modes of which records have shapes that are not one, beyond noise: their amplitudes are of rank two.
+
+    A mode of several records is one pole; two of the same pole are any mixture of two shapes in each.
+    """
+    rates, found = refined.modes.poles.real, []
+    lasts = [power_sums(np.exp(2.0 * r.sample_time * rates), r.n_samples)[0].real for r in records]
+    each = zip(refined.amplitudes, refined.noise, lasts, strict=True)
+    # real and imaginary parts in units of their standard errors
+    seen = np.stack([a / noise[:, None] * np.sqrt(0.5 * last) for a, noise, last in each])
+    n_records, n_outputs, n_modes = seen.shape
+    limit = chi2.isf(FALSE_ALARM / n_modes, 2 * (n_records - 1) * (n_outputs - 1))
+    for r in only:
+        squares = np.linalg.svd(seen[:, :, r], compute_uv=False) ** 2
+        share = np.sqrt(squares[1:].sum() / squares.sum())
+        if share > RING_DOWN.other_shape and squares[1:].sum() > limit:
+            found.append(mode_text(r, refined.modes.frequencies_hz[r], f", {100 * share:.0f} %"))
+    if not found:
+        return ()
+    return (
+        f"the records have no one shape of {', '.join(found)}: two modes of one frequency, of which only the plane of"
+        " their shapes is determined, not the shape that is given; or sensors that were moved or gained otherwise",
+    )
 
 
 def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
