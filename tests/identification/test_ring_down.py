@@ -29,6 +29,22 @@ def found_within_errors(told):
     return omega.shape == (2,) and (np.abs(omega - MODES.omega) < 4 * told.refined.omega_std).all()
 
 
+@pytest.mark.parametrize("of", ["output", "record"])
+def test_a_clock_that_runs_fast_is_told_from_twice_as_many_modes(of):
+    """By 0.1 %, of one output or of one of two records: every frequency is 1.001 times that of the others."""
+    shapes = np.array([[1.0, 0.5, -0.7], [0.3, -0.8, 0.6], [0.7, 0.9, 0.4]])
+
+    def at_rate(rate, seed):
+        modes = SampledModes(rate * np.array([8.0, 17.0, 30.0]), [0.003] * 3, shapes, np.arange(3.0))
+        return free_decay(modes, sample_time=0.02, n_samples=4000, noise_std=0.001, seed=seed)
+
+    right, fast = at_rate(1.0, 1), at_rate(1.001, 2)
+    mixed = [replace(right, outputs=np.vstack([right.outputs[:2], fast.outputs[2:]]))]
+    told = ring_down(mixed if of == "output" else [right, fast])
+    assert told.modes.n_modes == 6
+    assert any("pairs whose frequencies all differ by 0.1 %" in note for note in told.notes)
+
+
 def test_two_modes_of_one_frequency_have_no_one_shape_in_several_decays():
     """Modes (1, 2) and (2, 1) of a hinged square plate, sin iπx sin jπy, struck at three places; (1, 1) is one."""
     x, y = np.array([[0.2, 0.15], [0.35, 0.6], [0.7, 0.25], [0.6, 0.8]]).T

@@ -29,7 +29,7 @@ from workbench.identification.signal.data_quality import (
     dropout_remark,
     of_same_sensors,
 )
-from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
+from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined, clock_remarks
 from workbench.identification.signal.overtones import multiple_of
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
@@ -164,6 +164,7 @@ def ring_down(
             *budget.remarks,
             *_goes_on(found.refined, cut),
             *_shaken(found.refined, doubts),
+            *clock_remarks(found.refined, sure),
             *_of_other_shapes(found.refined, cut, sure),
             *shape_remarks(found.refined, cut[0].output_names, sure),
             *doubtful,

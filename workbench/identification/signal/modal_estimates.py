@@ -17,6 +17,7 @@ from workbench.structure.printed import Printed, counted
 # of two neighbours that are one mode of two set-ups: relative distance of frequencies at most; cosine between the sizes
 # of their shapes, of which noise leaves 0.01, at most; and between those of their participation factors at least
 NEAR, APART, ALIKE = 0.05, 0.1, 0.9
+OF_CLOCKS = 0.01  # relative difference of two frequencies, at most, that may be one of sample rates
 SURE = 3.0  # standard errors below zero from which on a damping ratio is negative
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
 
@@ -266,6 +267,29 @@ def repeated_remarks(found: "ModalEstimates") -> tuple[str, ...]:
     return (
         f"modes {', '.join(pairs)} may be one repeated root: only the plane of their two shapes is determined, and each"
         " shape is one of many in it, which need not be real",
+    )
+
+
+def clock_remarks(found: "ModalEstimates", only: Sequence[int]) -> tuple[str, ...]:
+    """A remark where all modes come in pairs of one damping and one ratio of frequencies: of two clocks.
+
+    Args:
+        found: modes of several outputs or records, by rising frequency.
+        only: the modes to look at, from 0.
+    """
+    if len(only) < 4 or len(only) % 2:
+        return ()
+    omega, zeta = (values[list(only)].reshape(-1, 2).T for values in (found.modes.omega, found.modes.zeta))
+    omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in (found.omega_std, found.zeta_std))
+    faster, error = omega[1] / omega[0] - 1.0, np.hypot(*(omega_std / omega))
+    mean = np.average(faster, weights=error**-2)
+    apart = (SURE * error < faster) & (faster < OF_CLOCKS)
+    alike = (np.abs(faster - mean) < SURE * error) & (np.abs(np.diff(zeta, axis=0)[0]) < SURE * np.hypot(*zeta_std))
+    if not (apart & alike).all():
+        return ()
+    return (
+        f"modes come in pairs whose frequencies all differ by {100.0 * mean:.2g} %: has an output or a record another"
+        " sample rate, by so much? Put it on the clock of the others; one mode of each pair is the other",
     )
 
 
