@@ -24,7 +24,7 @@ class ClocksSettings:
     least: float = 0.1  # of a shape's size: an entry that has a phase
     phase: float = 0.1  # rad rms: of residues, from which on they are not real
     refined: float = 0.01  # rad rms: likewise, where outputs were found late before
-    left: float = 1.0 / 3.0  # of that phase, at most, once a late output is put in time
+    small: float = 0.01  # chance that small phases, as damping makes them, leave as little once put in time
 
 
 CLOCKS = ClocksSettings()
@@ -134,7 +134,8 @@ def late_outputs(residues: np.ndarray, poles: np.ndarray, least: float = CLOCKS.
         weights = share[:, which, None] ** 2 * at[:, None, None]
         before, after = np.sqrt((weights * off**2).sum(axis=(0, 1)) / weights.sum())
         told = chance * squares.shape[1] < FALSE_ALARM and before > least
-        return seconds if told and after < min(CLOCKS.phase, CLOCKS.left * before) else 0.0
+        small = after < CLOCKS.phase and after < CLOCKS.small ** (1.0 / (np.count_nonzero(at) - 1)) * before
+        return seconds if told and small else 0.0
 
     each = np.arange(squares.shape[1])
     together = late(each, np.ones(omega.size, bool))
