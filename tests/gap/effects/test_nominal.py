@@ -11,6 +11,8 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, shape_of
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import NamedPoints
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.plate import Plate
 from workbench.trials.plane_frame import Section, plane_frame
 
@@ -60,6 +62,24 @@ def test_an_uneven_stiffness_turns_modes_into_one_another_as_it_does_in_the_matr
     assert after < 0.2 * before and before > 0.01 * np.linalg.norm(true[:, lowest])
     mass = even.mass.toarray()
     np.testing.assert_allclose(turned.T @ mass @ turned, np.eye(8), atol=1e-9)
+
+
+def test_an_uneven_mass_brings_rigid_motion_into_elastic_modes_as_it_does_in_the_matrices():
+    """Two inertias with a spring between them: φ_s gains -φ_rᵀ δM φ_s φ_r, and the rigid mode nothing."""
+    points = NamedPoints(("motor", "load"))
+    mass, stiffness = np.diag([2e-3, 5e-3]), 40.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    modes = FiniteElements(mass, stiffness, nodes=points).modes(2)
+    shapes = modes.phi(points.names)
+    off = 0.01
+    uneven = np.linalg.inv(shapes @ np.array([[1.0, off], [off, 1.0]]) @ shapes.T)  # (Φ X Φᵀ)⁻¹, X⁻¹ in modes
+    true = FiniteElements(uneven, stiffness, nodes=points).modes(2).phi(points.names)
+    true *= np.sign(np.sum(true * shapes, axis=0))
+    rig = Rig(modes, [Actuator("torque", "motor")], [Sensor("angle", "load")])
+    errors = nominal_errors(rig, NominalPrior(coupling=0.01), {"coupling_1_2": off})
+    found = apply_all(rig, (errors,)).modes.phi(points.names)
+    assert np.abs(true - shapes).max() > 0.005 * np.abs(shapes).max()
+    np.testing.assert_allclose(found, true, atol=3.0 * off**2 * np.abs(shapes).max())
+    np.testing.assert_allclose(found[:, 0], shapes[:, 0], rtol=1e-12)
 
 
 def test_a_plate_that_is_a_little_off_has_the_modes_left_out_of_its_model():

@@ -12,7 +12,8 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import Fit, fit
-from workbench.gap.search.jointly import fit_jointly, size_of, surely_late
+from workbench.gap.search.intervals import with_intervals
+from workbench.gap.search.jointly import fit_jointly, size_of, surely_late, with_all_errors
 from workbench.gap.search.plain import (
     _at_ports,
     common_as_errors,
@@ -69,6 +70,21 @@ def test_a_damper_stands_in_place_of_the_damping_of_every_mode(search):
     assert damper.values["coefficient"] == pytest.approx(0.06, rel=0.05)
     assert errors.values["stiffness_0"] == pytest.approx(np.log(1.008), rel=0.02)
     assert errors.values["damping_1"] == pytest.approx(np.log(1.12), rel=0.1)
+
+
+def test_a_gain_beside_common_errors_is_known_no_better_than_calibrations(search):
+    """Of a model that is a little off no port is calibrated exactly, be it an actuator or one of four sensors.
+
+    Three ratios of these five gains are told to be 1, and make 1 % of each s² = (2 + 0 * 3) / (2 + 3) of its square.
+    """
+    gain = Effect(kind_named("actuator_gain"), "F", {"gain": 0.8})
+    one = search((gain, MODULUS, DAMPING))
+    found = common_as_errors(one, fit(one.rig, (gain, MODULUS, DAMPING), one.data))
+    wide = replace(found, effects=with_all_errors(one, found.effects))
+    np.testing.assert_allclose(*(one.data.residual(apply_all(one.rig, f.effects)) for f in (found, wide)), atol=1e-6)
+    told = with_intervals(one.rig, wide, one.data).effects[0]
+    of_gains = 0.01 * np.sqrt(2.0 / 5.0) * np.sqrt(1.0 + 1.0 / 4.0)  # and the mass is not known exactly either
+    assert of_gains < told.deviations["gain"] / 0.8 < 2.0 * of_gains
 
 
 def test_what_is_common_to_all_modes_of_a_plate_is_an_error_of_each(search):

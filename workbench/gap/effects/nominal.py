@@ -49,7 +49,8 @@ class NominalPrior:
     Attributes:
         stiffness, mass: relative, of each cosine along a structure whose profiles are known; of the modal mass else.
         frequency: relative, of each natural frequency by itself.
-        coupling: of each two modes by an uneven stiffness, over the root of the product of their own.
+        coupling: of each two modes by an uneven stiffness, over the root of the product of their own; of a rigid mode
+            and an elastic one by an uneven mass, over the modal mass.
         damping: of the logarithm of each damping ratio.
         delay: of each sensor, in samples.
         gain: relative, of each actuator and each sensor, as far as they were calibrated.
@@ -262,13 +263,17 @@ def _off_structure(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> R
 def _couplings(frequencies: bytes) -> tuple[tuple[str, int, int, float], ...]:
     """Name of each two modes' coupling, both modes, and the angle by which a coupling of one turns them, rad.
 
-    To first order φ_r gains k_rs / (ω_r² - ω_s²) φ_s and φ_s loses as much of φ_r, with k_rs = e ω_r ω_s.
+    To first order φ_r gains k_rs / (ω_r² - ω_s²) φ_s and φ_s loses as much of φ_r, with k_rs = e ω_r ω_s. A rigid mode
+    no stiffness couples, and mass errors leave it one: with m_rs = -e an elastic φ_s gains e φ_r, and φ_r nothing.
     """
     omega = np.frombuffer(frequencies)
     found = []
     for r, s in combinations(range(omega.size), 2):
         apart = abs(omega[s] ** 2 - omega[r] ** 2)
-        angle = omega[r] * omega[s] / max(apart, omega[r] * omega[s] / STRONG) if omega[r] > 0 else 0.0
+        if omega[r] > 0:
+            angle = omega[r] * omega[s] / max(apart, omega[r] * omega[s] / STRONG)
+        else:
+            angle = 1.0 if omega[s] > 0 else 0.0
         if angle > LITTLE:
             found.append((f"coupling_{r + 1}_{s + 1}", r, s, float(angle)))
     return tuple(found)
@@ -281,7 +286,7 @@ def _turned(modes: Modes, values: dict[str, float]) -> Modes:
         angles[r, s] = angle * values.get(name, 0.0)
     if not angles.any():
         return modes
-    shapes, turn = modes.shapes, expm(angles - angles.T)
+    shapes, turn = modes.shapes, expm(angles - angles.T * (modes.omega > 0))
     return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) @ turn)
 
 

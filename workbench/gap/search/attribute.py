@@ -22,6 +22,7 @@ from workbench.gap.search.beside_random import decide_on_random, random_beside, 
 from workbench.gap.search.finish import best_of_each, finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
+from workbench.gap.search.jointly import with_all_errors
 from workbench.gap.search.nominal_figures import beside_modes, beside_records
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import are_common, common_as_errors, may_be_error
@@ -217,6 +218,8 @@ def attribute(
     logged = within.logged
     if random is None:
         logged = logged or _logged(search, best, noise_of(search, best) if noise is None else noise)
+        if outcome == "explained":
+            best = replace(best, effects=with_all_errors(within, best.effects))
         best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None, logged=logged)
         best = _settled(search, best)
         if outcome == "explained":

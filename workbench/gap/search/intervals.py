@@ -5,12 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from workbench.arrays import scaled_inverse
 from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_all
+from workbench.gap.effects.nominal import NominalPrior, group_of
 from workbench.gap.prediction.noise import noise_of_inputs
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.fit import Fit, finite_residual, parameters_of, slopes
-from workbench.gap.search.settings import INTERVALS
+from workbench.gap.search.settings import INTERVALS, JOINT, SELECTION
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
@@ -27,10 +29,10 @@ def with_intervals(
 
     or s² A⁻¹ where that is larger, over blocks b of each record: d_b is what the numbers change by without block b, so
     the many numbers that few blocks tell do not make it too small (the jackknife of clusters: MacKinnon, Nielsen &
-    Webb, J. Applied Econometrics 38 (2023) 671). Noise of the logged inputs goes through the laws of the structure,
-    which no filter of a linear one makes white, so it is drawn too: each draw changes what is left by δ, and the
-    numbers by A⁻¹ Jᵀ δ. The joint covariance is no smaller than any of these in any direction. No number of an effect
-    is known to better than a part in ten thousand.
+    Webb, J. Applied Econometrics 38 (2023) 671). P is of errors as large as `_as_believed` has them. Noise of the
+    logged inputs goes through the laws of the structure, which no filter of a linear one makes white, so it is drawn
+    too: each draw changes what is left by δ, and the numbers by A⁻¹ Jᵀ δ. The joint covariance is no smaller than any
+    of these in any direction. No number of an effect is known to better than a part in ten thousand.
 
     Args:
         rig: nominal.
@@ -40,6 +42,7 @@ def with_intervals(
         wide: as of `slopes`.
         logged: noise of the logged inputs, as a share of their rms.
     """
+    data = data.finely(SELECTION.fine)  # errors of stepping are no noise: they would count as scatter
     residual, jacobian = slopes(rig, found.effects, data, workers=workers, wide=wide)
     if jacobian.shape[1] == 0:
         return found
@@ -47,7 +50,7 @@ def with_intervals(
     level = max(float(residual @ residual) / residual.size, 1.0)
     jacobian = _along_places(rig, found.effects, data, residual, jacobian, level)
     least = np.array([_least(found.effects[i], p) for i, p in parameters])
-    priors = np.array([_precision(p) for _, p in parameters])
+    priors = np.array([_precision(p) for _, p in parameters_of(rig, _as_believed(rig, found.effects, jacobian, level))])
     scale = np.sqrt(np.maximum((jacobian**2).sum(axis=0) + level * priors, 1e-300))
     jacobian, priors = jacobian / scale, priors / scale**2
     information = jacobian.T @ jacobian + level * np.diag(priors)
@@ -112,6 +115,44 @@ def _precision(parameter: Parameter) -> float:
     if parameter.name in COORDINATES:  # the variance of a uniform distribution over the extent
         return 12.0 * (parameter.scale / (parameter.high - parameter.low)) ** 2
     return 0.0
+
+
+def _as_believed(rig: Rig, effects: Sequence[Effect], jacobian: np.ndarray, level: float) -> list[Effect]:
+    """The effects, with errors of the nominal model that a careful one may have although none were learnt.
+
+    An effect may do what these would, and then the records do not show that they are none. Of each group
+
+        s² = (k c² + Σ (a² + v)) / (k + n),
+
+    over its n errors a, with variances v beside all else: what the records do not tell has v = s², and leaves c, a
+    careful model's; no less than was learnt.
+    """
+    return [
+        replace(e, target=_careful(rig, effects, i, jacobian, level)) if isinstance(e.target, NominalPrior) else e
+        for i, e in enumerate(effects)
+    ]
+
+
+def _careful(rig: Rig, effects: Sequence[Effect], i: int, jacobian: np.ndarray, level: float) -> NominalPrior:
+    """The sizes of `_as_believed`, of the errors that are effect i."""
+    learnt: NominalPrior = effects[i].target
+    normal = jacobian.T @ jacobian / level
+    careful = {g: max(INTERVALS.careful * size, getattr(learnt, g)) for g, size in JOINT.widest if g in learnt.groups}
+    sizes = careful
+    for _ in range(INTERVALS.rounds):
+        believed = replace(effects[i], target=replace(learnt, **sizes))
+        parameters = parameters_of(rig, [*effects[:i], believed, *effects[i + 1 :]])
+        precision = np.array([_precision(p) for _, p in parameters])
+        free = np.array([p.to_free(effects[k].values[p.name]) for k, p in parameters])
+        # each mean square over that which is believed: 1 of what the records do not tell
+        told = precision * (free**2 + np.diag(scaled_inverse(normal + np.diag(precision))))
+        groups = np.array([group_of(p.name) if k == i else "" for k, p in parameters])
+        sums = {g: size**2 * told[groups == g].sum() for g, size in sizes.items()}
+        n = {g: INTERVALS.counts + (groups == g).sum() for g in sizes}
+        sizes = {
+            g: max(np.sqrt((INTERVALS.counts * c**2 + sums[g]) / n[g]), getattr(learnt, g)) for g, c in careful.items()
+        }
+    return replace(learnt, **sizes)
 
 
 def _least(effect: Effect, parameter: Parameter) -> float:

@@ -302,6 +302,21 @@ def opened(search: Search, errors: Effect) -> Effect:
     return nominal_errors(search.rig, replace(errors.target, **closed), errors.values)
 
 
+def with_all_errors(search: Search, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The effects, errors beside them with all groups: a model that is a little off may be so in all.
+
+    Those that were closed at none are open at as good as none, for intervals to allow for.
+    """
+    return tuple(_with_all(search, e) if isinstance(e.target, NominalPrior) else e for e in effects)
+
+
+def _with_all(search: Search, errors: Effect) -> Effect:
+    """The errors as they are, with a value of every group."""
+    groups = replace(search, by_mode=errors.target.by_mode).prior.groups
+    closed = {g: JOINT.narrowest * size for g, size in JOINT.widest if g in set(groups) - set(errors.target.groups)}
+    return nominal_errors(search.rig, replace(errors.target, waves=JOINT.last_waves, **closed), errors.values)
+
+
 def surely_late(errors: Effect) -> Effect:
     """The errors with the sides of accelerometers open, but for those that are later than a gap makes them seem."""
     late = tuple(name for name in errors.target.late if errors.values[f"delay_{name}"] > JOINT.surely_late)

@@ -338,6 +338,9 @@ class IntervalSettings:
     alike: float = 1e-4  # of a number, or of the extent: how far two numerical routes to the same records put it apart
     most_leverage: float = 0.5  # of a block on a direction that it alone tells: what there is no telling without it
     blocks: int = 12  # a record: long beside the correlation of what is left, many enough to scatter
+    careful: float = 0.5  # share of the widest that errors of a careful model have, where the records do not tell them
+    counts: float = 2.0  # errors of a group, that this belief weighs as much as
+    rounds: int = 20  # of the sizes, to where they come to rest
     draws: int = 48  # of noise of the logged inputs: a standard deviation of 48 is known to a tenth
     straight: float = 0.01  # of the extent: how far from a place readings are taken to change in proportion
     secants: int = 4  # after the tangent: each halves, on a logarithmic scale at least, what the last was off by
