@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import sqrtm
 from scipy.signal import butter, cont2discrete, dlsim, lfilter
 
 from workbench.gap.diagnose import diagnose
@@ -320,6 +321,85 @@ def test_a_turned_sign_is_found_beside_a_missing_mass(seed):
     (fault,) = setup_faults(rig, records)
     assert fault.sentence == "The output tacho has the wrong sign: multiply by -1." and fault.closes > 0.5
     assert setup_faults(*without_faults([fault], rig, records)) == ()
+
+
+def chain_with_a_wrong_spring(times):
+    """Four masses and springs by the matrix exponential; one spring is so many times as stiff as the model says."""
+    rng, dt, k = np.random.default_rng(6), 2e-3, 2e4
+
+    def stiffness(of_second):
+        springs = np.array([k, of_second * k, k, k])
+        return np.diag(springs + np.r_[springs[1:], 0.0]) - np.diag(springs[1:], 1) - np.diag(springs[1:], -1)
+
+    names = ("m1", "m2", "m3", "m4")
+    chain = FiniteElements(np.eye(4), stiffness(1.0), nodes=NamedPoints(names), damping=ModalDamping(0.01))
+    sensors = (*(Sensor(f"a{i}", f"m{i}", "acceleration", noise_std=0.01) for i in (1, 2, 3)),)
+    sensors += (Sensor("v4", "m4", "velocity", noise_std=1e-4),)
+    rig = Rig(chain.modes(4), (Actuator("F1", "m2"), Actuator("F2", "m4")), sensors)
+    true, b = stiffness(times), np.eye(4)[:, [1, 3]]
+    damping = 0.02 * sqrtm(true)  # a hundredth of critical in every mode, as in the model
+    a = np.block([[np.zeros((4, 4)), np.eye(4)], [-true, -damping]])
+    c = np.vstack([np.hstack([-true, -damping])[:3], np.eye(8)[7]])
+    plant = cont2discrete((a, np.vstack([np.zeros((4, 2)), b]), c, np.vstack([b[:3], np.zeros((1, 2))])), dt)
+    records = []
+    for name, share in (("one", [1.0, 0.3]), ("other", [0.3, 1.0])):
+        forces = np.array(share)[:, None] * rng.standard_normal((2, 3000))
+        noise = np.array([[0.01], [0.01], [0.01], [1e-4]]) * rng.standard_normal((4, 3000))
+        records.append(rig.record(forces, dlsim(plant, forces.T)[1].T + noise, sample_time=dt, name=name))
+    return rig, records
+
+
+ALL_IN_G = "All outputs are 9.81 times too small, or all inputs are 9.81 times too large"
+
+
+@pytest.mark.parametrize("times", [0.85, 1.3])
+@pytest.mark.parametrize(
+    ("spoilt", "sentence"),
+    [
+        ({"outputs": np.eye(4) / 9.80665}, f"{ALL_IN_G}: multiply by 9.80665 (the outputs)."),
+        (
+            {"outputs": -np.eye(4)},
+            "All outputs have the wrong sign, or all inputs have the wrong sign: multiply by -1 (the outputs).",
+        ),
+        ({"outputs": diagonal(4, 1, -1.0)}, "The output a2 has the wrong sign: multiply by -1."),
+        (
+            {"outputs": diagonal(4, 3, 1e3)},
+            "The output v4 is 1000 times too large, such as mm for m: multiply by 0.001.",
+        ),
+        ({"outputs": exchanged(4, 0, 2)}, "The outputs a1 and a3 are exchanged: swap them."),
+        ({"inputs": exchanged(2, 0, 1)}, "The inputs F1 and F2 are exchanged: swap them."),
+        ({"inputs": diagonal(2, 1, 1e3)}, "The input F2 is 1000 times too large, such as mN for N: multiply by 0.001."),
+    ],
+)
+def test_a_fault_is_found_whole_beside_an_effect_that_bends_every_mode(times, spoilt, sentence):
+    rig, records = chain_with_a_wrong_spring(times)
+    assert setup_faults(rig, records) == ()
+    wrong = change(records, **spoilt)
+    (fault,) = setup_faults(rig, wrong)
+    assert fault.sentence == sentence and fault.records == ("one", "other")
+    again = without_faults([fault], rig, wrong)
+    assert all(np.allclose(a.outputs, r.outputs) for a, r in zip(again[1], records, strict=True))
+    assert all(np.allclose(a.inputs, r.inputs) for a, r in zip(again[1], records, strict=True))
+    assert setup_faults(*again) == ()
+
+
+def test_a_mislabelled_quantity_is_found_beside_an_effect_that_bends_every_mode():
+    rig, records = chain_with_a_wrong_spring(1.3)
+    sensors = (replace(rig.sensors[0], quantity="velocity"), *rig.sensors[1:])
+    (fault,) = setup_faults(replace(rig, sensors=sensors), records)
+    assert fault.sentence == 'The output a1 is acceleration, not velocity: state the quantity "acceleration".'
+
+
+def test_a_sensor_that_reads_noise_alone_has_no_fault_of_units():
+    rig, records = chain_with_a_wrong_spring(1.3)
+    noise = np.random.default_rng(1).standard_normal(3000)
+    dead = [replace(r, outputs=np.vstack([r.outputs[:2], 0.01 * noise, r.outputs[3:]])) for r in records]
+    assert setup_faults(rig, dead) == ()
+
+
+def test_all_outputs_ten_times_too_small_may_be_an_amplifier(case):
+    (fault,) = setup_faults(case.rig, change(case.fit, outputs=np.eye(7) / 10.0))
+    assert not fault.certain and "differs from that by -1.9 %" in fault.sentence
 
 
 @pytest.mark.slow

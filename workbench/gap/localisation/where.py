@@ -389,13 +389,13 @@ def _by_mode(frequencies: Floats, scaled: Sequence[tuple[Record, Floats]], noise
 
     Rigid modes, which no frequency tells apart, have one band, in equal parts.
     """
-    rigid, *others = _shares_between(mode_bands(frequencies), scaled, noise)
+    rigid, *others = _shares_between(_mode_bands(frequencies), scaled, noise)
     above = others.pop() if others else 0.0  # of rigid modes alone nothing lies above
     n_rigid = frequencies.size - len(others)
     return np.r_[np.full(n_rigid, rigid / max(n_rigid, 1)), others], float(above)
 
 
-def mode_bands(frequencies: Floats) -> Floats:
+def _mode_bands(frequencies: Floats) -> Floats:
     """Edges, Hz, of the band of all rigid modes, empty where there are none, of each other mode, and above the last."""
     elastic = frequencies[frequencies > 0]
     first = WHERE.rigid * elastic[:1] * (elastic.size < frequencies.size)

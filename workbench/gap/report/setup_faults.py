@@ -1,20 +1,22 @@
 """Faults of the test set-up, looked for before any effect: of wiring, of units and of bookkeeping.
 
-A fault is believed where its correction takes nearly all of the gap away on the channels that it concerns. Physics gone
-astray does not do that: no missing effect turns a sign, multiplies by 1000, or exchanges two channels. Beside a missing
-effect a turned sign is believed of a sensor that reads every mode turned, while others read them as predicted.
+A fault of channels is believed where its correction makes measured and predicted signals alike in most bands of modes,
+over all records and channels that it concerns, and more than any other correction does: a missing effect bends some
+bands, either way, and a fault moves all of them alike. Other faults are believed where their correction takes nearly
+all of the gap away: no missing effect changes a sample rate, or a damping ratio a hundredfold.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from workbench.arrays import Flags, Floats
-from workbench.gap.localisation.where import mode_bands
 from workbench.gap.prediction.residuals import lead_of
+from workbench.gap.report.by_band import Spectra, asked, unlike
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, predict
@@ -28,17 +30,21 @@ WIDE_GAP = (
 )
 # leaves 2, an exchange about 1.4, a factor of 2π at least 0.84
 LEFT = 0.15  # share of a channel's measured power that may remain beyond the noise: a prediction of nothing leaves all
+NOISY = 0.5  # share of noise in a channel's measured power from which it shows no fault
 CLOSED = 0.9  # share of the closable power that a correction must take away, on the channels that it concerns
-ALIKE = 0.7  # correlation with the prediction of a sensor that reads as predicted beside an effect; less it, turned
-MODE_TURNED = (
-    -0.5
-)  # correlation in the band of one mode; a sensor beyond a node reads some modes turned, at 0.9 or more
-OF_MODE = 1e-3  # of a sensor's power: a mode with less is not asked
+FELT = 0.2  # change of unlikeness in a band from which a mend is felt there
+TAKES = 0.4  # of unlikeness, in the mean of the bands where a mend is felt: of a factor 1.8 or more, of a sign 2
+UNRELATED = 0.9  # of unlikeness that must not remain in that mean: signals with nothing in common leave 1 at least
+SHARE_GONE = 0.5  # of it that must go there: what a missing effect bends stays
+MOSTLY = 0.8  # share of those bands that must come closer
+AHEAD = 0.25  # of unlikeness, by which it must be better than any other where they differ: of 2π and 9.81 it is 0.44
+TELLING = 0.1  # share of the bands where a mend is felt in which it must differ from any other
 NEAR = 0.15  # relative error of a gain that still is that factor: the least ratio of two of them is 1.56
 MOST_CHANNELS = 12  # pairs of inputs are simulated one by one: beyond, only neighbours are
 MOST_ROUNDS = 4  # faults that hide one another are found one after the other
 GAIN_TAKES = 0.5  # share of what a factor leaves beyond the noise that a gain near it takes away: it is no unit then
 CALIBRATED = 1e-3  # relative: a gain nearer to a factor is that factor (9.81 for 9.80665 is 3.4e-4)
+TEN = 0.01  # relative: where all gains are as near to 10, an amplifier is as likely as g, which is 2 % off
 GAIN_CHI2 = 25.0  # and five standard deviations of the gain, in noise that is white
 PER_CENT_FROM = 0.05  # damping ratio above which a structure is asked whether per cent was meant
 G, TURN = 9.80665, 2.0 * np.pi
@@ -61,7 +67,6 @@ IN_G = "look like g where m/s² is meant"
 RATES = {2.0: "twice", 0.5: "half", 1e3: "1000 times", 1e-3: "a thousandth of"}
 QUANTITIES = ("displacement", "velocity", "acceleration")
 OF_CHANNELS = ("exchanged inputs", "exchanged outputs", "sign", "unit")  # kinds that a record may have or not
-WORST = 1e12  # times the measured power: a prediction that leaves more is of no use
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +121,12 @@ def setup_faults(
     alone = [("record", record) for record in fit if len(fit) > 1]
     for what, record in (*alone, *(("validation record", record) for record in held)):
         of_it = _by_rounds(rig, (record,), settle, WAYS_OF_ONE)
-        found += [_of_one(what, record, fault) for fault in of_it if fault.certain]
+        others = [r for r in (*fit, *held) if r.name != record.name]
+        found += [
+            _of_one(what, record, fault)
+            for fault in of_it
+            if fault.certain and fault.closes >= CLOSED and _is_alone(fault, rig, others, settle)
+        ]
     return tuple(found)
 
 
@@ -147,18 +157,29 @@ def _by_rounds(
     return found
 
 
-def _judged_on(records: Sequence[Record], fault: SetupFault, rig: Rig, settle: float) -> SetupFault:
-    """A fault of all fit records, without those records that agree worse with the model by its correction.
+def _disagreeing(records: Sequence[Record], fault: SetupFault, rig: Rig, settle: float) -> list[str]:
+    """Names of the records that agree worse with the model by a correction.
 
     What is silent in a record, or decayed there, says nothing of it.
     """
 
     def left(of: Rig, these: Sequence[Record]) -> float:
-        return float(np.minimum(_Gap.of(of, these, settle).before, WORST).sum())
+        gap = _Gap.of(of, these, settle)
+        return float(gap.unlike[asked(gap.seen)].sum())
 
-    others = [r.name for r in records if left(*fault.correction(rig, (r,))) > left(rig, (r,)) + WIDE_GAP**2]
+    return [r.name for r in records if left(*fault.correction(rig, (r,))) > left(rig, (r,)) + FELT]
+
+
+def _judged_on(records: Sequence[Record], fault: SetupFault, rig: Rig, settle: float) -> SetupFault:
+    """A fault of all fit records, without those records that agree worse with the model by its correction."""
+    others = _disagreeing(records, fault, rig, settle)
     sentence = f"{fault.sentence[:-1]}; not in {', '.join(others)}." if others else fault.sentence
     return replace(fault, sentence=sentence, records=tuple(r.name for r in records if r.name not in others))
+
+
+def _is_alone(fault: SetupFault, rig: Rig, others: Sequence[Record], settle: float) -> bool:
+    """Whether some other record shows that it has not the fault: one of all records was asked for among them all."""
+    return fault.kind not in OF_CHANNELS or not others or bool(_disagreeing(others, fault, rig, settle))
 
 
 def _of_one(what: str, record: Record, fault: SetupFault) -> SetupFault:
@@ -303,6 +324,43 @@ class _Gap:
         moves = np.any([np.ptp(y, axis=1) > 0 for y in self.measured], axis=0)
         return np.asarray(moves & (self.before > np.maximum(WIDE_GAP**2, 4.0 * self.noise)))
 
+    @cached_property
+    def seen(self) -> Spectra:
+        """Of what is measured."""
+        return self.read(self.measured)
+
+    @cached_property
+    def spectra(self) -> Spectra:
+        """Of what is predicted."""
+        return self.read(self.predicted)
+
+    @cached_property
+    def unlike(self) -> Floats:
+        """(n_records, n_outputs, n_modes) how unlike measured and predicted signals are."""
+        return unlike(self.seen, self.spectra)
+
+    @property
+    def n_samples(self) -> int:
+        """That are compared, of one output over all records."""
+        return sum(y.shape[1] for y in self.measured)
+
+    def read(self, signals: Sequence[Floats]) -> Spectra:
+        """Of the outputs, at the samples that are compared."""
+        return Spectra.read(signals, self.records, self.rig.modes.frequencies_hz)
+
+    def with_rows(self, at: Sequence[int], left: Floats) -> Floats:
+        """How unlike the signals are where some outputs are as said."""
+        whole = self.unlike.copy()
+        whole[:, list(at)] = left
+        return whole
+
+    @cached_property
+    def gains(self) -> Floats:
+        """(n_outputs,) what multiplies each prediction best."""
+        over = sum((p**2).sum(axis=1) for p in self.predicted)
+        along = sum((y * p).sum(axis=1) for y, p in zip(self.measured, self.predicted, strict=True))
+        return np.asarray(np.divide(along, over, out=np.ones_like(over), where=over > 0))
+
     def predict(self, rig: Rig, records: Sequence[Record]) -> list[Floats]:
         """What another rig reads on other records, (n_outputs, n_samples) each, at the samples that are compared."""
         return _counted(self.measured, [_predict(rig, record) for record in records])
@@ -315,9 +373,12 @@ class _Gap:
         return np.asarray(np.nan_to_num(left / count / self.scale, nan=np.inf))
 
     def closed(self, after: np.ndarray) -> np.ndarray:
-        """(n_outputs,) share of the power beyond the noise that is gone; 0 where much of the signal is still missed."""
+        """(n_outputs,) share of the power beyond the noise that is gone; 0 where much of the signal is still missed,
+        or noise is most of it."""
         left = np.maximum(after - self.noise, 0.0)
-        return np.where(left > LEFT, 0.0, 1.0 - left / np.maximum(self.before - self.noise, 1e-300))
+        return np.where(
+            (left > LEFT) | (self.noise > NOISY), 0.0, 1.0 - left / np.maximum(self.before - self.noise, 1e-300)
+        )
 
     def closes(self, rig: Rig, records: Sequence[Record]) -> float:
         """The share that another rig and other records close, in the median of the channels with a wide gap."""
@@ -350,80 +411,181 @@ def _overall(faults: Sequence[SetupFault], gap: _Gap) -> float:
     return -float(np.minimum(_Gap.of(rig, kept, gap.settle).before, 1.0).mean())
 
 
-def _scaled_outputs(gap: _Gap) -> list[SetupFault]:
-    """Outputs that read a known factor times what is predicted."""
-    rig = gap.rig
-    over = sum((p**2).sum(axis=1) for p in gap.predicted)
-    along = sum((y * p).sum(axis=1) for y, p in zip(gap.measured, gap.predicted, strict=True))
-    gains = np.divide(along, over, out=np.ones_like(over), where=over > 0)
-    freely = gap.power([gains[:, None] * p for p in gap.predicted])
-    n_samples = sum(y.shape[1] for y in gap.measured)
-    factors: dict[tuple[float, bool], list[int]] = {}
-    turned = _turned(gap)
-    for j in np.flatnonzero(gap.wide):
-        factor = _factor(float(gains[j]))
-        if turned[j]:
-            factors.setdefault((-1.0, True), []).append(int(j))
-        elif factor is not None:
-            left = gap.power([factor * p for p in gap.predicted])
-            if gap.closed(left)[j] >= CLOSED:
-                certain = not _is_gain(
-                    float(gains[j]),
-                    factor,
-                    n_samples * left[j],
-                    n_samples * freely[j],
-                    n_samples * gap.noise[j],
-                    n_samples,
-                )
-                factors.setdefault((factor, certain), []).append(int(j))
-    faults = []
-    for (factor, certain), outputs in factors.items():
-        names = [rig.sensors[j].name for j in outputs]
-        after = np.maximum(gap.power([factor * p for p in gap.predicted]) - gap.noise, 0.0)
-        closes = float((1.0 - after / (gap.before - gap.noise))[outputs].min())
-        every = len(outputs) == len(rig.sensors)
-        what, of_inputs = FACTORS[factor]
-        if factor == 1.0 / G and {rig.sensors[j].quantity for j in outputs} == {"acceleration"}:
-            what = IN_G
-        who = "All outputs" if every and len(names) > 1 else _named("output", names)
-        rest = f", or all inputs {of_inputs}" if every else ""
-        cure = "multiply by -1" if factor == -1.0 else f"multiply by {1.0 / factor:.6g}"
-        kind = "sign" if factor == -1.0 else "unit"
-        sentence = f"{_one(f'{who} {what}', names)}{rest}: {cure}{' (the outputs)' if rest else ''}."
-        if not certain:
-            sentence = _doubtful(f"{who} {what}{rest}", gains[outputs] / factor - 1.0)
-        correction = partial(_outputs_times, dict.fromkeys(names, 1.0 / factor))
-        faults.append(SetupFault(kind, sentence, closes, correction, certain, gap.names))
-    return faults
+@dataclass(frozen=True, eq=False)
+class _Mend:
+    """A fault of a channel, of two that are exchanged or of all outputs alike, as if it were corrected.
 
-
-def _turned(gap: _Gap) -> Flags:
-    """(n_outputs,) whether an output reads every mode with the wrong sign in every record, and as many others do not.
-
-    A resonance that is off in phase is so for every sensor, and a sensor at another place keeps the sign of some modes.
+    Attributes:
+        kind: "outputs" or "inputs" for a factor, "quantity", "exchanged outputs" or "exchanged inputs".
+        value: the factor, the quantities said and meant, or the names of the two channels.
+        at: the channels, by index.
+        left: (n_records, n_outputs, n_modes) how unlike measured and predicted signals then are.
     """
-    edges = mode_bands(gap.rig.modes.frequencies_hz)
-    n_bands = 1 + np.count_nonzero(gap.rig.modes.omega)  # above the last mode's there is none to ask
-    sound, turned = np.ones((2, len(gap.rig.sensors)), bool)
-    several = ~turned
-    for record, y, p in zip(gap.records, gap.measured, gap.predicted, strict=True):
-        if not np.isfinite(p).all():
-            return np.zeros_like(turned)
-        window = np.hanning(y.shape[1])
-        of_y, of_p = (np.fft.rfft((a - a.mean(axis=1, keepdims=True)) * window) for a in (y, p))
-        band = np.digitize(np.fft.rfftfreq(y.shape[1], record.sample_time), edges) - 1
-        # (3, n_outputs, n_bands) of measured, predicted and both
-        products = (of_y * of_y.conj()).real, (of_p * of_p.conj()).real, (of_y * of_p.conj()).real
-        powers = np.array([[np.bincount(band, row, edges.size)[:n_bands] for row in product] for product in products])
-        measured, predicted, both = powers
-        alike = both / np.sqrt(np.maximum(measured * predicted, 1e-300))
-        over_all = both.sum(axis=1) / np.sqrt(np.maximum(measured.sum(axis=1) * predicted.sum(axis=1), 1e-300))
-        asked = measured > OF_MODE * measured.sum(axis=1, keepdims=True)
-        sound &= over_all > ALIKE
-        turned &= (over_all < -ALIKE) & (~asked | (alike < MODE_TURNED)).all(axis=1)
-        several |= asked.sum(axis=1) > 1
-    turned &= several
-    return np.asarray(turned & (sound.sum() >= turned.sum()))
+
+    kind: str
+    value: Any
+    at: tuple[int, ...]
+    left: Floats
+
+
+def _mends(gap: _Gap) -> Iterator[_Mend]:
+    """Every fault of one channel or of all outputs alike, of channels with a wide gap."""
+    rig, spectra = gap.rig, gap.spectra
+    n, wide = len(rig.sensors), [int(j) for j in np.flatnonzero(gap.wide)]
+    for factor in FACTORS:
+        left = unlike(gap.seen, spectra, factor)
+        yield _Mend("outputs", factor, tuple(range(n)), left)
+        for j in wide if n > 1 else ():
+            yield _Mend("outputs", factor, (j,), gap.with_rows((j,), left[:, [j]]))
+    for i, j in combinations(wide, 2):
+        left = unlike(gap.seen.rows((i, j)), spectra.rows((j, i)))
+        names = rig.sensors[i].name, rig.sensors[j].name
+        yield _Mend("exchanged outputs", names, (i, j), gap.with_rows((i, j), left))
+    for quantity in QUANTITIES:
+        here = [j for j in wide if rig.sensors[j].quantity in set(QUANTITIES) - {quantity}]
+        if here:
+            meant = _relabelled(rig, [rig.sensors[j].name for j in here], quantity)
+            left = unlike(gap.seen, gap.read(gap.predict(meant, gap.records)))
+            for j in here:
+                yield _Mend("quantity", (rig.sensors[j].quantity, quantity), (j,), gap.with_rows((j,), left[:, [j]]))
+    m = len(rig.actuators)
+    if 1 < m <= MOST_CHANNELS and not is_stepped(rig):
+        for p in range(m):
+            own = gap.read(gap.predict(rig, _driven_by(p, gap.records)))
+            for factor in (*FACTORS, 0.0) if any(np.any(of) for of in own.of) else ():
+                of = [every + (factor - 1.0) * part for every, part in zip(spectra.of, own.of, strict=True)]
+                yield _Mend("inputs", factor, (p,), unlike(gap.seen, spectra.like(of)))
+    for p, q in combinations(range(m), 2):
+        if m <= MOST_CHANNELS or q == p + 1:
+            names = rig.actuators[p].name, rig.actuators[q].name
+            crossed = gap.read(gap.predict(*_exchanged("inputs", *names, rig, gap.records)))
+            yield _Mend("exchanged inputs", names, (p, q), unlike(gap.seen, crossed))
+
+
+def _driven_by(p: int, records: Sequence[Record]) -> list[Record]:
+    """The records with one input alone."""
+    return [replace(r, inputs=r.inputs * (np.arange(r.n_inputs) == p)[:, None]) for r in records]
+
+
+def _believed(gap: _Gap) -> list[_Mend]:
+    """The mends that take most of what is unlike away where they are felt, and more than any rival, the best first.
+
+    A rival is felt in half of the same bands or more: a fault elsewhere may be there too. An input that does nothing
+    is one, where an effect has made another of it than the model says.
+    """
+    compared = asked(gap.seen)
+    now = gap.unlike[compared]
+    better = [mend for mend in _mends(gap) if mend.left[compared].sum() < now.sum()]
+    better.sort(key=lambda mend: float(mend.left[compared].sum()))
+    left = np.array([mend.left[compared] for mend in better]).reshape(-1, now.size)
+    felt = np.abs(left - now) > FELT
+    believed = []
+    for i, mend in enumerate(better):
+        at = felt[i]
+        if not at.any():
+            continue
+        gone = (now - left[i])[at]
+        enough = max(TAKES, SHARE_GONE * now[at].mean(), now[at].mean() - UNRELATED)
+        if gone.mean() < enough or (gone > 0).mean() < MOSTLY:
+            continue
+        rivals = felt[:, at].mean(axis=1) >= 0.5
+        rivals[i] = False
+        differs = np.abs(left[rivals] - left[i]) > FELT
+        ahead = np.where(differs, left[rivals] - left[i], 0.0).sum(axis=1)
+        if (ahead > AHEAD * np.maximum(differs.sum(axis=1), TELLING * at.sum())).all():
+            believed.append(mend)
+    return believed
+
+
+def _of_channels(gap: _Gap, kinds: Collection[str]) -> list[SetupFault]:
+    """The likeliest fault: of all outputs, else of channels that have the same one; else those in doubt."""
+    n = len(gap.rig.sensors)
+    faults: dict[tuple[str, Any, bool], list[_Mend]] = {}
+    for mend in _believed(gap):
+        certain = _is_certain(gap, mend)
+        if mend.kind in kinds and certain is not None:
+            faults.setdefault((mend.kind, mend.value, certain), []).append(mend)
+            if certain and mend.kind == "outputs" and len(mend.at) == n:
+                return [_fault_of(gap, mend.kind, mend.value, mend.at, True)]
+    made = [
+        _fault_of(gap, kind, value, sorted({c for mend in mends for c in mend.at}), certain)
+        for (kind, value, certain), mends in faults.items()
+    ]
+    return [fault for fault in made if fault.certain][:1] or made
+
+
+def _is_certain(gap: _Gap, mend: _Mend) -> bool | None:
+    """Whether a fault is certain, False where a factor may be an error of calibration; None where nobody can tell."""
+    if mend.value == 0.0:
+        return None
+    turns_one = mend.kind == "outputs" and mend.value == -1.0 and len(mend.at) == 1
+    if turns_one:  # a sensor beyond a node reads a mode turned
+        felt = asked(gap.seen) & (np.abs(mend.left - gap.unlike) > FELT)
+        turns_one = int(felt.any(axis=(0, 1)).sum()) < 2
+    if mend.value not in MAY_BE_GAIN and not turns_one:
+        return True
+    if mend.kind == "inputs":  # these are weighed beside one another
+        return None
+    n, factor = gap.n_samples, float(mend.value)
+    if len(mend.at) > 1:
+        return bool((np.abs(gap.gains / (10.0 if factor > 1.0 else 0.1) - 1.0) > TEN).any())
+    (j,) = mend.at
+    left, freely = (gap.power([by * p for p in gap.predicted]) for by in (factor, gap.gains[:, None]))
+    if gap.closed(left)[j] < CLOSED:
+        return None
+    return not _is_gain(float(gap.gains[j]), factor, n * left[j], n * freely[j], n * gap.noise[j], n)
+
+
+def _fault_of(gap: _Gap, kind: str, value: Any, at: Sequence[int], certain: bool) -> SetupFault:
+    """What is wrong with some channels, and the correction."""
+    rig = gap.rig
+    names = [(rig.actuators if "inputs" in kind else rig.sensors)[c].name for c in at]
+    called, fault_records = kind, gap.names
+    if kind == "outputs":
+        sentence = _sentence_of_outputs(gap, value, at, certain)
+        correction = partial(_outputs_times, dict.fromkeys(names, 1.0 / value))
+    elif kind == "inputs":
+        what = f"{_named('input', names)} {FACTORS[value][1]}"
+        sentence = f"{_one(what, names)}: multiply by {value:.6g}."
+        correction = partial(_inputs_times, dict.fromkeys(names, value))
+    elif kind == "quantity":
+        said, meant = value
+        what = _one(f"{_named('output', names)} are {meant}, not {said}", names)
+        sentence = f'{what}: state the quantity "{meant}".'
+        correction, fault_records = partial(_quantity_set, frozenset(names), meant), ()
+    else:
+        sentence = f"The {kind.split()[1]} {' and '.join(value)} are exchanged: swap them."
+        correction = partial(_exchanged, kind.split()[1], *value)
+    if kind in ("outputs", "inputs"):
+        called = "sign" if value == -1.0 else "unit"
+    fault = SetupFault(called, sentence, np.nan, correction, certain, fault_records)
+    return replace(
+        fault, closes=_share_closed(fault, gap, [int(j) for j in np.flatnonzero(gap.wide)] if "inputs" in kind else at)
+    )
+
+
+def _share_closed(fault: SetupFault, gap: _Gap, outputs: Sequence[int]) -> float:
+    """The share of the power beyond the noise that a correction takes away, in the median of some outputs."""
+    at = list(outputs)
+    after = _Gap.of(*fault.correction(gap.rig, gap.records), gap.settle)
+    left, was = (np.maximum(each.before - each.noise, 0.0)[at] for each in (after, gap))
+    return float(np.median(1.0 - left / np.maximum(was, 1e-300)))
+
+
+def _sentence_of_outputs(gap: _Gap, factor: float, at: Sequence[int], certain: bool) -> str:
+    """What outputs read, and what to multiply them by; of all outputs, what the inputs may be instead."""
+    sensors = gap.rig.sensors
+    names = [sensors[j].name for j in at]
+    every = len(at) == len(sensors)
+    what, of_inputs = FACTORS[factor]
+    if factor == 1.0 / G and {sensors[j].quantity for j in at} == {"acceleration"}:
+        what = IN_G
+    who = "All outputs" if every and len(names) > 1 else _named("output", names)
+    rest = f", or all inputs {of_inputs}" if every else ""
+    if not certain:
+        return _doubtful(f"{who} {what}{rest}", gap.gains[list(at)] / factor - 1.0)
+    cure = "multiply by -1" if factor == -1.0 else f"multiply by {1.0 / factor:.6g}"
+    return f"{_one(f'{who} {what}', names)}{rest}: {cure}{' (the outputs)' if rest else ''}."
 
 
 def _is_gain(gain: float, factor: float, left: float, freely: float, noise: float, n_samples: int) -> bool:
@@ -451,37 +613,6 @@ def _factor(gain: float) -> float | None:
     return min(near, key=lambda factor: abs(gain / factor - 1.0), default=None)
 
 
-def _exchanged_outputs(gap: _Gap) -> list[SetupFault]:
-    rig = gap.rig
-    for i, j in combinations(np.flatnonzero(gap.wide), 2):
-        order = np.arange(len(rig.sensors))
-        order[[i, j]] = j, i
-        after = gap.power([p[order] for p in gap.predicted])
-        closes = float(gap.closed(after)[[i, j]].min())
-        if closes >= CLOSED:
-            one, other = rig.sensors[i].name, rig.sensors[j].name
-            sentence = f"The outputs {one} and {other} are exchanged: swap them."
-            correction = partial(_exchanged, "outputs", one, other)
-            return [SetupFault("exchanged outputs", sentence, closes, correction, records=gap.names)]
-    return []
-
-
-def _exchanged_inputs(gap: _Gap) -> list[SetupFault]:
-    rig, records = gap.rig, gap.records
-    found: list[SetupFault] = []
-    n = len(rig.actuators)
-    for i, j in combinations(range(n), 2):
-        if n > MOST_CHANNELS and j != i + 1:
-            continue
-        one, other = rig.actuators[i].name, rig.actuators[j].name
-        correction = partial(_exchanged, "inputs", one, other)
-        closes = gap.closes(*correction(rig, records))
-        if closes >= CLOSED:
-            sentence = f"The inputs {one} and {other} are exchanged: swap them."
-            found.append(SetupFault("exchanged inputs", sentence, closes, correction, records=gap.names))
-    return sorted(found, key=lambda fault: -fault.closes)[:1]
-
-
 def _scaled_inputs(gap: _Gap) -> list[SetupFault]:
     """Inputs that a linear rig would need a known factor larger or smaller, by least squares on their responses."""
     rig, records = gap.rig, gap.records
@@ -506,7 +637,7 @@ def _scaled_inputs(gap: _Gap) -> list[SetupFault]:
     if any(known[p] is None and abs(gains[p] - 1.0) > NEAR for p in acting):
         return []
     wrong = {p: factor for p, factor in known.items() if factor is not None}
-    if not wrong or (len(wrong) == acting.size and len(set(wrong.values())) == 1):
+    if not wrong or len(wrong) == acting.size:  # what all inputs have, all outputs may have
         return []
     correction = partial(_inputs_times, {rig.actuators[p].name: factor for p, factor in wrong.items()})
     closes = gap.closes(*correction(rig, records))
@@ -533,30 +664,6 @@ def _scaled_inputs(gap: _Gap) -> list[SetupFault]:
 
 def _squares(values: Floats) -> float:
     return float(values @ values)
-
-
-def _quantities(gap: _Gap) -> list[SetupFault]:
-    """Outputs that are another time derivative of the motion than their label says."""
-    rig, records = gap.rig, gap.records
-    meant: dict[tuple[str, str], list[int]] = {}
-    for quantity in QUANTITIES:
-        here = [j for j in np.flatnonzero(gap.wide) if rig.sensors[j].quantity in set(QUANTITIES) - {quantity}]
-        if not here:
-            continue
-        every = {rig.sensors[j].name for j in here}
-        closed = gap.closed(gap.power(gap.predict(_relabelled(rig, every, quantity), records)))
-        for j in here:
-            if closed[j] >= CLOSED:
-                meant.setdefault((rig.sensors[j].quantity, quantity), []).append(int(j))
-    faults = []
-    for (said, quantity), outputs in meant.items():
-        names = [rig.sensors[j].name for j in outputs]
-        closed = gap.closed(gap.power(gap.predict(_relabelled(rig, names, quantity), records)))
-        what = _one(f"{_named('output', names)} are {quantity}, not {said}", names)
-        sentence = f'{what}: state the quantity "{quantity}".'
-        correction = partial(_quantity_set, frozenset(names), quantity)
-        faults.append(SetupFault("quantity", sentence, float(closed[outputs].min()), correction))
-    return faults
 
 
 def _rates(gap: _Gap) -> list[SetupFault]:
@@ -633,8 +740,9 @@ def _one(sentence: str, names: Sequence[str]) -> str:
     return sentence
 
 
-WAYS_OF_ONE = (_scaled_outputs, _exchanged_outputs, _exchanged_inputs, _scaled_inputs, _rates)  # a record by itself
-WAYS = (*WAYS_OF_ONE[:-1], _quantities, _rates, _structure)
+OF_ONE = ("outputs", "inputs", "exchanged outputs", "exchanged inputs")
+WAYS_OF_ONE = (partial(_of_channels, kinds=OF_ONE), _scaled_inputs, _rates)  # a record by itself
+WAYS = (partial(_of_channels, kinds=(*OF_ONE, "quantity")), _scaled_inputs, _rates, _structure)
 
 
 # --- corrections: of (rig, records), once all before these is given
