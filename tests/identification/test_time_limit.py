@@ -31,7 +31,7 @@ def test_a_record_without_end_ends_and_says_so():
     began = thread_time()
     found = wb.identify(hardening(), seconds=0.5)
     assert thread_time() - began < 20.0  # the step that is under way is finished
-    assert found.modes.n_modes >= 1 and "stopped after 0.5 s" in found.remarks[0]
+    assert found.modes.n_modes >= 1 and "of the 0.5 s allowed" in found.remarks[0]
     assert found.remarks[0] in str(found)
 
 
@@ -41,7 +41,7 @@ def test_a_search_for_which_the_time_was_up_asks_for_time_and_not_for_other_mode
     moves = np.convolve(force, np.exp(-t) * np.sin(60.0 * t))[:400] + 0.01 * noise
     driven = Record(0.01, moves[None], (Channel("v", "velocity"),), force[None], (Channel("f", "force"),))
     report = identification_report([driven], seconds=1e-3)
-    assert any("stopped after 0.001 s" in line for line in report.lines)
+    assert any("of the 0.001 s allowed" in line for line in report.lines)
     assert not any("did not converge" in line for line in report.lines)
 
 
