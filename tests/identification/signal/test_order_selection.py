@@ -63,7 +63,7 @@ class Slow(Endless):
 
 def test_the_search_goes_on_in_the_time_that_the_check_of_each_mode_leaves():
     budget = Budget(0.18)  # of which the search has six tenths before the first check
-    found = Stepwise(Slow(), 10_000, 2, 6, forgets=False, budget=budget).select(())
+    found = Stepwise(Slow(), 10_000, 2, 6, forgets=False, budget=budget, alone=True).select(())
     assert len(found) == 12 and not budget.remarks
 
 

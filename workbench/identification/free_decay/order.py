@@ -168,7 +168,7 @@ def _selected(
     verdicts: "Verdicts",
 ) -> tuple["_FreeDecay", "_Model"]:
     problem = _FreeDecay(records, false_alarm, measured, budget, verdicts)
-    selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, forgets=False, budget=budget)
+    selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, False, budget, alone=True)
     model = selection.select(problem.nothing)
     problem.rejected = selection.rejected
     return problem, model

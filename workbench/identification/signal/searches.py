@@ -307,6 +307,7 @@ class Stepwise(Generic[Model, Candidate]):
         most_splits: candidates that split a mode before the search ends; None where they count as weak ones.
         forgets: whether a rejected candidate may be tried again once another mode has entered.
         budget: of time.
+        alone: whether all of that is for this search; other things follow unless given.
         rejected: poles tried and rejected, with their gain.
         full: whether the search stopped at the most modes.
         cut_short: whether the last search forward ended because its time was up.
@@ -318,6 +319,7 @@ class Stepwise(Generic[Model, Candidate]):
     most_splits: int | None
     forgets: bool
     budget: Budget = field(default_factory=Budget)
+    alone: bool = False
     rejected: list[tuple[complex, float]] = field(default_factory=list)
     full: bool = False
     cut_short: bool = False
@@ -334,7 +336,7 @@ class Stepwise(Generic[Model, Candidate]):
             model = self.backward(self.problem.settled(grown))
             left = self.problem.n_modes(model)
             # What the check of each mode has left of the time is for the search that had a share of it.
-            if self.cut_short and not self.budget.is_past:
+            if self.cut_short and self.alone and not self.budget.is_past:
                 continue
             # With nothing remembered the next round would only repeat this one.
             if left == most or (self.forgets and left <= before):
