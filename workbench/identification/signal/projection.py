@@ -226,7 +226,7 @@ class _Exponentials:
             alive = int(np.searchsorted(-self.lives, -first * self.dt, side="right"))
             if not alive:
                 return
-            begin = self.dt * np.arange(first, part.stop, PROJECTION.block)
+            begin: Floats = self.dt * np.arange(first, part.stop, PROJECTION.block, dtype=float)
             yield part, begin, np.exp(np.outer(begin, self.slow[:alive]))
 
     def sums(self) -> tuple[Floats, Floats]:
@@ -362,7 +362,7 @@ def disturbed(shared: Floats, amplitudes: np.ndarray) -> Floats:
         shared: C (n_outputs, n_outputs).
         amplitudes: a (n_outputs, n_modes), over the noise of each output.
     """
-    if not np.triu(shared, 1).any():
+    if not _share(shared):
         return np.ones(amplitudes.shape[1])
     ratio: Floats = (amplitudes.conj() * (shared @ amplitudes)).sum(axis=0).real / (np.abs(amplitudes) ** 2).sum(axis=0)
     return ratio
@@ -370,7 +370,12 @@ def disturbed(shared: Floats, amplitudes: np.ndarray) -> Floats:
 
 def mixing_of(shared: Floats) -> Floats | None:
     """Combinations (n_outputs, n_outputs) of outputs, over their noise, that make it independent; None where it is."""
-    return np.linalg.inv(np.linalg.cholesky(shared)) if np.triu(shared, 1).any() else None
+    return np.linalg.inv(np.linalg.cholesky(shared)) if _share(shared) else None
+
+
+def _share(shared: Floats) -> bool:
+    """Whether a correlation is not the identity."""
+    return bool(np.count_nonzero(shared) > len(shared))
 
 
 def independent(records: Sequence[Record], left: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:
