@@ -513,7 +513,8 @@ def _selected(
     noise = None if budget.spent("search for noise of the inputs") else input_noise(data, sure)
     if noise is not None:
         (data, start), strongest = with_white_noise(data, sure, noise, how["false_alarm"], budget), None
-    strongest = _strongest(data, start, **how) if strongest is None else strongest
+    if strongest is None:
+        strongest = _strongest(data, start, **{**how, "budget": budget.share(SELECTION.search_share)})
     data = data.with_distorted(strongest.distorted)
     apart = data.apart(strongest.fit)
     if apart is None:
