@@ -112,3 +112,10 @@ def test_what_cannot_be_read_ends_in_one_line(run, tmp_path):
     (tmp_path / "note.csv").write_text("hello\n")
     refused = run("look", tmp_path / "note.csv")
     assert refused.exit_code == 2 and len(refused.output.strip().splitlines()) == 1
+
+
+def test_of_many_faults_of_a_kind_the_first_and_their_number_are_said(run, tmp_path):
+    names = ["time", "a", *(f"d{j}" for j in range(30))]
+    columns = [*decay(np.random.default_rng(0)), *np.ones((30, N))]
+    seen = run("look", write(tmp_path / "many.csv", names, columns), "--page", tmp_path / "p.html")
+    assert seen.output.count("the sensor is dead") == 24 and "6 more channels are dead" in seen.output

@@ -2,6 +2,7 @@
 
 import pytest
 
+from workbench.study import catalogue
 from workbench.study.catalogue import find_study, list_studies, output_root, run_study
 from workbench.study.runs.outcome import Outcome
 
@@ -37,3 +38,13 @@ def test_a_script_from_elsewhere_leaves_its_own_folder_as_it_is(elsewhere, tmp_p
     result, page = run_study(found, None, outcome, output_root(found))
     assert result == elsewhere / "out" / "results" / "one.json" and page == elsewhere / "out" / "one.html"
     assert [path.name for path in away.iterdir() if path.suffix] == ["one.py"]
+
+
+def test_studies_beside_an_installed_package_are_found(elsewhere, monkeypatch):
+    """`pip install --target` puts what wheels call data beside the package."""
+    (elsewhere / "workbench" / "study").mkdir(parents=True)
+    beside = elsewhere / "share" / "workbench" / "studies"
+    beside.mkdir(parents=True)
+    (beside / "came.py").write_text(SCRIPT)
+    monkeypatch.setattr(catalogue, "__file__", str(elsewhere / "workbench" / "study" / "catalogue.py"))
+    assert [*catalogue.study_scripts()] == ["came"]

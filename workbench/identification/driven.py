@@ -32,7 +32,15 @@ from workbench.identification.input_output.input_noise import (
     with_white_noise,
 )
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, added_misfit, only, projected, scaled_vectors, settled
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    added_misfit,
+    modal_coordinate,
+    only,
+    projected,
+    scaled_vectors,
+    settled,
+)
 from workbench.identification.input_output.model_order import (
     ORDER,
     Selected,
@@ -68,6 +76,7 @@ class DrivenSettings:
     apart: int = 2  # times that modes are looked for in combinations of outputs that share no noise
     spare: int = 20  # states of a subspace model beyond two for each of the most modes: for noise
     drifting: float = 0.2  # of the time left, for each look at what is a drift
+    undriven: float = 0.3  # of the motion of a mode, what the inputs make of it: less is none of theirs
     final: float = 5.0  # s of processor time for the last check of modes, whatever the search has left
 
 
@@ -306,8 +315,20 @@ def identify_driven(
     decays = by_amplitude.remarks(fit.poles, _sizes(data, fit), deviation)
     # a response to the inputs may have a constant amplitude too
     undamped = np.flatnonzero(found.modes.zeta < SURE * found.zeta_std).tolist()
-    doubtful = (*harmonic_remarks(records, fit.poles, undamped), *unexcited_remarks(records, fit.poles))
+    lasting = [r for r in undamped if _goes_on_undriven(data, fit, r)]
+    doubtful = (*harmonic_remarks(records, fit.poles, undamped, lasting), *unexcited_remarks(records, fit.poles))
     return replace(found, remarks=(*decays, *doubtful, *found.remarks))
+
+
+def _goes_on_undriven(data: KnownInputs, fit: Fit, r: int) -> bool:
+    """Whether a mode goes on through the records and is not of the inputs, whose response may hide how steady it is."""
+    pole, l_r = fit.poles[r], fit.participation[r].copy()
+    responses = data.responses(pole)
+    whole = np.linalg.norm(modal_coordinate(responses, l_r))
+    l_r[data.n_inputs :] = 0.0
+    by_inputs = np.linalg.norm(modal_coordinate(responses, l_r))
+    decays = -pole.real * 2.0 * np.pi / data.resolution
+    return bool(decays < 1.0 and by_inputs < DRIVEN.undriven * whole)
 
 
 def _sizes(data: KnownInputs, fit: Fit) -> Floats:
@@ -492,7 +513,8 @@ def _selected(
     noise = None if budget.spent("search for noise of the inputs") else input_noise(data, sure)
     if noise is not None:
         (data, start), strongest = with_white_noise(data, sure, noise, how["false_alarm"], budget), None
-    strongest = _strongest(data, start, **how) if strongest is None else strongest
+    if strongest is None:
+        strongest = _strongest(data, start, **{**how, "budget": budget.share(SELECTION.search_share)})
     data = data.with_distorted(strongest.distorted)
     apart = data.apart(strongest.fit)
     if apart is None:
@@ -560,7 +582,7 @@ def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) ->
     while fit.poles.size > 1:
         std = np.sqrt(np.diag(pole_covariance(fit))).reshape(2, -1)
         modes = SampledModes.of_poles(fit.poles, fit.amplitudes, data.places)
-        good = credible(modes, std[0], std[1], data.highest)
+        good = credible(modes, std[0], std[1], data.highest) & (modes.zeta <= SELECTION.most_damped)
         if good.all() or not good.any():
             break
         out += list(modes.frequencies_hz[~good])
@@ -568,7 +590,10 @@ def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) ->
     if not out:
         return selected, ()
     which = ", ".join(f"{f:.4g}" for f in sorted(out))
-    remark = f"left out, as negatively damped, of unknown frequency or beyond Nyquist: poles at {which} Hz"
+    remark = (
+        f"left out, as damped negatively or by more than {SELECTION.most_damped:g}, of unknown frequency or beyond"
+        f" Nyquist: poles at {which} Hz"
+    )
     return selected.refitted(fit), (remark,)
 
 

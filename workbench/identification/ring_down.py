@@ -213,8 +213,11 @@ def _without_drift(
         if not drifting and taken and not budget.unfinished:
             taken = []
             continue
-        settles = any(drift.time_constant is not None for drift in drifts)  # found better beside better modes
-        if not drifting or (poles.size == before.size and taken and not settles) or budget.unfinished:
+        if not drifting or budget.unfinished:
+            break
+        # What settles is found better beside better modes.
+        settles = any(drift.time_constant is not None for drift in drifts)
+        if taken and poles.size == before.size and not (settles and _moved(drifts, taken, found)):
             break
         taken = drifts
     if not any(drift.size.any() for drift in taken):
@@ -226,6 +229,13 @@ def _without_drift(
     i, j = np.unravel_index(int(np.argmax(in_noise)), in_noise.shape)
     name, drift = records[0].output_names[j], taken[int(i)]
     return found, cleared, [f"{drift.words} of {drift.size[j]:.3g} was removed from output {name!r}"]
+
+
+def _moved(drifts: list[Drift], before: list[Drift], found: Identified) -> bool:
+    """Whether drifts are others than before by more than a standard error: by a χ² of one."""
+    each = zip(drifts, before, found.refined.noise, strict=True)
+    changes = ((now.record.outputs - then.record.outputs) / noise[:, None] for now, then, noise in each)
+    return sum(float(np.vdot(change, change)) for change in changes) > 1.0
 
 
 def _is_swing(drift: Drift) -> bool:

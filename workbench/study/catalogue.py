@@ -44,9 +44,11 @@ def study_scripts(*, here_first: bool = False) -> dict[str, Path]:
     Args:
         here_first: only those here, where there are any.
     """
-    package = Path(__file__).resolve().parents[2] / "studies"
-    installed = Path(sysconfig.get_path("data")) / "share" / "workbench" / "studies"
-    folders = [Path.cwd() / "studies", package if package.is_dir() else installed]
+    root = Path(__file__).resolve().parents[2]
+    # beside the package as its source has it or as an installer's --target does, or where the interpreter keeps data
+    installed = [folder / "share" / "workbench" / "studies" for folder in (root, Path(sysconfig.get_path("data")))]
+    came = next((folder for folder in (root / "studies", *installed) if folder.is_dir()), installed[-1])
+    folders = [Path.cwd() / "studies", came]
     scripts: dict[str, Path] = {}
     for folder in folders:
         if here_first and scripts:

@@ -1,14 +1,18 @@
 """One sensor and a beat: two linear modes, or one whose frequency and damping go with its amplitude."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from workbench.identification.free_decay import backbone
 from workbench.identification.free_decay.backbone import (
     POWERS,
     _Backbone,
     _Band,
     _envelopes,
+    _left_by_modes,
     are_two,
     left_by_backbone,
     left_by_common_backbone,
@@ -194,3 +198,23 @@ def test_the_amplitude_of_each_record_is_found_on_the_common_backbone():
     bands = [_Band(record, pair, np.zeros(0, complex)) for record in records]
     left = left_by_common_backbone(bands, 1.0 / noise, pair)
     np.testing.assert_allclose(left / (bands[0].y.size * noise**2), 1.0, atol=0.4)
+
+
+def test_a_long_record_is_compared_at_fewer_samples_with_the_same_result(monkeypatch):
+    """In 96,000 samples the lines of a decay are Σ_t of a geometric series; at every 96th sample as at each."""
+    time = 1e-4 * np.arange(96_000)
+    pair = np.array([-1.08 + 719.4j, -1.5 + 721.3j])
+    noise = 0.01 * np.random.default_rng(0).standard_normal(time.size)
+    record = Record(1e-4, (np.exp(np.outer(time, pair)).sum(axis=1).real + noise)[None], (Channel("v", "velocity"),))
+    few = _Band(record, pair, np.zeros(0, complex))
+    monkeypatch.setattr(backbone, "BACKBONE", replace(backbone.BACKBONE, few=time.size))
+    each = _Band(record, pair, np.zeros(0, complex))
+    assert few.time.size < each.time.size / 50
+    z = np.exp(pair * 1e-4)
+    turns = z / np.exp(2j * np.pi * np.outer(few.lines, [1.0, 1.0]) / time.size)
+    exact = 0.5 * (1.0 - z**time.size) / (1.0 - turns) / np.sqrt(0.5 * time.size)
+    found = few.seen(np.exp(np.outer(pair, few.time)))[0]
+    wanted = few.apart(np.vstack([exact.real, exact.imag]))
+    np.testing.assert_allclose(few.apart(found), wanted, atol=1e-7 * np.abs(wanted).max())
+    one, other = (_left_by_modes([band], pair)[0] for band in (few, each))
+    assert one == pytest.approx(other, rel=1e-5)

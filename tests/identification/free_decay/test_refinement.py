@@ -1,9 +1,11 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
 from workbench.identification.free_decay.ibrahim import stacked_delays
-from workbench.identification.free_decay.refinement import modal_amplitudes, refine
+from workbench.identification.free_decay.refinement import cramer_rao_bound, modal_amplitudes, refine
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
@@ -149,3 +151,14 @@ def test_refusals(truth):
         refine(record, truth)
     with pytest.raises(ValueError, match="no mode to refine"):
         refine(record, truth.select([]))
+
+
+def test_the_covariance_of_a_shape_of_many_outputs_is_held_once():
+    m = 1500
+    modes = SampledModes([20.0], [0.01], np.linspace(-1.0, 1.0, m)[:, None], np.linspace(0.0, 1.0, m))
+    record = free_decay(modes, sample_time=0.05, n_samples=40, noise_std=0.01)
+    tracemalloc.start()
+    found = cramer_rao_bound(modes, record, noise_std=0.01)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 1.5 * found.shape_covariance.nbytes

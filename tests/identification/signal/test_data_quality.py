@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.identification.free_decay.order import identify
+from workbench.identification.signal import data_quality
 from workbench.identification.signal.data_quality import check_data_quality, data_faults, steps
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
@@ -158,3 +159,14 @@ def test_a_record_given_twice_is_refused(sound):
 def test_the_step_of_a_rounded_output_is_read_from_it(sound):
     rounded = with_row(sound, 1, 0.3 + 0.02 * np.round(sound.outputs[1] / 0.02))
     np.testing.assert_allclose(steps(rounded), [0.0, 0.02, 0.0, 0.0], rtol=1e-9)
+
+
+def test_copies_of_one_signal_are_compared_with_it_at_once(monkeypatch):
+    """What the past of a signal predicts is asked once, not once for each of its copies."""
+    signals, asked = np.random.default_rng(0).standard_normal((3, 400)), []
+    innovation = data_quality._innovation_std
+    monkeypatch.setattr(data_quality, "_innovation_std", lambda row: asked.append(row) or innovation(row))
+    rows = np.vstack([signals] * 20) * np.linspace(-2.0, 3.0, 60)[:, None]
+    faults = data_faults(Record(0.01, rows, tuple(Channel(f"y{j}", "displacement") for j in range(60))))
+    assert [fault.outputs for fault in faults] == [(f"y{i}", f"y{j}") for i in range(3) for j in range(i + 3, 60, 3)]
+    assert len(asked) == 3

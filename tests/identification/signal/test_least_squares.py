@@ -52,4 +52,4 @@ def test_time_that_is_up_ends_the_search_and_is_noted():
     budget = Budget(1e-9)
     found = minimise(Misra(), np.array([500.0, 1e-4]), most_steps=100, budget=budget)
     assert found.steps == 1 and not found.converged and found.cost < Misra().cost((500.0, 1e-4))
-    assert budget.unfinished == ["refinement"] and "allow more time" in budget.remarks[0]
+    assert [*budget.unfinished] == ["refinement"] and "allow more time" in budget.remarks[0]

@@ -48,4 +48,32 @@ def test_a_search_without_end_leaves_time_to_check_each_mode():
     problem, budget = Endless(), Budget(0.3)
     found = Stepwise(problem, 10_000, 2, 6, forgets=False, budget=budget).select(())
     assert problem.checked > 0 and len(found) <= 1, "modes that are none are gone"
-    assert budget.unfinished[0] == "search for further modes"
+    assert "search for further modes" in budget.unfinished
+
+
+class Slow(Endless):
+    """Twelve modes, each true, of which the search takes a hundredth of a second and the check nothing."""
+
+    def strongest(self, model, rejected):
+        return None if len(model) == 12 else super().strongest(model, rejected)
+
+    def suspects(self, model):
+        return ()
+
+
+def test_the_search_goes_on_in_the_time_that_the_check_of_each_mode_leaves():
+    budget = Budget(0.18)  # of which the search has six tenths before the first check
+    found = Stepwise(Slow(), 10_000, 2, 6, forgets=False, budget=budget, alone=True).select(())
+    assert len(found) == 12 and not budget.remarks
+
+
+def test_what_was_ended_early_says_when():
+    """A part that half of the time was for ends at half of it, not when all is spent."""
+    budget = Budget(0.1)
+    part = budget.share(0.5)
+    until = thread_time() + 0.06
+    while not part.spent("search"):
+        assert thread_time() < until
+    (remark,) = budget.remarks
+    seconds = float(remark.split()[2])
+    assert 0.05 <= seconds < 0.09 and "of the 0.1 s allowed, unfinished: search (ended at 50 % of it);" in remark

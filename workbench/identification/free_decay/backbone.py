@@ -12,7 +12,9 @@ record that begins with amplitude a_i; or each record has a pole or a backbone o
 was loaded before differ from test to test. The more parameters are paid for by Schwarz's criterion.
 
 The models are compared in the lines of the transform about the two. There modes elsewhere, found or not, leave but a
-polynomial of low degree, as z in Σ_t z^t e^-iωt = (1 - z^n) / (1 - z e^-iω) is far from e^iω.
+polynomial of low degree, as z in Σ_t z^t e^-iωt = (1 - z^n) / (1 - z e^-iω) is far from e^iω. So does what a sum over
+every D-th sample of a long record lacks, by Euler's and Maclaurin's formula: terms of the ends, derivatives of the
+motion times powers of D.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.fft import fft
+from scipy.fft import fft, rfft
 
 from workbench.arrays import Complexes, Floats
 from workbench.identification.signal.projection import project
@@ -46,6 +48,9 @@ class BackboneSettings:
     lines: float = 10.0  # and
     bandwidths: float = 4.0  # about the two, in which they are compared
     smooth: int = 4  # coefficients of the polynomial that modes elsewhere leave there
+    few: int = 1000  # samples, of more a motion is taken at every so many
+    turns: float = 0.25  # rad from the middle of the band to its end within a step, at most: 1e-8 of a sample is left
+    narrow: float = 0.1  # of the frequency, of a band in which the motion's mirror image is such a polynomial too
 
 
 BACKBONE = BackboneSettings()
@@ -100,7 +105,7 @@ class _Band:
     """The lines of a record about two modes, for as long as these last; without what is elsewhere.
 
     Attributes:
-        time: (n_samples,) s.
+        time: (n_times,) s, of the samples at which motions are taken: all, or every `step`-th.
         y: (2 n_lines,) real and imaginary parts of the lines, each of the noise that a sample has.
         amplitudes: (2,) complex, of the two.
         size: degrees of freedom of y.
@@ -109,27 +114,37 @@ class _Band:
 
     def __init__(self, record: Record, pair: Complexes, others: Complexes) -> None:
         record = while_it_lasts(record, pair, pair.size + others.size)
-        n, dt, y = record.n_samples, record.sample_time, record.outputs[0]
-        self.time: Floats = dt * np.arange(n, dtype=float)
+        dt = record.sample_time
+        half = band_about(pair, 2.0 * np.pi / (record.n_samples * dt))[1]
+        self.step = max(int(min(record.n_samples / BACKBONE.few, BACKBONE.turns / (half * dt))), 1)
+        if half > BACKBONE.narrow * float(pair.imag.min()):
+            self.step = 1
+        n = record.n_samples // self.step * self.step
+        y, time = record.outputs[0, :n], dt * np.arange(n, dtype=float)
+        self.time: Floats = time[:: self.step]
         middle, half = band_about(pair, 2.0 * np.pi / (n * dt))
         first, last = (int(np.ceil((middle + side * half) * n * dt / (2.0 * np.pi))) for side in (-1.0, 1.0))
         self.lines = np.arange(max(first, 1), max(min(last, (n + 1) // 2), 2))
         amplitudes = project(record, np.append(pair, others), True).complex_amplitudes[0]
         self.amplitudes = amplitudes[:2]
         within = np.abs(others.imag - middle) < half + np.abs(others.real)
-        elsewhere = (amplitudes[2:][~within] @ np.exp(np.outer(others[~within], self.time))).real
+        elsewhere = (amplitudes[2:][~within] @ np.exp(np.outer(others[~within], time))).real
         beside = np.hstack(self.seen(np.exp(np.outer(others[within], self.time))))
         smooth = np.linspace(-1.0, 1.0, self.lines.size)[:, None] ** np.arange(BACKBONE.smooth)
         beside = np.hstack([beside, np.kron(np.eye(2), smooth)])
         self.beside = np.linalg.qr(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300))[0]
-        self.y = self.apart(self.seen((y - elsewhere)[None])[0])[:, 0]
+        lines = rfft(y - elsewhere)[self.lines] / np.sqrt(0.5 * n)
+        self.y = self.apart(np.r_[lines.real, lines.imag])
         self.size = max(self.y.size - beside.shape[1], 1)
         self.round_off = FIT.round_off * float(y @ y) + 1e-300
 
     def seen(self, motions: np.ndarray) -> tuple[Floats, Floats]:
-        """The lines, (2 n_lines, n_motions), of the real and the imaginary parts of motions (n_motions, n_samples)."""
-        found = fft(motions, axis=1) / np.sqrt(0.5 * self.time.size)
-        one, other = found[:, self.lines].T, found[:, -self.lines].conj().T
+        """The lines, (2 n_lines, n_motions), of the real and the imaginary parts of motions (n_motions, n_times)."""
+        m = self.time.size
+        found = fft(motions, axis=1) * np.sqrt(self.step / (0.5 * m))
+        one, other = found[:, self.lines % m].T, np.zeros(())
+        if self.step == 1:
+            other = found[:, -self.lines].conj().T
         real, imaginary = 0.5 * (one + other), -0.5j * (one - other)
         return np.vstack([real.real, real.imag]), np.vstack([imaginary.real, imaginary.imag])
 
@@ -137,11 +152,11 @@ class _Band:
         return np.asarray(columns - self.beside @ (self.beside.T @ columns))
 
     def left(self, motions: Complexes, slopes: Complexes, which: Sequence[int]) -> tuple[Floats, Floats]:
-        """What motions (n_motions, n_samples) leave, A projected out (Kaufman 1975), and how that goes with unknowns.
+        """What motions (n_motions, n_times) leave, A projected out (Kaufman 1975), and how that goes with unknowns.
 
         Args:
             motions: complex, of free amplitudes A.
-            slopes: (n_unknowns, n_samples) of a motion by each unknown.
+            slopes: (n_unknowns, n_times) of a motion by each unknown.
             which: motion that each unknown is of.
         """
         if not (np.abs(slopes) < BACKBONE.largest).all():

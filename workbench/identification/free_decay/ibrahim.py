@@ -24,6 +24,7 @@ from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import normalised_shapes, time_derivatives
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, mac
+from workbench.threads import one_blas_thread
 
 LARGEST_MATRIX = 4_000_000  # entries
 
@@ -60,6 +61,7 @@ def two_delays(record: Record, *, first: int = 0, spacing: int = 1, columns: int
     return as_modes(mu, vectors[:m], record)
 
 
+@one_blas_thread
 def stacked_delays(
     records: Record | Sequence[Record], *, n_modes: int, delays: int | None = None, branch: int = 0
 ) -> SampledModes:
@@ -174,6 +176,7 @@ class StableModes:
     presence: np.ndarray
 
 
+@one_blas_thread
 def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], delays: int | None = None) -> Stabilisation:
     """Identify at several orders from one subspace.
 

@@ -30,7 +30,7 @@ from workbench.identification.free_decay.refinement import (
 )
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import Projection, forget_transforms, independent
-from workbench.identification.signal.searches import FALSE_ALARM, FIT, SELECTION, Budget, spurious_modes
+from workbench.identification.signal.searches import FALSE_ALARM, FIT, FURTHER, SELECTION, Budget, spurious_modes
 from workbench.records.record import Record
 from workbench.threads import cores
 
@@ -118,7 +118,7 @@ class _Search:
         for _ in range(LONG.most_rounds):
             before = self.poles.size
             # The first modes are worth the wait.
-            ended = fruitless >= LONG.most_fruitless or (before > 0 and self.budget.spent("search for further modes"))
+            ended = fruitless >= LONG.most_fruitless or (before > 0 and self.budget.spent(FURTHER))
             peaks = np.zeros(0) if ended else self.peaks()[: max(max_modes - before, 0)]
             if peaks.size:
                 self.take_in(peaks)

@@ -12,9 +12,11 @@ the strongest candidate is no stronger than the strongest of so many in noise.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
+from scipy.fft import rfft
 from scipy.stats import chi2
 
 from workbench.arrays import Complexes, Floats
@@ -166,7 +168,7 @@ def _selected(
     verdicts: "Verdicts",
 ) -> tuple["_FreeDecay", "_Model"]:
     problem = _FreeDecay(records, false_alarm, measured, budget, verdicts)
-    selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, forgets=False, budget=budget)
+    selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, False, budget, alone=True)
     model = selection.select(problem.nothing)
     problem.rejected = selection.rejected
     return problem, model
@@ -192,6 +194,13 @@ class _Model:
     poles: np.ndarray
     weights: np.ndarray
     residuals: list[np.ndarray]
+
+    @cached_property
+    def left(self) -> Floats:
+        """Mean power of what is left of the outputs of the first record, in units of their noise, at its lines."""
+        lines = rfft(self.residuals[0] * self.weights[0], axis=0)[1:]
+        power: Floats = (lines.real**2 + lines.imag**2).mean(axis=1)
+        return power
 
 
 class _FreeDecay:
@@ -414,7 +423,7 @@ class _FreeDecay:
     def _noise_ratio(self, model: _Model, pole: complex) -> float:
         """Noise about a frequency over its mean, where it is larger: median of the residual's spectrum, 1 if white."""
         grid = self.grids[0]
-        left = grid.power(model.residuals[0] * model.weights[0]).mean(axis=1)
+        left = model.left
         at = round((pole.imag - grid.lowest) / grid.bin_width)
         beside = left[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
         return max(1.0, float(np.median(beside)) / float(left.mean())) if beside.size else 1.0
@@ -456,10 +465,6 @@ class _Grid:
                 found.append((decay, float(decay @ decay), w, double, ends))
             self._sums[n] = found
         return self._sums[n]
-
-    def power(self, residual: np.ndarray) -> np.ndarray:
-        """Of a residual at each frequency, (n_frequencies, n_outputs)."""
-        return np.asarray(np.abs(np.fft.rfft(residual, axis=0)[1:]) ** 2)
 
     def near(self, pole: complex, bins: float) -> np.ndarray:
         """Frequencies within so many bins, or half as many rates of decay, of a pole's."""

@@ -122,11 +122,14 @@ def as_refined(
     variance = noise[:, :, None] ** 2 * np.ones(n) * (1.0 if noise_ratio is None else noise_ratio)
     derivative = time_derivatives(records[0].output_channels)
     shapes, shape_covariance = _mean_shapes(fits, derivative, covariance, variance)
+    if (np.diff(order) < 0).any():
+        shape_covariance = shape_covariance[order]
+    shape_covariance.setflags(write=False)  # not `frozen`, which copies: of thousands of outputs it fills the memory
     return Refined(
         modes=SampledModes.of_poles(poles[order], normalised_shapes(shapes)[:, order], records[0].positions),
         covariance=frozen((jacobian @ covariance @ jacobian.T)[np.ix_(both, both)]),
         amplitudes=tuple(frozen(fit.complex_amplitudes[:, order], complex) for fit in fits),
-        shape_covariance=frozen(shape_covariance[order]),
+        shape_covariance=shape_covariance,
         noise=frozen(noise),
         converged=bool(converged),
         steps=steps,
@@ -187,13 +190,18 @@ def _mean_shapes(
         weights = weights / weights.sum(axis=0)
         ratios = shapes[:, :, r] / shapes[:, k, r, None]
         mean[:, r] = (weights * ratios).sum(axis=0)
-        shared = np.zeros((len(derivative), 2 * n))
+        shared, own_noise, columns = np.zeros((len(derivative), 2 * n)), np.zeros(len(derivative)), []
         for fit, each, weight, ratio, noise in zip(fits, shapes, weights, ratios, variance[:, :, r], strict=True):
             moved = _by_poles(fit, r) @ root * to_displacement[:, r, None]
             shared += weight[:, None] * ((moved - ratio[:, None] * moved[k]) / each[k, r]).real
             unit = to_displacement[:, r] / each[k, r]
-            covariance[r] += np.outer(weight, weight) * _by_noise(fit, r, k, unit, ratio, noise)
-        covariance[r] += shared @ shared.T
+            common, own_part = _by_noise(fit, r, k, unit, ratio, noise)
+            columns.append(weight[:, None] * common)
+            own_noise += weight**2 * own_part
+        # of thousands of outputs the matrix fills the memory: it is made once
+        factor = np.hstack([shared, *columns])
+        np.matmul(factor, factor.T, out=covariance[r])
+        np.einsum("jj->j", covariance[r])[:] += own_noise
         covariance[r][k] = covariance[r][:, k] = 0.0
     return mean, covariance
 
@@ -207,12 +215,14 @@ def _by_poles(fit: Projection, r: int) -> np.ndarray:
     return np.vstack([cosine * alpha + sine * beta, sine * alpha - cosine * beta]).T
 
 
-def _by_noise(fit: Projection, r: int, k: int, unit: np.ndarray, ratio: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Covariance of the real parts by each output's own noise, (Φ^T Φ)^-1, and by that of the reference, poles held."""
+def _by_noise(
+    fit: Projection, r: int, k: int, unit: np.ndarray, ratio: np.ndarray, variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of the covariance of the real parts, poles held: a factor (n_outputs, 2) of what the reference's noise makes, and
+    the variance (n_outputs,) by each output's own, (Φ^T Φ)^-1."""
     pair = np.array([1.0, -1j]) @ symmetric_root(fit.spread[np.ix_([r, fit.poles.size + r], [r, fit.poles.size + r])])
     each = np.sqrt(variance)[:, None] * pair * unit[:, None]
-    common = (ratio[:, None] * each[k]).real
-    return np.asarray(common @ common.T + np.diag((each.real**2).sum(axis=1)))
+    return (ratio[:, None] * each[k]).real, (each.real**2).sum(axis=1)
 
 
 @one_blas_thread

@@ -243,13 +243,16 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
     copies: set[int] = set()
     for first in range(0, len(scaled), DATA.block):
         alike = scaled[first : first + DATA.block] @ scaled[first:].T / part.shape[1]
-        for i, j in (first + np.argwhere(np.triu(np.abs(alike) > 1.0 - 1e-6, 1))).tolist():
-            if i in copies or j in copies:
-                continue
-            noise = _innovation_std(scaled[i])
-            apart = np.sqrt(((scaled[i] - np.sign(alike[i - first, j - first]) * scaled[j]) ** 2).mean())
+        near = np.triu(np.abs(alike) > 1.0 - 1e-6, 1)
+        for row in np.flatnonzero(near.any(axis=1)).tolist():
+            i, others = first + row, np.flatnonzero(near[row])
+            others = others[~np.isin(first + others, list(copies))]
+            noise = 0.0 if i in copies or not others.size else _innovation_std(scaled[i])
             # Without noise, sensors of a single mode are the same but for scale.
-            if noise > DATA.noise_free and apart < DATA.copied * noise:
+            if noise <= DATA.noise_free:
+                continue
+            apart = scaled[i] - np.sign(alike[row, others])[:, None] * scaled[first + others]
+            for j in (first + others[np.sqrt((apart**2).mean(axis=1)) < DATA.copied * noise]).tolist():
                 copies.add(j)
                 yield DataFault(
                     "copied",

@@ -29,20 +29,23 @@ class HarmonicSettings:
 HARMONICS = HarmonicSettings()
 
 
-def harmonic_remarks(records: Sequence[Record], poles: Complexes, among: Sequence[int]) -> tuple[str, ...]:
+def harmonic_remarks(
+    records: Sequence[Record], poles: Complexes, among: Sequence[int], lasting: Sequence[int] = ()
+) -> tuple[str, ...]:
     """A remark on the modes about whose frequencies the motion of every record has an envelope that stays the same.
 
     Args:
         records: motion that is driven all along.
         poles: (n_modes,) rad/s.
         among: the modes that may be harmonic excitation, from 0.
+        lasting: of these, those that are known to go on as they are.
     """
     steady = list(among)
     for record in records if steady else ():
         about = record.outputs - record.outputs.mean(axis=1, keepdims=True)
         lines, power = np.fft.rfft(about), np.maximum((about**2).sum(axis=1), 1e-300)
         bin_width = 2.0 * np.pi / (record.n_samples * record.sample_time)
-        steady = [r for r in steady if _is_steady(lines, power, poles[r] / bin_width)]
+        steady = [r for r in steady if r in lasting or _is_steady(lines, power, poles[r] / bin_width)]
     if not steady:
         return ()
     modes = ", ".join(mode_text(r, abs(poles[r]) / (2.0 * np.pi)) for r in steady)

@@ -38,8 +38,10 @@ class ProjectionSettings:
     """Constants of projections and of what is said of their noise."""
 
     largest_factored: int = 300_000  # samples by modes up to which Φ is factored at once: 5 MB
+    longest_factored: int = 20_000  # samples, likewise: beyond, normal equations take a tenth of the time
     many: int = 1_000_000  # samples of a transform whose tables are not kept
-    part: int = 2048  # samples of a part of a longer record
+    part: int = 8192  # samples of a part of a longer record, whole blocks
+    block: int = 256  # samples of a block of a part
     died_away: float = 41.0  # nepers: e^-41 is below the last digit of 1
     summed: float = 1e-14  # round-off of squares that are a difference of sums over the record, as a share of these
     split: float = 0.05  # chance that records of one noise are each given their own, which costs little
@@ -95,10 +97,7 @@ class Projection:
     @cached_property
     def residual(self) -> np.ndarray:
         """(n_samples, n_outputs); of a long record computed only on demand."""
-        exponentials = _Exponentials(self.record, self.poles)
-        left = np.empty((self.record.n_samples, self.record.n_outputs))
-        for part, rows, phi, y in exponentials.parts():
-            np.subtract(y, phi @ self.coefficients[rows], out=left[part])
+        left = self.record.outputs.T - _Exponentials(self.record, self.poles).motion(self.complex_amplitudes)
         if len(self.coefficients) > 2 * self.poles.size:
             left -= self.coefficients[-1]
         return left
@@ -116,7 +115,8 @@ def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
     Raises:
         numpy.linalg.LinAlgError: two of them cannot be distinguished.
     """
-    if record.n_samples * poles.size > PROJECTION.largest_factored:
+    n = record.n_samples
+    if n > PROJECTION.longest_factored or n * poles.size > PROJECTION.largest_factored:
         return _project_by_parts(record, poles, offset)
     tau = record.sample_time * np.arange(record.n_samples)
     phi = _columns(_exponentials(record.n_samples, record.sample_time, poles))
@@ -184,12 +184,7 @@ def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projec
     They square the condition number, which long records of many modes can afford: their length separates the modes.
     """
     whole, tilted, doubly = _grams(poles, record, offset)
-    seen, t_seen = np.zeros((2, 2 * poles.size, record.n_outputs))
-    exponentials = _Exponentials(record, poles)
-    for part, rows, phi, y in exponentials.parts():
-        along = phi.T @ y
-        seen[rows] += along
-        t_seen[rows] += part.start * record.sample_time * along + (exponentials.tau[: len(phi), None] * phi).T @ y
+    seen, t_seen = _Exponentials(record, poles).sums()
     if offset:
         seen = np.vstack([seen, record.outputs.sum(axis=1)])
     power = np.einsum("jt,jt->j", record.outputs, record.outputs)
@@ -209,7 +204,10 @@ def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projec
 
 
 class _Exponentials:
-    """The columns Φ of a record part by part, without the exponentials that have decayed."""
+    """e^{λt} of a record without those that have decayed: of the sample τ of a block from T on, e^{λT} e^{λτ}.
+
+    Sums over the samples are thus products of the outputs, a row a block, with one table of e^{λτ}.
+    """
 
     def __init__(self, record: Record, poles: np.ndarray) -> None:
         self.record, self.dt = record, record.sample_time
@@ -217,17 +215,44 @@ class _Exponentials:
         self.order = np.argsort(-poles.real)
         self.slow = poles[self.order]
         self.lives = PROJECTION.died_away / np.maximum(-self.slow.real, 1e-300)
-        self.tau = self.dt * np.arange(min(PROJECTION.part, record.n_samples))
-        self.begin = _exponentials(self.tau.size, self.dt, self.slow)
+        self.tau = self.dt * np.arange(PROJECTION.block)
+        self.near = np.exp(np.outer(self.tau, self.slow))
 
-    def parts(self) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
-        """Samples, rows of the exponentials left, their columns of Φ, and the outputs, (n_part, n_outputs)."""
-        for first in range(0, self.record.n_samples, PROJECTION.part):
-            part = slice(first, min(first + PROJECTION.part, self.record.n_samples))
+    def _parts(self) -> Iterator[tuple[slice, Floats, Complexes]]:
+        """Samples, where their blocks begin, s, and e^{λT} there of the exponentials left, (n_blocks, n_left)."""
+        n = self.record.n_samples
+        for first in range(0, n, PROJECTION.part):
+            part = slice(first, min(first + PROJECTION.part, n))
             alive = int(np.searchsorted(-self.lives, -first * self.dt, side="right"))
-            rows = np.r_[self.order[:alive], self.order.size + self.order[:alive]]
-            exponentials = self.begin[: part.stop - first, :alive] * np.exp(first * self.dt * self.slow[:alive])
-            yield part, rows, _columns(exponentials), self.record.outputs[:, part].T
+            if not alive:
+                return
+            begin: Floats = self.dt * np.arange(first, part.stop, PROJECTION.block, dtype=float)
+            yield part, begin, np.exp(np.outer(begin, self.slow[:alive]))
+
+    def sums(self) -> tuple[Floats, Floats]:
+        """Φᵀy and (tΦ)ᵀy, (2 n_modes, n_outputs) each."""
+        found = np.zeros((2, self.order.size, self.record.n_outputs), complex)
+        for part, begin, far in self._parts():
+            y = self.record.outputs[:, part]
+            y = np.pad(y, ((0, 0), (0, begin.size * self.tau.size - y.shape[1]))).reshape(-1, self.tau.size)
+            near = self.near[:, : far.shape[1]]
+            both = np.hstack([near, self.tau[:, None] * near])
+            inner = (y @ both.view(float)).view(complex).reshape(-1, begin.size, 2, far.shape[1])
+            level, rising = inner[:, :, 0], inner[:, :, 1] + begin[:, None] * inner[:, :, 0]
+            for total, each in zip(found, (level, rising), strict=True):
+                total[self.order[: far.shape[1]]] += np.einsum("jbr,br->rj", each, far)
+        return np.concatenate([found[0].real, found[0].imag]), np.concatenate([found[1].real, found[1].imag])
+
+    def motion(self, amplitudes: Complexes) -> Floats:
+        """Re Σ_r a_jr e^{λ_r t} of amplitudes (n_outputs, n_modes), (n_samples, n_outputs)."""
+        found = np.zeros((self.record.n_samples, len(amplitudes)))
+        for part, _, far in self._parts():
+            alive = far.shape[1]
+            turned = (amplitudes[:, None, self.order[:alive]] * far).reshape(-1, alive)
+            near = self.near[:, :alive]
+            moved = turned.real @ near.real.T - turned.imag @ near.imag.T
+            found[part] = moved.reshape(len(amplitudes), -1)[:, : part.stop - part.start].T
+        return found
 
 
 def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | None:
@@ -337,7 +362,7 @@ def disturbed(shared: Floats, amplitudes: np.ndarray) -> Floats:
         shared: C (n_outputs, n_outputs).
         amplitudes: a (n_outputs, n_modes), over the noise of each output.
     """
-    if not np.triu(shared, 1).any():
+    if not _share(shared):
         return np.ones(amplitudes.shape[1])
     ratio: Floats = (amplitudes.conj() * (shared @ amplitudes)).sum(axis=0).real / (np.abs(amplitudes) ** 2).sum(axis=0)
     return ratio
@@ -345,7 +370,12 @@ def disturbed(shared: Floats, amplitudes: np.ndarray) -> Floats:
 
 def mixing_of(shared: Floats) -> Floats | None:
     """Combinations (n_outputs, n_outputs) of outputs, over their noise, that make it independent; None where it is."""
-    return np.linalg.inv(np.linalg.cholesky(shared)) if np.triu(shared, 1).any() else None
+    return np.linalg.inv(np.linalg.cholesky(shared)) if _share(shared) else None
+
+
+def _share(shared: Floats) -> bool:
+    """Whether a correlation is not the identity."""
+    return bool(np.count_nonzero(shared) > len(shared))
 
 
 def independent(records: Sequence[Record], left: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:

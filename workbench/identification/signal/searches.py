@@ -27,6 +27,8 @@ from workbench.structure.modes import mac
 
 State = TypeVar("State")
 SECONDS = 30.0  # of processor time
+WHOLE = 0.995  # of the time: as good as all
+FURTHER = "search for further modes"
 STOPPED = "stopped after"  # as the remark of a search begins that the time was up for
 # Chance that a record of nothing but noise yields a mode.
 FALSE_ALARM = 1e-3
@@ -77,13 +79,13 @@ class Budget(Deadline):
 
     Attributes:
         progress: called as the searches go on.
-        unfinished: the searches that were ended early, each once.
+        unfinished: the searches that were ended early, each with the share of the whole time that had passed then.
     """
 
     def __init__(self, seconds: float | None = None, progress: Progress | None = None) -> None:
         super().__init__(seconds)
         self.progress, self._whole = progress, self._end
-        self.unfinished: list[str] = []
+        self.unfinished: dict[str, float] = {}
 
     def spent(self, search: str) -> bool:
         """Whether the time is up; the search that asks is then noted as unfinished."""
@@ -91,8 +93,7 @@ class Budget(Deadline):
             self.progress(search, min((self._now - self._begun) / (self._whole - self._begun), 1.0))
         if not self.is_past:
             return False
-        if search not in self.unfinished:
-            self.unfinished.append(search)
+        self.unfinished.setdefault(search, (self._end - self._begun) / (self._whole - self._begun))
         return True
 
     def share(self, share: float) -> "Budget":
@@ -110,8 +111,14 @@ class Budget(Deadline):
         """What was left undone, in one sentence; empty where all was finished."""
         if not self.unfinished:
             return ()
-        what = ", ".join(self.unfinished)
-        return (f"{STOPPED} {self.seconds:g} s, unfinished: {what}; allow more time by `seconds`",)
+        each = (
+            f"{what} (ended at {100.0 * share:.0f} % of it)" if share < WHOLE else what
+            for what, share in self.unfinished.items()
+        )
+        return (
+            f"{STOPPED} {self._now - self._begun:.2g} s of the {self.seconds:g} s allowed, unfinished:"
+            f" {', '.join(each)}; allow more time by `seconds`",
+        )
 
 
 @dataclass(frozen=True)
@@ -300,8 +307,10 @@ class Stepwise(Generic[Model, Candidate]):
         most_splits: candidates that split a mode before the search ends; None where they count as weak ones.
         forgets: whether a rejected candidate may be tried again once another mode has entered.
         budget: of time.
+        alone: whether all of that is for this search; other things follow unless given.
         rejected: poles tried and rejected, with their gain.
         full: whether the search stopped at the most modes.
+        cut_short: whether the last search forward ended because its time was up.
     """
 
     problem: Selection[Model, Candidate]
@@ -310,8 +319,10 @@ class Stepwise(Generic[Model, Candidate]):
     most_splits: int | None
     forgets: bool
     budget: Budget = field(default_factory=Budget)
+    alone: bool = False
     rejected: list[tuple[complex, float]] = field(default_factory=list)
     full: bool = False
+    cut_short: bool = False
 
     def select(self, model: Model) -> Model:
         """The modes of a measurement, from those of a model on."""
@@ -324,6 +335,9 @@ class Stepwise(Generic[Model, Candidate]):
                 break
             model = self.backward(self.problem.settled(grown))
             left = self.problem.n_modes(model)
+            # What the check of each mode has left of the time is for the search that had a share of it.
+            if self.cut_short and self.alone and not self.budget.is_past:
+                continue
             # With nothing remembered the next round would only repeat this one.
             if left == most or (self.forgets and left <= before):
                 break
@@ -333,6 +347,9 @@ class Stepwise(Generic[Model, Candidate]):
         """With every candidate that the likelihood asks for."""
         weak = splits = 0
         growing = self.budget.share(SELECTION.growing)
+        if self.cut_short:
+            self.budget.unfinished.pop(FURTHER, None)
+            self.cut_short = False
         if self.forgets:
             self.rejected.clear()
         while (
@@ -340,7 +357,7 @@ class Stepwise(Generic[Model, Candidate]):
             and weak < self.most_weak
             and (self.most_splits is None or splits < self.most_splits)
             # The first mode is worth the wait.
-            and not (self.problem.n_modes(model) and growing.spent("search for further modes"))
+            and not (self.problem.n_modes(model) and self._ends(growing))
         ):
             candidate = self.problem.strongest(model, self.rejected)
             if candidate is None:
@@ -363,6 +380,11 @@ class Stepwise(Generic[Model, Candidate]):
                 continue
             self.rejected.append((complex(pole), gain))
         return model
+
+    def _ends(self, growing: Budget) -> bool:
+        """Whether the time of the search for further modes is up; noted, as there may be more once it is not."""
+        self.cut_short = growing.spent(FURTHER)
+        return self.cut_short
 
     def backward(self, model: Model) -> Model:
         """Without the modes that the likelihood does not miss."""

@@ -13,7 +13,7 @@ from scipy.signal import find_peaks
 from workbench.draw.plot import plot
 from workbench.draw.spectra import SEGMENTS, plot_frf, plot_spectra, plot_transfer, power_spectrum
 from workbench.identification.free_decay.preparation import decay_start
-from workbench.identification.signal.data_quality import data_faults, input_faults
+from workbench.identification.signal.data_quality import DataFault, data_faults, input_faults
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.study.pages.page import PageContent, block
@@ -25,6 +25,7 @@ FALLING = 6  # tenths, each quieter than the one before: by chance in one statio
 PEAKS = 4  # shown of each channel
 PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of its surroundings; these as a part of the lines
 MOST_ROWS = 100  # of the table
+MOST_FAULTS = 24  # said one by one; of more of a kind, only how many there are
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def _record(record: Record, path: Path) -> Look:
         f"{outputs} output{'s' * (outputs != 1)} and {inputs} input{'s' * (inputs != 1)}, {record.n_samples} samples at"
         f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
     )
-    remarks = [*record.remarks, *(fault.message for fault in (*faults, *input_faults(record)))]
+    remarks = [*record.remarks, *_said([*faults, *input_faults(record)])]
     if len(channels) > MOST_ROWS:
         remarks.append(f"the first {MOST_ROWS} of {len(channels)} channels are shown")
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
@@ -110,6 +111,17 @@ def _record(record: Record, path: Path) -> Look:
         made_by=f"workbench look {path}",
     )
     return Look(heading, rows, tuple(remarks), _command(path, options), page_content)
+
+
+def _said(faults: Sequence[DataFault]) -> list[str]:
+    """The messages of faults, of many of a kind the first and the number of the others."""
+    said = []
+    for kind in dict.fromkeys(fault.kind for fault in faults):
+        each = [fault for fault in faults if fault.kind == kind]
+        said += [fault.message for fault in each[:MOST_FAULTS]]
+        if len(each) > MOST_FAULTS:
+            said.append(f"{len(each) - MOST_FAULTS} more channels are {kind}")
+    return said
 
 
 def _with_inputs(record: Record, names: Sequence[str]) -> Record:
