@@ -49,6 +49,35 @@ def test_sums_of_powers(n):
         assert np.allclose(found, terms.sum(axis=1), rtol=0, atol=1e-12 * np.abs(terms).sum(axis=1).max())
 
 
+@pytest.mark.parametrize("n", [7, 150, 3001])
+@pytest.mark.parametrize("offset", [True, False])
+def test_projection_is_least_squares_of_all_samples(truth, n, offset):
+    record = free_decay(truth, sample_time=0.5, n_samples=n, noise_std=0.1)
+    poles = truth.poles[1::2] if n > 7 else truth.poles[:0]
+    time = 0.5 * np.arange(n)[:, None]
+    phi = np.hstack([np.exp(time * poles).real, np.exp(time * poles).imag])
+    columns = np.hstack([phi, np.ones((n, int(offset)))])
+    c = np.linalg.lstsq(columns, record.outputs.T, rcond=None)[0]
+    left = record.outputs.T - columns @ c
+    tilt = np.linalg.lstsq(columns, time * phi, rcond=None)[0]
+    rest = time * phi - columns @ tilt
+    found = project(record, poles, offset)
+    expected = {"residual": left, "squares": (left**2).sum(axis=0), "coefficients": c, "tilt": tilt}
+    expected |= {"gram": rest.T @ rest, "slopes": (time * phi).T @ left, "spread": np.linalg.inv(columns.T @ columns)}
+    for name, exact in expected.items():
+        assert np.allclose(getattr(found, name), exact, rtol=0, atol=1e-10 * np.abs(exact).max(initial=1.0)), name
+
+
+def test_projection_holds_no_table_of_all_samples(truth):
+    record = free_decay(truth, sample_time=0.5, n_samples=20_000, noise_std=0.1)
+    tracemalloc.start()
+    project(record, truth.poles, True)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # Five modes are eleven columns; twice the record is the residual and its making.
+    assert peak < 5 * record.outputs.nbytes
+
+
 @pytest.mark.parametrize("offset", [True, False])
 def test_projection_by_parts_is_the_same(truth, monkeypatch, offset):
     record = free_decay(truth, sample_time=0.5, n_samples=3000, noise_std=0.1)

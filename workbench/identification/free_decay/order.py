@@ -27,7 +27,7 @@ from workbench.identification.free_decay.preparation import decay_start
 from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors, steps
 from workbench.identification.signal.modal_estimates import Identified
-from workbench.identification.signal.projection import differ, project, variances, whitened
+from workbench.identification.signal.projection import Projection, differ, project, variances, whitened
 from workbench.identification.signal.searches import (
     FALSE_ALARM,
     FIT,
@@ -188,12 +188,17 @@ class _Model:
     Attributes:
         poles: (n_modes,) rad/s.
         weights: (n_records, n_outputs) 1 / noise.
-        residuals: one (n_samples, n_outputs) a record.
+        fits: projections of the records on these.
     """
 
     poles: np.ndarray
     weights: np.ndarray
-    residuals: list[np.ndarray]
+    fits: list[Projection]
+
+    @property
+    def residuals(self) -> list[Floats]:
+        """One (n_samples, n_outputs) a record."""
+        return [fit.residual for fit in self.fits]
 
     @cached_property
     def left(self) -> Floats:
@@ -284,7 +289,7 @@ class _FreeDecay:
     def splits(self, model: _Model, trial: _Model) -> bool:
         # One that splits another already, on its way or to be left out, is not the new one's fault; nor is one that
         # stays where it is, away from the new one, and only now is found to split another.
-        before, after = (self._spurious(poles, model) for poles in (model.poles, trial.poles))
+        before, after = (self._spurious(each, model) for each in (model, trial))
         old, new, width = trial.poles[:-1], trial.poles[-1], self.grids[0].bin_width
         band = np.abs(old.real) + width
         stays = np.abs(old - model.poles) < band
@@ -311,13 +316,13 @@ class _FreeDecay:
         with suppress(np.linalg.LinAlgError):
             spurious = np.zeros(0, bool)
             trial = self.fitted(np.append(model.poles, found), model.weights, DECIDES)
-            while trial.poles.size > n and (spurious := self._spurious(trial.poles, trial)).any():
+            while trial.poles.size > n and (spurious := self._spurious(trial, trial)).any():
                 trial = self.fitted(trial.poles[~spurious], trial.weights, DECIDES)
         return trial if trial.poles.size > n else model
 
     def suspects(self, model: _Model) -> Iterator[tuple[complex, _Model, bool]]:
         """The weakest that is spurious, or else the modes whose amplitudes are weak or that stand close to another."""
-        statistic, spurious = self.statistic(model), self._spurious(model.poles, model)
+        statistic, spurious = self.statistic(model), self._spurious(model, model)
         if spurious.any():
             r = int(np.argmin(np.where(spurious, statistic, np.inf)))
             yield complex(model.poles[r]), self._without(model, r), True
@@ -340,9 +345,8 @@ class _FreeDecay:
 
     def statistic(self, model: _Model) -> np.ndarray:
         """χ² of each mode's amplitudes, poles held, (n_modes,)."""
-        fits = [project(record, model.poles, True) for record in self.records]
         n, strength = model.poles.size, np.zeros(model.poles.size)
-        for fit, weights in zip(fits, model.weights, strict=True):
+        for fit, weights in zip(model.fits, model.weights, strict=True):
             for r in range(n):
                 both = [r, n + r]
                 a = fit.coefficients[both] * weights
@@ -353,14 +357,14 @@ class _FreeDecay:
         """The modes refined in the records as measured: filters cost the first samples, the strongest."""
         poles = model.poles
         if self.budget.unfinished:  # perhaps before each mode was checked
-            spurious = self._spurious(poles, model)
+            spurious = self._spurious(model, model)
             poles = poles[~spurious] if not spurious.all() else poles
             self.rejected += [(complex(pole), 0.0) for pole in model.poles if pole not in poles]
         refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
         while (lost := self._lost(poles, refined.modes.poles)).any() and not lost.all():
             poles = poles[~lost]
             refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
-        statistic = self.statistic(replace(model, poles=poles))[np.argsort(np.abs(poles))]
+        statistic = self.statistic(replace(model, poles=poles, fits=self._projected(poles)))[np.argsort(np.abs(poles))]
         found = identified(in_coloured_noise(refined, records), statistic, self.limit, self.rejected, records[0])
         return replace(found, remarks=self.budget.remarks)
 
@@ -379,20 +383,22 @@ class _FreeDecay:
     def fitted(self, poles: np.ndarray, weights: np.ndarray, how: Mapping[str, Any] = FULLY) -> _Model:
         """Poles after a search, sensors then weighted by the noise found in each record."""
         if poles.size == 0:
-            residuals = [grid.nothing for grid in self.grids]
+            fits = self._projected(poles)
         else:
             poles, fits, *_ = search(self.records, poles, weights, True, budget=self.budget, **how)
-            residuals = [fit.residual for fit in fits]
-        n = np.array([r.shape[0] for r in residuals])
-        return _Model(poles, 1.0 / np.sqrt(variances(np.maximum(_squares(residuals), self.round_off), n)), residuals)
+        n, squares = np.array([r.n_samples for r in self.records]), _squares([fit.residual for fit in fits])
+        return _Model(poles, 1.0 / np.sqrt(variances(np.maximum(squares, self.round_off), n)), fits)
+
+    def _projected(self, poles: np.ndarray) -> list[Projection]:
+        return [project(record, poles, True) for record in self.records]
 
     def _without(self, model: _Model, r: int) -> _Model:
         return self.fitted(np.delete(model.poles, r), model.weights, DECIDES)
 
-    def _spurious(self, poles: np.ndarray, model: _Model) -> np.ndarray:
-        """Which of some poles are spurious, in the noise that a model leaves."""
-        fits = [project(record, poles, True) for record in self.records]
-        shapes = np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(fits, model.weights, strict=True)])
+    def _spurious(self, of: _Model, model: _Model) -> np.ndarray:
+        """Which modes of one model are spurious, in the noise that another leaves."""
+        poles = of.poles
+        shapes = np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(of.fits, model.weights, strict=True)])
         strength = np.linalg.norm(shapes, axis=0)
         if self.records[0].n_outputs == 1:  # the modes of one sensor have no shape, in however many records
             shapes = strength[None]

@@ -37,8 +37,8 @@ from workbench.records.record import Record
 class ProjectionSettings:
     """Constants of projections and of what is said of their noise."""
 
-    largest_factored: int = 300_000  # samples by modes up to which Φ is factored at once: 5 MB
-    longest_factored: int = 20_000  # samples, likewise: beyond, normal equations take a tenth of the time
+    largest_factored: int = 300_000  # samples by modes up to which Φ is factored, block by block
+    longest_factored: int = 20_000  # samples, likewise: beyond, normal equations take less time
     many: int = 1_000_000  # samples of a transform whose tables are not kept
     part: int = 8192  # samples of a part of a longer record, whole blocks
     block: int = 256  # samples of a block of a part
@@ -118,21 +118,60 @@ def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
     n = record.n_samples
     if n > PROJECTION.longest_factored or n * poles.size > PROJECTION.largest_factored:
         return _project_by_parts(record, poles, offset)
-    tau = record.sample_time * np.arange(record.n_samples)
-    phi = _columns(_exponentials(record.n_samples, record.sample_time, poles))
-    t_phi = tau[:, None] * phi
-    columns = np.hstack([phi, np.ones((len(phi), 1))]) if offset else phi
+    rows = _Rows(record, poles)
+    columns = np.hstack([rows.phi, rows.level[:, None]]) if offset else rows.phi
     q, r = qr(columns, mode="economic", check_finite=False)
-    y = record.outputs.T
-    qy = q.T @ y
-    residual = y - q @ qy
-    q_t = q.T @ t_phi
-    rest = t_phi - q @ q_t
+    qy = q.T @ rows.y
+    fitted = q @ qy
+    q_t = q.T @ rows.t_phi
+    rest = rows.t_phi - q @ q_t
     inverse = solve_triangular(r, np.eye(r.shape[0]))
-    squares, gram, slopes = (residual**2).sum(axis=0), rest.T @ rest, t_phi.T @ residual
+    residual = record.outputs.T - rows.over_time(fitted)
+    squares, gram, slopes = (residual**2).sum(axis=0), rest.T @ rest, rows.t_phi.T @ (rows.y - fitted)
     fit = Projection(record, poles, squares, 0.0, inverse @ qy, gram, slopes, inverse @ inverse.T, inverse @ q_t)
     fit.__dict__["residual"] = residual
     return fit
+
+
+class _Rows:
+    """Φ, tΦ, a constant and y in fewer rows, of the same products: of each block of the record, its part along Q.
+
+    The exponentials of a block from T on are e^{λT} e^{λτ}: in all blocks they lie in the span of one table,
+    [e^{λτ}, τ e^{λτ}, 1] = Q R. What of y is across Q has no product with any column.
+
+    Attributes:
+        phi, t_phi: (n_rows, 2 n_modes).
+        level: (n_rows,) of the constant.
+        y: (n_rows, n_outputs).
+    """
+
+    def __init__(self, record: Record, poles: np.ndarray) -> None:
+        n, k, dt, y = record.n_samples, poles.size, record.sample_time, record.outputs
+        # The table of a block and what is left of all blocks then take as long to factor.
+        self.blocks = max(int(np.sqrt(2.0 * n / (4 * k + 1))), 1)
+        size = n // self.blocks
+        self.whole = size * self.blocks
+        tau, begin = dt * np.arange(size), dt * size * np.arange(self.blocks)
+        near = _columns(_exponentials(size, dt, poles))
+        table = np.hstack([near, tau[:, None] * near, np.ones((size, 1))])
+        self.q, r = qr(table, mode="economic", check_finite=False)
+        # Samples after the last whole block are rows as they are.
+        last = dt * np.arange(self.whole, n)
+        far = np.exp(np.outer(begin, poles))[:, None]
+        once = far * (r[:, :k] + 1j * r[:, k : 2 * k])
+        tilted = begin[:, None, None] * once + far * (r[:, 2 * k : 3 * k] + 1j * r[:, 3 * k : 4 * k])
+        ends = np.exp(np.outer(last, poles))
+        self.phi = _columns(np.vstack([once.reshape(self.blocks * len(r), k), ends]))
+        self.t_phi = _columns(np.vstack([tilted.reshape(self.blocks * len(r), k), last[:, None] * ends]))
+        self.level = np.r_[np.tile(r[:, -1], self.blocks), np.ones(last.size)]
+        along = y[:, : self.whole].reshape(len(y), self.blocks, size) @ self.q
+        self.y = np.vstack([along.reshape(len(y), -1).T, y[:, self.whole :].T])
+
+    def over_time(self, rows: Floats) -> Floats:
+        """The samples (n_samples, n_outputs) of combinations of the columns, given in these rows."""
+        m, inside = rows.shape[1], self.blocks * self.q.shape[1]
+        blocks = rows[:inside].T.reshape(m, self.blocks, -1) @ self.q.T
+        return np.vstack([blocks.reshape(m, -1).T, rows[inside:]])
 
 
 def power_sums(w: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
