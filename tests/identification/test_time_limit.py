@@ -89,7 +89,9 @@ def test_what_cannot_be_a_mode():
 
 def test_artefacts_join_the_noise():
     covariance = np.diag([1e-4, 900.0, 1e-6, 1e-6])
-    refined = Refined(MODES, covariance**2, (np.ones((2, 2)),), np.zeros((2, 2, 2)), np.ones((1, 2)), True, 3)
+    refined = Refined(
+        MODES, covariance**2, (np.ones((2, 2)),), np.zeros((2, 2, 1)), np.zeros((2, 2)), np.ones((1, 2)), True, 3
+    )
     none = SampledModes(np.zeros(0), np.zeros(0), np.zeros((2, 0)), MODES.positions)
     found = Identified(refined, np.array([90.0, 40.0]), 30.0, none, np.zeros(0)).without_artefacts(300.0)
     assert found.modes.omega.tolist() == [20.0] and found.noise_modes.omega.tolist() == [50.0]

@@ -156,7 +156,7 @@ def ring_down(
         found.noise_modes,
         found.noise_statistic,
         found.threshold,
-        amplitude_dependence(cut, found.refined),
+        amplitude_dependence(cut, found.refined, budget=budget),
         proportional_fit(found.refined, sure) if len(sure) > 1 else None,
         (
             *notes,

@@ -337,7 +337,7 @@ def _modes_of(
     damped_hz = fit.poles.imag / (2.0 * np.pi)
     noise_ratio = np.tile(lines.noise_ratio_near(fit), (len(channels), 1))
     stated = lines.weights is not None and not lines.guessed
-    shared = np.eye(len(channels)) if stated else correlation_of_lines([lines.left(fit).reshape(len(channels), -1)])
+    shared = None if stated else correlation_of_lines([lines.left(fit).reshape(len(channels), -1)])
     covariance = pole_covariance(fit, noise_ratio * disturbed(shared, fit.amplitudes / fit.noise[:, None]))
     sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < TRANSFER.unsure * np.abs(fit.poles)
     sure &= fit.poles.real < SURE * np.sqrt(np.diag(covariance)[fit.poles.size :]) * np.abs(fit.poles)

@@ -221,7 +221,7 @@ def test_exponentials_that_round_off_makes_alike_are_refused():
 @pytest.mark.parametrize(("m", "n"), [(4, 80), (4, 200), (20, 1000), (60, 3000), (200, 2000)])
 def test_independent_noise_is_not_said_to_be_shared(m, n):
     for seed in range(5):
-        assert (correlation([np.random.default_rng(seed).standard_normal((m, n))]) == np.eye(m)).all()
+        assert correlation([np.random.default_rng(seed).standard_normal((m, n))]) is None
 
 
 def test_the_correlation_of_noise_beside_modes_that_are_not_found_yet():

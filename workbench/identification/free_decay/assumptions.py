@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine
 from workbench.identification.signal.data_quality import dropouts, steps
 from workbench.identification.signal.modal_estimates import Refined
+from workbench.identification.signal.searches import Budget
 from workbench.records.record import Record, as_records
 from workbench.renamed import Renamed
 from workbench.structure.damping import ProportionalDamping
@@ -84,7 +85,11 @@ class AmplitudeDependence:
 
 @one_blas_thread
 def amplitude_dependence(
-    records: Record | Sequence[Record], refined: Refined, *, stretches: int = ASSUMPTIONS.segments
+    records: Record | Sequence[Record],
+    refined: Refined,
+    *,
+    stretches: int = ASSUMPTIONS.segments,
+    budget: Budget | None = None,
 ) -> AmplitudeDependence:
     """Frequency and damping of each mode of free decays, stretch by stretch.
 
@@ -92,6 +97,7 @@ def amplitude_dependence(
         records: the free decays that `refined` was found in.
         refined: their modes.
         stretches: how many of each record, each twice as long as the one before.
+        budget: of time, after which no further stretch is looked at; none unless given.
 
     Raises:
         ValueError: fewer than two stretches.
@@ -100,7 +106,8 @@ def amplitude_dependence(
         raise ValueError(f"amplitudes are compared over two stretches or more; got {stretches}")
     records = as_records(records)
     each = zip(records, refined.amplitudes, refined.noise, strict=True)
-    values = [_segments(record, refined, np.abs(a), noise, stretches) for record, a, noise in each]
+    budget = Budget() if budget is None else budget
+    values = [_segments(record, refined, np.abs(a), noise, stretches, budget) for record, a, noise in each]
     start = np.concatenate([each[0] for each in values])
     amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in values]))
     alike = np.stack(
@@ -116,7 +123,7 @@ def amplitude_dependence(
 
 
 def _segments(
-    record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int
+    record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int, budget: Budget
 ) -> tuple[np.ndarray, np.ndarray]:
     """Starts (n_stretches,), and (5, n_stretches, n_modes) of amplitude, ω and its error, ζ and its error."""
     modes = refined.modes
@@ -141,8 +148,10 @@ def _segments(
         stretch = record.between(begins, ends)
         if (stretch.outputs.std(axis=1) < coarse).any():  # what rounding leaves of so little is not the motion
             continue
+        if budget.spent("comparison of modes by amplitude"):
+            break
         try:
-            found = in_coloured_noise(refine(stretch, modes.select(list(there)), offset=True), stretch)
+            found = in_coloured_noise(refine(stretch, modes.select(list(there)), offset=True, budget=budget), stretch)
         except np.linalg.LinAlgError:
             continue
         if not found.converged:

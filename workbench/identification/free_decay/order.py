@@ -33,6 +33,7 @@ from workbench.identification.signal.searches import (
     FIT,
     SECONDS,
     SELECTION,
+    STOPPED,
     Budget,
     Progress,
     Stepwise,
@@ -104,10 +105,13 @@ def identify(
     """
     check_count("max_modes", max_modes)
     records = of_same_sensors(records)
-    found = identify_within(records, Budget(seconds, progress), max_modes=max_modes, false_alarm=false_alarm)
+    budget = Budget(seconds, progress)
+    found = identify_within(records, budget, max_modes=max_modes, false_alarm=false_alarm)
     found = found.without_artefacts(np.pi / records[0].sample_time)
     begun = tuple(remark for record in records for remark in _begins_later(record))
-    return replace(found, remarks=(*begun, *found.remarks, *amplitude_dependence(records, found.refined).remarks))
+    by_amplitude = amplitude_dependence(records, found.refined, budget=budget)
+    said = tuple(remark for remark in found.remarks if not remark.startswith(STOPPED))
+    return replace(found, remarks=(*begun, *said, *budget.remarks, *by_amplitude.remarks))
 
 
 def _begins_later(record: Record) -> tuple[str, ...]:

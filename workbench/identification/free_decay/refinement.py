@@ -121,15 +121,13 @@ def as_refined(
     both = np.r_[order, order + n]
     variance = noise[:, :, None] ** 2 * np.ones(n) * (1.0 if noise_ratio is None else noise_ratio)
     derivative = time_derivatives(records[0].output_channels)
-    shapes, shape_covariance = _mean_shapes(fits, derivative, covariance, variance)
-    if (np.diff(order) < 0).any():
-        shape_covariance = shape_covariance[order]
-    shape_covariance.setflags(write=False)  # not `frozen`, which copies: of thousands of outputs it fills the memory
+    shapes, shape_factor, shape_variance = _mean_shapes(fits, derivative, covariance, variance)
     return Refined(
         modes=SampledModes.of_poles(poles[order], normalised_shapes(shapes)[:, order], records[0].positions),
         covariance=frozen((jacobian @ covariance @ jacobian.T)[np.ix_(both, both)]),
         amplitudes=tuple(frozen(fit.complex_amplitudes[:, order], complex) for fit in fits),
-        shape_covariance=shape_covariance,
+        shape_factor=frozen(shape_factor[order]),
+        shape_variance=frozen(shape_variance[order]),
         noise=frozen(noise),
         converged=bool(converged),
         steps=steps,
@@ -161,9 +159,10 @@ def normal_equations(
 
 def _mean_shapes(
     fits: Sequence[Projection], derivative: np.ndarray, pole_covariance: np.ndarray, variance: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Shapes relative to their largest entry, (n_outputs, n_modes) complex, and the covariance of their real parts,
-    (n_modes, n_outputs, n_outputs).
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shapes relative to their largest entry, (n_outputs, n_modes) complex, and of the covariance of their real parts a
+    factor of what outputs share, (n_modes, n_outputs, n_factors), and the variance of each output's own, (n_modes,
+    n_outputs).
 
     Records share shapes but not amplitudes: of record i only ρ_j = s_j / s_k counts, k the largest entry. Each entry is
     the mean over the records by their own noise, so that a record that misses a mode, or is noisy, counts little.
@@ -181,7 +180,8 @@ def _mean_shapes(
     own = variance * np.abs(to_displacement) ** 2 * spread[:, None]
     strongest = (np.abs(shapes) ** 2 / own).sum(axis=1).argmax(axis=0)
     root = symmetric_root(pole_covariance)
-    mean, covariance = np.empty(shapes.shape[1:], complex), np.zeros((n, len(derivative), len(derivative)))
+    mean, factors = np.empty(shapes.shape[1:], complex), np.zeros((n, len(derivative), 2 * n + 2 * len(fits)))
+    by_own = np.zeros((n, len(derivative)))
     for r in range(n):
         best = shapes[strongest[r], :, r]
         k = int(np.argmax(np.abs(best)))
@@ -198,12 +198,9 @@ def _mean_shapes(
             common, own_part = _by_noise(fit, r, k, unit, ratio, noise)
             columns.append(weight[:, None] * common)
             own_noise += weight**2 * own_part
-        # of thousands of outputs the matrix fills the memory: it is made once
-        factor = np.hstack([shared, *columns])
-        np.matmul(factor, factor.T, out=covariance[r])
-        np.einsum("jj->j", covariance[r])[:] += own_noise
-        covariance[r][k] = covariance[r][:, k] = 0.0
-    return mean, covariance
+        factors[r], by_own[r] = np.hstack([shared, *columns]), own_noise
+        factors[r, k], by_own[r, k] = 0.0, 0.0
+    return mean, factors, by_own
 
 
 def _by_poles(fit: Projection, r: int) -> np.ndarray:

@@ -92,8 +92,9 @@ def after_impacts(records: Sequence[Record], budget: Budget) -> AfterImpacts:
     part = budget.aside(AFTER_IMPACTS.share)
     with suppress(ValueError, np.linalg.LinAlgError):  # nothing decays freely: the inputs alone tell
         refined = identify_within(free, part).without_artefacts(np.pi / free[0].sample_time).refined
+        by_amplitude = amplitude_dependence(free, refined, budget=part)
         if not part.unfinished:
-            return _that_matter(refined, amplitude_dependence(free, refined))
+            return _that_matter(refined, by_amplitude)
     return AfterImpacts()
 
 

@@ -40,8 +40,7 @@ def far_from_real(modes: SampledModes) -> np.ndarray:
 
 def shape_errors(found: ShapeEstimates) -> np.ndarray:
     """Standard error of each shape's real part over its size, (n_modes,)."""
-    trace = np.trace(found.shape_covariance, axis1=1, axis2=2)
-    return np.asarray(np.sqrt(trace) / np.linalg.norm(found.modes.shapes, axis=0))
+    return np.asarray(np.linalg.norm(found.shape_std, axis=0) / np.linalg.norm(found.modes.shapes, axis=0))
 
 
 def are_far(far: np.ndarray, error: np.ndarray) -> np.ndarray:

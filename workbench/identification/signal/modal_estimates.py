@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -38,6 +39,9 @@ class ShapeEstimates(Protocol):
 
     @property
     def shape_covariance(self) -> np.ndarray: ...
+
+    @property
+    def shape_std(self) -> np.ndarray: ...
 
 
 class ModalEstimates(Printed):
@@ -114,8 +118,9 @@ class Refined(ModalEstimates):
         modes: refined; shapes of displacement, largest entry 1.
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
         amplitudes: one (n_outputs, n_modes) complex a record: y = Re Σ a_r e^{λ_r (t - t_first)}, in its own units.
-        shape_covariance: (n_modes, n_outputs, n_outputs) of the real parts of the shapes, relative to each one's
-            largest entry (which is 1 and so without error).
+        shape_factor, shape_variance: (n_modes, n_outputs, n_factors) F and (n_modes, n_outputs) v of the covariance
+            F F^T + diag v of the real parts of the shapes, relative to each one's largest entry (which is 1 and so
+            without error).
         noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
         converged: whether the search ended because the step was small.
         steps: taken.
@@ -124,7 +129,8 @@ class Refined(ModalEstimates):
     modes: SampledModes
     covariance: np.ndarray
     amplitudes: tuple[np.ndarray, ...]
-    shape_covariance: np.ndarray
+    shape_factor: np.ndarray
+    shape_variance: np.ndarray
     noise: np.ndarray
     converged: bool
     steps: int
@@ -137,8 +143,20 @@ class Refined(ModalEstimates):
             modes=self.modes.select(list(which)),
             covariance=frozen(self.covariance[np.ix_(both, both)]),
             amplitudes=tuple(frozen(each[:, which], complex) for each in self.amplitudes),
-            shape_covariance=frozen(self.shape_covariance[which]),
+            shape_factor=frozen(self.shape_factor[which]),
+            shape_variance=frozen(self.shape_variance[which]),
         )
+
+    @cached_property
+    def shape_covariance(self) -> np.ndarray:
+        """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each.
+
+        Made only where it is asked for: that of thousands of outputs fills the memory.
+        """
+        found = np.matmul(self.shape_factor, self.shape_factor.transpose(0, 2, 1))
+        np.einsum("rjj->rj", found)[:] += self.shape_variance
+        found.setflags(write=False)
+        return np.asarray(found)
 
     @property
     def noise_std(self) -> np.ndarray:
@@ -148,7 +166,7 @@ class Refined(ModalEstimates):
     @property
     def shape_std(self) -> np.ndarray:
         """Standard error of the real part of each shape (n_outputs, n_modes)."""
-        return np.asarray(np.sqrt(np.einsum("rjj->jr", self.shape_covariance)))
+        return np.asarray(np.sqrt((self.shape_factor**2).sum(axis=2) + self.shape_variance).T)
 
 
 class OfRefined(ModalEstimates):
@@ -169,6 +187,11 @@ class OfRefined(ModalEstimates):
     def shape_covariance(self) -> np.ndarray:
         """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each."""
         return self.refined.shape_covariance
+
+    @property
+    def shape_std(self) -> np.ndarray:
+        """Standard error of the real part of each shape (n_outputs, n_modes)."""
+        return self.refined.shape_std
 
 
 @dataclass(frozen=True, eq=False, repr=False)

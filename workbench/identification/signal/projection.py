@@ -333,14 +333,14 @@ def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | Non
     ]
 
 
-def correlation(left: Sequence[np.ndarray]) -> Floats:
-    """Of the noise of outputs, over all records, (n_outputs, n_outputs); the identity where they may share none.
+def correlation(left: Sequence[np.ndarray]) -> Floats | None:
+    """Of the noise of outputs, over all records, (n_outputs, n_outputs); None where they may share none.
 
     Args:
         left: (n_outputs, n_samples) a record.
     """
     if len(left[0]) == 1:
-        return np.eye(1)
+        return None
     return correlation_of_lines([_lines_of(each) for each in left])
 
 
@@ -356,7 +356,7 @@ def _lines_of(signals: np.ndarray) -> Complexes:
     return lines
 
 
-def correlation_of_lines(left: Sequence[np.ndarray]) -> Floats:
+def correlation_of_lines(left: Sequence[np.ndarray]) -> Floats | None:
     """The same of lines of frequency, (n_outputs, n_lines) complex a record.
 
     The median over bands, so that modes not found yet do not count for noise. Bartlett's test of sphericity
@@ -364,13 +364,13 @@ def correlation_of_lines(left: Sequence[np.ndarray]) -> Floats:
     """
     m, size = len(left[0]), 2 * sum(each.shape[1] for each in left)
     if m == 1 or min(each.shape[1] for each in left) < PROJECTION.band or size < PROJECTION.samples_each * m:
-        return np.eye(m)
+        return None
     values, vectors = np.linalg.eigh(_median_correlation(left))
     shared: Floats = (vectors * np.maximum(values, PROJECTION.own)) @ vectors.T
     shared /= np.sqrt(np.outer(np.diag(shared), np.diag(shared)))
     lost = -(PROJECTION.of_median * size - (2 * m + 5) / 6.0) * np.linalg.slogdet(shared)[1]
     none = lost < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2) or values[-1] < PROJECTION.harmless
-    return np.eye(m) if none else shared
+    return None if none else shared
 
 
 def _median_correlation(left: Sequence[np.ndarray]) -> Floats:
@@ -393,28 +393,23 @@ def _median_correlation(left: Sequence[np.ndarray]) -> Floats:
     return median
 
 
-def disturbed(shared: Floats, amplitudes: np.ndarray) -> Floats:
+def disturbed(shared: Floats | None, amplitudes: np.ndarray) -> Floats:
     """Variance of what noise of that correlation does to each mode over that of noise which outputs do not share:
     a^H C a / a^H a, (n_modes,).
 
     Args:
-        shared: C (n_outputs, n_outputs).
+        shared: C (n_outputs, n_outputs); None where they share none.
         amplitudes: a (n_outputs, n_modes), over the noise of each output.
     """
-    if not _share(shared):
+    if shared is None:
         return np.ones(amplitudes.shape[1])
     ratio: Floats = (amplitudes.conj() * (shared @ amplitudes)).sum(axis=0).real / (np.abs(amplitudes) ** 2).sum(axis=0)
     return ratio
 
 
-def mixing_of(shared: Floats) -> Floats | None:
+def mixing_of(shared: Floats | None) -> Floats | None:
     """Combinations (n_outputs, n_outputs) of outputs, over their noise, that make it independent; None where it is."""
-    return np.linalg.inv(np.linalg.cholesky(shared)) if _share(shared) else None
-
-
-def _share(shared: Floats) -> bool:
-    """Whether a correlation is not the identity."""
-    return bool(np.count_nonzero(shared) > len(shared))
+    return None if shared is None else np.linalg.inv(np.linalg.cholesky(shared))
 
 
 def independent(records: Sequence[Record], left: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:
