@@ -278,9 +278,13 @@ def _changes(data: Measurement, poles: np.ndarray) -> np.ndarray:
 
 
 def _can_ring(data: Measurement, poles: np.ndarray) -> np.ndarray:
-    """Which poles are of a frequency that the measurement holds, and not damped too much to ring."""
+    """Which poles are of a frequency that the measurement holds, and not damped too much to ring.
+
+    One whose band reaches the highest is no oscillation there: how inputs run between samples looks like that.
+    """
     ringing = -poles.real < SELECTION.most_damped * np.abs(poles)
-    return np.asarray(ringing & (poles.imag > 0) & (poles.imag < data.highest))
+    below = poles.imag < data.highest - np.maximum(np.abs(poles.real), data.resolution)
+    return np.asarray(ringing & (poles.imag > 0) & below)
 
 
 def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
@@ -327,7 +331,7 @@ def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> 
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
-    """Which are damped too much to ring, or split another mode that has their shape, participation and band."""
+    """Which cannot ring, or split another mode that has their shape, participation and band."""
     poles = fit.poles
     shapes = fit.amplitudes / fit.noise[:, None]
     strength = statistic_of_each(fit)
@@ -336,7 +340,7 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
     one = shapes.shape[0] * data.n_inputs == 1  # which has no shape; how a record begins is none
     split = near & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not one)
-    return np.asarray(split.any(axis=1) | (-poles.real > SELECTION.most_damped * np.abs(poles)))
+    return np.asarray(split.any(axis=1) | ~_can_ring(data, poles))
 
 
 def statistic_of(fit: Fit, r: int) -> float:
