@@ -6,6 +6,7 @@ import pytest
 from scipy.io import loadmat
 from scipy.signal import csd, lfilter, welch
 
+from workbench.identification import transfer
 from workbench.identification.rig_from import rig_from
 from workbench.identification.signal.clocks import far_from_real
 from workbench.identification.transfer import coherence_noise, identify_transfer
@@ -428,3 +429,25 @@ def test_damping_that_hanns_window_makes_too_high_is_remarked():
     found = identify_transfer(h[:, inside], f[inside], channels=(Channel("a", "displacement"), Channel("b")))
     assert (found.modes.zeta > 1.3 * 0.005).all()
     assert any("of modes 1, 2: if these are averages by Hann's window" in remark for remark in found.remarks)
+
+
+def test_a_band_that_ended_early_is_searched_in_the_time_that_others_leave(monkeypatch):
+    f = np.arange(1.0, 33.0, 0.02)
+    s, poles = 2j * np.pi * f, 2.0 * np.pi * np.array([5.0, 15.0, 28.0]) * (-0.01 + 1j)
+    h = sum(1.0 / (s - pole) + 1.0 / (s - pole.conjugate()) for pole in poles)[None]
+    rng, searched, selected = np.random.default_rng(0), [], transfer._selected
+    h = h + 1e-4 * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+
+    def ended_once(budget, h, omega, *args, **how):
+        first = not searched
+        searched.append((omega[0], budget.seconds))
+        found = selected(budget, h, omega, *args, **how)
+        if first:
+            budget.unfinished["search for further modes"] = 0.1
+        return found
+
+    monkeypatch.setattr(transfer, "_selected", ended_once)
+    found = identify_transfer(h, f, channels=(Channel("v", "velocity"),), seconds=60.0)
+    assert [begin for begin, _ in searched] == sorted({begin for begin, _ in searched}) + [searched[0][0]]
+    assert searched[-1][1] > 2.0 * searched[0][1]
+    assert found.modes.n_modes == 3 and not any("stopped after" in remark for remark in found.remarks)

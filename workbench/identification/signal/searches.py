@@ -106,6 +106,17 @@ class Budget(Deadline):
         """A share of the time left for a look on the side; what it leaves unfinished does not count here."""
         return Budget(self.share(share).seconds)
 
+    def apart(self, share: float) -> "Budget":
+        """A share of the time left for one of several tasks; what it leaves unfinished counts once it is `counted`."""
+        part = self.share(share)
+        part.unfinished = {}
+        return part
+
+    def counted(self, part: "Budget") -> None:
+        """What a task left unfinished now counts here."""
+        for search, share in part.unfinished.items():
+            self.unfinished.setdefault(search, share)
+
     @property
     def remarks(self) -> tuple[str, ...]:
         """What was left undone, in one sentence; empty where all was finished."""
