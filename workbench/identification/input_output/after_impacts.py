@@ -24,7 +24,7 @@ from workbench.records.record import Record
 class AfterImpactsSettings:
     """Constants of the look at free decays."""
 
-    share: float = 0.2  # of the time of an identification
+    share: float = 0.4  # of the time of an identification: modes known from there are searched in a tenth of it
     least: float = 0.5  # share of a record that the last impact must leave, for the decay to tell of its modes
     matters: float = 0.1  # of the half-power bandwidth: a mode that moves by less within a decay is a linear one
     near: float = 0.1  # of the frequency of a mode, within which one identified from all of the record is the same

@@ -34,6 +34,8 @@ class ChangingResponseSettings:
     unseen: float = 1e-4  # of the slopes of what is left: a participation that moves less stays as it is
     faded: float = 16.0  # standard deviations of the time of its energy, from which on a mode stays as it is
     least: float = 1e-3  # of the largest amplitude: below it a mode changes no more
+    undriven: float = 1e-12  # of its largest amplitude: nothing drives a mode where no more does
+    step: float = 0.005  # time constants: of the steps where nothing drives, at most
     largest: float = 1e3  # times that of the constant mode: beyond this a motion diverges
 
 
@@ -83,6 +85,7 @@ def _squares(left: Floats, n_outputs: int) -> Floats:
 def _moved(
     start: np.ndarray, drive: np.ndarray, change: np.ndarray, powers: Floats, by_time: bool, step: complex,
     scale: float, least: float, largest: float, dt: float, middle: float, width: float, faded: float,
+    driven: int, many: int,
 ) -> np.ndarray:  # fmt: skip
     """z of a mode at the samples, (n, n_cases), for each row of changes c_0, c_1, ... (n_cases, 1 + n_powers).
 
@@ -91,29 +94,44 @@ def _moved(
         drive: (n - 1, n_cases) what drives the constant mode from each sample to the next.
         step: e^{λΔt}.
         middle, width: of time, as a share of the record.
+        driven: samples after which nothing drives.
+        many: samples of a step from there on, within which the rate goes straight from its first to its last.
     """
     n, n_cases = drive.shape[0] + 1, drive.shape[1]
     z = np.zeros((n, n_cases), np.complex128)
     for i in range(n_cases):
         at = start[i]
         z[0, i] = at
-        for k in range(n - 1):
-            rate, guess = 0j, at
+        k = 0
+        while k < n - 1:
+            ahead = 1 if k < driven else min(many, n - 1 - k)
+            carried, force = step**ahead, drive[k, i] if k < driven else 0j
+            first, rate, guess = 0j, 0j, at
             for stage in range(2):
                 size = (
-                    min(((k + stage) / (n - 1) - middle) / width, faded) if by_time else max(abs(guess) / scale, least)
+                    min(((k + stage * ahead) / (n - 1) - middle) / width, faded)
+                    if by_time
+                    else max(abs(guess) / scale, least)
                 )
                 now = change[i, 0]
                 for p in range(powers.size):
                     now += change[i, p + 1] * size ** powers[p]
-                rate = now if stage == 0 else 0.5 * (rate + now)
                 if stage == 0:
-                    guess = step * np.exp(rate * dt) * at + drive[k, i] * np.exp(0.5 * rate * dt)
-            at = step * np.exp(rate * dt) * at + drive[k, i] * np.exp(0.5 * rate * dt)
+                    first = rate = now
+                    guess = carried * np.exp(rate * ahead * dt) * at + force * np.exp(0.5 * rate * dt)
+                else:
+                    rate = 0.5 * (rate + now)
+            turn = (rate - first) * 2.0 * dt / ahead
+            grows, more = step * np.exp(first * dt + 0.5 * turn), np.exp(turn)
+            for j in range(1, ahead):
+                z[k + j, i] = z[k + j - 1, i] * grows
+                grows *= more
+            at = carried * np.exp(rate * ahead * dt) * at + force * np.exp(0.5 * rate * dt)
             if not abs(at) < largest * scale:
                 z[k + 1 :, i] = np.nan
                 break
-            z[k + 1, i] = at
+            k += ahead
+            z[k, i] = at
     return z
 
 
@@ -216,9 +234,11 @@ class _Response:
         for z in self.coordinates:
             all_cases = z @ participation.T
             drive = all_cases[1:] - step * all_cases[:-1]
+            drives = np.flatnonzero(np.abs(drive).max(axis=1) > RESPONSE.undriven * self.scale)
             moved = _moved(
                 np.ascontiguousarray(all_cases[0]), drive, self.rate * numbers[:, :size], powers, by_time, step,
                 self.scale, RESPONSE.least, RESPONSE.largest, self.data.dt, self.middle, self.width, RESPONSE.faded,
+                int(drives[-1]) + 1 if drives.size else 0, max(int(RESPONSE.step / (self.rate * self.data.dt)), 1),
             )  # fmt: skip
             found.append(np.column_stack([moved[:, 0], (moved[:, 1:] - moved[:, :1]) / RIVALS.slightly]))
         return found
