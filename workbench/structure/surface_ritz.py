@@ -149,7 +149,9 @@ def _ritz(
         raise ValueError(UNSTABLE) from error
     inverse, vectors = inverse[::-1], vectors[:, ::-1]
     vectors = vectors / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))
-    functions = Functions(*axes, vectors[:n].reshape(axes[0].n, axes[1].n, n_modes))
+    # contiguous: products with functions at places would copy them each time
+    shares = np.ascontiguousarray(vectors[:n])
+    functions = Functions(*axes, shares.reshape(axes[0].n, axes[1].n, n_modes))
     parts = [(functions, np.eye(n_modes)), *((s, vectors[n + i : n + i + 1]) for i, s in enumerate(statics))]
     # from the derivatives themselves, where all functions are polynomials on one grid: no digit is lost
     values = 1.0 / inverse - problem.scale if statics else functions.energies(problem)

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.deadline import Deadline
+from workbench.deadline import NEVER, Deadline
 from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out, simpler_forms
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.nonlinear import BEYOND, any_beyond, in_catalogue
@@ -250,8 +250,8 @@ def attribute(
 
 
 def _anew(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
-    """The effects fitted to all records, from where they are near."""
-    finely = data.finely(SELECTION.fine)
+    """The effects fitted to all records, from where they are near; where the search was cut off too."""
+    finely = replace(data.finely(SELECTION.fine), deadline=NEVER)
     return fit(search.rig, effects, finely, iterations=ATTRIBUTION.together, workers=search.workers, chord=Chord())
 
 

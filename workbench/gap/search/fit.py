@@ -296,9 +296,9 @@ class _Problem:
 
     def keep(self) -> None:
         """Hand on the slopes along believed values, where they are to be kept and are not yet."""
-        chord, columns = self.chord, self._columns[self.believed, : self.data.n_values]
+        chord = self.chord
         if chord is not None and chord.columns is None and self.is_known:
-            chord.columns = np.sqrt(self.data.heat) * columns.T
+            chord.columns = np.sqrt(self.data.heat) * self._columns[self.believed, : self.data.n_values].T
 
     def end(self) -> None:
         """No slope is asked for any more."""
