@@ -91,6 +91,16 @@ def test_what_runs_away_is_likely_nowhere_and_ends_nothing(kalman, residual):
         assert not np.isfinite(whiten(kalman, astray)).all()
 
 
+def test_readings_beyond_all_measure_are_likely_nowhere_and_end_nothing(hinged_rig, residual):
+    """What a late sensor reads of a mode that decays within a sample, as the model counts it back."""
+    rig = hinged_rig(n_modes=3)
+    modes = replace(rig.modes, damping=rig.modes.damping + np.diag([0.0, 0.0, 4e3]))
+    late = tuple(replace(sensor, delay=0.9 * DT) for sensor in rig.sensors)
+    lost = force_filter(sampled_model(modes, late, NOISE, DT), modes.phi(0.9).T, np.array([150.0]))
+    assert np.linalg.eigvalsh(lost.innovation)[0] < 0.0  # rounding left no covariance of it
+    assert log_likelihood(lost, [residual]) == -np.inf
+
+
 def test_the_smoother_tells_the_mean_of_all_states_given_all_readings(kalman, joint, residual):
     mean = (joint[0] @ np.linalg.solve(joint[1], residual.T.ravel())).reshape(SAMPLES, -1).T
     found = smoothed_states(kalman, residual)

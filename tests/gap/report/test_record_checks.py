@@ -11,7 +11,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.record_checks import RecordsError, check_modes, check_records, detectability
 from workbench.rig.actuators import Actuator
-from workbench.rig.elements import PeriodicForce
+from workbench.rig.elements import LinearSpring, PeriodicForce
 from workbench.rig.rig import Rig
 from workbench.structure.member import Beam
 from workbench.structure.plate import Membrane, Plate
@@ -71,6 +71,17 @@ def test_the_channel_in_other_units_is_named(rig, data, kept):
         check_records(few, [replace(record, outputs=factors * record.outputs)])
     with pytest.raises(RecordsError, match="the outputs read about 1000 times"):
         check_records(few, [replace(record, outputs=1e3 * record.outputs)])
+
+
+@pytest.mark.parametrize("stiffness", [5.0, 60.0])
+def test_all_outputs_in_other_units_are_told_beside_a_strong_spring(rig, record_of, stiffness):
+    """It leaves little likeness, of some outputs or of all."""
+    rng = np.random.default_rng(7)
+    commands = 0.3 * np.repeat(rng.normal(size=(2, 200)), 5, axis=1)
+    record = record_of(replace(rig, elements=(LinearSpring(1.1, stiffness),)), commands, rng)
+    check_records(rig, [record])
+    with pytest.raises(RecordsError, match=r"the outputs read about 0.00\d+ times the prediction"):
+        check_records(rig, [replace(record, inputs=1e3 * record.inputs)])
 
 
 def test_faults_of_records_held_out_are_refused_like_those_of_records_to_be_fitted(rig, data):

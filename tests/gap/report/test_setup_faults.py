@@ -323,30 +323,80 @@ def test_a_turned_sign_is_found_beside_a_missing_mass(seed):
     assert setup_faults(*without_faults([fault], rig, records)) == ()
 
 
-def chain_with_a_wrong_spring(times):
-    """Four masses and springs by the matrix exponential; one spring is so many times as stiff as the model says."""
-    rng, dt, k = np.random.default_rng(6), 2e-3, 2e4
+DT = 2e-3
 
-    def stiffness(of_second):
-        springs = np.array([k, of_second * k, k, k])
+
+def chain(springs):
+    """Four masses and springs; the springs are so many times as stiff as the model says.
+
+    Returns:
+        The model's rig, and what a record of it reads by the matrix exponential: of noise, of the forces that are
+        logged (2, n_samples), and of those that act.
+    """
+    k = 2e4
+
+    def stiffness(times):
+        springs = k * np.array(times)
         return np.diag(springs + np.r_[springs[1:], 0.0]) - np.diag(springs[1:], 1) - np.diag(springs[1:], -1)
 
     names = ("m1", "m2", "m3", "m4")
-    chain = FiniteElements(np.eye(4), stiffness(1.0), nodes=NamedPoints(names), damping=ModalDamping(0.01))
+    model = FiniteElements(np.eye(4), stiffness([1.0] * 4), nodes=NamedPoints(names), damping=ModalDamping(0.01))
     sensors = (*(Sensor(f"a{i}", f"m{i}", "acceleration", noise_std=0.01) for i in (1, 2, 3)),)
     sensors += (Sensor("v4", "m4", "velocity", noise_std=1e-4),)
-    rig = Rig(chain.modes(4), (Actuator("F1", "m2"), Actuator("F2", "m4")), sensors)
-    true, b = stiffness(times), np.eye(4)[:, [1, 3]]
+    rig = Rig(model.modes(4), (Actuator("F1", "m2"), Actuator("F2", "m4")), sensors)
+    true, b = stiffness(springs), np.eye(4)[:, [1, 3]]
     damping = 0.02 * sqrtm(true)  # a hundredth of critical in every mode, as in the model
     a = np.block([[np.zeros((4, 4)), np.eye(4)], [-true, -damping]])
     c = np.vstack([np.hstack([-true, -damping])[:3], np.eye(8)[7]])
-    plant = cont2discrete((a, np.vstack([np.zeros((4, 2)), b]), c, np.vstack([b[:3], np.zeros((1, 2))])), dt)
+    plant = cont2discrete((a, np.vstack([np.zeros((4, 2)), b]), c, np.vstack([b[:3], np.zeros((1, 2))])), DT)
+
+    def record(name, rng, logged, acting):
+        noise = np.array([[0.01], [0.01], [0.01], [1e-4]]) * rng.standard_normal((4, logged.shape[1]))
+        return rig.record(logged, dlsim(plant, acting.T)[1].T + noise, sample_time=DT, name=name)
+
+    return rig, record
+
+
+def chain_with_a_wrong_spring(times):
+    """Driven by noise; the second spring is so many times as stiff as the model says."""
+    rng = np.random.default_rng(6)
+    rig, record = chain([1.0, times, 1.0, 1.0])
     records = []
     for name, share in (("one", [1.0, 0.3]), ("other", [0.3, 1.0])):
         forces = np.array(share)[:, None] * rng.standard_normal((2, 3000))
-        noise = np.array([[0.01], [0.01], [0.01], [1e-4]]) * rng.standard_normal((4, 3000))
-        records.append(rig.record(forces, dlsim(plant, forces.T)[1].T + noise, sample_time=dt, name=name))
+        records.append(record(name, rng, forces, forces))
     return rig, records
+
+
+@pytest.mark.parametrize(("most", "levels"), [(0.2, (1.0, 1.5)), (0.1, (1.0, 3.0)), (0.01, (1.0, 3.0))])
+def test_an_amplifier_that_saturates_is_no_factor_of_units(most, levels):
+    """It leaves about a 2π-th, a tenth or a hundredth of the lower level, and less of the other."""
+    rng = np.random.default_rng(7)
+    rig, record = chain([1.0] * 4)
+    asked = [level * rng.standard_normal((2, 3000)) for level in levels]
+    records = [record(f"at {u[0, 0]:g}", rng, u, np.clip(u, -most, most)) for u in asked]
+    (fault,) = setup_faults(rig, records)
+    assert not fault.certain and " may be " in fault.sentence
+    assert fault.sentence.endswith(", as where an amplifier saturates.")
+
+
+@pytest.mark.parametrize(
+    ("springs", "hertz", "phase"),
+    [
+        ([9.5] * 4, 1.0, 1.5),  # quasi-static: all move a ninth as far
+        ([9.0] * 4, 1.0, 1.5),
+        ([1.3, 1.0, 1.0, 1.0], 8.0, 0.0),  # between the first resonance of the model and the true one
+        ([1.2, 1.0, 1.0, 1.0], 8.0, 1.5),
+        ([0.6] * 4, 7.0, 0.0),
+    ],
+)
+def test_a_tone_in_one_mode_shows_no_sign_and_no_unit(springs, hertz, phase):
+    rng = np.random.default_rng(8)
+    rig, record = chain(springs)
+    time = DT * np.arange(3000)
+    tones = np.sin(2.0 * np.pi * hertz * time + [[0.0], [phase]]) * np.minimum(1.0, time)
+    forces = [most * np.array([[1.0], [1.0 if phase else 0.5]]) * tones for most in (1e3, 2e3)]
+    assert setup_faults(rig, [record(f"to {u.max():.0f} N", rng, u, u) for u in forces]) == ()
 
 
 ALL_IN_G = "All outputs are 9.81 times too small, or all inputs are 9.81 times too large"

@@ -290,7 +290,7 @@ def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) ->
     beyond = bool(np.median(by_record.argmin(axis=0)) < 1.0)
     losses = by_record[1:].sum(axis=1)
     best = int(np.argmin(losses))
-    if best in (0, len(SHARES) - 1):
+    if best in (0, len(SHARES) - 1) or not np.isfinite(losses[best - 1 : best + 2]).all():
         return LikeliestShare(SHARES[best], float(losses[best]), beyond)
     before, at, after = losses[best - 1 : best + 2]
     turn = 0.5 * (before - after) / (before - 2.0 * at + after)

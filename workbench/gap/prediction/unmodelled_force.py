@@ -248,11 +248,17 @@ def innovations(filter_: ForceFilter, residual: Floats) -> Floats:
 
 
 def log_likelihoods(filter_: ForceFilter, residual: Floats) -> Floats:
-    """Gaussian log-likelihood of each sample of a residual given those before it, constants left out: (n_samples,)."""
+    """Gaussian log-likelihood of each sample of a residual given those before it, constants left out: (n_samples,).
+
+    -∞ where the motion runs away, or rounding leaves no positive covariance, as of readings beyond all measure.
+    """
     e = innovations(filter_, residual)
     if not np.abs(e).max() < RUNAWAY:
         return np.full(e.shape[1], -np.inf)
-    white = _of_unit_covariance(filter_, e)
+    try:
+        white = _of_unit_covariance(filter_, e)
+    except np.linalg.LinAlgError:
+        return np.full(e.shape[1], -np.inf)
     squares: Floats = np.einsum("jk,jk->k", white, white)
     return -0.5 * (squares + float(np.linalg.slogdet(filter_.innovation)[1]))
 

@@ -71,3 +71,11 @@ def unlike(measured: Spectra, predicted: Spectra, factor: float = 1.0) -> Floats
         ratio = 0.5 * (np.log(np.maximum(of_y, tiny)) - np.log(np.maximum(of_p * factor**2, tiny)))
         alike = np.sign(factor) * both / np.sqrt(np.maximum(of_y * of_p, tiny))
         return np.asarray(np.nan_to_num(np.minimum(np.abs(ratio), MOST) + 1.0 - alike, nan=MOST + 1.0))
+
+
+def log_ratios(measured: Spectra, predicted: Spectra) -> Floats:
+    """(n_records, n_signals, n_modes) logarithm of measured by predicted amplitude; nan in bands that are not asked."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        of_y, of_p = (np.log(np.maximum(each.shared(each), 1e-300)) for each in (measured, predicted))
+        ratio = 0.5 * (of_y - of_p)
+    return np.where(asked(measured) & np.isfinite(ratio), ratio, np.nan)

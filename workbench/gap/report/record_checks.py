@@ -26,6 +26,7 @@ ALIKE = 0.995
 SEEN = 25.0  # of chi-squared: five standard deviations
 TURNED = -0.95
 FAR_OFF, ABOVE_NOISE = 50.0, 5.0  # times the model: in other units; times the noise: worth comparing
+NO_EFFECT = 500.0  # times less than the model, of all outputs: no effect makes so much of it
 ALIKE_IN_SHAPE = 0.5  # correlation of a reading with the model's, whatever its unit
 STUCK = 0.5
 LEAST_SAMPLES = 16  # of a record, as in a case folder
@@ -123,10 +124,10 @@ def _compared(rig: Rig, records: Sequence[Record], what: str, settle: float) -> 
         pairs = zip(outputs, predicted, strict=True)
         row = [float(np.corrcoef(y, p)[0, 1]) if np.ptp(p) > 0 else 0.0 for y, p in pairs]
         signs.append(row)
-        sizes.append(_sizes(rig, outputs, predicted, np.array(row)))
+        sizes.append(_sizes(rig, outputs, predicted, np.abs(row) > ALIKE_IN_SHAPE))
     if not signs:
         return False
-    _check_units(rig, records[0], np.array(sizes), what)
+    _check_units(rig, records[0], np.array(sizes), np.abs(signs) > ALIKE_IN_SHAPE, what)
     turned = np.flatnonzero((np.array(signs) < TURNED).all(axis=0))
     if turned.size and turned.size < len(rig.sensors):
         name = rig.sensors[turned[0]].name
@@ -138,48 +139,52 @@ def _compared(rig: Rig, records: Sequence[Record], what: str, settle: float) -> 
 
 
 def _sizes(rig: Rig, measured: np.ndarray, predicted: np.ndarray, alike: np.ndarray) -> np.ndarray:
-    """Each sensor's reading over the model's (n_sensors,); NaN where the model's is lost in the noise, or is another's.
+    """Each sensor's reading over the model's (n_sensors,); NaN where one of the two is lost in the noise.
 
     Args:
-        alike: (n_sensors,) correlation of the two. What nobody modelled may be far stronger than the inputs, but does
-            not go as their reply does.
+        alike: (n_sensors,) whether the two go together: then the reading is more than noise.
     """
-    noise = np.array([sensor.noise_std for sensor in rig.sensors])
-    expected = predicted.std(axis=1)
-    comparable = (expected > ABOVE_NOISE * noise) & (np.abs(alike) > ALIKE_IN_SHAPE)
-    return np.where(comparable, measured.std(axis=1) / np.where(comparable, expected, 1.0), np.nan)
+    least = ABOVE_NOISE * np.array([sensor.noise_std for sensor in rig.sensors])
+    expected, read = predicted.std(axis=1), measured.std(axis=1)
+    comparable = (expected > least) & ((read > least) | alike)
+    return np.where(comparable, read / np.where(comparable, expected, 1.0), np.nan)
 
 
-def _check_units(rig: Rig, record: Record, sizes: np.ndarray, what: str) -> None:
+def _check_units(rig: Rig, record: Record, sizes: np.ndarray, alike: np.ndarray, what: str) -> None:
     """A channel that goes as the model does, and reads fifty times too much or too little in every record.
+
+    What nobody modelled may be far stronger than the inputs, but does not go as their reply does. All outputs together
+    need not go as the model does where they read far less than it: an effect that bends them leaves more.
 
     Args:
         record: any, for its units.
         sizes: (n_records, n_sensors) readings over the model's.
+        alike: (n_records, n_sensors) whether they go as those do.
         what: such records are called.
     """
-    ratios_of = [column[np.isfinite(column)] for column in sizes.T]
-    off = [
-        j
-        for j, ratios in enumerate(ratios_of)
-        if ratios.size and ((ratios > FAR_OFF).all() or (ratios < 1.0 / FAR_OFF).all())
-    ]
-    if not off:
-        return
-    if len(off) == sum(ratios.size > 0 for ratios in ratios_of) > 1:
+
+    def off(ratios: np.ndarray, by: float = FAR_OFF) -> int:
+        known = ratios[np.isfinite(ratios)]
+        return int((known > by).all()) - int((known < 1.0 / by).all()) if known.size else 0
+
+    far = [j for j, column in enumerate(np.where(alike, sizes, np.nan).T) if off(column)]
+    known = np.isfinite(sizes).any(axis=0).sum()
+    if known > 1 and (off(sizes, NO_EFFECT) < 0 or (far and off(sizes))):
         raise RecordsError(
-            f"the outputs read about {_about(np.concatenate(ratios_of))} times the prediction of the model in every"
-            f" {what}: are outputs, inputs and model in consistent units, {_units(record)}?"
+            f"the outputs read about {_about(sizes)} times the prediction of the model in every {what}: are outputs,"
+            f" inputs and model in consistent units, {_units(record)}?"
         )
-    name, unit = rig.sensors[off[0]].name, record.output_channels[off[0]].unit or "its unit"
+    if not far:
+        return
+    name, unit = rig.sensors[far[0]].name, record.output_channels[far[0]].unit or "its unit"
     raise RecordsError(
-        f"output {name!r} reads about {_about(ratios_of[off[0]])} times what the model predicts in every {what}: is"
-        f" it in {unit}?"
+        f"output {name!r} reads about {_about(np.where(alike, sizes, np.nan)[:, far[0]])} times what the model predicts"
+        f" in every {what}: is it in {unit}?"
     )
 
 
 def _about(ratios: np.ndarray) -> str:
-    return f"{float(f'{np.median(ratios):.2g}'):g}"
+    return f"{float(f'{np.nanmedian(ratios):.2g}'):g}"
 
 
 def _units(record: Record) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 
 from workbench.arrays import Flags, Floats
 from workbench.gap.prediction.residuals import lead_of
-from workbench.gap.report.by_band import Spectra, asked, unlike
+from workbench.gap.report.by_band import Spectra, asked, log_ratios, unlike
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, predict
@@ -40,6 +40,7 @@ MOSTLY = 0.8  # share of those bands that must come closer
 AHEAD = 0.25  # of unlikeness, by which it must be better than any other where they differ: of 2π and 9.81 it is 0.44
 TELLING = 0.1  # share of the bands where a mend is felt in which it must differ from any other
 NEAR = 0.15  # relative error of a gain that still is that factor: the least ratio of two of them is 1.56
+SAME = 0.1  # of a factor's logarithm that gains may differ by from record to record: of 2π by a factor 1.2
 MOST_CHANNELS = 12  # pairs of inputs are simulated one by one: beyond, only neighbours are
 MOST_ROUNDS = 4  # faults that hide one another are found one after the other
 GAIN_TAKES = 0.5  # share of what a factor leaves beyond the noise that a gain near it takes away: it is no unit then
@@ -81,8 +82,10 @@ class SetupFault:
             nan where no prediction was needed to see the fault.
         correction: (rig, records) -> (rig, records) without the fault.
         records: names of those that show it and are corrected; empty where the rig, or a channel of every record, is.
-        certain: False for a factor that may be one of units, where a gain near it explains far more: an error of
-            calibration is likelier. It is said and not corrected.
+        factor: of units, by which measured and predicted signals differ; 1 for any other fault.
+        certain: False for a factor that may be one of units, where a gain near it explains far more, as an error of
+            calibration does, or another one in each record, as of an amplifier that saturates. It is said and not
+            corrected.
     """
 
     kind: str
@@ -91,6 +94,7 @@ class SetupFault:
     correction: Correction
     certain: bool = True
     records: tuple[str, ...] = ()
+    factor: float = 1.0
 
 
 def setup_faults(
@@ -125,7 +129,7 @@ def setup_faults(
         found += [
             _of_one(what, record, fault)
             for fault in of_it
-            if fault.certain and fault.closes >= CLOSED and _is_alone(fault, rig, others, settle)
+            if fault.certain and fault.closes >= CLOSED and _is_alone(fault, rig, record, others, settle)
         ]
     return tuple(found)
 
@@ -177,9 +181,51 @@ def _judged_on(records: Sequence[Record], fault: SetupFault, rig: Rig, settle: f
     return replace(fault, sentence=sentence, records=tuple(r.name for r in records if r.name not in others))
 
 
-def _is_alone(fault: SetupFault, rig: Rig, others: Sequence[Record], settle: float) -> bool:
-    """Whether some other record shows that it has not the fault: one of all records was asked for among them all."""
-    return fault.kind not in OF_CHANNELS or not others or bool(_disagreeing(others, fault, rig, settle))
+def _is_alone(fault: SetupFault, rig: Rig, record: Record, others: Sequence[Record], settle: float) -> bool:
+    """Whether some other record shows that it has not the fault: one of all records was asked for among them all.
+
+    Without a factor of units, that record has the gain that this one has once corrected.
+    """
+    if fault.kind not in OF_CHANNELS or not others:
+        return True
+    without = _disagreeing(others, fault, rig, settle)
+    (own,) = _gains_once_corrected(_Gap.of(rig, (record,), settle), fault)
+    gains = [(own, *_Gap.of(rig, (other,), settle).log_ratios) for other in others if other.name in without]
+    return any(_apart(both) <= _same_gain(fault) for both in gains)
+
+
+def _gains_once_corrected(gap: "_Gap", fault: SetupFault) -> Floats:
+    """(n_records, n_outputs, n_modes) logarithms of the gains that a correction leaves; nan where it is not felt."""
+    after = _Gap.of(*fault.correction(gap.rig, gap.records), gap.settle).log_ratios
+    return np.where(np.abs(after - gap.log_ratios) > FELT, after, np.nan)
+
+
+def _apart(gains: Iterable[Floats]) -> float:
+    """By how much the logarithms of the gains of two records differ, in the median of the bands that both show."""
+    apart = [both[np.isfinite(both)] for both in (one - other for one, other in combinations(gains, 2))]
+    return max((float(abs(np.median(both))) for both in apart if both.size), default=0.0)
+
+
+def _same_gain(fault: SetupFault) -> float:
+    """By how much they may differ: no limit where the fault is none of units."""
+    return SAME * abs(np.log(fault.factor)) if fault.factor != 1.0 else np.inf
+
+
+def _by_record(gap: "_Gap", fault: SetupFault) -> SetupFault:
+    """A fault; in doubt where the records that it brings nearer to the model differ in gain.
+
+    A factor of units is the same in all; what an amplifier that saturates leaves is another one at each level.
+    """
+    nearer = []
+    for was, gains in zip(gap.log_ratios, _gains_once_corrected(gap, fault), strict=True):
+        felt = np.isfinite(gains)
+        if felt.any() and np.median(np.abs(gains[felt])) < np.median(np.abs(was[felt])):
+            nearer.append(gains)
+    if not fault.certain or _apart(nearer) <= _same_gain(fault):
+        return fault
+    but = f"from record to record the gain differs by a factor {np.exp(_apart(nearer)):.2g}"
+    what = _perhaps(fault.sentence.split(": multiply")[0])
+    return replace(fault, certain=False, sentence=f"{what}; but {but}, as where an amplifier saturates.")
 
 
 def _of_one(what: str, record: Record, fault: SetupFault) -> SetupFault:
@@ -338,6 +384,11 @@ class _Gap:
     def unlike(self) -> Floats:
         """(n_records, n_outputs, n_modes) how unlike measured and predicted signals are."""
         return unlike(self.seen, self.spectra)
+
+    @cached_property
+    def log_ratios(self) -> Floats:
+        """(n_records, n_outputs, n_modes) logarithms of measured by predicted amplitude; nan where none is asked."""
+        return log_ratios(self.seen, self.spectra)
 
     @property
     def n_samples(self) -> int:
@@ -506,9 +557,9 @@ def _of_channels(gap: _Gap, kinds: Collection[str]) -> list[SetupFault]:
         if mend.kind in kinds and certain is not None:
             faults.setdefault((mend.kind, mend.value, certain), []).append(mend)
             if certain and mend.kind == "outputs" and len(mend.at) == n:
-                return [_fault_of(gap, mend.kind, mend.value, mend.at, True)]
+                return [_by_record(gap, _fault_of(gap, mend.kind, mend.value, mend.at, True))]
     made = [
-        _fault_of(gap, kind, value, sorted({c for mend in mends for c in mend.at}), certain)
+        _by_record(gap, _fault_of(gap, kind, value, sorted({c for mend in mends for c in mend.at}), certain))
         for (kind, value, certain), mends in faults.items()
     ]
     return [fault for fault in made if fault.certain][:1] or made
@@ -518,11 +569,9 @@ def _is_certain(gap: _Gap, mend: _Mend) -> bool | None:
     """Whether a fault is certain, False where a factor may be an error of calibration; None where nobody can tell."""
     if mend.value == 0.0:
         return None
-    turns_one = mend.kind == "outputs" and mend.value == -1.0 and len(mend.at) == 1
-    if turns_one:  # a sensor beyond a node reads a mode turned
-        felt = asked(gap.seen) & (np.abs(mend.left - gap.unlike) > FELT)
-        turns_one = int(felt.any(axis=(0, 1)).sum()) < 2
-    if mend.value not in MAY_BE_GAIN and not turns_one:
+    if mend.kind in ("outputs", "inputs") and _of_one_mode(gap, mend.value, np.abs(mend.left - gap.unlike) > FELT):
+        return None
+    if mend.value not in MAY_BE_GAIN:
         return True
     if mend.kind == "inputs":  # these are weighed beside one another
         return None
@@ -530,10 +579,21 @@ def _is_certain(gap: _Gap, mend: _Mend) -> bool | None:
     if len(mend.at) > 1:
         return bool((np.abs(gap.gains / (10.0 if factor > 1.0 else 0.1) - 1.0) > TEN).any())
     (j,) = mend.at
+    if mend.value in (G, 1.0 / G) and gap.rig.sensors[j].quantity != "acceleration":
+        return None
     left, freely = (gap.power([by * p for p in gap.predicted]) for by in (factor, gap.gains[:, None]))
     if gap.closed(left)[j] < CLOSED:
         return None
     return not _is_gain(float(gap.gains[j]), factor, n * left[j], n * freely[j], n * gap.noise[j], n)
+
+
+def _of_one_mode(gap: _Gap, factor: float, felt: Flags | bool) -> bool:
+    """Whether one mode alone, of several, speaks of a factor, where it can do so by itself.
+
+    A resonance that moved past the excitation and a sensor beyond a node turn it, another stiffness gives it any gain.
+    """
+    n = int((asked(gap.seen) & felt).any(axis=(0, 1)).sum())
+    return factor in (-1.0, *MAY_BE_GAIN) and n < min(2, gap.rig.modes.n_modes)
 
 
 def _fault_of(gap: _Gap, kind: str, value: Any, at: Sequence[int], certain: bool) -> SetupFault:
@@ -558,7 +618,8 @@ def _fault_of(gap: _Gap, kind: str, value: Any, at: Sequence[int], certain: bool
         correction = partial(_exchanged, kind.split()[1], *value)
     if kind in ("outputs", "inputs"):
         called = "sign" if value == -1.0 else "unit"
-    fault = SetupFault(called, sentence, np.nan, correction, certain, fault_records)
+    factor = value if called == "unit" else 1.0
+    fault = SetupFault(called, sentence, np.nan, correction, certain, fault_records, factor)
     return replace(
         fault, closes=_share_closed(fault, gap, [int(j) for j in np.flatnonzero(gap.wide)] if "inputs" in kind else at)
     )
@@ -602,9 +663,19 @@ def _is_gain(gain: float, factor: float, left: float, freely: float, noise: floa
 
 def _doubtful(what: str, off: Floats) -> str:
     """What may be a fault of units, and by how much it is none; off: relative differences of the gains."""
-    may = what.replace(" look ", " may look ", 1).replace(" are ", " may be ", 1)
     far = ", ".join(dict.fromkeys(f"{100 * share:+.2g} %" for share in off))
-    return f"{may}; but the gain differs from that by {far}, more than its error: taken for an error of calibration."
+    return (
+        f"{_perhaps(what)}; but the gain differs from that by {far}, more than its error: taken for an error of"
+        " calibration."
+    )
+
+
+def _perhaps(what: str) -> str:
+    """The same, with "may" before its first verb."""
+    for sure, may in ((" look ", " may look "), (" looks ", " may look "), (" are ", " may be "), (" is ", " may be ")):
+        if sure in what:
+            return what.replace(sure, may, 1)
+    return what
 
 
 def _factor(gain: float) -> float | None:
@@ -637,6 +708,8 @@ def _scaled_inputs(gap: _Gap) -> list[SetupFault]:
     if any(known[p] is None and abs(gains[p] - 1.0) > NEAR for p in acting):
         return []
     wrong = {p: factor for p, factor in known.items() if factor is not None}
+    if any(_of_one_mode(gap, factor, True) for factor in wrong.values()):
+        return []
     if not wrong or len(wrong) == acting.size:  # what all inputs have, all outputs may have
         return []
     correction = partial(_inputs_times, {rig.actuators[p].name: factor for p, factor in wrong.items()})
@@ -658,8 +731,8 @@ def _scaled_inputs(gap: _Gap) -> list[SetupFault]:
             sentence = _doubtful(what, gains[inputs] / factor - 1.0)
         kind = "sign" if factor == -1.0 else "unit"
         own = partial(_inputs_times, dict.fromkeys(names, factor))
-        faults.append(SetupFault(kind, sentence, closes, own, certain, gap.names))
-    return faults
+        faults.append(SetupFault(kind, sentence, closes, own, certain, gap.names, abs(factor)))
+    return [_by_record(gap, fault) for fault in faults]
 
 
 def _squares(values: Floats) -> float:
