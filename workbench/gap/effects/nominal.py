@@ -37,8 +37,7 @@ PLACE_UNIT = 0.001  # likewise, of the extent
 MOST_AHEAD = 0.9  # of a sample: the timing of a sensor is off by no more
 JUST_LATE = 1e-3  # of a sample: later, an accelerometer reads what was before a jump
 SURE = 1e-9  # of the largest variance of errors, each in units of its own: less is no doubt
-LITTLE = 1.0  # radian by which a coupling of one turns two modes: less is left to errors of shapes
-STRONG = 25.0  # likewise: more is no small error
+LITTLE, STRONG = 0.25, 25.0  # radians by which a coupling of one turns two modes: less is none, more is no small error
 WIDEST = 8.0  # prior deviations: bounds, far outside of what a nominal model can be off by
 PROFILE_LEAST = 0.02  # what errors of a profile are believed to be before any record
 
@@ -275,7 +274,7 @@ def _couplings(frequencies: bytes) -> tuple[tuple[str, int, int, float], ...]:
             angle = omega[r] * omega[s] / max(apart, omega[r] * omega[s] / STRONG)
         else:
             angle = 1.0 if omega[s] > 0 else 0.0
-        if angle >= LITTLE:
+        if angle > LITTLE:
             found.append((f"coupling_{r + 1}_{s + 1}", r, s, float(angle)))
     return tuple(found)
 

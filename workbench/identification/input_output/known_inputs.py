@@ -127,7 +127,7 @@ class KnownInputs:
             fixed.append(np.vstack([beside[a + self.first : b] for a, b in zip(starts, starts[1:])]))
         self.fixed = self._rows(np.hstack(fixed))
         self.resolution = 2.0 * np.pi / (max(lengths) * self.dt)
-        self.highest = np.pi / self.dt
+        self.highest = self.nyquist = np.pi / self.dt
         self.size = next_fast_len(2 * max(lengths))
         span = max(lengths) * self.dt
         fastest = max(0.1 * np.pi / self.dt, 2.0 / span)

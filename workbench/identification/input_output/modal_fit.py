@@ -38,6 +38,7 @@ class Measurement(Protocol):
         weights: (n_rows, n_outputs) inverse relative noise, or None where it is the same in all rows of an output.
         resolution: rad/s, of a measurement of this length.
         highest: rad/s, beyond which no pole is searched.
+        nyquist: rad/s, half of the sample rate; inf of response functions.
         n_inputs: of the excitations, that are no initial states.
         cells: number of poles that could be distinguished, for the chance of a false alarm.
         distorted: poles of modes that are more than linear ones; about these no further mode is looked for.
@@ -49,6 +50,7 @@ class Measurement(Protocol):
     weights: np.ndarray | None
     resolution: float
     highest: float
+    nyquist: float
     n_inputs: int
     cells: int
     distorted: tuple[complex, ...]

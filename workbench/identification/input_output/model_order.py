@@ -278,13 +278,14 @@ def _changes(data: Measurement, poles: np.ndarray) -> np.ndarray:
 
 
 def _can_ring(data: Measurement, poles: np.ndarray) -> np.ndarray:
-    """Which poles are of a frequency that the measurement holds, and not damped too much to ring.
-
-    One whose band reaches the highest is no oscillation there: how inputs run between samples looks like that.
-    """
+    """Which poles are of a frequency that the measurement holds, and not damped too much to ring."""
     ringing = -poles.real < SELECTION.most_damped * np.abs(poles)
-    below = poles.imag < data.highest - np.maximum(np.abs(poles.real), data.resolution)
-    return np.asarray(ringing & (poles.imag > 0) & below)
+    return np.asarray(ringing & (poles.imag > 0) & (poles.imag < data.highest) & ~_reaches_nyquist(data, poles))
+
+
+def _reaches_nyquist(data: Measurement, poles: np.ndarray) -> np.ndarray:
+    """Whose band reaches half of the sample rate: no oscillation, but how inputs run between samples."""
+    return np.asarray(poles.imag > data.nyquist - np.maximum(np.abs(poles.real), data.resolution))
 
 
 def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
@@ -331,7 +332,10 @@ def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> 
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
-    """Which cannot ring, or split another mode that has their shape, participation and band."""
+    """Which are damped too much to ring, reach half of the sample rate, or split another mode.
+
+    One splits another that has its shape, participation and band.
+    """
     poles = fit.poles
     shapes = fit.amplitudes / fit.noise[:, None]
     strength = statistic_of_each(fit)
@@ -340,7 +344,8 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
     one = shapes.shape[0] * data.n_inputs == 1  # which has no shape; how a record begins is none
     split = near & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not one)
-    return np.asarray(split.any(axis=1) | ~_can_ring(data, poles))
+    damped = -poles.real > SELECTION.most_damped * np.abs(poles)
+    return np.asarray(split.any(axis=1) | damped | _reaches_nyquist(data, poles))
 
 
 def statistic_of(fit: Fit, r: int) -> float:

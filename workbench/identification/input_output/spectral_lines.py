@@ -77,7 +77,7 @@ class Lines:
             self.fixed = np.hstack([self.fixed, beside])
         self.resolution = float(np.diff(omega).min())
         # A pole may leave the band: one close beyond it is no constant there. Such poles are residual terms.
-        self.highest = 2.0 * float(omega[-1])
+        self.highest, self.nyquist = 2.0 * float(omega[-1]), np.inf
         span = omega[-1] - omega[0]
         self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), LINES.rates)
         self.cells = LINES.rates * self.lines
