@@ -132,7 +132,8 @@ def fit_jointly(
             break
         falls = level < JOINT.falling * before
         counted += not falls or not np.isfinite(before)
-        if known is None and (falls or to_the_end):  # far from where the slopes were taken, or as exact as can be
+        # far from where the slopes were taken, as exact as can be, or taken at once
+        if known is None and (falls or to_the_end or len(errors.values) < JOINT.few):
             chord = Chord()
         before = level if known is not None or not quickly else np.inf
         i += 1
@@ -186,7 +187,7 @@ def _at_rest(search: Search, found: Fit, data: FitData, chord: Chord) -> Fit:
             iterations=JOINT.iterations,
             tolerance=JOINT.tolerance,
             workers=search.workers,
-            chord=chord,
+            chord=chord if len(effects[-1].values) > JOINT.few else Chord(),
             damping=JOINT.undamped,
         )
     return found

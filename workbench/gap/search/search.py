@@ -171,7 +171,8 @@ class Search:
             delay=0.1,
             gain=0.01 if len(self.rig.actuators) + len(self.rig.sensors) > 2 else 0.0,  # of one each: the mass says it
             place=0.0 if isinstance(self.rig.modes.domain, NamedPoints) else 0.001,
-            shape=0.01 if by_mode or self.rig.structure is None else 0.0,
+            # of one mode, gains and the mass say it
+            shape=0.01 if (by_mode or self.rig.structure is None) and self.rig.modes.n_modes > 1 else 0.0,
             record=0.005 if self.differs else 0.0,
             sample_time=self.data.records[0].sample_time,
             records=tuple(record.name for record in self.data.records) if self.differs else (),

@@ -208,6 +208,7 @@ class JointSettings:
     rounds: int = 4
     most_rounds: int = 12
     falling: float = 0.3  # share of what was left that a round leaves where the cost falls
+    few: int = 16  # errors, of which slopes are taken anew: kept ones took a servo's friction for a damper
     # settled, last_settled: share of what is left that a round must have taken away for another; in the last fit
     settled: float = 0.02
     last_settled: float = 1e-3
