@@ -256,9 +256,8 @@ def with_equals(
         return rivals
     weighted = _weighted(search, [here, *equals])
     of_each = {f.key: p for f, p in weighted}
-    if not search.explains(
-        weighted[0][0]
-    ):  # of what sets leave that all leave more than noise no law of chance is known
+    # of what sets leave that all leave more than noise no law of chance is known
+    if not search.explains(weighted[0][0]):
         of_each = dict.fromkeys(of_each, 1.0 / len(of_each))
     rest = [(f, p * of_each[here.key]) for f, p in rivals]
     return tuple(sorted([*((f, of_each[f.key]) for f in equals), *rest], key=lambda each: -each[1]))

@@ -187,7 +187,7 @@ def _at_rest(search: Search, found: Fit, data: FitData, chord: Chord) -> Fit:
             iterations=JOINT.iterations,
             tolerance=JOINT.tolerance,
             workers=search.workers,
-            chord=chord if len(effects[-1].values) > JOINT.few else Chord(),
+            chord=Chord() if len(effects[-1].values) < JOINT.few else chord,
             damping=JOINT.undamped,
         )
     return found
