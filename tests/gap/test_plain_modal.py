@@ -11,6 +11,7 @@ from workbench.cases.case import read_case
 from workbench.cases.writing import write_case
 from workbench.draw.gap import plot_unmodelled_force, plot_where
 from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.prediction.unmodelled_force import sampled_model, wandering_force_filter
 from workbench.records.record import Channel, Record
@@ -160,7 +161,16 @@ def test_shapes_that_are_off_by_themselves_are_no_effect(spacecraft):
 def test_a_limit_and_a_gain_are_found_beside_shapes_that_are_off(spacecraft):
     rig, records = spacecraft
     *fit, check = records(limit=25.0, gain=1.12)
-    verdict = diagnose(rig, fit, validation=[check], workers=1)
+    names = (
+        "actuator_saturation",
+        "sensor_gain",
+        "sensor_crosstalk",
+        "point_mass",
+        "actuator_dead_zone",
+        "modal_damping",
+    )
+    kinds = tuple(kind_named(name) for name in names)  # the right ones, and what was named for them
+    verdict = diagnose(rig, fit, validation=[check], catalogue=kinds, workers=1)
     limit, gain, _ = verdict.effects
     assert (limit.label, gain.label) == ("actuator_saturation[T1]", "sensor_gain[a1]")
     assert limit.values["limit"] == pytest.approx(25.0, abs=3.0 * limit.deviations["limit"])

@@ -56,7 +56,7 @@ def test_linear_modes_after_a_blow_have_no_such_remark():
     assert not any("change" in remark for remark in found.remarks)
 
 
-@pytest.mark.parametrize("verb", [identify, ring_down])
+@pytest.mark.parametrize("verb", [pytest.param(identify, marks=pytest.mark.slow), ring_down])
 def test_free_decays_say_what_depends_on_amplitude(verb):
     """The lowest amplitude is where the mode is linear."""
     record = struck(0.1)

@@ -46,7 +46,7 @@ def noisy(outputs, level, seed):
 def filtered():
     """A shaker test, force and outputs through the same anti-aliasing filter of 420 Hz, sampled at 1 kHz."""
     rate, over = 1000, 20
-    force = np.repeat(np.random.default_rng(7).standard_normal(3 * rate), over)
+    force = np.repeat(np.random.default_rng(7).standard_normal(2 * rate), over)
     kernel = firwin(801, 0.42 * rate, fs=rate * over)
     outputs = lfilter(kernel, 1.0, response(force, rate * over), axis=1)[:, ::over]
     return lfilter(kernel, 1.0, force)[::over], outputs, rate
