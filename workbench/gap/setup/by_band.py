@@ -29,7 +29,7 @@ class Spectra:
     @staticmethod
     def read(signals: Sequence[Floats], records: Sequence[Record], frequencies_hz: Floats) -> "Spectra":
         """Of signals, (n_signals, n_samples) a record; a band ends halfway between two natural frequencies."""
-        # every line is compared in some band; `localisation.where`, which shares a gap among modes, takes geometric means
+        # every line is compared in some band; `localisation.where` shares a gap among modes, and takes geometric means
         edges = np.r_[0.0, (frequencies_hz[1:] + frequencies_hz[:-1]) / 2.0, np.inf]
         of, ends = [], []
         for signal, record in zip(signals, records, strict=True):
