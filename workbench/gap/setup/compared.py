@@ -38,9 +38,7 @@ class Compared:
     kept: dict[Correction, "Compared"] = field(default_factory=dict)
 
     @staticmethod
-    def of(
-        rig: Rig, records: Sequence[Record], settle: float = 0.0, predicted: Sequence[Floats] | None = None
-    ) -> "Compared":
+    def of(rig: Rig, records: Sequence[Record], settle: float, predicted: Sequence[Floats] | None = None) -> "Compared":
         measured = [record.outputs[:, lead_of(record, settle) :] for record in records]
         if predicted is None:
             predicted = _counted(measured, [predicted_by(rig, record) for record in records])
@@ -75,7 +73,8 @@ class Compared:
         m = len(self.rig.actuators)
         if not 1 < m <= MOST_CHANNELS or is_stepped(self.rig):
             return []
-        return [self.predict(self.rig, _driven_by(p, self.records)) for p in range(m)]
+        alone = [[replace(r, inputs=r.inputs * (np.arange(m) == p)[:, None]) for r in self.records] for p in range(m)]
+        return [self.predict(self.rig, records) for records in alone]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -169,8 +168,3 @@ def predicted_by(rig: Rig, record: Record) -> Floats:
     """`predict`, of what grows beyond all numbers too."""
     with np.errstate(over="ignore", invalid="ignore"):
         return predict(rig, record)
-
-
-def _driven_by(p: int, records: Sequence[Record]) -> list[Record]:
-    """The records with one input alone."""
-    return [replace(r, inputs=r.inputs * (np.arange(r.n_inputs) == p)[:, None]) for r in records]
