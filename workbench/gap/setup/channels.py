@@ -1,7 +1,6 @@
 """Faults of channels: exchanged, turned, in another unit, or of another quantity than is said."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -75,7 +74,7 @@ def _fault_of(gap: Compared, kind: str, value: Any, at: Sequence[int], certain: 
         sentence = sentence_of_outputs(rig.sensors, at, value, None if certain else gap.gains[list(at)] / value - 1.0)
         correction = partial(outputs_times, dict.fromkeys(names, 1.0 / value))
     elif kind == "inputs":
-        sentence = sentence_of_inputs(names, value, None)
+        sentence = sentence_of_inputs(names, value)
         correction = partial(inputs_times, dict.fromkeys(names, value))
     elif kind == "quantity":
         said, meant = value
@@ -88,17 +87,10 @@ def _fault_of(gap: Compared, kind: str, value: Any, at: Sequence[int], certain: 
     if kind in ("outputs", "inputs"):
         called = "sign" if value == -1.0 else "unit"
     factor = value if called == "unit" else 1.0
-    fault = SetupFault(called, sentence, np.nan, correction, certain, fault_records, factor)
-    return replace(
-        fault, closes=_share_closed(fault, gap, [int(j) for j in np.flatnonzero(gap.wide)] if "inputs" in kind else at)
-    )
-
-
-def _share_closed(fault: SetupFault, gap: Compared, outputs: Sequence[int]) -> float:
-    """The share of the power beyond the noise that a correction takes away, in the median of some outputs."""
-    at = list(outputs)
-    left, was = (np.maximum(each.before - each.noise, 0.0)[at] for each in (gap.corrected(fault.correction), gap))
-    return float(np.median(1.0 - left / np.maximum(was, 1e-300)))
+    outputs = np.flatnonzero(gap.wide) if "inputs" in kind else list(at)
+    left, was = (np.maximum(each.before - each.noise, 0.0)[outputs] for each in (gap.corrected(correction), gap))
+    closes = float(np.median(1.0 - left / np.maximum(was, 1e-300)))  # of the power beyond the noise
+    return SetupFault(called, sentence, closes, correction, certain, fault_records, factor)
 
 
 def scaled_inputs(gap: Compared) -> list[SetupFault]:

@@ -140,10 +140,9 @@ class Compared:
 
     def power(self, predicted: Sequence[Floats]) -> Floats:
         """(n_outputs,) mean square of what is left, as a share of the mean square measured."""
-        count = sum(y.shape[1] for y in self.measured)
         with np.errstate(over="ignore", invalid="ignore"):
             left = sum(((y - p) ** 2).sum(axis=1) for y, p in zip(self.measured, predicted, strict=True))
-        return np.asarray(np.nan_to_num(left / count / self.scale, nan=np.inf))
+        return np.asarray(np.nan_to_num(left / self.n_samples / self.scale, nan=np.inf))
 
     def closed(self, after: np.ndarray) -> np.ndarray:
         """(n_outputs,) share of the power beyond the noise that is gone; 0 where much of the signal is still missed,

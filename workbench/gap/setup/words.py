@@ -79,7 +79,7 @@ def sentence_of_outputs(sensors: Sequence[Sensor], at: Sequence[int], factor: fl
     return f"{one(f'{who} {what}', names)}{rest}: {cure}{' (the outputs)' if rest else ''}."
 
 
-def sentence_of_inputs(names: Sequence[str], factor: float, off: Floats | None) -> str:
+def sentence_of_inputs(names: Sequence[str], factor: float, off: Floats | None = None) -> str:
     """What inputs are logged as, and what to multiply them by; off: as for outputs."""
     what = f"{named('input', names)} {FACTORS[factor][1]}"
     return f"{one(what, names)}: multiply by {factor:.6g}." if off is None else doubtful(what, off)
