@@ -30,7 +30,7 @@ FLOORS = {
 INSIDE = {
     "identification": ("signal", "free_decay", "input_output", "output_only", "shapes", "updating"),
     "design": ("laws", "estimation", "loop", "export", "spillover", "placement"),
-    "gap": ("effects", "prediction", "localisation", "search", "report"),
+    "gap": ("effects", "prediction", "setup", "localisation", "search", "report"),
     "study": ("runs", "pages"),
 }
 ENGINES = {

@@ -389,9 +389,16 @@ def test_noise_that_goes_with_size_hides_no_mode_and_makes_none_change(relative,
     assert (found.omega_std < 0.02 * relative * omega).all()
 
 
-@pytest.mark.parametrize("quantity", ["displacement", "acceleration"])
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("late", [(0.004,) * 4, (0.0, 0.004, 0.0, 0.01)])
+@pytest.mark.parametrize(
+    ("quantity", "late"),
+    [
+        ("displacement", (0.004,) * 4),
+        ("acceleration", (0.0, 0.004, 0.0, 0.01)),
+        pytest.param("displacement", (0.0, 0.004, 0.0, 0.01), marks=pytest.mark.slow),
+        pytest.param("acceleration", (0.004,) * 4, marks=pytest.mark.slow),
+    ],
+)
 def test_outputs_that_a_filter_delays_are_put_in_time(quantity, late):
     """Put in time, the modes are real, and none beside them stand for what the delay makes of a direct term."""
     modes, h, channels = beam(quantity)

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,13 +16,13 @@ from workbench.design.laws.on_off import on_off
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
-from workbench.records.units import Units
+from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.robust.on_rig import default_estimator, fitted, impulse_test, tuned
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.redesign import redesign
+from workbench.robust.redesign import _losses, redesign
 from workbench.robust.verification import Verification, verify
 from workbench.structure.domain import Patch
 from workbench.trials.controlled import control_plant
@@ -54,6 +55,22 @@ FAULTS = {
     "gain of a sensor": effect("sensor_gain", "d2", gain=1.5),
     "offset of a sensor": effect("sensor_bias", "d2", bias=0.05),
 }
+
+
+@pytest.mark.parametrize(
+    ("step", "lost", "words"),
+    [
+        ("delay", {"delay": 0.015, "time_constant": 0.02}, "F1: delay 15 ms, lag 20 ms"),
+        ("dead zone", {"bias": 0.2}, "F1: bias 0.2 N"),
+        ("saturation", {"rate_limit": 3.0}, "F1: rate 3 N/s"),  # the limit was said to be infinite
+        ("saturation", {"limit": 2.0, "rate_limit": 3.0}, "F1: limit 2 N, rate 3 N/s"),
+        ("saturation", {"delay": 0.015}, ""),
+    ],
+)
+def test_a_step_says_what_it_takes_out_and_no_more(rig, step, lost, words):
+    one = replace(rig.actuators[0], **lost)
+    loop = SimpleNamespace(law=SimpleNamespace(actuators=[one]))
+    assert _losses(replace(rig, actuators=(one, *rig.actuators[1:])), loop, step, SI) == words
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -61,8 +61,10 @@ def diagnose(
     from workbench.gap.diagnose import diagnose_case
     from workbench.gap.effects.effect import COORDINATES
     from workbench.gap.report.record_checks import check_alive
-    from workbench.gap.report.setup_faults import check_disjoint, setup_faults, without_faults
     from workbench.gap.report.verdict import place_in_words
+    from workbench.gap.setup.corrections import without_faults
+    from workbench.gap.setup.faults import setup_faults
+    from workbench.gap.setup.repeats import check_disjoint
     from workbench.study.measured_case import measured_case
     from workbench.study.pages.verdict_page import verdict_page
 

@@ -30,7 +30,8 @@ def uncertain_rig(
         ValueError: no verdict of this case, or channels that are certainly exchanged or turned.
     """
     from workbench.gap.diagnose import SECONDS, diagnose_case
-    from workbench.gap.report.setup_faults import check_disjoint, setup_faults
+    from workbench.gap.setup.faults import setup_faults
+    from workbench.gap.setup.repeats import check_disjoint
     from workbench.robust.posterior import UncertainRig
 
     if verdict is not None:

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from workbench.arrays import Floats
 from workbench.draw.style import MOST_POINTS, envelope
+from workbench.structure.printed import rounded
 
 MOST_CELLS = (160, 320)
 DASHES = {"-": "", "--": "6 4", ":": "2 3", "-.": "7 3 2 3"}
@@ -267,7 +268,7 @@ KINDS: dict[type, Callable[[Axes, Any], list[dict[str, Any]]]] = {
 
 
 def _numbers(values: ArrayLike) -> list[float | None]:
-    return [float(f"{v:.6g}") if np.isfinite(v) else None for v in np.asarray(values, float)]
+    return [rounded(v) for v in np.asarray(values, float)]
 
 
 def _alpha(artist: Artist) -> float:

@@ -37,12 +37,13 @@ from workbench.gap.report.data_faults import data_faults
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.levels import steady_remainder
 from workbench.gap.report.record_checks import check_modes, check_records, detectability
-from workbench.gap.report.setup_faults import check_disjoint, setup_faults
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.gap.search.finish import with_equals
 from workbench.gap.search.jointly import too_large
 from workbench.gap.search.settings import JOINT
+from workbench.gap.setup.faults import setup_faults
+from workbench.gap.setup.repeats import check_disjoint
 from workbench.records.record import Record, as_records
 from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments

@@ -717,25 +717,18 @@ def _losses(rig: Rig, loop: Loop, step: str, units: Units) -> str:
     """What a step takes out, in words; empty where there is nothing."""
     words, newton = [], units.force
     for a in (named(rig.actuators, one.name) for one in loop.law.actuators):
-        if step == "delay" and (a.delay or a.time_constant):
-            late = [
-                f"{what} {_short(value, units)}"
-                for what, value in (("delay", a.delay), ("lag", a.time_constant))
-                if value
-            ]
-            words.append(f"{a.name}: {', '.join(late)}")
-        elif step == "dead zone" and (a.dead_zone or a.bias):
-            lost = [
-                f"{what} {value:.3g} {newton}"
-                for what, value in (("dead zone", a.dead_zone), ("bias", a.bias))
-                if value
-            ]
+        lost = []
+        if step == "delay":
+            parts = ("delay", a.delay), ("lag", a.time_constant)
+            lost = [f"{what} {_short(value, units)}" for what, value in parts if value]
+        elif step == "dead zone":
+            parts = ("dead zone", a.dead_zone), ("bias", a.bias)
+            lost = [f"{what} {value:.3g} {newton}" for what, value in parts if value]
+        elif step == "saturation":
+            limits = ("limit", a.limit, newton), ("rate", a.rate_limit, f"{newton}/{units.time}")
+            lost = [f"{what} {value:.3g} {unit}" for what, value, unit in limits if np.isfinite(value)]
+        if lost:
             words.append(f"{a.name}: {', '.join(lost)}")
-        elif step == "saturation" and (np.isfinite(a.limit) or np.isfinite(a.rate_limit)):
-            words.append(
-                f"{a.name}: limit {a.limit:.3g} {newton}"
-                + (f", rate {a.rate_limit:.3g} {newton}/{units.time}" if np.isfinite(a.rate_limit) else "")
-            )
     if step == "sensors":
         for s in (named(rig.sensors, one.name) for one in loop.controller.sensors):
             faults = [

@@ -18,6 +18,7 @@ from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
 from workbench.structure.domain import NamedPoints, middle
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import rounded
 from workbench.threads import one_blas_thread
 
 SETTLED = 0.01  # of the largest energy: a tenth of the amplitude
@@ -112,10 +113,10 @@ class Verification:
         return {
             "draws": self.n_draws,
             "stable": int(self.stable.sum()),
-            "small_gain_margin": _plain(self.small_gain_margin),
-            "margin_frequency_hz": _plain(self.margin_frequency_hz),
-            "damping": [[_plain(v) for v in interval(self.damping[:, r])] for r in self.controlled],
-            **{name: [_plain(v) for v in interval(values)] for name, values in figures.items()},
+            "small_gain_margin": rounded(self.small_gain_margin),
+            "margin_frequency_hz": rounded(self.margin_frequency_hz),
+            "damping": [[rounded(v) for v in interval(self.damping[:, r])] for r in self.controlled],
+            **{name: [rounded(v) for v in interval(values)] for name, values in figures.items()},
         }
 
 
@@ -124,10 +125,6 @@ def interval(values: np.ndarray) -> tuple[float, float, float]:
     outer = 0.5 * (1.0 - LEVEL)
     middle, low, high = np.quantile(values, (0.5, outer, 1.0 - outer), method="nearest")
     return float(middle), float(low), float(high)
-
-
-def _plain(value: float) -> float | None:
-    return float(f"{value:.6g}") if np.isfinite(value) else None
 
 
 @former_arguments(possible="rig", centre="margin_rig")

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from functools import wraps
 from html import escape
+from math import isfinite
 from typing import ParamSpec, Protocol, TypeVar
 from warnings import warn
 
@@ -44,6 +45,11 @@ class Printed:
         below = "".join(f"<p>{escape(remark)}</p>" for remark in remarks)
         table = f"<table><tr>{head}</tr>{body}</table>" if rows or not line else ""
         return f"{f'<p>{escape(line)}</p>' if line else ''}{table}{below}"
+
+
+def rounded(value: float) -> float | None:
+    """Six digits of a number, as JSON holds it: what is not finite is null."""
+    return float(f"{value:.6g}") if isfinite(value) else None
 
 
 def warns_of_remarks(function: Callable[P, R]) -> Callable[P, R]:

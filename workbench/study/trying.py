@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from math import isfinite
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,6 +21,7 @@ from workbench.draw.motion import frame_net
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, centred_at, middle, reach
+from workbench.structure.printed import rounded
 from workbench.study.runs.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
@@ -301,7 +301,7 @@ def _plain(values: ArrayLike) -> Any:
 def _short(values: list[Any]) -> list[Any]:
     if values and isinstance(values[0], list):
         return [_short(row) for row in values]
-    return [float(f"{value:.6g}") if isfinite(value) else None for value in values]
+    return [rounded(value) for value in values]
 
 
 def read_structure(path: Path | None) -> tuple[Rig, str]:

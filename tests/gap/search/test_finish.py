@@ -1,6 +1,7 @@
 """A set brought to its end: as the simplest that the records cannot tell from it, and no further than is of use."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -167,3 +168,12 @@ def test_any_number_of_sets_may_explain_the_records_as_well(rig, search, monkeyp
     found = with_equals(one, here, (), None, ())
     assert len(found) == 8
     assert [p for _, p in found] == pytest.approx([1.0 / 9.0] * 8)
+
+
+def test_sets_at_other_ports_come_in_the_order_of_their_likeness(rig, search):
+    """In a set of names it was another in every run."""
+    sensors = [sensor.name for sensor in reversed(rig.sensors)]
+    best = SimpleNamespace(effects=(Effect(kind_named("actuator_gain"), "F", {"gain": 1.0}),))
+    alike = [("actuator_gain[F]", f"sensor_gain[{name}]", 1.0) for name in sensors]
+    found = finish._at_other_ports(search(rig), best, None, alike)
+    assert [effect.target for (effect,) in found] == sensors

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, permutations
 from typing import Any
 
@@ -133,41 +134,53 @@ def _force(rig: Rig) -> float:
     return Scales.of(rig).force
 
 
-def _actuator(
+def _of_one_number(
+    path: str,
     name: str,
     field: str,
     unit: str,
     phrase: str,
     *,
-    targets: Callable[[Rig], tuple[str, ...]],
     starts: Starts,
-    low: float,
-    high: float,
-    log: bool = True,
+    targets: Callable[[Rig], tuple[str, ...]],
+    low: float = -1e12,
+    high: float = 1e12,
+    log: bool = False,
     attribute: str | None = None,
     neutral: float | None = None,
     size: Callable[[Rig], float] = lambda rig: 1.0,
     apply: Apply | None = None,
     **options: Any,
 ) -> Kind:
-    """A kind with one number of an actuator, which it sets the attribute of that name to unless told otherwise.
+    """A kind with one number of an actuator or a sensor; it sets the attribute of that name unless another is given.
 
     Its bounds are times a size that the rig has of itself.
     """
     attribute = attribute or field
+    change = _change_actuators if path == "actuator" else _change_sensors
+
+    def parameters(rig: Rig, target: str) -> tuple[Parameter, ...]:
+        shown, scale = unit, 0.1
+        if unit == OF_THE_SENSOR:
+            sensor = next(s for s in rig.sensors if s.name == target)
+            shown, scale = QUANTITIES.get(sensor.quantity, ""), max(sensor.noise_std, 1e-300)
+        bounds = low * size(rig), high * size(rig)
+        return (Parameter(field, shown, *bounds, logarithmic=log, scale=scale, neutral=neutral),)
+
     return Kind(
         name=name,
-        path="actuator",
-        parameters=lambda rig, _: (
-            Parameter(field, unit, low * size(rig), high * size(rig), logarithmic=log, scale=0.1, neutral=neutral),
-        ),
-        apply=apply or (lambda rig, target, v: _change_actuators(rig, target, **{attribute: v[field]})),
+        path=path,
+        parameters=parameters,
+        apply=apply or (lambda rig, target, v: change(rig, target, **{attribute: v[field]})),
         starts=starts,
         targets=targets,
         phrase=phrase,
         **options,
     )
 
+
+_actuator = partial(_of_one_number, "actuator", log=True)
+_sensor = partial(_of_one_number, "sensor", targets=each_sensor)
 
 ACTUATOR_GAIN = _actuator(
     "actuator_gain",
@@ -382,51 +395,12 @@ def _size(evidence: Evidence, target: str) -> float:
     return float(max(np.sqrt(np.mean(row**2)) for row in _read(evidence, target)))
 
 
-def _sensor(
-    name: str,
-    field: str,
-    phrase: str,
-    starts: Starts,
-    unit: str = "",
-    *,
-    targets: Callable[[Rig], tuple[str, ...]] = each_sensor,
-    low: float = -1e12,
-    high: float = 1e12,
-    log: bool = False,
-    attribute: str | None = None,
-    neutral: float | None = None,
-    size: Callable[[Rig], float] = lambda rig: 1.0,
-    apply: Apply | None = None,
-    **options: Any,
-) -> Kind:
-    """A kind with one number of a sensor, as `_actuator` of an actuator."""
-    attribute = attribute or field
-
-    def parameters(rig: Rig, target: str) -> tuple[Parameter, ...]:
-        noise = max((s.noise_std for s in rig.sensors if target in (s.name, ALL)), default=1.0)
-        scale = 0.1 if field == "gain" else max(noise, 1e-300)
-        quantity = next((s.quantity for s in rig.sensors if target in (s.name, ALL)), "")
-        shown = QUANTITIES.get(quantity, "") if unit == OF_THE_SENSOR else unit
-        bounds = low * size(rig), high * size(rig)
-        return (Parameter(field, shown, *bounds, logarithmic=log, scale=scale, neutral=neutral),)
-
-    return Kind(
-        name=name,
-        path="sensor",
-        parameters=parameters,
-        apply=apply or (lambda rig, target, v: _change_sensors(rig, target, **{attribute: v[field]})),
-        starts=starts,
-        targets=targets,
-        phrase=phrase,
-        **options,
-    )
-
-
 SENSOR_GAIN = _sensor(
     "sensor_gain",
     "gain",
+    "",
     "a wrong sensor gain",
-    lambda evidence, _: [{"gain": 0.9}],
+    starts=lambda evidence, _: [{"gain": 0.9}],
     apply=lambda rig, target, v: _amplify(rig, "sensors", target, v["gain"]),
     low=-100.0,
     high=100.0,
@@ -442,18 +416,18 @@ def _mean_residual(evidence: Evidence, target: str) -> float:
 SENSOR_BIAS = _sensor(
     "sensor_bias",
     "bias",
-    "a sensor bias",
-    lambda evidence, target: [{"bias": _mean_residual(evidence, target)}],
     OF_THE_SENSOR,
+    "a sensor bias",
+    starts=lambda evidence, target: [{"bias": _mean_residual(evidence, target)}],
     signed=True,
 )
 
 SENSOR_DRIFT = _sensor(
     "sensor_drift",
     "drift_over_record",
-    "a sensor drift",
-    lambda evidence, target: [{"drift_over_record": 2.0 * _mean_residual(evidence, target)}],
     OF_THE_SENSOR,
+    "a sensor drift",
+    starts=lambda evidence, target: [{"drift_over_record": 2.0 * _mean_residual(evidence, target)}],
     attribute="drift",
     signed=True,
 )
@@ -461,9 +435,9 @@ SENSOR_DRIFT = _sensor(
 SENSOR_LAG = _sensor(
     "sensor_lag",
     "time_constant",
-    "a lag of the sensors",
-    lambda evidence, _: [{"time_constant": s * _sample_time(evidence)} for s in (0.1, 0.4, 1.2, 4.0, 12.0)],
     "s",
+    "a lag of the sensors",
+    starts=lambda evidence, _: [{"time_constant": s * _sample_time(evidence)} for s in (0.1, 0.4, 1.2, 4.0, 12.0)],
     log=True,
     low=1e-6,
     high=1e4,
@@ -476,9 +450,9 @@ SENSOR_LAG = _sensor(
 SENSOR_DELAY = _sensor(
     "sensor_delay",
     "delay",
-    "a delay of a sensor",
-    lambda evidence, _: [{"delay": s * _sample_time(evidence)} for s in (0.1, 0.4, 0.8, 1.3, 2.5, 5.0)],
     "s",
+    "a delay of a sensor",
+    starts=lambda evidence, _: [{"delay": s * _sample_time(evidence)} for s in (0.1, 0.4, 0.8, 1.3, 2.5, 5.0)],
     log=True,
     low=1e-9,
     high=1e4,
@@ -609,9 +583,9 @@ def _clipping_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
 SENSOR_CLIPPING = _sensor(
     "sensor_clipping",
     "limit",
-    "clipping of a sensor",
-    _clipping_starts,
     OF_THE_SENSOR,
+    "clipping of a sensor",
+    starts=_clipping_starts,
     log=True,
     low=1e-300,
     nonlinear=True,
@@ -627,9 +601,9 @@ def _rounding_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
 SENSOR_QUANTISATION = _sensor(
     "sensor_quantisation",
     "step",
-    "rounding of a sensor",
-    _rounding_starts,
     OF_THE_SENSOR,
+    "rounding of a sensor",
+    starts=_rounding_starts,
     log=True,
     low=1e-300,
     nonlinear=True,

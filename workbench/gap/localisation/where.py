@@ -389,18 +389,15 @@ def _by_mode(frequencies: Floats, scaled: Sequence[tuple[Record, Floats]], noise
 
     Rigid modes, which no frequency tells apart, have one band, in equal parts.
     """
-    rigid, *others = _shares_between(_mode_bands(frequencies), scaled, noise)
+    elastic = frequencies[frequencies > 0]
+    first = WHERE.rigid * elastic[:1] * (elastic.size < frequencies.size)  # zero: a band that is empty
+    # geometric means, for a peak is as wide as its frequency is high, and what lies above the last mode is told by
+    # itself; `setup.by_band` compares whole signals, and ends bands halfway
+    edges = np.r_[0.0, first, np.sqrt(elastic[1:] * elastic[:-1]), WHERE.above * elastic[-1:], np.inf]
+    rigid, *others = _shares_between(edges, scaled, noise)
     above = others.pop() if others else 0.0  # of rigid modes alone nothing lies above
     n_rigid = frequencies.size - len(others)
     return np.r_[np.full(n_rigid, rigid / max(n_rigid, 1)), others], float(above)
-
-
-def _mode_bands(frequencies: Floats) -> Floats:
-    """Edges, Hz, of the band of all rigid modes, empty where there are none, of each other mode, and above the last."""
-    elastic = frequencies[frequencies > 0]
-    first = WHERE.rigid * elastic[:1] * (elastic.size < frequencies.size)
-    edges: Floats = np.r_[0.0, first, np.sqrt(elastic[1:] * elastic[:-1]), WHERE.above * elastic[-1:], np.inf]
-    return edges
 
 
 def _shares_between(edges: np.ndarray, scaled: Sequence[tuple[Record, Floats]], noise: Floats) -> np.ndarray:

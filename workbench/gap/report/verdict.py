@@ -18,7 +18,7 @@ from workbench.records.units import SI, Units
 from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
-from workbench.structure.printed import joined_in_words
+from workbench.structure.printed import joined_in_words, rounded
 
 NEAR = 0.05  # of the gap: a set that closes less is not near
 SHOWN = 0.005  # of the gap: what is less is not worth a word
@@ -281,9 +281,9 @@ class Verdict:
             "sentence": self.sentence,
             "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
             "nearest": [] if known else effects,
-            "probability": _rounded(self.probability) if self.outcome == "explained" else None,
+            "probability": rounded(self.probability) if self.outcome == "explained" else None,
             "alternatives": [
-                {"kind": label, "words": words, "probability": _rounded(p)}
+                {"kind": label, "words": words, "probability": rounded(p)}
                 for (label, p), (words, _) in zip(self.alternatives, self.alternatives_in_words, strict=True)
             ],
             "where": where_json(self.where),
@@ -294,11 +294,11 @@ class Verdict:
             },
             "shrinkage": {
                 **_rounded_all(shrink.share if shrink else {}),
-                **({"ci95": [_rounded(c) for c in shrink.ci95]} if shrink else {}),
+                **({"ci95": [rounded(c) for c in shrink.ci95]} if shrink else {}),
             },
             "residual": {
-                "nominal": _rounded(self.attribution.nominal_cost),
-                "corrected": _rounded(self.attribution.best.cost),
+                "nominal": rounded(self.attribution.nominal_cost),
+                "corrected": rounded(self.attribution.best.cost),
             },
             "check": {
                 "undetectable": list(self.detectability.undetectable),
@@ -309,8 +309,8 @@ class Verdict:
             "nominal": _rounded_all(dict(self.budget.errors)),
             "record_to_record": None if self.record_to_record is None else self.record_to_record.to_json(),
             "noise": {
-                "stated": [None if s.name in guessed else _rounded(s.noise_std) for s in self.nominal.sensors],
-                "found": [_rounded(v) for v in self.budget.noise_found],
+                "stated": [None if s.name in guessed else rounded(s.noise_std) for s in self.nominal.sensors],
+                "found": [rounded(v) for v in self.budget.noise_found],
                 "found_at_most": list(self.budget.is_noise_at_bound),
             },
             "notes": list(self.notes),
@@ -321,8 +321,8 @@ def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
     """One effect: kind, parameters with their standard deviations, place, input or output."""
     kind = effect.kind
     stated = effect.stated(nominal)
-    entry: dict[str, Any] = {"kind": kind.name, "parameters": {n: _rounded(v) for n, v in stated.items()}}
-    deviations = {n: _rounded(d) for n, d in effect.deviations.items() if n in stated}
+    entry: dict[str, Any] = {"kind": kind.name, "parameters": {n: rounded(v) for n, v in stated.items()}}
+    deviations = {n: rounded(d) for n, d in effect.deviations.items() if n in stated}
     if deviations:
         entry["parameters_std"] = deviations
     if kind.path in ("actuator", "sensor"):
@@ -332,7 +332,7 @@ def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
         entry["at"], entry["at_std"] = kind.fixed_place(effect, nominal)[0], 0.0
     elif effect.at is not None:
         entry |= _place_json(effect.at)
-        spread = [_rounded(effect.deviations.get(name, 0.0)) for name in COORDINATES if name in effect.values]
+        spread = [rounded(effect.deviations.get(name, 0.0)) for name in COORDINATES if name in effect.values]
         entry["at_std"] = spread if len(spread) > 1 else spread[0]
     return entry
 
@@ -342,8 +342,8 @@ def _place_json(where: Any) -> dict[str, Any]:
     if isinstance(where, Between):
         return {"between": list(where)}
     if isinstance(where, tuple):
-        return {"at": [_rounded(coordinate) for coordinate in where]}
-    return {"at": where if isinstance(where, str) else _rounded(where)}
+        return {"at": [rounded(coordinate) for coordinate in where]}
+    return {"at": where if isinstance(where, str) else rounded(where)}
 
 
 def where_json(where: Where) -> dict[str, Any]:
@@ -352,22 +352,26 @@ def where_json(where: Where) -> dict[str, Any]:
         "path": where.path,
         "modes": list(where.modes),
         "amplitude_dependent": where.amplitude_dependent,
-        "linear_share": _rounded(where.linear_share),
-        "above_last_mode": _rounded(where.share_above),
+        "linear_share": rounded(where.linear_share),
+        "above_last_mode": rounded(where.share_above),
         "point": {
             **_place_json(where.at),
-            "at_std": _rounded(where.at_std),
-            "share": _rounded(where.place.share),
+            "at_std": rounded(where.at_std),
+            "share": rounded(where.place.share),
             "single_force": where.place.is_single_force,
         },
-        "by_mode": [_rounded(s) for s in where.mode_shares],
+        "by_mode": [rounded(s) for s in where.mode_shares],
         "by_band": {
-            "edges_hz": [_rounded(f) for f in where.band_edges_hz],
-            "shares": [_rounded(s) for s in where.band_shares],
+            "edges_hz": [rounded(f) for f in where.band_edges_hz],
+            "shares": [rounded(s) for s in where.band_shares],
         },
-        "by_sensor": [_rounded(s) for s in where.sensor_shares],
+        "by_sensor": [rounded(s) for s in where.sensor_shares],
         "by_record": {
-            name: {"gap": _rounded(gap), "input_rms": _rounded(level), "by_eighth": [_rounded(s) for s in shares]}
+            name: {
+                "gap": rounded(gap),
+                "input_rms": rounded(level),
+                "by_eighth": [rounded(s) for s in shares],
+            }
             for name, gap, level, shares in zip(
                 where.record_names, where.record_gaps, where.input_levels, where.time_shares, strict=True
             )
@@ -433,9 +437,5 @@ def _with_deviation(value: float, deviation: float) -> str:
     return f"{value:.{digits}f} ± {deviation:.{digits}f}"
 
 
-def _rounded(value: float) -> float | None:
-    return float(f"{value:.6g}") if np.isfinite(value) else None
-
-
 def _rounded_all(values: dict[str, float]) -> dict[str, float | None]:
-    return {name: _rounded(value) for name, value in values.items()}
+    return {name: rounded(value) for name, value in values.items()}

@@ -255,12 +255,12 @@ def with_equals(
     if not equals:
         return rivals
     weighted = _weighted(search, [here, *equals])
-    of_each = {f.key: p for f, p in weighted}
     # of what sets leave that all leave more than noise no law of chance is known
     if not search.explains(weighted[0][0]):
-        of_each = dict.fromkeys(of_each, 1.0 / len(of_each))
-    rest = [(f, p * of_each[here.key]) for f, p in rivals]
-    return tuple(sorted([*((f, of_each[f.key]) for f in equals), *rest], key=lambda each: -each[1]))
+        weighted = [(f, 1.0 / len(weighted)) for f, _ in weighted]
+    own = next(p for f, p in weighted if f is here)
+    beside = [(f, p) for f, p in weighted if f is not here]
+    return tuple(sorted([*beside, *((f, p * own) for f, p in rivals)], key=lambda each: -each[1]))
 
 
 def _at_other_ports(
@@ -272,9 +272,8 @@ def _at_other_ports(
     }
     for effect in best.effects:
         if effect.label in labels:
-            pairs = [pair[:2] for pair in alike if effect.label in pair[:2]]
-            for label in {label for pair in pairs for label in pair if label != effect.label and label in labels}:
-                kind, target = labels[label]
+            likes = dict.fromkeys(label for *pair, _ in alike if effect.label in pair for label in pair)
+            for kind, target in (labels[label] for label in likes if label in labels and label != effect.label):
                 for values in list(kind.starts(evidence, target))[:1]:
                     other = Effect(kind, target, dict(values))
                     yield tuple(other if e is effect else e for e in best.effects)

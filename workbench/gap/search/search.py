@@ -117,14 +117,12 @@ class Search:
 
     def with_noise(self, noise: np.ndarray) -> "Search":
         """The same search with other standard deviations of the sensors' noise (n_outputs,)."""
-        data, quick, first = (data.with_noise(noise) for data in (self.data, self.quick, self.first))
         nominal = self.nominal * (self.data.noise / noise) ** 2
-        return replace(self, data=data, quick=quick, first=first, nominal=nominal)
+        return replace(self._in(lambda data: data.with_noise(noise)), nominal=nominal)
 
     def through(self, whitener: ForceFilter, observer: Observer) -> "Search":
         """The same search beside a random force."""
-        data, quick, first = (data.through(whitener, observer) for data in (self.data, self.quick, self.first))
-        return replace(self, data=data, quick=quick, first=first)
+        return self._in(lambda data: data.through(whitener, observer))
 
     def beside_inputs(self, rig: Rig, share: float) -> "Search":
         """The same search beside noise of the logged inputs.
@@ -134,9 +132,12 @@ class Search:
             share: of the inputs' rms.
         """
         filters = input_filters(rig, self.data, share)
-        data, quick, first = (d.beside_inputs(filters) for d in (self.data, self.quick, self.first))
-        nominal = data.by_channel(data.residual(self.rig))
-        return replace(self, data=data, quick=quick, first=first, nominal=nominal, logged=share)
+        beside = self._in(lambda data: data.beside_inputs(filters))
+        return replace(beside, nominal=beside.data.by_channel(beside.data.residual(self.rig)), logged=share)
+
+    def _in(self, changed: Callable[[FitData], FitData]) -> "Search":
+        """The same search in its records once changed."""
+        return replace(self, data=changed(self.data), quick=changed(self.quick), first=changed(self.first))
 
     def evidence_of(self, rig: Rig) -> Evidence:
         """What the records say of an unmodelled force beside what a rig has."""
@@ -149,9 +150,8 @@ class Search:
             return self
         sensors = tuple(self.rig.sensors[j] for j in kept)
         names = tuple(sensor.name for sensor in sensors)
-        data, quick, first = (data.of_outputs(names) for data in (self.data, self.quick, self.first))
         rig = replace(self.rig, sensors=sensors)
-        return replace(self, rig=rig, data=data, quick=quick, first=first, nominal=self.nominal[:, kept])
+        return replace(self._in(lambda data: data.of_outputs(names)), rig=rig, nominal=self.nominal[:, kept])
 
     def beside(self, figures: Effect) -> "Search":
         """The same search beside believed figures, which give way to every candidate to first order."""

@@ -38,6 +38,7 @@ from workbench.identification.signal.searches import (
     Progress,
     Stepwise,
     check_count,
+    overdamped,
     spurious_modes,
 )
 from workbench.records.record import Record
@@ -376,8 +377,7 @@ class _FreeDecay:
         """Which modes are no more where they were selected: what else is in a record than modes has drawn them off,
         or damps them too much to ring."""
         away = np.abs(np.subtract.outer(poles, refined))
-        damped = (-refined.real > SELECTION.most_damped * np.abs(refined))[away.argmin(axis=1)]
-        return np.asarray(damped | self.lost(poles, refined))
+        return np.asarray(overdamped(refined)[away.argmin(axis=1)] | self.lost(poles, refined))
 
     def lost(self, poles: np.ndarray, found: np.ndarray) -> np.ndarray:
         """Which poles have none of those found within a few of their bandwidths."""

@@ -19,7 +19,7 @@ from workbench.identification.input_output.modal_fit import (
     search,
     settled,
 )
-from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget, Stepwise
+from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget, Stepwise, overdamped
 from workbench.structure.modes import mac
 
 
@@ -279,8 +279,8 @@ def _changes(data: Measurement, poles: np.ndarray) -> np.ndarray:
 
 def _can_ring(data: Measurement, poles: np.ndarray) -> np.ndarray:
     """Which poles are of a frequency that the measurement holds, and not damped too much to ring."""
-    ringing = -poles.real < SELECTION.most_damped * np.abs(poles)
-    return np.asarray(ringing & (poles.imag > 0) & (poles.imag < data.highest) & ~_reaches_nyquist(data, poles))
+    held = (poles.imag > 0) & (poles.imag < data.highest)
+    return np.asarray(held & ~overdamped(poles) & ~_reaches_nyquist(data, poles))
 
 
 def _reaches_nyquist(data: Measurement, poles: np.ndarray) -> np.ndarray:
@@ -344,8 +344,7 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
     one = shapes.shape[0] * data.n_inputs == 1  # which has no shape; how a record begins is none
     split = near & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not one)
-    damped = -poles.real > SELECTION.most_damped * np.abs(poles)
-    return np.asarray(split.any(axis=1) | damped | _reaches_nyquist(data, poles))
+    return np.asarray(split.any(axis=1) | overdamped(poles) | _reaches_nyquist(data, poles))
 
 
 def statistic_of(fit: Fit, r: int) -> float:

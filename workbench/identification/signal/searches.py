@@ -415,6 +415,11 @@ class Stepwise(Generic[Model, Candidate]):
         return model
 
 
+def overdamped(poles: np.ndarray) -> np.ndarray:
+    """Which poles are damped too much to ring."""
+    return np.asarray(-poles.real > SELECTION.most_damped * np.abs(poles))
+
+
 def spurious_modes(
     poles: np.ndarray,
     shapes: np.ndarray,
@@ -433,7 +438,7 @@ def spurious_modes(
     """
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
-    damped = -poles.real > SELECTION.most_damped * np.abs(poles)
+    damped = overdamped(poles)
     # An overdamped one has every band; it is split itself.
     # One signal has no shape, and a mode that depends on amplitude looks like two there.
     others = len(shapes) - 1

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -28,6 +29,7 @@ class Spectra:
     @staticmethod
     def read(signals: Sequence[Floats], records: Sequence[Record], frequencies_hz: Floats) -> "Spectra":
         """Of signals, (n_signals, n_samples) a record; a band ends halfway between two natural frequencies."""
+        # every line is compared in some band; `localisation.where` shares a gap among modes, and takes geometric means
         edges = np.r_[0.0, (frequencies_hz[1:] + frequencies_hz[:-1]) / 2.0, np.inf]
         of, ends = [], []
         for signal, record in zip(signals, records, strict=True):
@@ -45,6 +47,11 @@ class Spectra:
         """Some of the signals, in that order."""
         return self.like([of[list(at)] for of in self.of])
 
+    @cached_property
+    def power(self) -> Floats:
+        """(n_records, n_signals, n_modes) of each signal."""
+        return self.shared(self)
+
     def shared(self, other: "Spectra") -> Floats:
         """(n_records, n_signals, n_modes) what each signal has in common with its like: of itself, its power."""
         in_bands = []
@@ -56,8 +63,7 @@ class Spectra:
 
 def asked(measured: Spectra) -> Flags:
     """(n_records, n_signals, n_modes) the bands that hold enough of a signal to be compared."""
-    power = measured.shared(measured)
-    return np.asarray(power > OF_CHANNEL * power.sum(axis=2, keepdims=True))
+    return np.asarray(measured.power > OF_CHANNEL * measured.power.sum(axis=2, keepdims=True))
 
 
 def unlike(measured: Spectra, predicted: Spectra, factor: float = 1.0) -> Floats:
@@ -67,7 +73,7 @@ def unlike(measured: Spectra, predicted: Spectra, factor: float = 1.0) -> Floats
     """
     tiny = 1e-300
     with np.errstate(over="ignore", invalid="ignore"):
-        of_y, of_p, both = measured.shared(measured), predicted.shared(predicted), measured.shared(predicted)
+        of_y, of_p, both = measured.power, predicted.power, measured.shared(predicted)
         ratio = 0.5 * (np.log(np.maximum(of_y, tiny)) - np.log(np.maximum(of_p * factor**2, tiny)))
         alike = np.sign(factor) * both / np.sqrt(np.maximum(of_y * of_p, tiny))
         return np.asarray(np.nan_to_num(np.minimum(np.abs(ratio), MOST) + 1.0 - alike, nan=MOST + 1.0))
@@ -76,6 +82,6 @@ def unlike(measured: Spectra, predicted: Spectra, factor: float = 1.0) -> Floats
 def log_ratios(measured: Spectra, predicted: Spectra) -> Floats:
     """(n_records, n_signals, n_modes) logarithm of measured by predicted amplitude; nan in bands that are not asked."""
     with np.errstate(over="ignore", invalid="ignore"):
-        of_y, of_p = (np.log(np.maximum(each.shared(each), 1e-300)) for each in (measured, predicted))
+        of_y, of_p = (np.log(np.maximum(each.power, 1e-300)) for each in (measured, predicted))
         ratio = 0.5 * (of_y - of_p)
     return np.where(asked(measured) & np.isfinite(ratio), ratio, np.nan)

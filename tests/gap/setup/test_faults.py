@@ -8,10 +8,14 @@ from scipy.linalg import sqrtm
 from scipy.signal import butter, cont2discrete, dlsim, lfilter
 
 from workbench.gap.diagnose import diagnose
-from workbench.gap.report.setup_faults import SetupFault, check_disjoint, setup_faults, without_faults
+from workbench.gap.setup import compared
+from workbench.gap.setup.corrections import SetupFault, without_faults
+from workbench.gap.setup.faults import setup_faults
+from workbench.gap.setup.repeats import check_disjoint
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import predict
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints
 from workbench.structure.finite_elements import FiniteElements
@@ -62,6 +66,13 @@ def expect(case, records, sentence, rig=None):
 
 def test_nothing_is_wrong_with_a_case_wired_rightly(case):
     assert setup_faults(case.rig, case.fit) == ()
+
+
+def test_a_case_wired_rightly_is_simulated_once_a_record(case, monkeypatch):
+    simulated = []
+    monkeypatch.setattr(compared, "predict", lambda rig, record: simulated.append(record.name) or predict(rig, record))
+    assert setup_faults(case.rig, case.fit, case.validation) == ()
+    assert simulated == [record.name for record in (*case.fit, *case.validation)]
 
 
 def test_exchanged_inputs_are_named_and_corrected_to_the_last_bit(case):

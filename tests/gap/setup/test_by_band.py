@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from workbench.gap.report.by_band import MOST, Spectra, asked, unlike
+from workbench.gap.setup.by_band import MOST, Spectra, asked, unlike
 
 F = np.array([2.0, 6.0, 11.0])  # Hz: bands end at 4 and 8.5
 T = np.arange(4000) * 0.01
