@@ -281,7 +281,7 @@ class _Response:
     def _about(self, rows: Floats, weighted: bool = True) -> Floats:
         """Rows as the fit sees them, as lines about the modes."""
         parts = [rows[part] for part in self.data.rows]
-        return np.vstack([(x if self.data.by_line else lines_of(x))[self._which(len(x))] for x in parts])
+        return np.vstack([(x if self.data.rows_are_lines else lines_of(x))[self._which(len(x))] for x in parts])
 
     def _about_samples(self, samples: list[np.ndarray]) -> Floats:
         return np.vstack([lines_of(x)[self._which(len(x))] for x in samples])

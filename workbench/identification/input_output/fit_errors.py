@@ -11,7 +11,13 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.arrays import Floats, scaled_inverse, symmetric_root
-from workbench.identification.input_output.modal_fit import Fit, Part, free_parameters, moves, normal
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    Part,
+    free_parameters,
+    normal_equations,
+    tangent_weights,
+)
 from workbench.identification.signal.modal_estimates import by_poles
 
 Figures = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -19,7 +25,7 @@ Figures = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 def covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
     """Of the free unknowns; `noise_ratio` is κ, (n_outputs, n_modes)."""
-    bound = scaled_inverse(normal(fit, fit.noise)[0])
+    bound = scaled_inverse(normal_equations(fit, fit.noise)[0])
     if np.all(noise_ratio == 1.0):
         return bound
     each = np.broadcast_to(noise_ratio, (fit.noise.size, fit.poles.size))
@@ -27,7 +33,7 @@ def covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
         replace(part, coefficients=part.coefficients * _by_column(part, each[outputs]))
         for part, outputs in fit.outputs()
     )
-    return np.asarray(bound @ normal(replace(fit, parts=rescaled), fit.noise)[0] @ bound)
+    return np.asarray(bound @ normal_equations(replace(fit, parts=rescaled), fit.noise)[0] @ bound)
 
 
 def pole_covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0, further: Floats | None = None) -> np.ndarray:
@@ -53,7 +59,9 @@ def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray, further: Floats 
     """
     n, p = fit.participation.shape
     free, size, at = free_parameters(fit), n * (p + 1), (fit.poles, fit.participation, fit.amplitudes)
-    drift = np.concatenate([-np.einsum("ct,tkj->ckj", part.tilt, moves(fit, part)) for part in fit.parts], axis=2)
+    drift = np.concatenate(
+        [-np.einsum("ct,tkj->ckj", part.tilt, tangent_weights(fit, part)) for part in fit.parts], axis=2
+    )
     changes = []
 
     def add(unknowns: Floats, c: Floats | None = None) -> None:
@@ -135,7 +143,7 @@ def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray, further: Flo
     """
     bound, free, n, found = covariance(fit, noise_ratio), free_parameters(fit), 2 * fit.poles.size, []
     for part, outputs in fit.outputs():
-        drift = np.einsum("ct,tkj->ckj", part.tilt[n:], moves(fit, part)[:, free])
+        drift = np.einsum("ct,tkj->ckj", part.tilt[n:], tangent_weights(fit, part)[:, free])
         own = np.diag(part.spread)[n:, None] * fit.noise[outputs] ** 2 * fixed[:, outputs]
         found.append(own + np.einsum("ckj,kl,clj->cj", drift, bound, drift))
     variance = np.hstack(found)

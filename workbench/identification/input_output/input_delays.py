@@ -124,7 +124,7 @@ def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray
         wanted = [np.real((l_r * of[:, None]).T @ fit.amplitudes.T) for of in (now, before)]
         weight = (1.0 - f, f) if data.hold == "first" else (0.0, 1.0)
         left = columns - wanted
-        if data.may_feel:  # the direct term takes what goes along its own columns
+        if data.may_have_feedthrough:  # the direct term takes what goes along its own columns
             across = weight[1] * left[0] - weight[0] * left[1]
             cost[k] = (across**2 / ((weight[1] * noise[0]) ** 2 + (weight[0] * noise[1]) ** 2)).sum(axis=1)
         else:

@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, moves, projected
+from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, projected, tangent_weights
 from workbench.identification.input_output.model_order import sure_modes
 from workbench.identification.input_output.noise_spectrum import lines_of, samples_of
 from workbench.identification.signal.projection import PROJECTION
@@ -90,7 +90,7 @@ def noise_levels(data: KnownInputs, fit: Fit, records: Sequence[Record]) -> Inpu
 
 def _spectra_left(data: KnownInputs, fit: Fit) -> tuple[Floats, Floats]:
     """Of all records: power of what a fit leaves (n_outputs, n_lines), and |G|² (n_inputs, n_outputs, n_lines)."""
-    responses, taken = _impulse_responses(data, fit), np.clip(data.taken(fit), 0.0, PROJECTION.most_taken)
+    responses, taken = _impulse_responses(data, fit), np.clip(data.leverage(fit), 0.0, PROJECTION.most_taken)
     powers, gains = [], []
     for rows, left in zip(data.rows, data.left(fit), strict=True):
         powers.append(lines_of(left) ** 2 / (1.0 - taken[rows]))
@@ -196,7 +196,7 @@ def spread_by_inputs(data: KnownInputs, fit: Fit, std: Floats, acts: Sequence[Fl
         for i in np.flatnonzero(std):
             unknowns, along, drifts = np.zeros((n, free.size)), [], []
             for part, outputs in fit.outputs():
-                moved, rest = moves(fit, part)[:, free], tangents[rows] - phi[rows] @ part.tilt
+                moved, rest = tangent_weights(fit, part)[:, free], tangents[rows] - phi[rows] @ part.tilt
                 for k, j in enumerate(range(outputs.start, outputs.stop)):
                     square = weights[rows, j, None] ** 2 if len(weights) > 1 else 1.0
                     heard = data.samples(square * np.hstack([rest, phi[rows]]))
