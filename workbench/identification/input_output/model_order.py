@@ -306,7 +306,7 @@ def _candidate_gain(
 
     Args:
         bases: orthonormal columns of the fit, see `bases_of`.
-        left: (n_rows, n_outputs) residual over its noise.
+        residual: (n_rows, n_outputs), in units of the noise.
     """
     real, imaginary = data.responses(pole)
     columns, strength, blocks = np.hstack([real, imaginary]), 0.0, []
@@ -347,7 +347,7 @@ def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> 
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
-    """Whether each mode is overdamped, reaches Nyquist, or splits a stronger mode.
+    """Whether each mode is damped too much, reaches Nyquist, or splits a stronger mode.
 
     A split mode overlaps the stronger one and has its shape and participation factors.
     """
@@ -357,9 +357,8 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + data.resolution
     overlapping = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
-    single_channel = (
-        shapes.shape[0] * data.n_inputs == 1
-    )  # a single FRF has no shapes to compare; initial states do not count
+    # one output and one input leave no shapes to compare; initial states do not count
+    single_channel = shapes.shape[0] * data.n_inputs == 1
     splits = overlapping & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not single_channel)
     damped = -poles.real > SELECTION.most_damped * np.abs(poles)
     return np.asarray(splits.any(axis=1) | damped | _reaches_nyquist(data, poles))
