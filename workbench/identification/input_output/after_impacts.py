@@ -24,7 +24,7 @@ from workbench.records.record import Record
 class AfterImpactsSettings:
     """Constants of the identification from free decays."""
 
-    share: float = 0.4  # of the time of an identification; starting from these modes takes a tenth of a search
+    share: float = 0.4  # of the time of an identification; a search that starts from these modes takes a tenth of it
     least: float = 0.5  # share of a record that must follow the last impact
     matters: float = 0.1  # of the half-power bandwidth: a mode whose frequency varies less over a decay is linear
     near: float = 0.1  # of the frequency of a mode, within which one identified from the whole record is the same

@@ -41,10 +41,10 @@ def force_window(records: Sequence[Record]) -> tuple[tuple[Record, ...], tuple[s
         for row, name in zip(inputs, record.input_names, strict=True):
             offset = np.median(row)
             noise = float(median_abs_deviation(row, scale="normal"))
-            blows = _in_impacts(row - offset, noise)
-            between = np.where(blows, 0.0, row - offset)
-            if blows.any() and between.any() and not _correlates(between, np.where(blows, 0.0, record.outputs)):
-                row[:] = np.where(blows, row - offset, 0.0)
+            impacts = _in_impacts(row - offset, noise)
+            between = np.where(impacts, 0.0, row - offset)
+            if impacts.any() and between.any() and not _correlates(between, np.where(impacts, 0.0, record.outputs)):
+                row[:] = np.where(impacts, row - offset, 0.0)
                 removed.setdefault(name, []).append(noise)
         unchanged = np.array_equal(inputs, record.inputs)
         windowed.append(record if unchanged else replace(record, inputs=inputs))

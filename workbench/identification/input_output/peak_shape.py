@@ -55,7 +55,7 @@ class Peaks(NamedTuple):
 
 
 def peaks(lines: Lines, fit: Fit) -> Peaks:
-    """The term 1 / (s - λ)³ of every mode, estimated with the poles, shapes and fixed columns of the fit re-fitted."""
+    """The term 1 / (s - λ)³ of every mode, estimated jointly with first-order changes of the fit."""
     n = fit.poles.size
     if not n:
         return Peaks(np.zeros(0, bool), np.zeros(0), np.zeros(0))

@@ -116,15 +116,18 @@ class Lines:
         return selected
 
     def _stacked(self, values: np.ndarray) -> np.ndarray:
+        """Rows of the fit, (2 n_references n_lines, n), from complex values (n, n_references, n_lines)."""
         rows = values.reshape(values.shape[0], -1).T
         return np.vstack([rows.real, rows.imag])
 
     def _of_reference(self, reference: int, values: np.ndarray) -> np.ndarray:
+        """Values (n_lines,) of one reference, zero for the others, (n_references, n_lines)."""
         rows = np.zeros((self.refs, self.lines), complex)
         rows[reference] = values
         return rows
 
     def unstacked(self, rows: np.ndarray) -> np.ndarray:
+        """Complex values (n, n_references, n_lines) from rows of the fit, the inverse of `_stacked`."""
         real, imaginary = np.split(rows, 2)
         return (real + 1j * imaginary).T.reshape(-1, self.refs, self.lines)
 

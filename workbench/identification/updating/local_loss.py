@@ -126,17 +126,18 @@ class LocatedDamage(Printed):
     @property
     def remarks(self) -> tuple[str, ...]:
         """Other explanations of the modes, and whether the modes are explained at all."""
-        remarks, loss, lossy = [], self.damaged.loss, self.damaged.chi2
+        remarks, loss, chi2_with_loss = [], self.damaged.loss, self.damaged.chi2
         assert loss is not None, "damaged is an explanation with a loss"
         if self.with_mass is not None and self._is_mass:
             part = self.with_mass.structure.attachments[-1]
             remarks.append(
                 f"a point mass of {part.pair[0]:.3g} kg at {part.at:.4g} m, which the nominal structure lacks,"
-                f" explains the modes better than a loss: χ² {self.with_mass.chi2:.4g}, {lossy:.4g} with the loss"
+                f" explains the modes better than a loss: χ² {self.with_mass.chi2:.4g}, {chi2_with_loss:.4g} with the"
+                " loss"
             )
         if not self.best.explains:
             place = f"{100 * loss.share:.2g} % at {loss.centre:.4g} m"
-            text = f"; with a loss of {place} it is {lossy:.4g}: no proof of damage"
+            text = f"; with a loss of {place} it is {chi2_with_loss:.4g}: no proof of damage"
             remarks.append(f"{unexplained(self.best)}{'' if self.detected else text}. {LACKING}")
         return tuple(remarks)
 
@@ -253,7 +254,7 @@ def _fit_with_mass(
     for n_terms in {tuple(numbers[: LOSS.first_terms][-1] for numbers in terms): None, damaged.n_terms: None}:
         problem = Problem.of(task, *(basis(n) for n in n_terms))
         starts = [
-            (whole, part) for whole in _structures_without_loss(problem) for part in _likely_masses(problem, whole)
+            (intact, part) for intact in _structures_without_loss(problem) for part in _likely_masses(problem, intact)
         ]
         if best is not None:
             starts.append((best, cast(PointMass, best.structure.attachments[-1])))
@@ -284,9 +285,9 @@ def _whole_mass(problem: Problem) -> float:
     return float(problem.task.nominal.length * problem.task.nominal.mass_per_length(x).mean())
 
 
-def _likely_masses(problem: Problem, whole: FittedStructure) -> list[PointMass]:
+def _likely_masses(problem: Problem, intact: FittedStructure) -> list[PointMass]:
     """Point masses at the peaks of the first-order decrease of χ² along the structure."""
-    z, small_mass = problem.free_near(whole), LOSS.first_mass * _whole_mass(problem)
+    z, small_mass = problem.free_near(intact), LOSS.first_mass * _whole_mass(problem)
     residuals, slopes = problem.residuals(z)
     basis = np.linalg.qr(slopes)[0]
     places = np.linspace(0.0, problem.task.nominal.length, LOSS.mass_places)
@@ -352,7 +353,9 @@ def _fit_near_either(other: FittedStructure, problem: Problem, near: FittedStruc
 
 def _fit_from_scan(problem: Problem, near: FittedStructure | None) -> FittedStructure:
     """The maximum likelihood structure with a loss, searched from the likeliest places and from an earlier fit."""
-    starts = [(whole, loss) for whole in _structures_without_loss(problem) for loss in _likely_losses(problem, whole)]
+    starts = [
+        (intact, loss) for intact in _structures_without_loss(problem) for loss in _likely_losses(problem, intact)
+    ]
     return _likeliest(problem, starts if near is None else [*starts, (near, near.loss)])
 
 
@@ -380,10 +383,10 @@ def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLo
     return min(fits, key=lambda fit: fit.chi2)
 
 
-def _likely_losses(problem: Problem, whole: FittedStructure) -> list[LocalLoss]:
+def _likely_losses(problem: Problem, intact: FittedStructure) -> list[LocalLoss]:
     """Losses at the peaks of `scan`, for each width; none where no loss lowers χ²."""
     length = problem.task.nominal.length
-    places, all_gains = scan(problem, whole)
+    places, all_gains = scan(problem, intact)
     losses = []
     for width, gain in zip(LOSS.widths, all_gains, strict=True):
         peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))

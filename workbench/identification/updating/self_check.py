@@ -64,16 +64,23 @@ class Identified(Printed):
         return self.distributions.remarks
 
 
-def structure_of(found: Distributions, *, kind: str, length: float, left: str | End, right: str | End) -> Bar | Beam:
+def structure_of(
+    distributions: Distributions, *, kind: str, length: float, left: str | End, right: str | End
+) -> Bar | Beam:
     """The `Bar` or `Beam` that identified distributions describe.
 
     Raises:
         ValueError: a distribution that is not positive everywhere.
     """
-    arguments: dict[str, Any] = {"length": length, "left": left, "right": right, "mass_per_length": found.mass.profile}
+    arguments: dict[str, Any] = {
+        "length": length,
+        "left": left,
+        "right": right,
+        "mass_per_length": distributions.mass.profile,
+    }
     if kind == "bar":
-        return Bar(axial_stiffness=found.stiffness.profile, **arguments)
-    return Beam(bending_stiffness=found.stiffness.profile, **arguments)
+        return Bar(axial_stiffness=distributions.stiffness.profile, **arguments)
+    return Beam(bending_stiffness=distributions.stiffness.profile, **arguments)
 
 
 @one_blas_thread

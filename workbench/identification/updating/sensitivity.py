@@ -25,7 +25,7 @@ from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile
 from workbench.structure.supports import HELD, PointDamper, PointMass
 
-EXTRA_DEGREES = 4  # of the polynomials, beyond those that the modes alone need
+EXTRA_DEGREES = 4  # margin of the degree of the polynomials
 RIGID = 1e-10  # of the eigenvalue of a half wave, below which a mode is a rigid-body mode
 ROUND_OFF = 1e-15
 

@@ -117,7 +117,7 @@ def choose(
                     )
                 except ValueError as error:
                     tried[i, j], reason = None, str(error)
-        fits = {pair: found for pair, found in tried.items() if found is not None}
+        fits = {pair: result for pair, result in tried.items() if result is not None}
         if not fits:
             raise ValueError(reason)
         least = min(fits, key=lambda pair: fits[pair].criterion)

@@ -271,16 +271,16 @@ class Problem:
             low, high = (middle, high) if is_within_error(middle) else (low, middle)
         return shifted(high)
 
-    def free_near(self, found: FittedStructure) -> np.ndarray:
+    def free_near(self, fit: FittedStructure) -> np.ndarray:
         """Free parameters, with those of a loss, of the series nearest to a structure fitted with other terms."""
         nominal, length = self.task.nominal, self.task.nominal.length
         x = (np.arange(100) + 0.5) / 100 * length
-        mass = found.mass(x) / nominal.mass_per_length(x)
-        stiffness = found.stiffness(x) / self.series.nominal_stiffness(x)
-        if found.loss is None:
+        mass = fit.mass(x) / nominal.mass_per_length(x)
+        stiffness = fit.stiffness(x) / self.series.nominal_stiffness(x)
+        if fit.loss is None:
             return self._nearest(x, mass, stiffness)
-        intact = stiffness / found.loss.of(Profile.constant(1.0), length)(x)
-        return np.asarray(np.r_[self._nearest(x, mass, intact), found.parameters[-3:]])
+        intact = stiffness / fit.loss.of(Profile.constant(1.0), length)(x)
+        return np.asarray(np.r_[self._nearest(x, mass, intact), fit.parameters[-3:]])
 
     def _start(self) -> np.ndarray:
         """Free parameters of the nominal structure, scaled to the known values and the measured frequencies."""

@@ -277,6 +277,6 @@ LACKING = (
 )
 
 
-def unexplained(found: FittedStructure) -> str:
+def unexplained(fit: FittedStructure) -> str:
     """The remark that a structure does not explain its modes, with χ² and its limit."""
-    return f"the modes are not explained: χ² is {found.chi2:.4g}, and noise alone gives at most {found.limit:.4g}"
+    return f"the modes are not explained: χ² is {fit.chi2:.4g}, and noise alone gives at most {fit.limit:.4g}"
