@@ -139,15 +139,13 @@ class _Decays:
         third = 6.0 * spline.c[0]
         jumps = np.vstack([-third[:1], third[:-1] - third[1:], third[-1:]])
         a, b = (each - 1j * lines.omega[:, None] for each in (pole, pole.conjugate()))
-        exponentials = np.exp(a * self.time)
+        exp_a = np.exp(a * self.time)
 
         def boundary_terms(exponent: np.ndarray, at: float) -> np.ndarray:
             """Boundary terms of the integral by parts, at one end; the third derivative is constant between knots."""
             return np.asarray(sum((-1) ** k * spline(at, k)[None] / exponent ** (k + 1) for k in range(3)))
 
-        self.above = (
-            exponentials[:, -1:] * boundary_terms(a, end) - boundary_terms(a, 0.0) - (exponentials / a**4) @ jumps
-        )
+        self.above = exp_a[:, -1:] * boundary_terms(a, end) - boundary_terms(a, 0.0) - (exp_a / a**4) @ jumps
         self.below = -boundary_terms(b, 0.0)
 
     def rows(self, motions: np.ndarray) -> tuple[Floats, Floats]:
@@ -278,6 +276,4 @@ class _Peak:
         for y, basis, weight, noise in each:
             x = weight * rows
             projected.append(projected_residual(y, (x - basis @ (basis.T @ x)) / noise))
-        return np.concatenate([residual for residual, _ in projected]), np.vstack(
-            [jacobian for _, jacobian in projected]
-        )
+        return np.concatenate([r for r, _ in projected]), np.vstack([j for _, j in projected])

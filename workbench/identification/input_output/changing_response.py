@@ -255,14 +255,12 @@ class _Response:
         if not all(np.isfinite(each).all() for each in motions):
             diverged = 10.0 * np.abs(np.concatenate(self.values))
             return diverged, np.zeros((diverged.size, motions[0].shape[1] - 1))
-        rows, projected = self._lines_of_samples([np.hstack([z.real, z.imag]) for z in motions]), []
+        rows, fits = self._lines_of_samples([np.hstack([z.real, z.imag]) for z in motions]), []
         each = zip(self.values, self.bases, self.weights, self.fit.noise, strict=True)
         for y, basis, weight, noise in each:
             x = weight[:, None] * rows / noise
-            projected.append(projected_residual(y, x - basis @ (basis.T @ x)))
-        return np.concatenate([residual for residual, _ in projected]), np.vstack(
-            [jacobian for _, jacobian in projected]
-        )
+            fits.append(projected_residual(y, x - basis @ (basis.T @ x)))
+        return np.concatenate([r for r, _ in fits]), np.vstack([j for _, j in fits])
 
     def _motion(self, motions: list[np.ndarray]) -> Motion:
         motion_rows = self.data.rows_of([np.hstack([z.real, z.imag]) for z in motions])

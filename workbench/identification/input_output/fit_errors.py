@@ -61,7 +61,7 @@ def propagated_covariance(
     """
     n, p = fit.participation.shape
     free, size, estimate = free_parameters(fit), n * (p + 1), (fit.poles, fit.participation, fit.amplitudes)
-    parameter_effect = np.concatenate(
+    effect = np.concatenate(
         [-np.einsum("ct,tkj->ckj", part.tilt, tangent_weights(fit, part)) for part in fit.parts], axis=2
     )
     directions = []
@@ -71,7 +71,7 @@ def propagated_covariance(
         all_unknowns = np.zeros(2 * size)
         all_unknowns[free] = unknowns
         step = (all_unknowns[:size] + 1j * all_unknowns[size:]).reshape(n, p + 1)
-        c = np.einsum("ckj,k->cj", parameter_effect, all_unknowns) if c is None else c
+        c = np.einsum("ckj,k->cj", effect, all_unknowns) if c is None else c
         directions.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
 
     for column in _root(covariance(fit, noise_ratio)).T:
@@ -132,11 +132,11 @@ def vector_covariance(
         driven = participation[kept, :n_inputs] * (0.5 * displacements[largest, modes] / scale)[:, None]
         return np.concatenate([relative.real.T, driven.real, driven.imag], axis=1).ravel()
 
-    covariances = propagated_covariance(fit, functions, noise_ratio, further).reshape(kept.size, k, kept.size, k)[
+    blocks = propagated_covariance(fit, functions, noise_ratio, further).reshape(kept.size, k, kept.size, k)[
         modes, :, modes
     ]
-    covariances[modes, largest], covariances[modes, :, largest] = 0.0, 0.0  # one by definition
-    return covariances
+    blocks[modes, largest], blocks[modes, :, largest] = 0.0, 0.0  # one by definition
+    return blocks
 
 
 def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray, further: Floats | None = None) -> np.ndarray:
@@ -149,9 +149,9 @@ def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray, further: Flo
     """
     bound, free, n, variances = covariance(fit, noise_ratio), free_parameters(fit), 2 * fit.poles.size, []
     for part, outputs in fit.outputs():
-        parameter_effect = np.einsum("ct,tkj->ckj", part.tilt[n:], tangent_weights(fit, part)[:, free])
+        effect = np.einsum("ct,tkj->ckj", part.tilt[n:], tangent_weights(fit, part)[:, free])
         column_variance = np.diag(part.spread)[n:, None] * fit.noise[outputs] ** 2 * fixed[:, outputs]
-        variances.append(column_variance + np.einsum("ckj,kl,clj->cj", parameter_effect, bound, parameter_effect))
+        variances.append(column_variance + np.einsum("ckj,kl,clj->cj", effect, bound, effect))
     variance = np.hstack(variances)
     if further is not None:
         variance += np.diag(further)[free.size :].reshape(fit.noise.size, -1).T[n:]

@@ -14,9 +14,7 @@ from workbench.records.record import Record
 class WindowSettings:
     """Constants of the detection of impacts in an input."""
 
-    loud: float = (
-        6.0  # standard deviations of the reading between impacts; normal noise exceeds them in 1 of 5e8 samples
-    )
+    loud: float = 6.0  # standard deviations of the reading between impacts: normal noise exceeds them once in 5e8
     clear: float = 30.0  # likewise, that the peak of an impact exceeds
     most: float = 0.1  # share of a record that impacts take; another excitation takes more
     # correlation, at any lag, of the reading between impacts with an output, above which it is a force: that of an

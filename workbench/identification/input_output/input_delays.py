@@ -162,16 +162,12 @@ def best_delays(
             return cost(np.where(unit > 0, delay, rest))
 
         # interpolation spreads a band-limited input ahead of its delay, so the first lag is too early
-        best_whole = max(float(delays_found[i]), 0.0)
-        middle_cost, next_cost = at(best_whole), at(best_whole + 1.0)
-        while (
-            next_cost < middle_cost
-            and best_whole < DELAYS.most_lags
-            and not budget.spent("search for delays of the inputs")
-        ):
-            best_whole, middle_cost, next_cost = best_whole + 1.0, next_cost, at(best_whole + 2.0)
-        lowest = max(best_whole - 1.0, 0.0)
-        best = minimize_scalar(at, bounds=(lowest, best_whole + 1.0), method="bounded", options={"xatol": 1e-3})
+        whole = max(float(delays_found[i]), 0.0)
+        middle_cost, after = at(whole), at(whole + 1.0)
+        while after < middle_cost and whole < DELAYS.most_lags and not budget.spent("search for delays of the inputs"):
+            whole, middle_cost, after = whole + 1.0, after, at(whole + 2.0)
+        lowest = max(whole - 1.0, 0.0)
+        best = minimize_scalar(at, bounds=(lowest, whole + 1.0), method="bounded", options={"xatol": 1e-3})
         without_delay = at(0.0) if lowest == 0.0 else np.inf
         delays_found[i] = best.x if best.fun < without_delay - limit else 0.0
     return delays_found

@@ -45,9 +45,8 @@ def hold_remarks(data: KnownInputs, fit: Fit, threshold: float, budget: Budget) 
                 refitted = settled(other, start, SELECTION.few_steps, budget, ORDER.decided)
             except np.linalg.LinAlgError:
                 continue
-            cost = (
-                other.cost(refitted) * len(fit.residual) / len(refitted.residual)
-            )  # a fractional delay has a row fewer
+            # a fractional delay has a row fewer
+            cost = other.cost(refitted) * len(fit.residual) / len(refitted.residual)
             costs[hold] = min(cost, costs.get(hold, np.inf))
     best = min(costs, key=lambda hold: costs[hold], default=data.hold)
     if best == data.hold or costs[best] > data.cost(fit) - threshold:

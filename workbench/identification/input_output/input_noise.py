@@ -169,11 +169,9 @@ def _whitened(data: KnownInputs, fit: Fit, noise: InputNoise) -> KnownInputs:
         u, s, _ = np.linalg.svd(noise_gain, full_matrices=False)
         lines = np.fft.rfft(residual / noise.outputs, size, axis=0)
         shared = np.einsum("fji,fj->fi", u.conj(), lines) * (1.0 - 1.0 / np.sqrt(1.0 + s**2))
-        shared_samples = (
-            np.fft.irfft(np.einsum("fji,fi->jf", u, shared), size)[:, : len(residual)] * noise.outputs[:, None]
-        )
+        excess = np.fft.irfft(np.einsum("fji,fi->jf", u, shared), size)[:, : len(residual)] * noise.outputs[:, None]
         outputs = record.outputs.copy()
-        outputs[:, data.first :] -= shared_samples
+        outputs[:, data.first :] -= excess
         records.append(replace(record, outputs=outputs))
     return data.with_white_noise(records)
 
@@ -197,24 +195,22 @@ def spread_by_inputs(data: KnownInputs, fit: Fit, std: Floats, acts: Sequence[Fl
         size = next_fast_len(n + responses.shape[2], real=True)
         spectra = _spectra(responses, size).conj()
         for i in np.flatnonzero(std):
-            unknowns, coefficient_terms, parameter_effects = np.zeros((n, free.size)), [], []
+            unknowns, along, effects = np.zeros((n, free.size)), [], []
             for part, outputs in fit.outputs():
-                jacobian, orthogonal = (
+                jacobian, rest = (
                     tangent_weights(fit, part)[:, free],
                     tangents[rows] - phi[rows] @ part.tilt,
                 )
                 for k, j in enumerate(range(outputs.start, outputs.stop)):
                     square = weights[rows, j, None] ** 2 if len(weights) > 1 else 1.0
-                    terms = data.samples(square * np.hstack([orthogonal, phi[rows]]))
+                    terms = data.samples(square * np.hstack([rest, phi[rows]]))
                     terms = np.fft.irfft(spectra[:, j, i, None] * np.fft.rfft(terms, size, axis=0), size, axis=0)[:n]
-                    unknowns += terms[:, : orthogonal.shape[1]] @ jacobian[:, :, k] / fit.noise[j] ** 2
-                    coefficient_terms.append(terms[:, orthogonal.shape[1] :] @ part.spread)
-                    parameter_effects.append(part.tilt @ jacobian[:, :, k])
+                    unknowns += terms[:, : rest.shape[1]] @ jacobian[:, :, k] / fit.noise[j] ** 2
+                    along.append(terms[:, rest.shape[1] :] @ part.spread)
+                    effects.append(part.tilt @ jacobian[:, :, k])
             unknowns = unknowns @ bound
-            coefficients = [
-                z - unknowns @ drift.T for z, drift in zip(coefficient_terms, parameter_effects, strict=True)
-            ]
-            error = std[i] * np.hstack([unknowns, *coefficients])[noisy[i, data.first :]]
+            each = [z - unknowns @ drift.T for z, drift in zip(along, effects, strict=True)]
+            error = std[i] * np.hstack([unknowns, *each])[noisy[i, data.first :]]
             total += error.T @ error
     return total
 

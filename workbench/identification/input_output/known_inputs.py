@@ -298,22 +298,18 @@ class KnownInputs:
         std = np.sqrt(variances(*self._squares(fit)))
         each = zip(fit.poles, fit.participation)
         coordinates = [modal_coordinate(self.responses(pole), l_r) for pole, l_r in each]
-        near_modes, along_columns, energy, power = [], [], [], []
+        near, along, energy, power = [], [], [], []
         for k, rows in enumerate(self.rows):
             residual = self.samples(fit.residual[rows] / std[k])
-            near_modes.append(noise_near(fit.poles, residual, np.ones(residual.shape[1]), self.dt))
+            near.append(noise_near(fit.poles, residual, np.ones(residual.shape[1]), self.dt))
             weights = np.ones((1, std.shape[1])) if self.weights is None else self.weights[rows]
             weighted = [self.samples(weight[:, None] * self.fixed[rows]) for weight in weights.T]
-            ratios = [
-                noise_along(column, output, fit.poles.size) for column, output in zip(weighted, residual.T[:, :, None])
-            ]
-            along_columns.append(np.hstack(ratios))
+            ratios = [noise_along(column, row, fit.poles.size) for column, row in zip(weighted, residual.T[:, :, None])]
+            along.append(np.hstack(ratios))
             squares = np.broadcast_to(weights**2, residual.shape).T
             energy.append(np.column_stack([squares @ (x[rows] ** 2 + y[rows] ** 2) for x, y in coordinates]))
             power.append((squares @ self.fixed[rows] ** 2).T)
-        return np.average(near_modes, axis=0, weights=energy), np.average(
-            along_columns, axis=0, weights=np.array(power) + 1e-300
-        )
+        return np.average(near, axis=0, weights=energy), np.average(along, axis=0, weights=np.array(power) + 1e-300)
 
     def _squares(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
         """Sums of squares of the residual, (n_records, n_outputs), and their degrees of freedom."""
@@ -479,11 +475,9 @@ class KnownInputs:
             # The correlation is normalised by the power of the pole's response to the input.
             for r, autocorrelation in zip(cross_correlations, autocorrelations):
                 correlation = np.abs(np.fft.rfft(r * decay, size)) ** 2
-                response_power = 2.0 * np.fft.rfft(autocorrelation * decay, size).real - autocorrelation[:, :1]
+                power = 2.0 * np.fft.rfft(autocorrelation * decay, size).real - autocorrelation[:, :1]
                 floor = 1e-12 * autocorrelation[:, :1]
-                score += (correlation / np.maximum(response_power / (1.0 - np.exp(-2.0 * rate * self.dt)), floor)).sum(
-                    axis=0
-                )
+                score += (correlation / np.maximum(power / (1.0 - np.exp(-2.0 * rate * self.dt)), floor)).sum(axis=0)
             score[~oscillates] = 0.0
             peaks = 1 + np.flatnonzero((score[1:-1] > score[:-2]) & (score[1:-1] >= score[2:]))
             best = peaks[np.argsort(score[peaks])[-SELECTION.peaks_a_rate :]]

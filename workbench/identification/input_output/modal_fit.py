@@ -114,11 +114,9 @@ class Fit:
     def noise(self) -> np.ndarray:
         """Standard deviation of the residual of each output, (n_outputs,)."""
         residual = self.residual
-        degrees_of_freedom = max(
-            residual.shape[0] - self.coefficients.shape[0] - free_parameters(self).size / residual.shape[1], 1.0
-        )
+        free = max(residual.shape[0] - self.coefficients.shape[0] - free_parameters(self).size / residual.shape[1], 1.0)
         squares = (residual**2).sum(axis=0)
-        return np.asarray(np.sqrt(np.maximum(squares, 1e-28 * squares.max() + 1e-300) / degrees_of_freedom))
+        return np.asarray(np.sqrt(np.maximum(squares, 1e-28 * squares.max() + 1e-300) / free))
 
     def outputs(self) -> Iterator[tuple[Part, slice]]:
         """Each part, with the slice of the outputs it holds."""
@@ -290,11 +288,9 @@ class _OutputError:
 
     def moved(self, state: Fit, step: np.ndarray) -> tuple[Fit | None, np.ndarray]:
         n, p = state.participation.shape
-        all_unknowns = np.zeros(2 * n * (p + 1))
-        all_unknowns[free_parameters(state)] = step
-        change = (all_unknowns[: all_unknowns.size // 2] + 1j * all_unknowns[all_unknowns.size // 2 :]).reshape(
-            n, p + 1
-        )
+        full = np.zeros(2 * n * (p + 1))
+        full[free_parameters(state)] = step
+        change = (full[: full.size // 2] + 1j * full[full.size // 2 :]).reshape(n, p + 1)
         poles, participation = state.poles + change[:, 0], state.participation + change[:, 1:]
         highest, fastest_decay = self.data.highest, self.data.highest / np.pi
         growing = poles.real > FIT.most_growth * self.data.resolution / (2.0 * np.pi)

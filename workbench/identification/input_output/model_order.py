@@ -30,9 +30,7 @@ class OrderSettings:
     most_weak: int = 3  # consecutive candidates below the threshold, after which the search ends
     steps: int = 20  # of the fit by which a mode enters
     decided: float = 0.1  # χ² of each output, expected of a further step, below which such a fit ends
-    enter: float = (
-        0.5  # of the threshold, at which a candidate is fitted: its participation factors are not yet optimal
-    )
+    enter: float = 0.5  # of the threshold, at which a candidate is fitted: its participation factors are approximate
     distinct: float = 10.0  # times the threshold: two close modes, each above it, are not tested for removal
     floor: float = 1e-5  # noise floor of each output, relative: -100 dB
     collinear: float = 1e-10  # of the energy of each column, added so that coincident poles leave no singular matrix
@@ -120,9 +118,9 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
         gram[np.diag_indices_from(gram)] *= 1.0 + ORDER.collinear
         spreads.append(np.linalg.inv(gram))
         coefficients.append(spreads[-1] @ (weighted.T @ y))
-        squares = ((y - weighted @ coefficients[-1]) ** 2).sum(axis=0)
+        rss = ((y - weighted @ coefficients[-1]) ** 2).sum(axis=0)
         variances.append(
-            np.maximum(squares / max(len(columns) - columns.shape[1], 1), ORDER.floor**2 * (y**2).mean(axis=0))
+            np.maximum(rss / max(len(columns) - columns.shape[1], 1), ORDER.floor**2 * (y**2).mean(axis=0))
         )
     limit = chi2.isf(false_alarm / data.cells, size * data.values.shape[1])
     while poles.size:
@@ -135,13 +133,11 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
         weakest = int(np.argmin(statistic))
         if statistic[weakest] >= limit:
             break
-        removed, rest = blocks[weakest], np.delete(np.arange(len(scale)), blocks[weakest])
+        out, rest = blocks[weakest], np.delete(np.arange(len(scale)), blocks[weakest])
         for k, spread in enumerate(spreads):
-            update = np.linalg.solve(
-                spread[np.ix_(removed, removed)], np.column_stack([spread[removed], coefficients[k][removed]])
-            )
-            spreads[k] = (spread - spread[:, removed] @ update[:, : len(scale)])[np.ix_(rest, rest)]
-            coefficients[k] = (coefficients[k] - spread[:, removed] @ update[:, len(scale) :])[rest]
+            update = np.linalg.solve(spread[np.ix_(out, out)], np.column_stack([spread[out], coefficients[k][out]]))
+            spreads[k] = (spread - spread[:, out] @ update[:, : len(scale)])[np.ix_(rest, rest)]
+            coefficients[k] = (coefficients[k] - spread[:, out] @ update[:, len(scale) :])[rest]
         poles, scale = np.delete(poles, weakest), scale[rest]
     of_poles = slice(poles.size * size)
     residues = (np.hstack(coefficients) / scale[:, None])[of_poles].reshape(poles.size, size, data.values.shape[1])
@@ -184,10 +180,10 @@ class _Modes:
 
     def strongest(self, model: Fit, rejected: list[tuple[complex, float]]) -> tuple[complex, np.ndarray] | None:
         if self._scored is None or self._scored[0] is not model:
-            bases, residual = bases_of(self.data, model), model.residual / model.noise
+            bases, scaled = bases_of(self.data, model), model.residual / model.noise
             self._scored = (
                 model,
-                [(*_candidate_gain(self.data, bases, residual, p), p) for p in _candidates(self.data, model)],
+                [(*_candidate_gain(self.data, bases, scaled, p), p) for p in _candidates(self.data, model)],
             )
         candidates = [item for item in self._scored[1] if not self._is_near(item[2], rejected)]
         if not candidates:
@@ -386,12 +382,10 @@ def marginal_statistics_of(fit: Fit) -> np.ndarray:
     if n == 0:
         return statistics
     amplitudes = fit.coefficients[: 2 * n].reshape(2, n, -1)
-    parameter_effect = [
-        np.einsum("ct,tkj->cjk", part.tilt[: 2 * n], tangent_weights(fit, part)[:, free]) for part in fit.parts
-    ]
+    effect = [np.einsum("ct,tkj->cjk", part.tilt[: 2 * n], tangent_weights(fit, part)[:, free]) for part in fit.parts]
     for r in range(n):
         pair = [r, n + r]
-        effects = np.concatenate([each[pair] for each in parameter_effect], axis=1)
+        effects = np.concatenate([each[pair] for each in effect], axis=1)
         size = 2 * effects.shape[1]
         spread = effects.reshape(size, -1) @ bound @ effects.reshape(size, -1).T
         spread = spread.reshape(2, size // 2, 2, size // 2)

@@ -85,10 +85,8 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
     uneven, scatter, statistic = np.zeros(n, bool), np.zeros(n), np.zeros(n)
     for r, pole in enumerate(fit.poles):
         pair = np.array([r, 2 * n + r])
-        near_mode = np.abs(lines.omega - pole.imag) < max(
-            PEAKS.beside * abs(pole.real), PEAKS.beside * lines.resolution
-        )
-        noise_ratio = max(1.0, float(power[near_mode].mean())) if near_mode.any() else 1.0
+        near = np.abs(lines.omega - pole.imag) < max(PEAKS.beside * abs(pole.real), PEAKS.beside * lines.resolution)
+        noise_ratio = max(1.0, float(power[near].mean())) if near.any() else 1.0
         value = coefficients[pair]
         statistic[r] = value @ np.linalg.pinv(covariance[np.ix_(pair, pair)], hermitian=True) @ value
         scatter[r] = np.sqrt(np.hypot(*value) / size[r])

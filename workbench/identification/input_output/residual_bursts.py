@@ -50,20 +50,14 @@ def _burst(record: Record, residual: Floats, noise: Floats) -> tuple[str, ...]:
         return ()
     residual = residual / noise
     motion = (motion - motion.mean(axis=0)) / np.maximum(motion.std(axis=0), 1e-300)
-    shares, motion_shares = (
-        np.array([np.vdot(p, p) for p in np.array_split(x, BURSTS.parts)]) for x in (residual, motion)
-    )
+    shares, moving = (np.array([np.vdot(p, p) for p in np.array_split(x, BURSTS.parts)]) for x in (residual, motion))
     together = np.ones(BURSTS.together)
     # noise in proportion to the motion, and cubic distortion
-    expected_shares = [
-        np.convolve(motion_shares**k / max((motion_shares**k).sum(), 1e-300), together, "valid") for k in (1, 3)
-    ]
+    expected = [np.convolve(moving**k / max((moving**k).sum(), 1e-300), together, "valid") for k in (1, 3)]
     shares = np.convolve(shares / max(shares.sum(), 1e-300), together, "valid")
     first = int(np.argmax(shares))
-    threshold = max(BURSTS.share, BURSTS.times * max(each[first] for each in expected_shares))
-    if (
-        shares[first] < threshold or expected_shares[0].max() > BURSTS.share
-    ):  # after an impact the motion itself is a burst
+    least = max(BURSTS.share, BURSTS.times * max(each[first] for each in expected))
+    if shares[first] < least or expected[0].max() > BURSTS.share:  # after an impact the motion itself is a burst
         return ()
     edges = np.array_split(record.time[-len(residual) :], BURSTS.parts)
     begins, ends = edges[first][0], edges[first + BURSTS.together - 1][-1]

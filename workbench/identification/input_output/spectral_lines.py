@@ -155,16 +155,14 @@ class Lines:
         return real, imaginary
 
     def candidates(self, residual: np.ndarray) -> np.ndarray:
-        residuals = self.unstacked(residual if self.weights is None else residual * self.weights).reshape(
-            -1, self.lines
-        )
+        raw = self.unstacked(residual if self.weights is None else residual * self.weights).reshape(-1, self.lines)
         weight = 1.0 if self.weights is None else (np.abs(self.unstacked(self.weights)) ** 2).mean(axis=(0, 1)) / 2.0
-        power = (np.abs(residuals) ** 2).sum(axis=0)
+        power = (np.abs(raw) ** 2).sum(axis=0)
         lines = np.sort(np.argsort(power)[-LINES.most_candidates :])
         poles, strength = [], []
         for rate in self.rates:
             x = 1.0 / (1j * (self.omega - self.omega[lines, None]) + rate)
-            score = (np.abs(residuals @ x.conj().T) ** 2).sum(axis=0) / (np.abs(x) ** 2 * weight).sum(axis=1)
+            score = (np.abs(raw @ x.conj().T) ** 2).sum(axis=0) / (np.abs(x) ** 2 * weight).sum(axis=1)
             score[rate > SELECTION.most_damped * self.omega[lines]] = 0.0
             best = np.argsort(score)[-LINES.peaks_a_rate :]
             poles.append(-rate + 1j * self.omega[lines[best]])
@@ -207,12 +205,10 @@ class Lines:
                 if self.omega[0] < beside < self.omega[-1]:
                     columns = np.hstack(self.responses(-width + 1j * beside))
                     power = []
-                    for basis, weight, outputs in zip(
-                        bases, weights, np.split(residual, len(bases), axis=1), strict=True
-                    ):
+                    for basis, weight, rest in zip(bases, weights, np.split(residual, len(bases), axis=1), strict=True):
                         # The fit absorbed the noise along the basis.
                         orthogonal = weight * columns - basis @ (basis.T @ (weight * columns))
-                        power.append((orthogonal.T @ outputs) ** 2 / (orthogonal**2).sum(axis=0)[:, None])
+                        power.append((orthogonal.T @ rest) ** 2 / (orthogonal**2).sum(axis=0)[:, None])
                     noise_ratio.append(np.hstack(power))
             if not noise_ratio:
                 continue
@@ -261,16 +257,13 @@ def window_rate(residual: np.ndarray, omega: np.ndarray) -> float:
     correlation = np.array([(phasors[:, lag:] * phasors[:, :-lag].conj()).mean() for lag in lags])
     instants = (np.arange(LINES.instants) + 0.5) / LINES.instants
     power = np.exp(-2.0 * np.outer(WINDOWS, instants)) * (2.0 - 2.0 * np.cos(2.0 * np.pi * instants)) ** 2
-    expected = power @ np.exp(-2j * np.pi * np.outer(instants, lags)) / power.sum(axis=1, keepdims=True)
-    deviation = np.linalg.norm(
-        correlation - np.pi / 4.0 * expected * hyp2f1(0.5, 0.5, 2.0, np.abs(expected) ** 2), axis=1
+    model = power @ np.exp(-2j * np.pi * np.outer(instants, lags)) / power.sum(axis=1, keepdims=True)
+    misfit = np.linalg.norm(correlation - np.pi / 4.0 * model * hyp2f1(0.5, 0.5, 2.0, np.abs(model) ** 2), axis=1)
+    best = int(np.argmin(misfit))
+    sure = (
+        misfit[0] - misfit[best] > LINES.windowed / np.sqrt(omega.size) and misfit[best] < LINES.explained * misfit[0]
     )
-    best = int(np.argmin(deviation))
-    significant = (
-        deviation[0] - deviation[best] > LINES.windowed / np.sqrt(omega.size)
-        and deviation[best] < LINES.explained * deviation[0]
-    )
-    return float(WINDOWS[best] * step.mean() / (2.0 * np.pi)) if significant else 0.0
+    return float(WINDOWS[best] * step.mean() / (2.0 * np.pi)) if sure else 0.0
 
 
 def relative_noise(residual: np.ndarray, fitted: np.ndarray, omega: np.ndarray) -> np.ndarray | None:

@@ -270,10 +270,10 @@ def change_remarks(
     others = [r for r in named_near(fit, changing) if not sure[r] and fit.poles[r] not in named]
     remarks = []
     if linear:
-        linear_change = (
+        linearly = (
             f"frequencies change within the record, from its beginning to its end: {'; '.join(linear)}; {IS_MEAN}"
         )
-        remarks.append(linear_change)
+        remarks.append(linearly)
     if others:
         names_of_others = ", ".join(names[r] for r in others)
         remarks.append(f"modes change within the record, perhaps with amplitude: {names_of_others}; {IS_MEAN}")

@@ -118,9 +118,8 @@ class LeaveOneOut:
         """Upper confidence limit of τ² of a shape (n_sensors,) of known covariance; 0 where its errors may be noise."""
         error, noise, _ = self._errors(values, covariance)
         noise_variance = np.diag(noise)
-        scale = (
-            np.sum(noise**2 / np.outer(noise_variance, noise_variance)) / error.size
-        )  # scaled χ² of error.size / scale degrees of freedom (Satterthwaite)
+        # scaled χ² of error.size / scale degrees of freedom (Satterthwaite)
+        scale = np.sum(noise**2 / np.outer(noise_variance, noise_variance)) / error.size
         if (error**2 / noise_variance).sum() < scale * chi2.isf(BANDS.unlikely, error.size / scale):
             return 0.0
         return self.roughest(values, covariance)

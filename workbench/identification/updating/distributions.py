@@ -213,7 +213,7 @@ def distributions_of(
     """`mass_and_stiffness` without its warnings; `bases` and `priors` are of mass and of stiffness."""
     if kind not in ("bar", "beam"):
         raise ValueError(f"mass and stiffness are those of a bar or a beam; got {kind!r}")
-    unit_modes, scale = _unit_mean_square(modes)
+    unit, scale = _unit_mean_square(modes)
     identified = partial(
         _identified,
         order=1 if kind == "bar" else 2,
@@ -221,15 +221,13 @@ def distributions_of(
         known=known,
         priors=(as_profile(priors[0]), as_profile(priors[1])),
     )
-    mass, stiffness, gram = identified(unit_modes)
+    mass, stiffness, gram = identified(unit)
     scales = np.sqrt(np.diag(gram))
     orthogonality = float(np.abs(gram / np.outer(scales, scales) - np.eye(scales.size)).max())
     try:
-        without_each = [
-            identified(unit_modes.select([s for s in range(modes.n_modes) if s != r])) for r in range(modes.n_modes)
-        ]
-        mass = replace(mass, left_out=frozen(np.array([other[0].coefficients for other in without_each])))
-        stiffness = replace(stiffness, left_out=frozen(np.array([other[1].coefficients for other in without_each])))
+        others = [identified(unit.select([s for s in range(modes.n_modes) if s != r])) for r in range(modes.n_modes)]
+        mass = replace(mass, left_out=frozen(np.array([other[0].coefficients for other in others])))
+        stiffness = replace(stiffness, left_out=frozen(np.array([other[1].coefficients for other in others])))
     except ValueError:
         pass  # too few relations without one of the modes
     return Distributions(mass, stiffness, frozen(scales / scale), modes.length, orthogonality)

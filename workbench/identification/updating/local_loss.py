@@ -38,9 +38,7 @@ class LossSettings:
     """Constants of the search for a local loss."""
 
     places: int = 60  # along the structure, at which losses are tried
-    typical_width: float = (
-        0.1  # of the length: its inverse is the number of independent places at which noise is tested
-    )
+    typical_width: float = 0.1  # of the length: its inverse is the number of independent places that are tested
     # of the length: a search converges to a loss from half to twice its width
     widths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
     most_starts: int = 2  # of each width
@@ -113,14 +111,10 @@ class LocatedDamage(Printed):
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         test = f"statistic {self.statistic:.3g}, threshold {self.threshold:.3g}"
         if not self.detected:
-            conclusion = (
-                "no loss of stiffness is detected" if self.best.explains else "whether stiffness is lost is unknown"
-            )
-            return f"{conclusion} ({test})", (), (), self.remarks
-        parameters = zip(
-            ("share", "centre [m]", "width [m]"), self.damaged.parameters[-3:], self.interval(), strict=True
-        )
-        rows = [(name, f"{value:.4g}", f"{low:.4g} to {high:.4g}") for name, value, (low, high) in parameters]
+            text = "no loss of stiffness is detected" if self.best.explains else "whether stiffness is lost is unknown"
+            return f"{text} ({test})", (), (), self.remarks
+        loss = zip(("share", "centre [m]", "width [m]"), self.damaged.parameters[-3:], self.interval(), strict=True)
+        rows = [(name, f"{value:.4g}", f"{low:.4g} to {high:.4g}") for name, value, (low, high) in loss]
         return f"a loss of stiffness is detected ({test})", ("loss", "value", "95 % interval"), rows, self.remarks
 
     @property
@@ -253,9 +247,7 @@ def _fit_with_mass(
     best: FittedStructure | None = None
     for n_terms in {tuple(numbers[: LOSS.first_terms][-1] for numbers in terms): None, damaged.n_terms: None}:
         problem = Problem.of(task, *(basis(n) for n in n_terms))
-        starts = [
-            (intact, part) for intact in _structures_without_loss(problem) for part in _likely_masses(problem, intact)
-        ]
+        starts = [(fitted, part) for fitted in _without_loss(problem) for part in _likely_masses(problem, fitted)]
         if best is not None:
             starts.append((best, cast(PointMass, best.structure.attachments[-1])))
         for near, part in starts:
@@ -287,13 +279,11 @@ def _whole_mass(problem: Problem) -> float:
 
 def _likely_masses(problem: Problem, intact: FittedStructure) -> list[PointMass]:
     """Point masses at the peaks of the first-order decrease of χ² along the structure."""
-    z, small_mass = problem.free_near(intact), LOSS.first_mass * _whole_mass(problem)
+    z, step = problem.free_near(intact), LOSS.first_mass * _whole_mass(problem)
     residuals, slopes = problem.residuals(z)
     basis = np.linalg.qr(slopes)[0]
     places = np.linspace(0.0, problem.task.nominal.length, LOSS.mass_places)
-    effects = np.stack(
-        [(_with_point_mass(problem, at, small_mass).residuals(z)[0] - residuals) / small_mass for at in places]
-    )
+    effects = np.stack([(_with_point_mass(problem, at, step).residuals(z)[0] - residuals) / step for at in places])
     effects -= (effects @ basis) @ basis.T
     squares = np.maximum((effects**2).sum(axis=1), 1e-300)
     masses = -(effects @ residuals) / squares
@@ -312,11 +302,8 @@ def _fit_near_mass(problem: Problem, near: FittedStructure, part: PointMass) -> 
         return _with_point_mass(problem, *(z[-2:] * scale)).residuals(z[:-2])
 
     def slopes(z: np.ndarray) -> np.ndarray:
-        mass_parameters = z[-2:]
-        shifts = [
-            (np.clip(mass_parameters - step, 0.0, [1.0, np.inf]), np.clip(mass_parameters + step, 0.0, [1.0, np.inf]))
-            for step in steps
-        ]
+        own = z[-2:]
+        shifts = [(np.clip(own - step, 0.0, [1.0, np.inf]), np.clip(own + step, 0.0, [1.0, np.inf])) for step in steps]
         columns = [
             (residuals(np.r_[z[:-2], after])[0] - residuals(np.r_[z[:-2], before])[0]) / (after - before).sum()
             for before, after in shifts
@@ -353,13 +340,11 @@ def _fit_near_either(other: FittedStructure, problem: Problem, near: FittedStruc
 
 def _fit_from_scan(problem: Problem, near: FittedStructure | None) -> FittedStructure:
     """The maximum likelihood structure with a loss, searched from the likeliest places and from an earlier fit."""
-    starts = [
-        (intact, loss) for intact in _structures_without_loss(problem) for loss in _likely_losses(problem, intact)
-    ]
+    starts = [(fit, loss) for fit in _without_loss(problem) for loss in _likely_losses(problem, fit)]
     return _likeliest(problem, starts if near is None else [*starts, (near, near.loss)])
 
 
-def _structures_without_loss(problem: Problem) -> list[FittedStructure]:
+def _without_loss(problem: Problem) -> list[FittedStructure]:
     """Structures from which losses are searched: the nominal one, and the fitted one, which may imitate a loss."""
     structures = []
     for fit in (problem.nominal, problem.fit):

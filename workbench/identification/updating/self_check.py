@@ -64,23 +64,21 @@ class Identified(Printed):
         return self.distributions.remarks
 
 
-def structure_of(
-    distributions: Distributions, *, kind: str, length: float, left: str | End, right: str | End
-) -> Bar | Beam:
+def structure_of(found: Distributions, *, kind: str, length: float, left: str | End, right: str | End) -> Bar | Beam:
     """The `Bar` or `Beam` that identified distributions describe.
 
     Raises:
         ValueError: a distribution that is not positive everywhere.
     """
-    arguments: dict[str, Any] = {
+    common: dict[str, Any] = {
         "length": length,
         "left": left,
         "right": right,
-        "mass_per_length": distributions.mass.profile,
+        "mass_per_length": found.mass.profile,
     }
     if kind == "bar":
-        return Bar(axial_stiffness=distributions.stiffness.profile, **arguments)
-    return Beam(bending_stiffness=distributions.stiffness.profile, **arguments)
+        return Bar(axial_stiffness=found.stiffness.profile, **common)
+    return Beam(bending_stiffness=found.stiffness.profile, **common)
 
 
 @one_blas_thread

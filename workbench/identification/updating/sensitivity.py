@@ -252,7 +252,7 @@ def _nodes(places: Sequence[float], length: float) -> np.ndarray:
 def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mass and stiffness matrices of springs and attachments, and the indices of the unconstrained functions."""
     mass, stiffness = np.zeros((2, segments.n_functions, segments.n_functions))
-    constrained = []
+    fixed = []
 
     def add(matrix: np.ndarray, at: float, values: Sequence[float]) -> None:
         for derivative, value in enumerate(values[:order]):
@@ -262,11 +262,9 @@ def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndar
 
     for node, at, end in ((0, 0.0, nominal.left), (segments.nodes.size - 1, nominal.length, nominal.right)):
         springs = (end.translation, end.rotation)
-        constrained += [
-            order * node + derivative for derivative, spring in enumerate(springs[:order]) if spring == HELD
-        ]
+        fixed += [order * node + derivative for derivative, spring in enumerate(springs[:order]) if spring == HELD]
         add(stiffness, at, [0.0 if spring == HELD else spring for spring in springs])
     for part in nominal.attachments:
         if not isinstance(part, PointDamper):
             add(mass if isinstance(part, PointMass) else stiffness, cast(float, part.at), part.pair)
-    return mass, stiffness, np.setdiff1d(np.arange(segments.n_functions), constrained)
+    return mass, stiffness, np.setdiff1d(np.arange(segments.n_functions), fixed)

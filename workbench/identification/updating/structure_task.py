@@ -136,13 +136,11 @@ class Task:
 def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
     """Index of the nominal structure's elastic mode paired with each measured one by shape, (n_modes,), from 0."""
     modes = measured.modes
-    no_terms = Basis.polynomial(0)
-    n_tried = modes.n_modes + 4
-    solved = SeriesStructure(nominal, no_terms, no_terms, modes.positions).solve(
-        np.zeros(0), np.zeros(0), n_modes=n_tried
-    )
+    none = Basis.polynomial(0)
+    n = modes.n_modes + 4
+    solved = SeriesStructure(nominal, none, none, modes.positions).solve(np.zeros(0), np.zeros(0), n_modes=n)
     assert solved is not None, "a nominal structure has positive mass and stiffness"
-    shapes = solved.at_sensors[:, solved.n_rigid : solved.n_rigid + n_tried]
+    shapes = solved.at_sensors[:, solved.n_rigid : solved.n_rigid + n]
     agreement = mac(normalised_shapes(modes.shapes).real, shapes)
     pairs = linear_sum_assignment(-agreement)[1]
     worst = int(np.argmin(agreement[np.arange(modes.n_modes), pairs]))
