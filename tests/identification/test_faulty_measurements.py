@@ -261,7 +261,7 @@ def test_a_sound_record_has_no_burst(shaken):
 def test_samples_that_all_channels_lost_are_remarked(shaken):
     kept = np.r_[0:1000, 1040:2000]
     seam = replace(shaken, outputs=shaken.outputs[:, kept], inputs=shaken.inputs[:, kept])
-    (remark,) = (line for line in identify_driven(seam).remarks if "of what the modes leave" in line)
+    (remark,) = (line for line in identify_driven(seam).remarks if "of the residual energy" in line)
     begins, ends = (float(word) for word in remark.split(" lies from ")[1].split(" s:")[0].split(" to "))
     assert begins <= 1.0 <= ends and ends - begins < 0.2
 

@@ -68,7 +68,7 @@ def test_intervals_hold_without_false_modes(seeds, band_limited):
 
 def test_the_noise_is_found_as_large_as_it_is():
     record, _, _ = record_of(4, band_limited=False)
-    remark = next(r for r in identify_driven(record).remarks if "inputs read noise" in r)
+    remark = next(r for r in identify_driven(record).remarks if "inputs contain measurement noise" in r)
     assert float(remark.split("u0 ")[1].split(" rms")[0]) == pytest.approx(0.01, rel=0.15)
 
 

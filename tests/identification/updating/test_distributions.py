@@ -177,7 +177,7 @@ def test_what_noisy_shapes_and_a_mass_at_a_point_leave_unknown_is_said():
     with pytest.warns(UserWarning, match="two modes are orthogonal only to"):
         chosen = choose_terms(heavy, kind="beam", left="clamped", right="free", terms=range(1, 3), **known)
     assert "identified structure against measurement" in str(chosen)
-    with pytest.warns(UserWarning, match="the mass has no standard error, as no mode can be spared"):
+    with pytest.warns(UserWarning, match="the mass has no standard error, as no mode can be left out"):
         mass_and_stiffness(from_sensors(1e-5, 1).select([0, 1]), **known, **TERMS)
 
 

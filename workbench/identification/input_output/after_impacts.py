@@ -1,7 +1,7 @@
-"""Modes that depend on amplitude, seen in the free decay after an impact.
+"""Amplitude-dependent modes, identified from the free decay after an impact.
 
-A driven response holds nothing else to compare such a mode with than more modes near by. Where nothing drives the
-structure any more, frequency and damping are found at one amplitude after the other.
+A driven response can only compare such a mode with several close linear modes. In free decay, frequency and damping are
+identified at each amplitude.
 """
 
 from collections.abc import Sequence
@@ -22,12 +22,12 @@ from workbench.records.record import Record
 
 @dataclass(frozen=True)
 class AfterImpactsSettings:
-    """Constants of the look at free decays."""
+    """Constants of the identification from free decays."""
 
-    share: float = 0.4  # of the time of an identification: modes known from there are searched in a tenth of it
-    least: float = 0.5  # share of a record that the last impact must leave, for the decay to tell of its modes
-    matters: float = 0.1  # of the half-power bandwidth: a mode that moves by less within a decay is a linear one
-    near: float = 0.1  # of the frequency of a mode, within which one identified from all of the record is the same
+    share: float = 0.4  # of the time of an identification; a search that starts from these modes takes a tenth of it
+    least: float = 0.5  # share of a record that must follow the last impact
+    matters: float = 0.1  # of the half-power bandwidth: a mode whose frequency varies less over a decay is linear
+    near: float = 0.1  # of the frequency of a mode, within which one identified from the whole record is the same
 
 
 AFTER_IMPACTS = AfterImpactsSettings()
@@ -39,8 +39,8 @@ class AfterImpacts:
 
     Attributes:
         poles: of all modes, rad/s, means over the decays.
-        changing: those that depend on amplitude.
-        scatter: rad/s, rms over a decay of the frequency of each of these about its mean.
+        changing: poles of the amplitude-dependent modes.
+        scatter: rad/s, rms of the frequency of each of these about its mean over a decay.
         figures: frequency and damping of each of these by amplitude, in words.
     """
 
@@ -50,36 +50,36 @@ class AfterImpacts:
     figures: tuple[str, ...] = ()
 
     def among(self, poles: Complexes) -> tuple[complex, ...]:
-        """The modes identified that are these which change, of poles (n_modes,)."""
+        """The poles of the identified modes (n_modes,) that are amplitude-dependent ones."""
         return tuple(complex(poles[r]) for r in self._nearest(poles))
 
     def remarks(self, poles: Complexes, size: Floats, deviation: Complexes) -> tuple[str, ...]:
-        """On each that changes, numbered as the modes identified, and on these where they are its overtones.
+        """Remarks on the amplitude-dependent modes, numbered as identified, and on modes that are their overtones.
 
         Args:
             poles, size, deviation: of the modes identified, as `overtone_remarks` takes them.
         """
-        of_decay, scatter, words = poles.copy(), np.zeros(poles.size), []
+        means, scatter, words = poles.copy(), np.zeros(poles.size), []
         for r, k in self._nearest(poles).items():
-            of_decay[r], scatter[r] = self.changing[k], self.scatter[k]
+            means[r], scatter[r] = self.changing[k], self.scatter[k]
             words.append(f"mode {r + 1} from {self.figures[k]}")
         if not words:
             return ()
         changes = f"modes change within the record, as it decays: {', and '.join(words)}; {IS_MEAN}"
-        return (changes, *overtone_remarks(of_decay, size, scatter, deviation))
+        return (changes, *overtone_remarks(means, size, scatter, deviation))
 
     def _nearest(self, poles: Complexes) -> dict[int, int]:
-        """The mode identified that each which changes is, by index."""
-        found = {}
+        """Index of each identified mode that is amplitude-dependent, with its index in `changing`."""
+        matches = {}
         for k, pole in enumerate(self.changing):
             r = int(np.argmin(np.abs(poles - pole)))
             if abs(poles[r] - pole) < AFTER_IMPACTS.near * abs(pole):
-                found[r] = k
-        return found
+                matches[r] = k
+        return matches
 
 
 def after_impacts(records: Sequence[Record], budget: Budget) -> AfterImpacts:
-    """The modes that depend on amplitude, where every record ends in free decay; none otherwise.
+    """The amplitude-dependent modes, where every record ends in free decay; none otherwise.
 
     Args:
         records: inputs zero between impacts.
@@ -89,27 +89,27 @@ def after_impacts(records: Sequence[Record], budget: Budget) -> AfterImpacts:
     if not all(decays):
         return AfterImpacts()
     free = [decay for decay in decays if decay is not None]
-    part = budget.aside(AFTER_IMPACTS.share)
-    with suppress(ValueError, np.linalg.LinAlgError):  # nothing decays freely: the inputs alone tell
-        refined = identify_within(free, part).without_artefacts(np.pi / free[0].sample_time).refined
-        by_amplitude = amplitude_dependence(free, refined, budget=part)
-        if not part.unfinished:
-            return _that_matter(refined, by_amplitude)
+    share = budget.aside(AFTER_IMPACTS.share)
+    with suppress(ValueError, np.linalg.LinAlgError):  # no mode in free decay: the driven response alone is used
+        refined = identify_within(free, share).without_artefacts(np.pi / free[0].sample_time).refined
+        by_amplitude = amplitude_dependence(free, refined, budget=share)
+        if not share.unfinished:
+            return _significant(refined, by_amplitude)
     return AfterImpacts()
 
 
 def _free_decay(record: Record) -> Record | None:
-    """What follows the last sample that drives, if it is most of the record."""
+    """The free decay after the last nonzero input, if it is most of the record."""
     driven = np.flatnonzero(record.inputs.any(axis=0))
-    behind = int(driven[-1]) + 2 if driven.size else record.n_samples  # an input straight between samples ends one on
-    if record.n_samples - behind < AFTER_IMPACTS.least * record.n_samples:
+    first = int(driven[-1]) + 2 if driven.size else record.n_samples  # a first-order hold ends a sample later
+    if record.n_samples - first < AFTER_IMPACTS.least * record.n_samples:
         return None
-    decay = record.between(record.start_time + behind * record.sample_time)
+    decay = record.between(record.start_time + first * record.sample_time)
     return replace(decay, inputs=decay.inputs[:0], input_channels=())
 
 
-def _that_matter(refined: Refined, by_amplitude: AmplitudeDependence) -> AfterImpacts:
-    """Those that move by more than a linear model could overlook."""
+def _significant(refined: Refined, by_amplitude: AmplitudeDependence) -> AfterImpacts:
+    """The amplitude-dependent modes whose frequency varies by a significant part of the bandwidth."""
     poles, changing, scatter = refined.modes.poles, [], []
     for r in np.flatnonzero(by_amplitude.depends).tolist():
         omega = by_amplitude.omega[np.isfinite(by_amplitude.omega[:, r]), r]

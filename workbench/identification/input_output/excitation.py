@@ -1,4 +1,4 @@
-"""What inputs excite: whether they can tell modes at all, and which modes they hardly move."""
+"""Checks of the inputs: whether they can distinguish modes, and which modes they hardly excite."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from workbench.structure.printed import mode_text
 
 @dataclass(frozen=True)
 class ExcitationSettings:
-    """Constants of the look at the spectrum of the inputs."""
+    """Constants of the check of the input spectra."""
 
-    hardly: float = 1e-3  # of the mean power of a line, 3 % of its amplitude: less hardly moves a mode
+    hardly: float = 1e-3  # of the mean power of a line, 3 % of its amplitude: less hardly excites a mode
     about: float = 0.02  # of the frequency of a mode, to either side, in which the lines count
     lines: int = 4  # to either side, at least
 
@@ -23,7 +23,7 @@ EXCITATION = ExcitationSettings()
 
 
 def check_inputs(records: Sequence[Record]) -> None:
-    """Refuse records without inputs, of different ones, and inputs that never move or move alike.
+    """Refuse records without inputs or of different inputs, and inputs that are zero or proportional to each other.
 
     Raises:
         ValueError: naming the input.
@@ -38,26 +38,26 @@ def check_inputs(records: Sequence[Record]) -> None:
                 f" {', '.join(first.input_names)} and {record.name!r} has {', '.join(record.input_names)}"
             )
     inputs = np.hstack([record.inputs for record in records])
-    size = np.linalg.norm(inputs, axis=1)
-    if (size == 0).any():
-        name = first.input_names[int(np.argmin(size))]
+    norms = np.linalg.norm(inputs, axis=1)
+    if (norms == 0).any():
+        name = first.input_names[int(np.argmin(norms))]
         raise ValueError(f"record {first.name!r}: input {name!r} is zero throughout; leave it out, or excite there")
-    alike = (inputs / size[:, None]) @ (inputs / size[:, None]).T - np.eye(len(size))
-    i, k = np.unravel_index(int(np.argmax(np.abs(alike))), alike.shape)
-    if abs(alike[i, k]) > 1.0 - 1e-9:
+    correlation = (inputs / norms[:, None]) @ (inputs / norms[:, None]).T - np.eye(len(norms))
+    i, k = np.unravel_index(int(np.argmax(np.abs(correlation))), correlation.shape)
+    if abs(correlation[i, k]) > 1.0 - 1e-9:
         raise ValueError(
-            f"inputs {first.input_names[i]!r} and {first.input_names[k]!r} are the same signal but for its size, so"
-            " what each does cannot be distinguished; excite them one after the other, or by signals of their own"
+            f"inputs {first.input_names[i]!r} and {first.input_names[k]!r} are the same signal up to a factor, so"
+            " their effects cannot be distinguished; excite them one after the other, or by signals of their own"
         )
 
 
 def unexcited_remarks(records: Sequence[Record], poles: Complexes) -> tuple[str, ...]:
-    """A remark on modes where the inputs of no record have power, as beyond an anti-aliasing filter.
+    """A remark on modes at whose frequency the inputs of no record have power, as beyond an anti-aliasing filter.
 
-    What the course of the inputs between samples is taken for shows most there.
+    There the assumed course of the inputs between samples matters most.
 
     Args:
-        records: driven; those that begin in motion hold modes that no input excites, too.
+        records: driven; those not from rest hold modes that no input excites, too.
         poles: (n_modes,) rad/s.
     """
     amplitude = np.zeros(poles.size)

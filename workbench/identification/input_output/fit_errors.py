@@ -1,8 +1,8 @@
 """Standard errors of a `modal_fit`, in noise of any smooth spectrum.
 
-A mode is disturbed by noise about its own frequency only. Where output j has κ_jr times its mean noise there, a fit for
-white noise has errors H^-1 M H^-1, M as H with each mode's share of output j times κ_jr^½ (White, Econometrica 48,
-1980); amplitudes likewise. κ = 1 gives the Cramér-Rao bound.
+A mode is affected by the noise near its own frequency. Where output j has κ_jr times its mean noise power there, a fit
+that assumes white noise has the covariance H^-1 M H^-1, M as H with the share of each mode in output j times κ_jr^½
+(White, Econometrica 48, 1980); amplitudes likewise. κ = 1 gives the Cramér-Rao bound.
 """
 
 from collections.abc import Callable
@@ -11,58 +11,68 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.arrays import Floats, scaled_inverse, symmetric_root
-from workbench.identification.input_output.modal_fit import Fit, Part, free_parameters, moves, normal
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    Part,
+    free_parameters,
+    normal_equations,
+    tangent_weights,
+)
 from workbench.identification.signal.modal_estimates import by_poles
 
-Figures = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Functions = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
-    """Of the free unknowns; `noise_ratio` is κ, (n_outputs, n_modes)."""
-    bound = scaled_inverse(normal(fit, fit.noise)[0])
+    """Covariance of the free unknowns; `noise_ratio` is κ, (n_outputs, n_modes)."""
+    bound = scaled_inverse(normal_equations(fit, fit.noise)[0])
     if np.all(noise_ratio == 1.0):
         return bound
-    each = np.broadcast_to(noise_ratio, (fit.noise.size, fit.poles.size))
+    ratios = np.broadcast_to(noise_ratio, (fit.noise.size, fit.poles.size))
     rescaled = tuple(
-        replace(part, coefficients=part.coefficients * _by_column(part, each[outputs]))
+        replace(part, coefficients=part.coefficients * _by_column(part, ratios[outputs]))
         for part, outputs in fit.outputs()
     )
-    return np.asarray(bound @ normal(replace(fit, parts=rescaled), fit.noise)[0] @ bound)
+    return np.asarray(bound @ normal_equations(replace(fit, parts=rescaled), fit.noise)[0] @ bound)
 
 
 def pole_covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0, further: Floats | None = None) -> np.ndarray:
-    """Of (ω, ζ), (2 n_modes, 2 n_modes); `further` as in `errors`."""
+    """Covariance of (ω, ζ), (2 n_modes, 2 n_modes); `further` as in `propagated_covariance`."""
     n, q = fit.poles.size, fit.participation.shape[1] + 1
     free = free_parameters(fit)
-    at = np.searchsorted(free, np.r_[q * np.arange(n), q * n + q * np.arange(n)])
+    pole_indices = np.searchsorted(free, np.r_[q * np.arange(n), q * n + q * np.arange(n)])
     jacobian = by_poles(fit.poles)
-    whole = covariance(fit, noise_ratio)[np.ix_(at, at)]
+    pole_part = covariance(fit, noise_ratio)[np.ix_(pole_indices, pole_indices)]
     if further is not None:
-        whole = whole + further[np.ix_(at, at)]
-    return np.asarray(jacobian @ whole @ jacobian.T)
+        pole_part = pole_part + further[np.ix_(pole_indices, pole_indices)]
+    return np.asarray(jacobian @ pole_part @ jacobian.T)
 
 
-def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray, further: Floats | None = None) -> np.ndarray:
-    """Covariance of figures of (poles, participation, amplitudes) by their exact first-order change.
+def propagated_covariance(
+    fit: Fit, functions: Functions, noise_ratio: np.ndarray, further: Floats | None = None
+) -> np.ndarray:
+    """Covariance of functions of poles, participation factors and amplitudes, by first-order error propagation.
 
     Args:
-        figures: analytic up to conjugation, real (k,) of poles (n,), participation (n, n_excitations) and amplitudes
+        functions: analytic up to conjugation, real (k,) of poles (n,), participation (n, n_excitations) and amplitudes
             (n_outputs, n).
         noise_ratio: κ, (n_outputs, n_modes).
         further: covariance that is added, of the free unknowns, then of the coefficients of each output.
     """
     n, p = fit.participation.shape
-    free, size, at = free_parameters(fit), n * (p + 1), (fit.poles, fit.participation, fit.amplitudes)
-    drift = np.concatenate([-np.einsum("ct,tkj->ckj", part.tilt, moves(fit, part)) for part in fit.parts], axis=2)
-    changes = []
+    free, size, estimate = free_parameters(fit), n * (p + 1), (fit.poles, fit.participation, fit.amplitudes)
+    effect = np.concatenate(
+        [-np.einsum("ct,tkj->ckj", part.tilt, tangent_weights(fit, part)) for part in fit.parts], axis=2
+    )
+    directions = []
 
     def add(unknowns: Floats, c: Floats | None = None) -> None:
-        """A change of the free unknowns, and of the coefficients, which go along with these unless given."""
-        whole = np.zeros(2 * size)
-        whole[free] = unknowns
-        step = (whole[:size] + 1j * whole[size:]).reshape(n, p + 1)
-        c = np.einsum("ckj,k->cj", drift, whole) if c is None else c
-        changes.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
+        """Add a change of the free unknowns and of the coefficients, by default those that follow by least squares."""
+        all_unknowns = np.zeros(2 * size)
+        all_unknowns[free] = unknowns
+        step = (all_unknowns[:size] + 1j * all_unknowns[size:]).reshape(n, p + 1)
+        c = np.einsum("ckj,k->cj", effect, all_unknowns) if c is None else c
+        directions.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
 
     for column in _root(covariance(fit, noise_ratio)).T:
         add(column)
@@ -75,13 +85,13 @@ def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray, further: Floats 
             for column in (np.tile(np.sqrt(noise_ratio[output]), 2)[:, None] * spread).T:
                 a = np.zeros_like(fit.amplitudes)
                 a[output] = fit.noise[output] * (column[:n] - 1j * column[n:])
-                changes.append((np.zeros_like(fit.poles), np.zeros_like(fit.participation), a))
-    found = []
-    for change in changes:
-        # Central differences of a figure along one direction of the error ellipsoid, at a thousandth of its length.
-        above, below = (figures(*(x + h * d for x, d in zip(at, change, strict=True))) for h in (1e-3, -1e-3))
-        found.append((above - below) / 2e-3)
-    jacobian = np.array(found)
+                directions.append((np.zeros_like(fit.poles), np.zeros_like(fit.participation), a))
+    derivatives = []
+    for change in directions:
+        # Central differences along one direction of the error ellipsoid, at a thousandth of its length.
+        above, below = (functions(*(x + h * d for x, d in zip(estimate, change, strict=True))) for h in (1e-3, -1e-3))
+        derivatives.append((above - below) / 2e-3)
+    jacobian = np.array(derivatives)
     return jacobian.T @ jacobian
 
 
@@ -94,15 +104,17 @@ def vector_covariance(
     n_inputs: int,
     further: Floats | None = None,
 ) -> np.ndarray:
-    """Of each mode's shape over its largest entry, real part, then of its participation factors, real and imaginary.
+    """Covariance of each mode's relative shape and of its participation factors.
+
+    The shape is over its largest entry, real part; then real and imaginary parts of the participation factors.
 
     Args:
         noise_ratio: κ, (n_outputs, n_modes).
-        derivative: (n_outputs, 1) in time, of what each output measures.
-        kept: (n_kept,) the modes that are reported.
-        shapes: (n_outputs, n_kept) as they are reported, see `scaled_vectors`.
-        n_inputs: how many excitations, the first ones, are inputs.
-        further: as in `errors`.
+        derivative: (n_outputs, 1) order of the time derivative of displacement that each output measures.
+        kept: (n_kept,) indices of the modes that are reported.
+        shapes: (n_outputs, n_kept) as reported, see `scaled_vectors`.
+        n_inputs: number of excitations, the first ones, that are inputs.
+        further: as in `propagated_covariance`.
 
     Returns:
         (n_kept, k, k), k = n_outputs + 2 n_inputs.
@@ -111,18 +123,20 @@ def vector_covariance(
     if not kept.size:
         return np.zeros((0, k, k))
     largest = np.abs(fit.amplitudes[:, kept] / fit.poles[kept] ** derivative).argmax(axis=0)
-    each = np.arange(kept.size)
-    scale = shapes[largest, each]
+    modes = np.arange(kept.size)
+    scale = shapes[largest, modes]
 
-    def figures(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
-        seen = amplitudes[:, kept] / poles[kept] ** derivative
-        relative = seen / seen[largest, each]
-        driven = participation[kept, :n_inputs] * (0.5 * seen[largest, each] / scale)[:, None]
+    def functions(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
+        displacements = amplitudes[:, kept] / poles[kept] ** derivative
+        relative = displacements / displacements[largest, modes]
+        driven = participation[kept, :n_inputs] * (0.5 * displacements[largest, modes] / scale)[:, None]
         return np.concatenate([relative.real.T, driven.real, driven.imag], axis=1).ravel()
 
-    found = errors(fit, figures, noise_ratio, further).reshape(kept.size, k, kept.size, k)[each, :, each]
-    found[each, largest], found[each, :, largest] = 0.0, 0.0  # one by definition
-    return found
+    blocks = propagated_covariance(fit, functions, noise_ratio, further).reshape(kept.size, k, kept.size, k)[
+        modes, :, modes
+    ]
+    blocks[modes, largest], blocks[modes, :, largest] = 0.0, 0.0  # one by definition
+    return blocks
 
 
 def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray, further: Floats | None = None) -> np.ndarray:
@@ -131,26 +145,26 @@ def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray, further: Flo
     Args:
         noise_ratio: κ, (n_outputs, n_modes).
         fixed: κ of each fixed column and output, (n_fixed, n_outputs).
-        further: as in `errors`.
+        further: as in `propagated_covariance`.
     """
-    bound, free, n, found = covariance(fit, noise_ratio), free_parameters(fit), 2 * fit.poles.size, []
+    bound, free, n, variances = covariance(fit, noise_ratio), free_parameters(fit), 2 * fit.poles.size, []
     for part, outputs in fit.outputs():
-        drift = np.einsum("ct,tkj->ckj", part.tilt[n:], moves(fit, part)[:, free])
-        own = np.diag(part.spread)[n:, None] * fit.noise[outputs] ** 2 * fixed[:, outputs]
-        found.append(own + np.einsum("ckj,kl,clj->cj", drift, bound, drift))
-    variance = np.hstack(found)
+        effect = np.einsum("ct,tkj->ckj", part.tilt[n:], tangent_weights(fit, part)[:, free])
+        column_variance = np.diag(part.spread)[n:, None] * fit.noise[outputs] ** 2 * fixed[:, outputs]
+        variances.append(column_variance + np.einsum("ckj,kl,clj->cj", effect, bound, effect))
+    variance = np.hstack(variances)
     if further is not None:
         variance += np.diag(further)[free.size :].reshape(fit.noise.size, -1).T[n:]
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))  # of columns next to alike, round-off may be more
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))  # rounding error of nearly collinear columns may be negative
 
 
 def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:
-    """κ^½ of each column of a part, 1 for those that are fixed, (n_columns, n_outputs)."""
+    """κ^½ of each column of a part, 1 for fixed columns, (n_columns, n_outputs)."""
     coordinates = np.tile(np.sqrt(rows).T, (2, 1))
     return np.vstack([coordinates, np.ones((part.coefficients.shape[0] - len(coordinates), len(rows)))])
 
 
 def _root(matrix: np.ndarray) -> np.ndarray:
-    """R with R R^T = matrix, which close modes may have made singular."""
+    """R with R R^T = matrix, also of a matrix that close modes make singular."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     return size[:, None] * symmetric_root(matrix / np.outer(size, size))

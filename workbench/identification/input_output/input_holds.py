@@ -1,9 +1,9 @@
-"""Whether inputs run otherwise between samples than they are taken to: how likely the records are with each way.
+"""Test of the course of the inputs between samples, by the likelihood of the records with each hold.
 
-The same modes are fitted with the noise as it was found, and as many unknowns each way. Beside a direct term inputs
-held and straight give the same outputs, of other residues: these two are not told apart. What a false hold makes of the
-residues does not depend on the noise: a band-limited input taken as straight lines gives each residue 1/sinc²(f Δt) of
-its true size.
+The same modes are fitted with the same noise spectrum and as many parameters for each hold. With a direct term, zero-
+and first-order hold give the same outputs with other residues, so these two cannot be distinguished. The error of the
+residues by a false hold does not depend on the noise: a band-limited input taken for a first-order hold gives each
+residue 1/sinc²(f Δt) times its true size.
 """
 
 import numpy as np
@@ -21,20 +21,20 @@ WORDS = {
 }
 
 
-def hold_remarks(data: KnownInputs, fit: Fit, worth: float, budget: Budget) -> tuple[str, ...]:
-    """A remark where inputs that run otherwise between samples make the records more likely.
+def hold_remarks(data: KnownInputs, fit: Fit, threshold: float, budget: Budget) -> tuple[str, ...]:
+    """A remark where another course of the inputs between samples is significantly likelier.
 
     Args:
         data: as identified.
         fit: of its modes.
-        worth: by how much twice the logarithm of the likelihood must rise.
+        threshold: threshold of twice the log-likelihood ratio.
         budget: of time.
     """
     costs: dict[str, float] = {}
     for hold in HOLDS:
         if hold == data.hold or (data.feedthrough and "band-limited" not in (hold, data.hold)):
             continue
-        # a false hold may have made the delay
+        # the delay may be an artefact of the false hold
         whole = np.floor(data.delays)
         for delays in np.unique([data.delays, whole, np.maximum(whole - 1.0, 0.0)], axis=0):
             if budget.spent("check of how inputs run between samples"):
@@ -42,15 +42,16 @@ def hold_remarks(data: KnownInputs, fit: Fit, worth: float, budget: Budget) -> t
             other = data.with_hold(hold, delays)
             try:
                 start = projected(other, fit.poles, fit.participation)
-                found = settled(other, start, SELECTION.few_steps, budget, ORDER.decided)
+                refitted = settled(other, start, SELECTION.few_steps, budget, ORDER.decided)
             except np.linalg.LinAlgError:
                 continue
-            cost = other.cost(found) * len(fit.residual) / len(found.residual)  # a fraction has a row fewer
+            # a fractional delay has a row fewer
+            cost = other.cost(refitted) * len(fit.residual) / len(refitted.residual)
             costs[hold] = min(cost, costs.get(hold, np.inf))
     best = min(costs, key=lambda hold: costs[hold], default=data.hold)
-    if best == data.hold or costs[best] > data.cost(fit) - worth:
+    if best == data.hold or costs[best] > data.cost(fit) - threshold:
         return ()
     return (
-        f"by the records, inputs are {WORDS[best]}, and not {WORDS[data.hold]} as input_hold={data.hold!r} says:"
+        f"the records show inputs {WORDS[best]}, not {WORDS[data.hold]} as input_hold={data.hold!r} says:"
         f" residues and modal masses are wrong, the more the higher the mode; give input_hold={best!r}",
     )

@@ -1,21 +1,21 @@
 """Records with known inputs, as a `modal_fit.Measurement`: the response of each pole, and the noise.
 
-Each input u_i excites each pole, z' = λ z + Σ_i l_i u_i. Between samples the input is held, or straight from one
-to the next, or it is limited to the band below half of the sample rate (`records/band_limited.py`); z is exact at the
-samples. Of the first two,
+Each input u_i excites each pole, z' = λ z + Σ_i l_i u_i. Between samples the inputs follow a zero-order hold, a
+first-order hold, or are band-limited below half of the sample rate (`records/band_limited.py`); z is exact at the
+samples. With a zero- or first-order hold,
 
     z_k+1 = e^{λΔt} z_k + c_0 u_k + c_1 u_k+1
-    held: c_0 = Δt φ_1, c_1 = 0;    straight: c_0 = Δt (φ_1 - φ_2), c_1 = Δt φ_2
+    zero-order: c_0 = Δt φ_1, c_1 = 0;    first-order: c_0 = Δt (φ_1 - φ_2), c_1 = Δt φ_2
 
 with φ_1(x) = (e^x - 1)/x, φ_2(x) = (e^x - 1 - x)/x² at x = λΔt. The state at the first sample is one more excitation,
-an impulse before it. An input that acts late by d whole samples is shifted by d; by the fraction f of a sample more,
-the response is that of the step before carried on by h = (1 - f)Δt,
+an impulse before it. An input delayed by d whole samples is shifted by d. A further delay by the fraction f of a sample
+propagates the response of the sample before by h = (1 - f)Δt,
 
     z_k(f) = e^{λh} z_k-1 + c_0(h) u_k-1 + c_1(h) (f u_k-1 + (1 - f) u_k),
 
-which is e^{-λfΔt} z_k and a sum of u_k and u_k-1: whatever the fraction, modes with these two columns beside them are
-exact. A band-limited input is itself interpolated at the fraction. Noise that is not white is weighted line by line of
-the cosine transform of all columns.
+which is e^{-λfΔt} z_k plus a linear combination of u_k and u_k-1. Modes with u_k and u_k-1 as two further columns are
+thus exact for any fraction. A band-limited input is itself interpolated at the fraction. Coloured noise is weighted
+line by line of the cosine transform of all columns.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,13 @@ from scipy.signal import lfilter
 
 from workbench.arrays import Complexes, Floats
 from workbench.identification.input_output.fit_errors import covariance
-from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, modal_coordinate, moves
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    columns,
+    free_parameters,
+    modal_coordinate,
+    tangent_weights,
+)
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
 from workbench.identification.signal.projection import (
     correlation,
@@ -45,27 +51,29 @@ from workbench.identification.signal.searches import SELECTION
 from workbench.records.band_limited import later, response_of_pole, spectrum_of
 from workbench.records.record import Record
 
-# φ_k(x) = Σ x^i / (i + k)!, which ends below rounding for |x| < 6: a pole turns less than π a sample.
+# φ_k(x) = Σ x^i / (i + k)!; its last term is below rounding for |x| < 6. Below Nyquist |Im λΔt| < π.
 TERMS = 40
 SERIES = [np.array([1.0 / factorial(i + k) for i in range(TERMS)]) for k in (1, 2)]
 
 
 class KnownInputs:
-    """Rows are the samples, one record after another, or, with `line_std`, the lines of each record over their noise.
+    """The `modal_fit.Measurement` of records with known inputs.
+
+    Rows are the samples, one record after another, or, with `line_std`, the lines of each record over their noise.
 
     Args:
         records: with the same inputs and outputs at one rate.
         at_rest, hold, feedthrough: as in `identify_driven`; hold is its `input_hold`.
-        delays: (n_inputs,) samples by which each input acts late; none unless given.
-        any_fraction: whether each input acts later than that by any fraction of a sample, which stays unknown: then
-            each has two columns of its own, that of its delay and that a sample later.
+        delays: (n_inputs,) of each input, samples; none unless given.
+        any_fraction: whether each input has a further, unknown delay of a fraction of a sample: it then has two
+            columns, the input at its whole delay and a sample later.
         drift: degree of the polynomials of time that each output of each record holds; 0, a constant, unless given.
         line_std: relative noise of each line, one (n_rows, n_outputs) a record, of unit rms over all.
         beside: (n_samples, n_columns) of all records, fixed columns beside those of the inputs and the constants.
-        changing: poles of the modes that move along these.
-        distorted: poles about which no further mode is looked for.
-        free: poles of the modes of a free decay within the records, to start from where some of them are distorted.
-        measured: the records as they were, where noise of their inputs was made white.
+        changing: poles of the time- or amplitude-dependent modes whose columns `beside` holds.
+        distorted: poles of nonlinear modes; no further mode is searched near these.
+        free: poles identified from the free decay within the records, to start from where some are distorted.
+        measured: the records as measured, where the noise of their inputs was whitened.
     """
 
     def __init__(
@@ -87,13 +95,13 @@ class KnownInputs:
     ) -> None:
         self.measured = measured
         self.distorted, self.free = distorted, free
-        self.records, self.at_rest, self.hold, self.may_feel = records, at_rest, hold, feedthrough
+        self.records, self.at_rest, self.hold, self.may_have_feedthrough = records, at_rest, hold, feedthrough
         self.dt, self.places = records[0].sample_time, records[0].positions
         self.delays = np.zeros(records[0].n_inputs) if delays is None else np.asarray(delays, float)
         self.any_fraction = any_fraction
         self.whole = np.floor(self.delays).astype(int)
         self.fraction = self.delays - self.whole
-        # Inputs before the record are unknown but at rest: what they move at once is left out.
+        # Inputs before the record are unknown unless it begins at rest: the samples that need these are left out.
         late = bool(any_fraction or self.fraction.any())
         self.first = 0 if at_rest else int(self.whole.max()) + late
         self.driving, self.spectra = [record.inputs for record in records], [np.zeros((0, 0), complex)] * len(records)
@@ -108,7 +116,7 @@ class KnownInputs:
         ends = np.cumsum([0, *lengths])
         self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]
         self.line_std = line_std
-        self.by_line = line_std is not None and any(np.ptp(size, axis=0).any() for size in line_std)
+        self.rows_are_lines = line_std is not None and any(np.ptp(size, axis=0).any() for size in line_std)
         self.weights = None if line_std is None else 1.0 / np.vstack(line_std)
         self.values = self._rows(np.vstack(self._measured()))
         if self.weights is not None:
@@ -118,7 +126,7 @@ class KnownInputs:
         direct = np.vstack([self.direct(k).T[self.first :] for k in range(len(records))])
         self.n_inputs = records[0].n_inputs
         self.n_excitations = self.n_inputs + (0 if at_rest else len(records))
-        # The offset of each output holds an input that is constant already.
+        # A constant input is collinear with the offset of each output.
         self.feedthrough = (feedthrough or any_fraction) and bool(np.ptp(direct, axis=0).all())
         self.beside, self.changing = beside, changing
         fixed = [direct, slow] if self.feedthrough else [slow]
@@ -140,22 +148,22 @@ class KnownInputs:
         return self._with(line_std=line_std)
 
     def with_columns(self, rows: Floats, changing: tuple[complex, ...]) -> "KnownInputs":
-        """The same records with fixed columns of modes that change, (n_rows, n_columns) as the fit sees rows."""
+        """The same records with the fixed columns of changing modes, (n_rows, n_columns), rows as in `values`."""
         before = np.zeros((self.first, rows.shape[1]))
         samples = np.vstack([piece for part in self.rows for piece in (before, self.samples(rows[part]))])
         beside = samples if self.beside is None else np.hstack([self.beside, samples])
         return self._with(beside=beside, changing=(*self.changing, *changing))
 
     def without_columns(self) -> "KnownInputs":
-        """The same records without further fixed columns."""
+        """The same records without the fixed columns of changing modes."""
         return self._with(beside=None, changing=())
 
     def unweighted(self) -> "KnownInputs":
-        """The same records as samples of equal weight, without further fixed columns."""
+        """The same records as samples of equal weight, without the fixed columns of changing modes."""
         return self._with(line_std=None, beside=None, changing=())
 
     def first_half(self) -> "KnownInputs":
-        """The first half of each of such records."""
+        """The first half of each record."""
         halves = [
             replace(r, outputs=r.outputs[:, : r.n_samples // 2], inputs=r.inputs[:, : r.n_samples // 2])
             for r in self.records
@@ -167,23 +175,23 @@ class KnownInputs:
         return self._with(records=records, line_std=None)
 
     def with_white_noise(self, records: Sequence[Record]) -> "KnownInputs":
-        """Such records in which noise of the inputs was made white, as samples of equal weight."""
+        """Records in which the noise of the inputs was whitened, as samples of equal weight."""
         return self._with(records=records, measured=self.records, line_std=None)
 
     def as_measured(self) -> "KnownInputs":
-        """The records as they were before, as samples of equal weight."""
+        """The records before their noise was whitened, as samples of equal weight."""
         return self._with(records=self.measured, measured=None, line_std=None)
 
     def from_rest(self, records: Sequence[Record]) -> "KnownInputs":
-        """Other records of the same inputs that begin at rest, as samples of equal weight beside a constant alone."""
+        """Other records of the same inputs, from rest: samples of equal weight, fixed columns reset to a constant."""
         return self._with(records=records, line_std=None, at_rest=True, drift=0, beside=None, changing=())
 
     def with_drift(self, degree: int) -> "KnownInputs":
-        """The same records with polynomials of time beside the modes, of this degree."""
+        """The same records with polynomials of time of this degree."""
         return self._with(drift=degree)
 
     def drift_of(self, fit: Fit) -> Floats:
-        """How far the drift of each output goes over each record, (n_records, n_outputs)."""
+        """Range of the fitted drift of each output over each record, (n_records, n_outputs)."""
         degree = self.drift + 1
         first = 2 * fit.poles.size + self.fixed.shape[1] - degree * len(self.records)
         each = fit.coefficients[first:].reshape(len(self.records), degree, -1)
@@ -191,41 +199,44 @@ class KnownInputs:
         return np.asarray(np.ptp(np.einsum("td,kdj->ktj", slow, each[:, 1:]), axis=1))
 
     def with_distorted(self, poles: tuple[complex, ...]) -> "KnownInputs":
-        """The same records, no further mode being looked for about these poles either."""
+        """The same records with further poles near which no mode is searched."""
         new = tuple(pole for pole in poles if pole not in self.distorted)
         return self._with(distorted=(*self.distorted, *new)) if new else self
 
     def delayed_by(self, delays: np.ndarray, any_fraction: bool = False) -> "KnownInputs":
-        """The same records with inputs that act late by these delays, samples; lines weighted as before."""
-        found = self._with(delays=delays, any_fraction=any_fraction, line_std=None)
+        """The same records with inputs of these delays, samples; line weights are kept."""
+        delayed = self._with(delays=delays, any_fraction=any_fraction, line_std=None)
         if self.line_std is None:
-            return found
-        # Fewer or more rows: each line has the noise of the one at its frequency.
-        lengths = [rows.stop - rows.start for rows in found.rows]
-        return found.weighted_by([_resampled(std, n) for std, n in zip(self.line_std, lengths, strict=True)])
+            return delayed
+        # Another delay leaves fewer or more rows: noise is interpolated at the frequency of each line.
+        lengths = [rows.stop - rows.start for rows in delayed.rows]
+        return delayed.weighted_by([_resampled(std, n) for std, n in zip(self.line_std, lengths, strict=True)])
 
     def with_hold(self, hold: str, delays: np.ndarray) -> "KnownInputs":
-        """The same records with inputs that run otherwise between samples, late by these delays, samples."""
+        """The same records with another course of the inputs between samples and these delays, samples."""
         return self._with(hold=hold).delayed_by(delays)
 
     def apart(self, fit: Fit) -> "KnownInputs | None":
-        """Combinations of the outputs of unit noise that share none of what a fit leaves, lines of equal weight.
+        """Combinations of outputs with independent residuals of unit variance, lines of equal weight.
 
-        Poles and participation stay as they are. None where the outputs may share no noise.
+        Poles and participation factors stay valid. None where the outputs' residuals are not significantly correlated.
         """
-        found = independent(self.records, [left.T for left in self.left(fit)])
-        return None if found is None else self._with(records=found[0], line_std=None)
+        mixed = independent(self.records, [left.T for left in self.left(fit)])
+        return None if mixed is None else self._with(records=mixed[0], line_std=None)
 
     def disturbed(self, fit: Fit) -> Floats:
-        """Variance of what noise does to each mode over that of noise which outputs do not share, (n_modes,)."""
+        """Variance of each mode in noise that outputs share as the residual shows, over that in independent noise.
+
+        (n_modes,); see `projection.disturbed`.
+        """
         return disturbed(correlation([left.T for left in self.left(fit)]), fit.amplitudes / fit.noise[:, None])
 
     def beside_as(self, other: "KnownInputs") -> "KnownInputs":
-        """The same records, lines of equal weight, with the fixed columns that another has beside its own."""
+        """The same records, lines of equal weight, with the fixed columns of changing modes of `other`."""
         return self._with(line_std=None, beside=other.beside, changing=other.changing)
 
     def left(self, fit: Fit) -> list[np.ndarray]:
-        """What a fit leaves of the samples of each record, (n_samples, n_outputs)."""
+        """The residual of each record at its samples, (n_samples, n_outputs), in the unit of each output."""
         raw = fit.residual if self.weights is None else fit.residual / self.weights
         return [self.samples(raw[rows]) for rows in self.rows]
 
@@ -234,7 +245,7 @@ class KnownInputs:
             "records": self.records,
             "at_rest": self.at_rest,
             "hold": self.hold,
-            "feedthrough": self.may_feel,
+            "feedthrough": self.may_have_feedthrough,
             "delays": self.delays,
             "any_fraction": self.any_fraction,
             "drift": self.drift,
@@ -254,65 +265,67 @@ class KnownInputs:
 
     def noise_spectrum(self, fit: Fit) -> list[np.ndarray] | None:
         """Relative noise of the lines of each record, as `noise_spectrum` estimates it from the residual."""
-        taken = self.taken(fit)
-        shares = [taken[rows] for rows in self.rows]
-        return noise_spectrum(self.left(fit), self._measured(), shares, fit.poles.size, self._free(fit))
+        leverage = self.leverage(fit)
+        by_record = [leverage[rows] for rows in self.rows]
+        return noise_spectrum(self.left(fit), self._measured(), by_record, fit.poles.size, self._free(fit))
 
-    def taken(self, fit: Fit) -> np.ndarray:
-        """Leverage of each line, the share of its noise that the fit took, (n_rows, n_outputs)."""
+    def leverage(self, fit: Fit) -> np.ndarray:
+        """Leverage of each line, the share of its noise that the fit absorbs, (n_rows, n_outputs)."""
         phi, t = columns(self, fit.poles, fit.participation)
-        if not self.by_line:
+        if not self.rows_are_lines:
             phi, t = (np.vstack([lines_of(matrix[rows]) for rows in self.rows]) for matrix in (phi, t))
-        free, found = free_parameters(fit), []
+        free, leverages = free_parameters(fit), []
         bound = covariance(fit) if free.size else np.zeros((0, 0))
-        moved = np.concatenate([moves(fit, part)[:, free] for part in fit.parts], axis=2)
+        changes = np.concatenate([tangent_weights(fit, part)[:, free] for part in fit.parts], axis=2)
         weights = np.ones((1, fit.noise.size)) if self.weights is None else self.weights
-        for weight, std, each in zip(weights.T[:, :, None], fit.noise, moved.transpose(2, 0, 1)):
+        for weight, std, each in zip(weights.T[:, :, None], fit.noise, changes.transpose(2, 0, 1)):
             q = np.linalg.qr(weight * phi / np.maximum(np.linalg.norm(weight * phi, axis=0), 1e-300))[0]
-            searched = (weight * t) @ each
-            searched -= q @ (q.T @ searched)
-            found.append((q**2).sum(axis=1) + ((searched @ bound) * searched).sum(axis=1) / std**2)
-        return np.array(found).T
+            nonlinear = (weight * t) @ each
+            nonlinear -= q @ (q.T @ nonlinear)
+            leverages.append((q**2).sum(axis=1) + ((nonlinear @ bound) * nonlinear).sum(axis=1) / std**2)
+        return np.array(leverages).T
 
     def cost(self, fit: Fit) -> float:
-        """Twice the negative logarithm of the likelihood of modes and noise, up to a constant."""
+        """Twice the negative log-likelihood of modes and noise, up to a constant."""
         log_sizes = 0.0 if self.weights is None else -2.0 * float(np.log(self.weights).sum())
         return log_sizes + len(fit.residual) * float(np.log((fit.residual**2).sum(axis=0)).sum())
 
     def noise_ratios(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """κ, noise over its mean, about each mode, (n_outputs, n_modes), and along each fixed column, (n_fixed,
-        n_outputs): records weighted by the energy of the mode in each."""
+        """κ, noise power over its mean: near each mode and along each fixed column.
+
+        (n_outputs, n_modes) and (n_fixed, n_outputs). Records are weighted by the energy of the mode or column in each.
+        """
         std = np.sqrt(variances(*self._squares(fit)))
         each = zip(fit.poles, fit.participation)
         coordinates = [modal_coordinate(self.responses(pole), l_r) for pole, l_r in each]
-        near, beside, energy, power = [], [], [], []
+        near, along, energy, power = [], [], [], []
         for k, rows in enumerate(self.rows):
-            left = self.samples(fit.residual[rows] / std[k])
-            near.append(noise_near(fit.poles, left, np.ones(left.shape[1]), self.dt))
+            residual = self.samples(fit.residual[rows] / std[k])
+            near.append(noise_near(fit.poles, residual, np.ones(residual.shape[1]), self.dt))
             weights = np.ones((1, std.shape[1])) if self.weights is None else self.weights[rows]
-            seen = [self.samples(weight[:, None] * self.fixed[rows]) for weight in weights.T]
-            along = [noise_along(fixed, rest, fit.poles.size) for fixed, rest in zip(seen, left.T[:, :, None])]
-            beside.append(np.hstack(along))
-            squares = np.broadcast_to(weights**2, left.shape).T
+            weighted = [self.samples(weight[:, None] * self.fixed[rows]) for weight in weights.T]
+            ratios = [noise_along(column, row, fit.poles.size) for column, row in zip(weighted, residual.T[:, :, None])]
+            along.append(np.hstack(ratios))
+            squares = np.broadcast_to(weights**2, residual.shape).T
             energy.append(np.column_stack([squares @ (x[rows] ** 2 + y[rows] ** 2) for x, y in coordinates]))
             power.append((squares @ self.fixed[rows] ** 2).T)
-        return np.average(near, axis=0, weights=energy), np.average(beside, axis=0, weights=np.array(power) + 1e-300)
+        return np.average(near, axis=0, weights=energy), np.average(along, axis=0, weights=np.array(power) + 1e-300)
 
     def _squares(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """Squares of the residual and their degrees of freedom."""
+        """Sums of squares of the residual, (n_records, n_outputs), and their degrees of freedom."""
         squares = np.array([(fit.residual[rows] ** 2).sum(axis=0) for rows in self.rows])
         return np.maximum(squares, 1e-28 * squares.max() + 1e-300), self._free(fit)
 
     def _free(self, fit: Fit) -> np.ndarray:
-        length = np.array([rows.stop - rows.start for rows in self.rows])
-        lost = fit.coefficients.shape[0] + free_parameters(fit).size / self.values.shape[1]
-        return np.asarray(np.maximum(length * (1.0 - lost / length.sum()), 1.0))
+        n_rows = np.array([rows.stop - rows.start for rows in self.rows])
+        n_parameters = fit.coefficients.shape[0] + free_parameters(fit).size / self.values.shape[1]
+        return np.asarray(np.maximum(n_rows * (1.0 - n_parameters / n_rows.sum()), 1.0))
 
     def _measured(self) -> list[np.ndarray]:
         return [record.outputs.T[self.first :] for record in self.records]
 
     def direct(self, record: int) -> np.ndarray:
-        """What outputs feel at once of the inputs of a record, (n_columns, n_samples)."""
+        """The columns of the direct term of a record, (n_columns, n_samples): inputs at their delays."""
         u = self.driving[record]
         before = np.hstack([np.zeros((len(u), 1)), u[:, :-1]])
         if self.any_fraction:
@@ -323,19 +336,19 @@ class KnownInputs:
         return self._shifted(np.where(f > 0.0, late, u))
 
     def _shifted(self, of_inputs: np.ndarray) -> np.ndarray:
-        """What belongs to each input, (n_inputs, n_samples), later by its whole samples, zero before."""
+        """Rows (n_inputs, n_samples) delayed by the whole samples of each input, zero before."""
         if not self.whole.any():
             return of_inputs
         n = of_inputs.shape[1]
         return np.array([np.r_[np.zeros(d), row[: n - d]] for row, d in zip(of_inputs, self.whole, strict=True)])
 
     def _rows(self, samples: np.ndarray) -> np.ndarray:
-        """Columns of samples as the fit sees them."""
-        return self.rows_of([samples[rows] for rows in self.rows]) if self.by_line else samples
+        """Columns of samples of all records as rows of the fit."""
+        return self.rows_of([samples[rows] for rows in self.rows]) if self.rows_are_lines else samples
 
     def samples(self, rows: np.ndarray) -> np.ndarray:
-        """Rows of one record as samples."""
-        return samples_of(rows) if self.by_line else rows
+        """Rows of the fit of one record as samples."""
+        return samples_of(rows) if self.rows_are_lines else rows
 
     def modulated(self, rows: Floats, factor: Floats) -> Floats:
         """Columns (n_rows, k) times a factor at each sample, (n_samples,) of all records."""
@@ -343,17 +356,17 @@ class KnownInputs:
 
     @property
     def time(self) -> Floats:
-        """Of each sample in its record, from -1/2 at the first to 1/2 at the last, (n_samples,)."""
+        """Time of each sample within its record, from -1/2 at the first to 1/2 at the last, (n_samples,)."""
         return np.concatenate([np.linspace(-0.5, 0.5, part.stop - part.start) for part in self.rows])
 
     def modal_coordinate(self, pole: complex, l_r: np.ndarray) -> list[np.ndarray]:
-        """z of a mode at the samples of each record, (n_samples,) complex each."""
+        """Modal coordinate z of a pole at the samples of each record, (n_samples,) complex each."""
         z = np.column_stack(modal_coordinate(self.responses(pole), l_r))
         return [self.samples(z[part]) @ np.array([1.0, 1j]) for part in self.rows]
 
     def rows_of(self, samples: Sequence[np.ndarray]) -> Floats:
-        """Columns (n_samples, k) of each record as the fit sees them, one below the other."""
-        return np.vstack([lines_of(each) if self.by_line else each for each in samples])
+        """Columns (n_samples, k) of each record as rows of the fit, (n_rows, k)."""
+        return np.vstack([lines_of(each) if self.rows_are_lines else each for each in samples])
 
     def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         x = np.zeros((self.values.shape[0], self.n_excitations), complex, order="F")
@@ -365,27 +378,30 @@ class KnownInputs:
         return self._rows(x.real), self._rows(x.imag)
 
     def slopes(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = np.zeros(self.values.shape[0], complex)
+        slopes = np.zeros(self.values.shape[0], complex)
         mu, l_r = np.exp(pole * self.dt), participation[: self.n_inputs]
         each = zip(self.records, self.rows, self._of_pole(pole))
-        for k, (record, rows, (x, by_coefficients, decay)) in enumerate(each):
+        for k, (record, rows, (z, forcing_slope, decay)) in enumerate(each):
             u = record.inputs
             if self.fraction.any():
-                driving = self.dt * mu * x[:, :-1] + by_coefficients[:, 1:]
-                slope = lfilter([1.0], [1.0, -mu], np.hstack([np.zeros((len(u), 1)), driving]), axis=1)
-                all_samples = l_r @ self._shifted(self._late_driven(u, pole, x, slope))
+                forcing = self.dt * mu * z[:, :-1] + forcing_slope[:, 1:]
+                slope = lfilter([1.0], [1.0, -mu], np.hstack([np.zeros((len(u), 1)), forcing]), axis=1)
+                all_samples = l_r @ self._shifted(self._late_driven(u, pole, z, slope))
             else:
-                later = self.dt * mu * (l_r @ self._shifted(x))[:-1] + (l_r @ self._shifted(by_coefficients))[1:]
-                all_samples = lfilter([1.0], [1.0, -mu], np.r_[0.0, later])
-            found[rows] = all_samples[self.first :]
+                forcing = self.dt * mu * (l_r @ self._shifted(z))[:-1] + (l_r @ self._shifted(forcing_slope))[1:]
+                all_samples = lfilter([1.0], [1.0, -mu], np.r_[0.0, forcing])
+            slopes[rows] = all_samples[self.first :]
             if not self.at_rest:
                 time = self.dt * np.arange(self.first, u.shape[1])
-                found[rows] += participation[self.n_inputs + k] * time * decay[self.first :]
-        return self._rows(found.real[:, None])[:, 0], self._rows(found.imag[:, None])[:, 0]
+                slopes[rows] += participation[self.n_inputs + k] * time * decay[self.first :]
+        return self._rows(slopes.real[:, None])[:, 0], self._rows(slopes.imag[:, None])[:, 0]
 
     def _of_pole(self, pole: complex) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """By record: z of each input from rest, the derivative of its sources by λ, (n_inputs, n_samples) each, and
-        what an initial state of one decays to, (n_samples,). Those of the last pole are remembered."""
+        """For each record: z of each input from rest, derivative of its forcing, and decay of a unit initial state.
+
+        The derivative of c_0 u_k + c_1 u_k+1 is by λ; (n_inputs, n_samples) twice, (n_samples,). Cached for the last
+        pole.
+        """
         if self._last is None or self._last[0] != pole:
             each = [
                 (*self._driven(u, spectrum, pole), powers(pole * self.dt, u.shape[1]))
@@ -395,101 +411,106 @@ class KnownInputs:
         return self._last[1]
 
     def _driven(self, inputs: Floats, spectrum: Complexes, pole: complex) -> tuple[np.ndarray, np.ndarray]:
-        """z of each input from rest, and the derivative of its sources by λ, (n_inputs, n_samples) each."""
+        """z of each input from rest, and the derivative of its forcing by λ, (n_inputs, n_samples) each."""
         if self.hold == "band-limited":
             z, slope = response_of_pole(spectrum, pole * self.dt, inputs.shape[1])
             from_sources = np.zeros_like(z)
             from_sources[:, 1:] = slope[:, 1:] - np.exp(pole * self.dt) * (slope[:, :-1] + z[:, :-1])
             return self.dt * z, self.dt**2 * from_sources
-        (now, after), (now_slope, after_slope) = sources(pole, self.dt, self.hold)
+        (now, following), (now_slope, following_slope) = sources(pole, self.dt, self.hold)
         u = inputs.astype(complex)
-        rest = -after * u[:, :1]
-        x = lfilter([after, now], [1.0, -np.exp(pole * self.dt)], u, axis=1, zi=rest)[0]
-        by_coefficients = after_slope * u
-        by_coefficients[:, 1:] += now_slope * inputs[:, :-1]
-        by_coefficients[:, 0] = 0.0  # nothing drives the first sample
-        return x, by_coefficients
+        initial = -following * u[:, :1]
+        z = lfilter([following, now], [1.0, -np.exp(pole * self.dt)], u, axis=1, zi=initial)[0]
+        forcing_slope = following_slope * u
+        forcing_slope[:, 1:] += now_slope * inputs[:, :-1]
+        forcing_slope[:, 0] = 0.0  # no input acts before the first sample
+        return z, forcing_slope
 
     def _late_driven(
         self, inputs: np.ndarray, pole: complex, z: np.ndarray, slope: np.ndarray | None = None
     ) -> np.ndarray:
-        """z of each input, or with its slope by λ that of the result, at inputs late by the fraction of a sample."""
-        found = (z if slope is None else slope).copy()
+        """z of each input, delayed by its fraction of a sample; its derivative by λ instead where `slope` is given.
+
+        Args:
+            inputs: (n_inputs, n_samples).
+            z, slope: (n_inputs, n_samples) without that delay, and the derivative of z by λ.
+        """
+        delayed = (z if slope is None else slope).copy()
         for i in np.flatnonzero(self.fraction):
             f = self.fraction[i]
             h = (1.0 - f) * self.dt
-            of_values, of_slopes = sources(pole, h, self.hold)
-            c_0, c_1 = of_values if slope is None else of_slopes
-            u, carried = inputs[i], np.exp(pole * h)
-            on = carried * (z[i] if slope is None else h * z[i] + slope[i])
-            found[i, 0] = 0.0
-            found[i, 1:] = on[:-1] + c_0 * u[:-1] + c_1 * (f * u[:-1] + (1.0 - f) * u[1:])
-        return found
+            coefficients, coefficient_slopes = sources(pole, h, self.hold)
+            c_0, c_1 = coefficients if slope is None else coefficient_slopes
+            u, factor = inputs[i], np.exp(pole * h)
+            propagated_z = factor * (z[i] if slope is None else h * z[i] + slope[i])
+            delayed[i, 0] = 0.0
+            delayed[i, 1:] = propagated_z[:-1] + c_0 * u[:-1] + c_1 * (f * u[:-1] + (1.0 - f) * u[1:])
+        return delayed
 
     def candidates(self, residual: np.ndarray) -> np.ndarray:
-        """Poles whose response to the inputs agrees best with the residual.
+        """Poles whose response to the inputs correlates most with the residual, (n_candidates,).
 
-        Σ_k y_k x_k(λ) = Σ_τ R_yu(τ) e^{λ τ}, so that one transform of the correlations, weighted by a decay, compares
-        all frequencies at that rate of decay; the initial state is an impulse before the first sample.
+        Σ_k y_k x_k(λ) = Σ_τ R_yu(τ) e^{λ τ}: one transform of the cross-correlations, weighted by a decay, compares all
+        frequencies at that rate of decay. The initial state is an impulse before the first sample.
         """
         size, omega = self.size, 2.0 * np.pi * np.fft.rfftfreq(self.size, self.dt)
         lags = np.arange(size // 2)
-        crossed, own = [], []
+        cross_correlations, autocorrelations = [], []
         for record, rows in zip(self.records, self.rows):
             weights = np.ones((1, residual.shape[1])) if self.weights is None else self.weights[rows]
             y = np.fft.rfft(self.samples(weights * residual[rows]).T, size)
             lines = np.pi / self.dt * np.arange(len(weights)) / len(weights)
-            counted = np.array([np.interp(omega, lines, weight**2) for weight in weights.T])
-            seen = self._shifted(record.inputs)[:, self.first :]
-            excitations = [*seen] if self.at_rest else [*seen, np.eye(1, seen.shape[1])[0]]
+            line_weights = np.array([np.interp(omega, lines, weight**2) for weight in weights.T])
+            delayed = self._shifted(record.inputs)[:, self.first :]
+            excitations = [*delayed] if self.at_rest else [*delayed, np.eye(1, delayed.shape[1])[0]]
             for u in filter(np.any, excitations):
                 spectrum = np.fft.rfft(u, size)
-                crossed.append(np.fft.irfft(y * spectrum.conj(), size)[:, : size // 2])
-                own.append(np.fft.irfft(counted * np.abs(spectrum) ** 2, size)[:, : size // 2])
-        found, strength = [], []
+                cross_correlations.append(np.fft.irfft(y * spectrum.conj(), size)[:, : size // 2])
+                autocorrelations.append(np.fft.irfft(line_weights * np.abs(spectrum) ** 2, size)[:, : size // 2])
+        poles, strength = [], []
         for rate in self.rates:
             decay = np.exp(-rate * self.dt * lags)
-            lowest = omega > max(0.5 * self.resolution, rate / SELECTION.most_damped)
+            oscillates = omega > max(0.5 * self.resolution, rate / SELECTION.most_damped)
             score = np.zeros(omega.size)
-            # The response's own power: the spectrum of the input seen through the pole.
-            for r, power in zip(crossed, own):
-                agreed = np.abs(np.fft.rfft(r * decay, size)) ** 2
-                whole = 2.0 * np.fft.rfft(power * decay, size).real - power[:, :1]
-                least = 1e-12 * power[:, :1]
-                score += (agreed / np.maximum(whole / (1.0 - np.exp(-2.0 * rate * self.dt)), least)).sum(axis=0)
-            score[~lowest] = 0.0
+            # The correlation is normalised by the power of the pole's response to the input.
+            for r, autocorrelation in zip(cross_correlations, autocorrelations):
+                correlation = np.abs(np.fft.rfft(r * decay, size)) ** 2
+                power = 2.0 * np.fft.rfft(autocorrelation * decay, size).real - autocorrelation[:, :1]
+                floor = 1e-12 * autocorrelation[:, :1]
+                score += (correlation / np.maximum(power / (1.0 - np.exp(-2.0 * rate * self.dt)), floor)).sum(axis=0)
+            score[~oscillates] = 0.0
             peaks = 1 + np.flatnonzero((score[1:-1] > score[:-2]) & (score[1:-1] >= score[2:]))
             best = peaks[np.argsort(score[peaks])[-SELECTION.peaks_a_rate :]]
-            found.append(-rate + 1j * omega[best])
+            poles.append(-rate + 1j * omega[best])
             strength.append(score[best])
         order = np.argsort(np.concatenate(strength))[::-1]
-        return np.concatenate(found)[order[: 3 * SELECTION.peaks_a_rate]]
+        return np.concatenate(poles)[order[: 3 * SELECTION.peaks_a_rate]]
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         longest = max(self.rows, key=lambda rows: rows.stop - rows.start)
         power = (np.abs(np.fft.rfft(self.samples(residual[longest]), axis=0)[1:]) ** 2).mean(axis=1)
-        at = round(pole.imag / self.resolution) - 1
-        beside = power[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
-        return max(1.0, float(np.median(beside) / power.mean())) if beside.size else 1.0
+        nearest = round(pole.imag / self.resolution) - 1
+        around = power[max(nearest - SELECTION.noise_bins, 0) : nearest + SELECTION.noise_bins + 1]
+        return max(1.0, float(np.median(around) / power.mean())) if around.size else 1.0
 
 
 def powers(exponent: complex, n: int) -> np.ndarray:
-    """e^(k exponent) for k = 0 ... n - 1, as products of few exponentials."""
-    few = int(np.ceil(np.sqrt(n)))
-    fine, coarse = np.exp(exponent * np.arange(few)), np.exp(exponent * few * np.arange(-(-n // few)))
+    """e^(k exponent) for k = 0 ... n - 1, as products of two tables of √n exponentials."""
+    n_fine = int(np.ceil(np.sqrt(n)))
+    fine, coarse = np.exp(exponent * np.arange(n_fine)), np.exp(exponent * n_fine * np.arange(-(-n // n_fine)))
     return np.asarray(np.multiply.outer(coarse, fine).ravel()[:n])
 
 
 def _resampled(line_std: np.ndarray, n_rows: int) -> np.ndarray:
-    """Noise of the lines of a record of another length, (n_rows, n_outputs)."""
+    """Relative noise of lines interpolated at those of a record of another length, (n_rows, n_outputs)."""
     if len(line_std) == n_rows:
         return line_std
-    at, lines = np.linspace(0.0, 1.0, n_rows), np.linspace(0.0, 1.0, len(line_std))
-    return np.column_stack([np.interp(at, lines, column) for column in line_std.T])
+    new_lines, lines = np.linspace(0.0, 1.0, n_rows), np.linspace(0.0, 1.0, len(line_std))
+    return np.column_stack([np.interp(new_lines, lines, column) for column in line_std.T])
 
 
 def sources(pole: complex, dt: float, hold: str) -> tuple[tuple[complex, complex], tuple[complex, complex]]:
-    """c_0, c_1 of inputs held or straight between samples, and their derivatives by λ."""
+    """(c_0, c_1) of a zero- or first-order hold, and their derivatives by λ."""
     x = pole * dt
     powers = x ** np.arange(TERMS)
     sums: list[Any] = [(s @ powers, s[1:] * np.arange(1, TERMS) @ powers[:-1]) for s in SERIES]

@@ -1,14 +1,14 @@
-"""Maximum likelihood modes of whatever excites them: poles, shapes and participation, in time or over frequency.
+"""Maximum likelihood estimates of poles, shapes and participation factors, in time or over frequency.
 
 Each mode has one complex modal coordinate z_r, which every output measures in proportion to its shape,
 
     y_j = Re Σ_r a_jr z_r + Σ_f d_jf v_f,      z_r = Σ_p l_rp x_p(λ_r),
 
 x_p(λ) the response of a pole λ to the p-th excitation and v_f columns known beforehand. For given poles and
-participation l the outputs are linear in a and d, which drop out (variable projection, Golub & Pereyra 1973); z_r is
-analytic in λ_r and l_rp, so one matrix of tangents T = ∂z_r/∂(λ_r, l_rp), projected on what the columns leave, gives
-the Gauss-Newton matrix H, and H^-1 in the noise of the outputs is the Cramér-Rao bound. One participation of each mode
-is held: the shape carries its scale.
+participation factors l the outputs are linear in a and d, which are eliminated (variable projection, Golub & Pereyra
+1973). z_r is analytic in λ_r and l_rp, so one matrix of tangents T = ∂z_r/∂(λ_r, l_rp), orthogonal to all columns,
+gives the Gauss-Newton matrix H; H^-1 in the noise of the outputs is the Cramér-Rao bound. One participation factor of
+each mode is held at 1: the shape carries its scale.
 """
 
 from collections.abc import Iterator
@@ -23,26 +23,27 @@ from workbench.identification.signal.projection import pole_blocks
 from workbench.identification.signal.searches import FIT, Budget, minimise
 
 Pair = tuple[np.ndarray, np.ndarray]
-# Rows from which on products of tangents are taken less those of their projections: these take three times as long to
-# make, and what is lost in rounding is less than the noise of so many
+# From this many rows on, the Gram matrix is that of the tangents less that of their projections: to form the projected
+# tangents takes three times as long, and the rounding error of the difference is below the noise of so many rows
 MANY_ROWS = 5000
-LEAST_APART = 1e-5  # of the length of a column, what others leave of it: of less its square would be lost in rounding
+# Length of a unit column orthogonal to the others, below which Cholesky factors lose it in rounding
+LEAST_INDEPENDENT = 1e-5
 
 
 class Measurement(Protocol):
-    """What a fit of modes needs to know of a measurement.
+    """A measurement to which modes are fitted.
 
     Attributes:
         values: (n_rows, n_outputs) real readings, divided by their relative noise where `weights` is given.
         fixed: (n_rows, n_fixed) columns v_f.
         weights: (n_rows, n_outputs) inverse relative noise, or None where it is the same in all rows of an output.
-        resolution: rad/s, of a measurement of this length.
+        resolution: 2π over the duration, rad/s.
         highest: rad/s, beyond which no pole is searched.
         nyquist: rad/s, half of the sample rate; inf of response functions.
-        n_inputs: of the excitations, that are no initial states.
+        n_inputs: number of excitations that are inputs; the others are initial states.
         cells: number of poles that could be distinguished, for the chance of a false alarm.
-        distorted: poles of modes that are more than linear ones; about these no further mode is looked for.
-        free: poles of modes that a free decay holds, where some of them are distorted.
+        distorted: poles of nonlinear modes; no further mode is searched near these.
+        free: poles identified from a free decay within the record, given where some of them are distorted.
     """
 
     values: np.ndarray
@@ -65,7 +66,7 @@ class Measurement(Protocol):
         ...
 
     def candidates(self, residual: np.ndarray) -> np.ndarray:
-        """Poles worth a try, (n_candidates,), residual in units of the noise."""
+        """Poles to try, (n_candidates,), from the residual in units of the noise."""
         ...
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
@@ -75,19 +76,19 @@ class Measurement(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Some outputs projected on the same columns."""
+    """The least-squares projection of outputs that share the same weighted columns."""
 
     residual: np.ndarray  # (n_rows, n_outputs)
     coefficients: np.ndarray  # (n_columns, n_outputs)
-    gram: np.ndarray  # projected tangents among themselves
-    slopes: np.ndarray  # tangents with the residual
+    gram: np.ndarray  # T^T (I - Φ Φ^+) T
+    slopes: np.ndarray  # T^T residual
     spread: np.ndarray  # (Φ^T Φ)^-1
     tilt: np.ndarray  # Φ^+ T
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Fitted modes: poles (n_modes,), participation (n_modes, n_excitations), and the projections behind them."""
+    """Fitted modes: poles (n_modes,), participation factors (n_modes, n_excitations), and the projections on them."""
 
     poles: np.ndarray
     participation: np.ndarray
@@ -112,13 +113,13 @@ class Fit:
     @property
     def noise(self) -> np.ndarray:
         """Standard deviation of the residual of each output, (n_outputs,)."""
-        left = self.residual
-        free = max(left.shape[0] - self.coefficients.shape[0] - free_parameters(self).size / left.shape[1], 1.0)
-        squares = (left**2).sum(axis=0)
+        residual = self.residual
+        free = max(residual.shape[0] - self.coefficients.shape[0] - free_parameters(self).size / residual.shape[1], 1.0)
+        squares = (residual**2).sum(axis=0)
         return np.asarray(np.sqrt(np.maximum(squares, 1e-28 * squares.max() + 1e-300) / free))
 
     def outputs(self) -> Iterator[tuple[Part, slice]]:
-        """The parts, and which outputs each holds."""
+        """Each part, with the slice of the outputs it holds."""
         first = 0
         for part in self.parts:
             yield part, slice(first, first + part.residual.shape[1])
@@ -126,7 +127,7 @@ class Fit:
 
 
 def projected(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> Fit:
-    """The shapes that belong to given poles and participation, by least squares."""
+    """The fit with given poles and participation factors; shapes by least squares."""
     phi, t = columns(data, poles, participation)
     if data.weights is None:
         return Fit(poles, participation, (_part(phi, t, data.values),))
@@ -160,7 +161,7 @@ def columns(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> 
 
 
 def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
-    """χ² that one fit leaves beyond what another does, outputs in units of `noise`."""
+    """Increase of χ² from the fit `more` to the fit `fewer`, outputs in units of `noise`."""
     return float((((fewer.residual**2).sum(axis=0) - (more.residual**2).sum(axis=0)) / noise**2).sum())
 
 
@@ -173,28 +174,28 @@ def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
     residual = y - q @ qy
     inverse = solve_triangular(r, np.eye(r.shape[0])) / size[:, None]
     if len(phi) < MANY_ROWS:
-        rest = t - q @ qt
-        gram, slopes = rest.T @ rest, rest.T @ residual
+        orthogonal = t - q @ qt
+        gram, slopes = orthogonal.T @ orthogonal, orthogonal.T @ residual
     else:
         gram, slopes = t.T @ t - qt.T @ qt, t.T @ residual
     return Part(residual, inverse @ qy, gram, slopes, inverse @ inverse.T, inverse @ qt)
 
 
 def _orthonormal(columns: np.ndarray) -> Pair:
-    """Q and R of columns, by Cholesky factors of their products twice where these are far from singular.
+    """Q and R of columns: by two Cholesky factorisations where well conditioned, else by Householder reflections.
 
     As accurate there as reflections, in a fraction of the time (Yamamoto et al., ETNA 44 (2015) 306).
     """
-    q, whole = columns, np.eye(columns.shape[1])
+    q, r_total = columns, np.eye(columns.shape[1])
     try:
         for _ in range(2):
             r = np.linalg.cholesky(q.T @ q).T
-            if r.size and np.diag(r).min() < LEAST_APART:
+            if r.size and np.diag(r).min() < LEAST_INDEPENDENT:
                 raise np.linalg.LinAlgError("columns that are nearly dependent")
-            q, whole = q @ solve_triangular(r, np.eye(r.shape[0])), r @ whole
+            q, r_total = q @ solve_triangular(r, np.eye(r.shape[0])), r @ r_total
     except np.linalg.LinAlgError:
-        q, whole = qr(columns, mode="economic", check_finite=False)
-    return q, whole
+        q, r_total = qr(columns, mode="economic", check_finite=False)
+    return q, r_total
 
 
 def scaled_vectors(fit: Fit, kept: np.ndarray, derivative: np.ndarray) -> Pair:
@@ -203,36 +204,39 @@ def scaled_vectors(fit: Fit, kept: np.ndarray, derivative: np.ndarray) -> Pair:
     y = Re Σ a z and H = Σ a l / 2 (s - λ) + conjugate: the participation factors take up the scale of the shape.
 
     Args:
-        kept: (n_kept,) the modes.
-        derivative: (n_outputs, 1) in time, of what each output measures.
+        kept: (n_kept,) indices of the modes.
+        derivative: (n_outputs, 1) order of the time derivative of displacement that each output measures.
     """
-    seen = fit.amplitudes[:, kept] / fit.poles[kept] ** derivative
-    shapes = normalised_shapes(seen) if kept.size else seen
-    at = np.abs(seen).argmax(axis=0), np.arange(kept.size)
-    return shapes, fit.participation[kept] * (0.5 * seen[at] / shapes[at])[:, None]
+    displacements = fit.amplitudes[:, kept] / fit.poles[kept] ** derivative
+    shapes = normalised_shapes(displacements) if kept.size else displacements
+    largest = np.abs(displacements).argmax(axis=0), np.arange(kept.size)
+    return shapes, fit.participation[kept] * (0.5 * displacements[largest] / shapes[largest])[:, None]
 
 
 def free_parameters(fit: Fit) -> np.ndarray:
-    """Indices of the unknowns searched, real parts first: pole and participation of each mode, less the held entry."""
+    """Indices of the free unknowns, real parts first: pole and participation factors of each mode but the held one."""
     n, p = fit.participation.shape
     free = np.ones((n, p + 1), bool)
     free[np.arange(n), 1 + np.argmin(np.abs(fit.participation - 1.0), axis=1)] = False
     return np.flatnonzero(np.r_[free.ravel(), free.ravel()])
 
 
-def moves(fit: Fit, part: Part) -> np.ndarray:
-    """How each unknown moves the outputs of a part along the tangents, (n_tangents, n_unknowns, n_outputs)."""
+def tangent_weights(fit: Fit, part: Part) -> np.ndarray:
+    """Coefficients of the tangents in the change of each output with each unknown.
+
+    (n_tangents, n_unknowns, n_outputs), for the outputs of one part.
+    """
     n, q = fit.poles.size, fit.participation.shape[1] + 1
     alpha = np.repeat(part.coefficients[:n], q, axis=0)
     beta = np.repeat(part.coefficients[n : 2 * n], q, axis=0)
     k, size = np.arange(n * q), n * q
-    found = np.zeros((2 * size, 2 * size, alpha.shape[1]))
-    found[k, k], found[size + k, k] = alpha, beta
-    found[k, size + k], found[size + k, size + k] = beta, -alpha
-    return found
+    changes = np.zeros((2 * size, 2 * size, alpha.shape[1]))
+    changes[k, k], changes[size + k, k] = alpha, beta
+    changes[k, size + k], changes[size + k, size + k] = beta, -alpha
+    return changes
 
 
-def normal(fit: Fit, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def normal_equations(fit: Fit, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton matrix and right-hand side of the free unknowns, outputs in units of their noise."""
     n, q = fit.poles.size, fit.participation.shape[1] + 1
     size = n * q
@@ -257,36 +261,40 @@ def search(
     budget: Budget | None = None,
     negligible: float = FIT.negligible,
 ) -> Fit:
-    """Least squares over poles and participation, outputs in units of `noise`, until a step promises little χ²."""
+    """Least-squares fit over poles and participation factors, outputs in units of `noise`.
+
+    Args:
+        negligible: expected decrease of χ² per value below which the search ends.
+    """
     strength = np.abs(participation) * [np.linalg.norm(np.vstack(data.responses(pole)), axis=0) for pole in poles]
     held = participation[np.arange(poles.size), np.argmax(strength, axis=1)]
     start = projected(data, poles, participation / held[:, None])
-    found = minimise(_OutputError(data, noise, negligible), start, most_steps=most_steps, budget=budget)
-    return replace(found.state, converged=found.converged, steps=found.steps)
+    minimum = minimise(_OutputError(data, noise, negligible), start, most_steps=most_steps, budget=budget)
+    return replace(minimum.state, converged=minimum.converged, steps=minimum.steps)
 
 
 class _OutputError:
-    """The `searches.LeastSquares` of a measurement."""
+    """The output-error problem of a measurement, as `searches.LeastSquares`."""
 
-    def __init__(self, data: Measurement, noise: np.ndarray, least: float) -> None:
-        self.data, self.noise, self.least = data, noise, least
+    def __init__(self, data: Measurement, noise: np.ndarray, least_decrease: float) -> None:
+        self.data, self.noise, self.least_decrease = data, noise, least_decrease
         self.signal = float(((data.values / noise) ** 2).sum())
 
     def cost(self, state: Fit) -> float:
         return float(((state.residual / self.noise) ** 2).sum())
 
     def normal_equations(self, state: Fit) -> tuple[np.ndarray, np.ndarray]:
-        return normal(state, self.noise)
+        return normal_equations(state, self.noise)
 
     def moved(self, state: Fit, step: np.ndarray) -> tuple[Fit | None, np.ndarray]:
         n, p = state.participation.shape
-        whole = np.zeros(2 * n * (p + 1))
-        whole[free_parameters(state)] = step
-        change = (whole[: whole.size // 2] + 1j * whole[whole.size // 2 :]).reshape(n, p + 1)
+        full = np.zeros(2 * n * (p + 1))
+        full[free_parameters(state)] = step
+        change = (full[: full.size // 2] + 1j * full[full.size // 2 :]).reshape(n, p + 1)
         poles, participation = state.poles + change[:, 0], state.participation + change[:, 1:]
-        highest, fastest = self.data.highest, self.data.highest / np.pi
+        highest, fastest_decay = self.data.highest, self.data.highest / np.pi
         growing = poles.real > FIT.most_growth * self.data.resolution / (2.0 * np.pi)
-        if ((poles.imag <= 0) | (poles.imag >= highest) | (-poles.real > fastest) | growing).any():
+        if ((poles.imag <= 0) | (poles.imag >= highest) | (-poles.real > fastest_decay) | growing).any():
             return None, step
         if not (np.abs(participation) < FIT.most_unlike).all():
             return None, step
@@ -296,11 +304,11 @@ class _OutputError:
             return None, step
 
     def negligible(self, decrease: float, cost: float) -> bool:
-        return decrease <= max(self.least * cost / self.data.values.size, FIT.round_off * self.signal)
+        return decrease <= max(self.least_decrease * cost / self.data.values.size, FIT.round_off * self.signal)
 
 
 def only(data: Measurement, fit: Fit, kept: np.ndarray) -> Fit:
-    """Some of the modes of a fit, in this order, by index or by flag; their poles and participation as they are."""
+    """The fit with some of its modes, in this order, by index or by flag; poles and participation factors unchanged."""
     return projected(data, fit.poles[kept], fit.participation[kept])
 
 
@@ -311,7 +319,7 @@ def settled(
     budget: Budget | None = None,
     negligible: float = FIT.negligible,
 ) -> Fit:
-    """Searched, weighted by the noise found, and searched again; as it is where the time is up."""
+    """The fit searched, reweighted by the noise it estimates, and searched again; unchanged where the time is up."""
     for _ in range(2):
         if fit.poles.size == 0 or (budget is not None and budget.spent("refinement")):
             break

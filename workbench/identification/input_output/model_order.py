@@ -1,4 +1,4 @@
-"""Which modes a measurement holds, whatever excites them, by stepwise selection."""
+"""Model order selection for a measurement with any excitation, stepwise by likelihood ratio."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,11 +13,11 @@ from workbench.identification.input_output.modal_fit import (
     Measurement,
     free_parameters,
     modal_coordinate,
-    moves,
     only,
     projected,
     search,
     settled,
+    tangent_weights,
 )
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget, Stepwise, overdamped
 from workbench.structure.modes import mac
@@ -25,17 +25,17 @@ from workbench.structure.modes import mac
 
 @dataclass(frozen=True)
 class OrderSettings:
-    """Constants of the selection of modes of a measurement, beside those of every selection (`searches.SELECTION`)."""
+    """Constants of the model order selection of a measurement, beside those of `searches.SELECTION`."""
 
-    most_weak: int = 3  # candidates below the threshold, one after the other, after which only noise is left
+    most_weak: int = 3  # consecutive candidates below the threshold, after which the search ends
     steps: int = 20  # of the fit by which a mode enters
-    decided: float = 0.1  # χ² that a step promises, each output, below which such a fit has decided
-    enter: float = 0.5  # of the threshold, by which a candidate, its participation not yet fitted, is tried
-    distinct: float = 10.0  # times the threshold, from which on two modes close to one another are two
-    floor: float = 1e-5  # of each output, taken for noise in any case: -100 dB
-    collinear: float = 1e-10  # of the energy of each column, lest poles that are one be singular
-    # distorted_rates, distorted_share: decay rates, and share of the frequency, to either side of a mode that is more
-    # than a linear one, within which no further mode is looked for: a spring that hardens by 3 % fills five bandwidths
+    decided: float = 0.1  # χ² of each output, expected of a further step, below which such a fit ends
+    enter: float = 0.5  # of the threshold, at which a candidate is fitted: its participation factors are approximate
+    distinct: float = 10.0  # times the threshold: two close modes, each above it, are not tested for removal
+    floor: float = 1e-5  # noise floor of each output, relative: -100 dB
+    collinear: float = 1e-10  # of the energy of each column, added so that coincident poles leave no singular matrix
+    # distorted_rates, distorted_share: decay rates, and share of the frequency, to either side of a nonlinear mode,
+    # within which no further mode is searched: the distortion of a spring that hardens by 3 % fills five bandwidths
     distorted_rates: float = 10.0
     distorted_share: float = 0.03
 
@@ -45,14 +45,14 @@ ORDER = OrderSettings()
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """Modes selected.
+    """The selected modes.
 
     Attributes:
-        fit: of them all.
-        statistic: (n_modes,) χ² of each.
-        limit: what noise alone exceeds by false alarm.
-        full: whether more might be there, the most modes being taken.
-        distorted: poles about which further modes were left out, as they predict nothing.
+        fit: of all selected modes.
+        statistic: (n_modes,) χ² of each mode.
+        limit: threshold of this χ², exceeded by noise alone with the chance of a false alarm.
+        full: whether the selection stopped at the maximum number of modes.
+        distorted: poles of nonlinear modes, near which modes that do not predict held-out data were removed.
     """
 
     fit: Fit
@@ -62,7 +62,7 @@ class Selected:
     distorted: tuple[complex, ...] = ()
 
     def refitted(self, fit: Fit) -> "Selected":
-        """The modes of another fit, with their statistic in it."""
+        """The same selection with another fit, and the statistic of each mode in that fit."""
         return replace(self, fit=fit, statistic=statistic_of_each(fit))
 
 
@@ -74,14 +74,14 @@ def select_modes(
     budget: Budget | None = None,
     start: Fit | None = None,
 ) -> Selected:
-    """The modes whose likelihood ratio is more than noise would give, taken in one by one and each tried again.
+    """The modes whose likelihood ratio exceeds the threshold for noise, by forward and backward stepwise selection.
 
     Args:
         data: the measurement.
-        max_modes: where to stop at the latest.
+        max_modes: maximum number of modes.
         false_alarm: chance that noise alone is taken for a mode.
         budget: of time; none unless given.
-        start: modes to start from, of whatever fit; none unless given.
+        start: modes to start from; none unless given.
     """
     budget = Budget() if budget is None else budget
     problem = _Modes(data, false_alarm, budget)
@@ -91,7 +91,7 @@ def select_modes(
         try:
             fit = selection.backward(problem.started(projected(data, start.poles, start.participation)))
         except np.linalg.LinAlgError:
-            pass  # modes that cannot be distinguished: without a start
+            pass  # modes that cannot be distinguished: search without a start
     fit = selection.select(fit)
     order = np.argsort(np.abs(fit.poles))
     ordered = replace(only(data, fit, order), converged=fit.converged, steps=fit.steps)
@@ -99,62 +99,64 @@ def select_modes(
 
 
 def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALSE_ALARM) -> Fit:
-    """Those of given poles that the measurement holds, with the participation that suits each best; none is moved.
+    """The significant ones of given poles, unchanged, with their best participation factors.
 
-    All residues are fitted at once, of any rank, and the pole that explains least is left out until none explains as
-    little as noise would.
+    Backward elimination: the residues of all poles are fitted at once, of any rank, and the pole of the smallest χ² is
+    removed until every χ² exceeds the threshold for noise.
     """
-    poles = poles[_can_ring(data, poles) & (poles.real < data.resolution / (2.0 * np.pi))]
+    poles = poles[_may_be_mode(data, poles) & (poles.real < data.resolution / (2.0 * np.pi))]
     size = 2 * data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
-    x = np.hstack([*(np.hstack(data.responses(pole)) for pole in poles), data.fixed])
-    scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
+    columns = np.hstack([*(np.hstack(data.responses(pole)) for pole in poles), data.fixed])
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     together = [data.values] if data.weights is None else np.hsplit(data.values, data.values.shape[1])
     spreads: list[np.ndarray] = []
     coefficients: list[np.ndarray] = []
     variances: list[np.ndarray] = []
     for weights, y in zip(weights_of(data), together, strict=True):
-        weighted = weights * x / scale
+        weighted = weights * columns / scale
         gram = weighted.T @ weighted
         gram[np.diag_indices_from(gram)] *= 1.0 + ORDER.collinear
         spreads.append(np.linalg.inv(gram))
         coefficients.append(spreads[-1] @ (weighted.T @ y))
-        left = ((y - weighted @ coefficients[-1]) ** 2).sum(axis=0)
-        variances.append(np.maximum(left / max(len(x) - x.shape[1], 1), ORDER.floor**2 * (y**2).mean(axis=0)))
+        rss = ((y - weighted @ coefficients[-1]) ** 2).sum(axis=0)
+        variances.append(
+            np.maximum(rss / max(len(columns) - columns.shape[1], 1), ORDER.floor**2 * (y**2).mean(axis=0))
+        )
     limit = chi2.isf(false_alarm / data.cells, size * data.values.shape[1])
     while poles.size:
         blocks = np.arange(poles.size * size).reshape(poles.size, size)
         statistic = np.zeros(poles.size)
         for spread, c, variance in zip(spreads, coefficients, variances, strict=True):
-            own = c[blocks]
+            residue = c[blocks]
             inner = spread[blocks[:, :, None], blocks[:, None, :]]
-            statistic += (own * np.linalg.solve(inner, own) / variance).sum(axis=(1, 2))
+            statistic += (residue * np.linalg.solve(inner, residue) / variance).sum(axis=(1, 2))
         weakest = int(np.argmin(statistic))
         if statistic[weakest] >= limit:
             break
         out, rest = blocks[weakest], np.delete(np.arange(len(scale)), blocks[weakest])
         for k, spread in enumerate(spreads):
-            taken = np.linalg.solve(spread[np.ix_(out, out)], np.column_stack([spread[out], coefficients[k][out]]))
-            spreads[k] = (spread - spread[:, out] @ taken[:, : len(scale)])[np.ix_(rest, rest)]
-            coefficients[k] = (coefficients[k] - spread[:, out] @ taken[:, len(scale) :])[rest]
+            update = np.linalg.solve(spread[np.ix_(out, out)], np.column_stack([spread[out], coefficients[k][out]]))
+            spreads[k] = (spread - spread[:, out] @ update[:, : len(scale)])[np.ix_(rest, rest)]
+            coefficients[k] = (coefficients[k] - spread[:, out] @ update[:, len(scale) :])[rest]
         poles, scale = np.delete(poles, weakest), scale[rest]
     of_poles = slice(poles.size * size)
     residues = (np.hstack(coefficients) / scale[:, None])[of_poles].reshape(poles.size, size, data.values.shape[1])
     norms = scale[of_poles].reshape(poles.size, size)
-    participation = [_of_rank_one(each, norm) for each, norm in zip(residues, norms, strict=True)]
+    participation = [_rank_one_participation(each, norm) for each, norm in zip(residues, norms, strict=True)]
     return projected(data, poles, np.array(participation, complex).reshape(poles.size, size // 2))
 
 
 def sure_modes(data: Measurement, start: Fit, false_alarm: float, budget: Budget) -> Fit:
-    """The modes of a start that noise of any smooth spectrum hardly makes, fitted."""
+    """The fitted modes of a start that exceed the threshold `SELECTION.weak` times, as coloured noise hardly does."""
     return _Modes(data, false_alarm, budget).started(start, SELECTION.weak)
 
 
-def _of_rank_one(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
-    """Participation (n_excitations,) of the outer product nearest to residues (2 n_excitations, n_outputs).
+def _rank_one_participation(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
+    """Participation factors (n_excitations,) of the rank-one approximation of residues (2 n_excitations, n_outputs).
 
     Args:
-        residues: real parts, then imaginary parts with their sign turned.
-        norm: (2 n_excitations,) of the columns they belong to.
+        residues: real parts, then negated imaginary parts.
+        norm: (2 n_excitations,) norms of the columns they belong to.
     """
     half = len(residues) // 2
     size = np.maximum(np.hypot(norm[:half], norm[half:]), 1e-300)
@@ -162,7 +164,7 @@ def _of_rank_one(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
 
 
 class _Modes:
-    """The `searches.Selection` of a measurement; a candidate is a pole and its participation."""
+    """The `searches.Selection` of a measurement; a candidate is a pole and its participation factors."""
 
     def __init__(self, data: Measurement, false_alarm: float, budget: Budget) -> None:
         self.data, self.budget = data, budget
@@ -178,12 +180,15 @@ class _Modes:
 
     def strongest(self, model: Fit, rejected: list[tuple[complex, float]]) -> tuple[complex, np.ndarray] | None:
         if self._scored is None or self._scored[0] is not model:
-            bases, left = bases_of(self.data, model), model.residual / model.noise
-            self._scored = model, [(*_added(self.data, bases, left, p), p) for p in _to_try(self.data, model)]
-        left_over = [item for item in self._scored[1] if not self._near(item[2], rejected)]
-        if not left_over:
+            bases, scaled = bases_of(self.data, model), model.residual / model.noise
+            self._scored = (
+                model,
+                [(*_candidate_gain(self.data, bases, scaled, p), p) for p in _candidates(self.data, model)],
+            )
+        candidates = [item for item in self._scored[1] if not self._is_near(item[2], rejected)]
+        if not candidates:
             return None
-        strength, participation, pole = max(left_over, key=lambda item: item[0])
+        strength, participation, pole = max(candidates, key=lambda item: item[0])
         return None if strength < ORDER.enter * self.threshold(model, pole) else (pole, participation)
 
     def extended(self, model: Fit, candidate: tuple[complex, np.ndarray]) -> Fit:
@@ -192,7 +197,7 @@ class _Modes:
         return search(self.data, poles, participation, model.noise, ORDER.steps, self.budget, ORDER.decided)
 
     def gain(self, smaller: Fit, larger: Fit) -> float:
-        """The noise of each output unknown."""
+        """Log-likelihood ratio statistic of two fits, the noise of each output a nuisance parameter."""
         n = self.data.values.shape[0]
         first, second = ((fit.residual**2).sum(axis=0) for fit in (smaller, larger))
         floor = 1e-24 * (self.data.values**2).sum(axis=0) + 1e-300
@@ -208,116 +213,122 @@ class _Modes:
         return settled(self.data, model, budget=self.budget)
 
     def started(self, start: Fit, times: float = 1.0) -> Fit:
-        """A start fitted, without the modes that are spurious or that the others may take over.
+        """The start fitted, without modes that are spurious or below the threshold.
 
-        The weaker half of them goes, then half of those that are left; one that goes in error is found again.
+        Each pass removes the weaker half of these; a mode removed in error is found again by the selection.
 
         Args:
-            times: the threshold, which a mode must exceed.
+            times: factor of the threshold that the χ² of a mode must exceed.
         """
         model = settled(self.data, start, SELECTION.few_steps, self.budget, ORDER.decided)
         while model.poles.size and not self.budget.spent("check of each mode"):
-            statistic = np.where(_spurious(self.data, model), 0.0, whole_statistic_of(model))
+            statistic = np.where(_spurious(self.data, model), 0.0, marginal_statistics_of(model))
             is_weak = statistic < [times * self.threshold(model, pole) for pole in model.poles]
-            weak = np.flatnonzero(is_weak & ~_changes(self.data, model.poles))
-            if not weak.size:
+            removable = np.flatnonzero(is_weak & ~_is_nonlinear(self.data, model.poles))
+            if not removable.size:
                 break
-            out = weak[np.argsort(statistic[weak])[: (weak.size + 1) // 2]]
-            rest = np.delete(np.arange(model.poles.size), out)
+            removed = removable[np.argsort(statistic[removable])[: (removable.size + 1) // 2]]
+            rest = np.delete(np.arange(model.poles.size), removed)
             model = settled(self.data, only(self.data, model, rest), SELECTION.few_steps, self.budget, ORDER.decided)
         return self.settled(model)
 
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
-        """Those that are spurious, weak, or close to another."""
-        spurious, whole_statistic = _spurious(self.data, model), whole_statistic_of(model)
-        changes = _changes(self.data, model.poles)
+        """The modes that are spurious, weak or close to another, each with the fit without it."""
+        spurious, statistic = _spurious(self.data, model), marginal_statistics_of(model)
+        changes = _is_nonlinear(self.data, model.poles)
         for r, pole in enumerate(model.poles):
             if changes[r]:
                 continue
-            near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf) < SELECTION.close * abs(pole.real)
+            is_close = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf) < SELECTION.close * abs(pole.real)
             threshold = self.threshold(model, pole)
-            doubtful = near and whole_statistic[r] < ORDER.distinct * threshold
+            doubtful = is_close and statistic[r] < ORDER.distinct * threshold
             if spurious[r] or doubtful or statistic_of(model, r) < SELECTION.weak * threshold:
                 without = only(self.data, model, np.delete(np.arange(model.poles.size), r))
                 without = settled(self.data, without, SELECTION.few_steps, self.budget, ORDER.decided)
                 yield complex(pole), without, bool(spurious[r])
 
-    def _near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:
+    def _is_near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:
         return any(abs(pole.imag - o.imag) < max(self.data.resolution, 0.5 * abs(o.real)) for o, _ in rejected)
 
 
-def _to_try(data: Measurement, fit: Fit) -> np.ndarray:
-    """Peaks of the residual, and poles beside the modes so far, which may mask others."""
+def _candidates(data: Measurement, fit: Fit) -> np.ndarray:
+    """Candidate poles: peaks of the residual, and poles close to the modes of the fit, which mask others."""
     width = np.maximum(np.abs(fit.poles.real), 0.5 * data.resolution)
     beside = [fit.poles + 1j * k * width for k in (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)]
     tries = np.concatenate([data.candidates(fit.residual / fit.noise), *beside])
-    return np.asarray(tries[_can_ring(data, tries) & ~is_about_distorted(data, tries)])
+    return np.asarray(tries[_may_be_mode(data, tries) & ~is_about_distorted(data, tries)])
 
 
 def is_about_distorted(data: Measurement, poles: np.ndarray) -> np.ndarray:
-    """Which poles stand about modes that are more than linear, or beside such ring on through the record.
+    """Whether each pole lies near a nonlinear mode, or is an undamped line beside any such mode.
 
-    What else a nonlinear structure does is seen as lines here and there, which rise far above noise of the sensors;
-    what a free decay holds is none of it.
+    The distortion of a nonlinear structure appears as isolated lines far above the noise floor. An undamped pole near
+    one identified from the free decay is no such line.
     """
-    out = (-poles.real < 0.5 * data.resolution) & bool(data.distorted)
+    near = (-poles.real < 0.5 * data.resolution) & bool(data.distorted)
     for pole in data.free:
-        out &= np.abs(poles.imag - pole.imag) > ORDER.distorted_share * pole.imag
+        near &= np.abs(poles.imag - pole.imag) > ORDER.distorted_share * pole.imag
     for pole in data.distorted:
         about = max(ORDER.distorted_rates * abs(pole.real), ORDER.distorted_share * pole.imag)
-        out |= np.abs(poles.imag - pole.imag) < about
-    return np.asarray(out)
+        near |= np.abs(poles.imag - pole.imag) < about
+    return np.asarray(near)
 
 
-def _changes(data: Measurement, poles: np.ndarray) -> np.ndarray:
-    """Which poles are those of modes that are more than linear: in what else these do, nothing is left of them."""
-    out = np.zeros(poles.size, bool)
+def _is_nonlinear(data: Measurement, poles: np.ndarray) -> np.ndarray:
+    """Whether each pole is that of a nonlinear mode: its residual is distortion, so it is not tested for removal."""
+    nonlinear = np.zeros(poles.size, bool)
     for pole in data.distorted:
-        out[np.argmin(np.abs(poles - pole))] = True
-    return out
+        nonlinear[np.argmin(np.abs(poles - pole))] = True
+    return nonlinear
 
 
-def _can_ring(data: Measurement, poles: np.ndarray) -> np.ndarray:
-    """Which poles are of a frequency that the measurement holds, and not damped too much to ring."""
-    held = (poles.imag > 0) & (poles.imag < data.highest)
-    return np.asarray(held & ~overdamped(poles) & ~_reaches_nyquist(data, poles))
+def _may_be_mode(data: Measurement, poles: np.ndarray) -> np.ndarray:
+    """Whether each pole lies within the frequency range of the measurement and is not damped too much to oscillate."""
+    within = (poles.imag > 0) & (poles.imag < data.highest)
+    return np.asarray(within & ~overdamped(poles) & ~_reaches_nyquist(data, poles))
 
 
 def _reaches_nyquist(data: Measurement, poles: np.ndarray) -> np.ndarray:
-    """Whose band reaches half of the sample rate: no oscillation, but how inputs run between samples."""
+    """Whether the band of each pole reaches Nyquist: it models the course of the inputs between samples, not a mode."""
     return np.asarray(poles.imag > data.nyquist - np.maximum(np.abs(poles.real), data.resolution))
 
 
-def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
-    """χ² by which one more pole lowers the misfit, residues unconstrained, and the best participation of rank one.
+def _candidate_gain(
+    data: Measurement, bases: list[np.ndarray], residual: np.ndarray, pole: complex
+) -> tuple[float, np.ndarray]:
+    """Decrease of χ² by one more pole with unconstrained residues, and its best participation factors (rank one).
 
-    Only the part of its response outside the basis of the columns so far counts.
+    Only the part of its response orthogonal to the columns of the fit counts.
+
+    Args:
+        bases: orthonormal columns of the fit, see `bases_of`.
+        residual: (n_rows, n_outputs), in units of the noise.
     """
     real, imaginary = data.responses(pole)
-    columns, strength, wanted = np.hstack([real, imaginary]), 0.0, []
+    columns, strength, blocks = np.hstack([real, imaginary]), 0.0, []
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    together = [left] if data.weights is None else np.hsplit(left, left.shape[1])
-    for weights, basis, rest in zip(weights_of(data), bases, together, strict=True):
+    together = [residual] if data.weights is None else np.hsplit(residual, residual.shape[1])
+    for weights, basis, output in zip(weights_of(data), bases, together, strict=True):
         weighted = weights * columns / scale
-        inside = basis.T @ weighted
-        squares, directions = np.linalg.eigh(weighted.T @ weighted - inside.T @ inside)
-        sizes = np.sqrt(np.maximum(squares, 0.0))
-        good = sizes > 1e-4 * max(sizes[-1], 1e-3)
-        apart = directions[:, good] / sizes[good]
-        seen = apart.T @ (weighted.T @ rest)  # what is left has no part in the basis
-        wanted.append(apart @ seen / scale[:, None])
-        strength += float((seen**2).sum())
-    residues = np.hstack(wanted)
-    return strength, _of_rank_one(residues, scale)
+        in_basis = basis.T @ weighted
+        eigenvalues, directions = np.linalg.eigh(weighted.T @ weighted - in_basis.T @ in_basis)
+        singular_values = np.sqrt(np.maximum(eigenvalues, 0.0))
+        kept = singular_values > 1e-4 * max(singular_values[-1], 1e-3)
+        whitening = directions[:, kept] / singular_values[kept]
+        amplitudes = whitening.T @ (weighted.T @ output)  # the residual is orthogonal to the basis
+        blocks.append(whitening @ amplitudes / scale[:, None])
+        strength += float((amplitudes**2).sum())
+    residues = np.hstack(blocks)
+    return strength, _rank_one_participation(residues, scale)
 
 
 def bases_of(data: Measurement, fit: Fit) -> list[np.ndarray]:
-    """Of `basis_of`: one for each output, or one for all of equal weights."""
+    """`basis_of` for each output, or one for all outputs of equal weights."""
     return [basis_of(data, fit, weights) for weights in weights_of(data)]
 
 
 def weights_of(data: Measurement) -> list[np.ndarray]:
-    """Of each output (n_rows, 1), in units of their mean; of all together where they are the same in all rows."""
+    """Weights of each output (n_rows, 1) over their rms; one for all outputs where they are the same in all rows."""
     if data.weights is None:
         return [np.ones((1, 1))]
     return list((data.weights / np.sqrt((data.weights**2).mean(axis=0))).T[:, :, None])
@@ -332,29 +343,30 @@ def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> 
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
-    """Which are damped too much to ring, reach half of the sample rate, or split another mode.
+    """Whether each mode is damped too much, reaches Nyquist, or splits a stronger mode.
 
-    One splits another that has its shape, participation and band.
+    A split mode overlaps the stronger one and has its shape and participation factors.
     """
     poles = fit.poles
     shapes = fit.amplitudes / fit.noise[:, None]
     strength = statistic_of_each(fit)
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + data.resolution
-    near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
+    overlapping = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
-    one = shapes.shape[0] * data.n_inputs == 1  # which has no shape; how a record begins is none
-    split = near & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not one)
-    return np.asarray(split.any(axis=1) | overdamped(poles) | _reaches_nyquist(data, poles))
+    # one output and one input leave no shapes to compare; initial states do not count
+    single_channel = shapes.shape[0] * data.n_inputs == 1
+    splits = overlapping & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not single_channel)
+    return np.asarray(splits.any(axis=1) | overdamped(poles) | _reaches_nyquist(data, poles))
 
 
 def statistic_of(fit: Fit, r: int) -> float:
-    """χ² of a mode's shape in the noise, poles and participation held."""
-    both, noise, found = [r, fit.poles.size + r], fit.noise, 0.0
+    """χ² of the shape of mode r in the noise, its pole and participation factors fixed."""
+    pair, noise, statistic = [r, fit.poles.size + r], fit.noise, 0.0
     for part, outputs in fit.outputs():
-        c = part.coefficients[both] / noise[outputs]
-        # a pole at Nyquist turns by half a turn a sample: no imaginary part
-        found += float(np.einsum("ij,ik,kj->", c, scaled_inverse(part.spread[np.ix_(both, both)]), c))
-    return found
+        c = part.coefficients[pair] / noise[outputs]
+        # a pole at Nyquist has no imaginary part at the samples: singular
+        statistic += float(np.einsum("ij,ik,kj->", c, scaled_inverse(part.spread[np.ix_(pair, pair)]), c))
+    return statistic
 
 
 def statistic_of_each(fit: Fit) -> np.ndarray:
@@ -362,27 +374,27 @@ def statistic_of_each(fit: Fit) -> np.ndarray:
     return np.array([statistic_of(fit, r) for r in range(fit.poles.size)])
 
 
-def whole_statistic_of(fit: Fit) -> np.ndarray:
-    """χ² of each mode's shape in the noise, (n_modes,), poles and participation of all modes unknown."""
+def marginal_statistics_of(fit: Fit) -> np.ndarray:
+    """χ² of each mode's shape in the noise, (n_modes,), poles and participation factors of all modes unknown."""
     n, bound, free = fit.poles.size, covariance(fit), free_parameters(fit)
-    found = np.zeros(n)
+    statistics = np.zeros(n)
     if n == 0:
-        return found
+        return statistics
     amplitudes = fit.coefficients[: 2 * n].reshape(2, n, -1)
-    drift = [np.einsum("ct,tkj->cjk", part.tilt[: 2 * n], moves(fit, part)[:, free]) for part in fit.parts]
+    effect = [np.einsum("ct,tkj->cjk", part.tilt[: 2 * n], tangent_weights(fit, part)[:, free]) for part in fit.parts]
     for r in range(n):
-        both = [r, n + r]
-        drifts = np.concatenate([each[both] for each in drift], axis=1)
-        size = 2 * drifts.shape[1]
-        spread = drifts.reshape(size, -1) @ bound @ drifts.reshape(size, -1).T
+        pair = [r, n + r]
+        effects = np.concatenate([each[pair] for each in effect], axis=1)
+        size = 2 * effects.shape[1]
+        spread = effects.reshape(size, -1) @ bound @ effects.reshape(size, -1).T
         spread = spread.reshape(2, size // 2, 2, size // 2)
         for part, outputs in fit.outputs():
-            own = part.spread[np.ix_(both, both)]
+            shape_covariance = part.spread[np.ix_(pair, pair)]
             for j in range(outputs.start, outputs.stop):
-                spread[:, j, :, j] += own * fit.noise[j] ** 2
+                spread[:, j, :, j] += shape_covariance * fit.noise[j] ** 2
         c = amplitudes[:, r].ravel()
         spread = spread.reshape(size, size)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))
-        # Modes that are all but alike leave it singular.
-        found[r] = c * scale @ np.linalg.pinv(spread * np.outer(scale, scale), hermitian=True) @ (c * scale)
-    return found
+        # Nearly identical modes make it singular.
+        statistics[r] = c * scale @ np.linalg.pinv(spread * np.outer(scale, scale), hermitian=True) @ (c * scale)
+    return statistics

@@ -1,9 +1,10 @@
-"""The noise spectrum of each output, estimated from the residual of a fit, to weight every line by its own noise.
+"""The noise spectrum of each output, estimated from the residual of a fit, to weight each line by its noise.
 
 In the cosine transform of a record of n samples, noise of spectrum S is independent from line to line, line k of
-variance S(πk / nΔt), even where S falls steeply, for the transform sees no jump between a record's ends (Ahmed,
-Natarajan & Rao, IEEE Trans. Comput. C-23, 1974). S is that of y_k = Σ_i a_i y_k-i + e_k, by Burg's recursion, as many
-terms as lower n ln var(e) + p ln n; before, each line gets back its leverage, the share of its noise that the fit took.
+variance S(πk / nΔt), even where S falls steeply, since the transform has no jump between a record's ends (Ahmed,
+Natarajan & Rao, IEEE Trans. Comput. C-23, 1974). S is that of an autoregressive model y_k = Σ_i a_i y_k-i + e_k, by
+Burg's recursion, of the order p that minimises n ln var(e) + p ln n. Before, each line is corrected for its leverage,
+the share of its noise that the fit absorbs.
 """
 
 from collections.abc import Sequence
@@ -20,47 +21,50 @@ def lines_of(samples: np.ndarray) -> np.ndarray:
 
 
 def samples_of(lines: np.ndarray) -> np.ndarray:
-    """Columns whose lines these are."""
+    """Samples of each column of lines, the inverse of `lines_of`."""
     return np.asarray(idct(lines, axis=0, norm="ortho"))
 
 
 def noise_spectrum(
-    left: Sequence[np.ndarray], whole: Sequence[np.ndarray], taken: Sequence[np.ndarray], n_modes: int, free: np.ndarray
+    residuals: Sequence[np.ndarray],
+    outputs: Sequence[np.ndarray],
+    leverage: Sequence[np.ndarray],
+    n_modes: int,
+    free: np.ndarray,
 ) -> list[np.ndarray] | None:
     """Standard deviation of the noise at each line of each record, (n_samples, n_outputs) each, over their rms.
 
     Args:
-        left: of each record, (n_samples, n_outputs): the residual.
-        whole: of each record, what was measured.
-        taken: of each record, (n_samples, n_outputs): share of the noise of each line that the fit took,
-            which is made good: about its modes the spectrum of the residual is too low.
+        residuals: of each record, (n_samples, n_outputs): the residual.
+        outputs: of each record, the measured outputs.
+        leverage: of each record, (n_samples, n_outputs): leverage of each line, for which the residual is corrected.
         n_modes: of the fit.
         free: (n_records,) degrees of freedom of the residual.
 
     Returns:
-        None where the noise may be white, and of equal level in all records, or is round-off.
+        None where the noise may be white and of equal level in all records, or is rounding error.
     """
-    squares = np.array([(each**2).sum(axis=0) for each in left])
-    measured = np.array([(each**2).sum(axis=0) for each in whole])
+    squares = np.array([(each**2).sum(axis=0) for each in residuals])
+    measured = np.array([(each**2).sum(axis=0) for each in outputs])
     if (squares.sum(axis=0) <= PROJECTION.rounding**2 * measured.sum(axis=0)).any():
         return None
     levels = np.sqrt(variances(squares, free))
-    power = [np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in left]
+    power = [np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in residuals]
     flat = np.all([white(each, n_modes) for each in power], axis=0)
     if flat.all() and not differ(squares, free).any():
         return None
-    good = [
+    corrected = [
         samples_of(lines_of(each) / np.sqrt(1.0 - np.clip(share, 0.0, PROJECTION.most_taken)))
-        for each, share in zip(left, taken, strict=True)
+        for each, share in zip(residuals, leverage, strict=True)
     ]
-    found = [np.tile(row, (len(each), 1)) for row, each in zip(levels, left, strict=True)]
+    std = [np.tile(row, (len(each), 1)) for row, each in zip(levels, residuals, strict=True)]
     for j in np.flatnonzero(~flat):
-        filtered = _burg([each[:, j] / row[j] for each, row in zip(good, levels, strict=True)])
-        for each in found:
-            turns = np.exp(-1j * np.pi / len(each) * np.arange(len(each)))
-            each[:, j] /= np.abs(np.polyval(filtered[::-1], turns))
-    rms = np.sqrt(np.vstack([each**2 for each in found]).mean(axis=0))
-    return [each / rms for each in found]
+        filter_ = _burg([each[:, j] / row[j] for each, row in zip(corrected, levels, strict=True)])
+        for each in std:
+            phasors = np.exp(-1j * np.pi / len(each) * np.arange(len(each)))
+            each[:, j] /= np.abs(np.polyval(filter_[::-1], phasors))
+    rms = np.sqrt(np.vstack([each**2 for each in std]).mean(axis=0))
+    return [each / rms for each in std]
 
 
 def alike(one: Sequence[np.ndarray] | None, other: Sequence[np.ndarray] | None) -> bool:
@@ -71,20 +75,20 @@ def alike(one: Sequence[np.ndarray] | None, other: Sequence[np.ndarray] | None) 
 
 
 def _burg(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """The filter [1, -a_1, ...] that makes records of one noise white (Burg 1967), order by Schwarz's criterion."""
+    """The prediction error filter [1, -a_1, ...] of records of one noise (Burg 1967); order by minimum BIC."""
     n = sum(row.size for row in rows)
-    ahead, back = list(rows), list(rows)
-    best = found = np.ones(1)
-    loss = sum(float(row @ row) for row in rows) / n
-    least = n * np.log(loss)
+    forward, backward = list(rows), list(rows)
+    best = coefficients = np.ones(1)
+    variance = sum(float(row @ row) for row in rows) / n
+    least_criterion = n * np.log(variance)
     for order in range(1, min(PROJECTION.order, n // PROJECTION.samples_each) + 1):
-        ahead, back = [f[1:] for f in ahead], [b[:-1] for b in back]
-        crossed = sum(float(f @ b) for f, b in zip(ahead, back, strict=True))
-        k = -2.0 * crossed / sum(float(f @ f + b @ b) for f, b in zip(ahead, back, strict=True))
-        both = list(zip(ahead, back, strict=True))
-        ahead, back = [f + k * b for f, b in both], [b + k * f for f, b in both]
-        found = np.r_[found, 0.0] + k * np.r_[0.0, found[::-1]]
-        loss *= 1.0 - k**2
-        if n * np.log(loss) + order * np.log(n) < least:
-            best, least = found, n * np.log(loss) + order * np.log(n)
+        forward, backward = [f[1:] for f in forward], [b[:-1] for b in backward]
+        cross = sum(float(f @ b) for f, b in zip(forward, backward, strict=True))
+        k = -2.0 * cross / sum(float(f @ f + b @ b) for f, b in zip(forward, backward, strict=True))
+        both = list(zip(forward, backward, strict=True))
+        forward, backward = [f + k * b for f, b in both], [b + k * f for f, b in both]
+        coefficients = np.r_[coefficients, 0.0] + k * np.r_[0.0, coefficients[::-1]]
+        variance *= 1.0 - k**2
+        if n * np.log(variance) + order * np.log(n) < least_criterion:
+            best, least_criterion = coefficients, n * np.log(variance) + order * np.log(n)
     return best

@@ -1,4 +1,4 @@
-"""Drift of sensors in driven records: a polynomial of time, or slow modes?"""
+"""Drift of sensors in driven records: a test of polynomials of time against slow modes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ from workbench.records.record import Record
 
 @dataclass(frozen=True)
 class DriftSettings:
-    """Constants of the search for drift."""
+    """Constants of the test for drift."""
 
-    degree: int = 3
-    lines: int = 10  # the lowest of what is left of an output beside a straight line
-    stands_out: float = 10.0  # times the median of these, that a straight line explains
+    degree: int = 3  # of the polynomials of time
+    lines: int = 10  # the lowest of each output after removal of a straight line
+    stands_out: float = 10.0  # times the median of these that the energy of the straight line exceeds
 
 
 DRIFT = DriftSettings()
 
 
 def may_drift(records: Sequence[Record]) -> bool:
-    """Whether an output follows a straight line beyond the slowest of its other motion: then it may drift."""
+    """Whether the straight line in an output exceeds its lowest frequency lines."""
     for record in records:
         t = np.linspace(-1.0, 1.0, record.n_samples)
         y = record.outputs - record.outputs.mean(axis=1, keepdims=True)
@@ -39,28 +39,26 @@ def may_drift(records: Sequence[Record]) -> bool:
 def beside_drift(
     data: KnownInputs, selected: Callable[[KnownInputs], Selected]
 ) -> tuple[KnownInputs, Selected | None, tuple[str, ...]]:
-    """The records with polynomials of time beside the modes where these are likelier so, and a remark.
+    """The records with polynomials of time where these are likelier, the strongest modes if searched, and a remark.
 
-    The strongest modes come with them, where they were searched to tell.
-
-    A free body displaced drifts too: its rigid mode explains that by the inputs, and stays.
+    A displaced free body drifts too: its rigid body mode explains that by the inputs, and stays.
 
     Args:
         data: the records.
-        selected: the strongest modes of records.
+        selected: selects the strongest modes of records.
     """
     if not may_drift(data.records):
         return data, None, ()
-    other = data.with_drift(DRIFT.degree)
-    plain, beside = selected(data), selected(other)
+    drifting = data.with_drift(DRIFT.degree)
+    without, with_polynomials = selected(data), selected(drifting)
     n_outputs = data.values.shape[1]
-    price = float(chi2.isf(FALSE_ALARM, n_outputs * (other.fixed.shape[1] - data.fixed.shape[1])))
-    saved = plain.limit * (plain.fit.poles.size - beside.fit.poles.size)
-    if other.cost(beside.fit) + price >= data.cost(plain.fit) + saved:
-        return data, plain, ()
-    drift = other.drift_of(beside.fit)
-    k, j = np.unravel_index(int(np.argmax(drift / beside.fit.noise)), drift.shape)
+    threshold = float(chi2.isf(FALSE_ALARM, n_outputs * (drifting.fixed.shape[1] - data.fixed.shape[1])))
+    threshold_of_modes = without.limit * (without.fit.poles.size - with_polynomials.fit.poles.size)
+    if drifting.cost(with_polynomials.fit) + threshold >= data.cost(without.fit) + threshold_of_modes:
+        return data, without, ()
+    drift = drifting.drift_of(with_polynomials.fit)
+    k, j = np.unravel_index(int(np.argmax(drift / with_polynomials.fit.noise)), drift.shape)
     record = data.records[int(k)]
     in_record = f" in record {record.name!r}" if len(data.records) > 1 else ""
     remark = f"outputs drift, {record.output_names[j]} by {drift[k, j]:.3g}{in_record}: fitted beside the modes"
-    return other, beside, (remark,)
+    return drifting, with_polynomials, (remark,)

@@ -1,26 +1,26 @@
 """Confidence bands of eigenfunctions, from noise and interpolation error; the boundary condition check.
 
 With values v at the sensors, a spline W(x) v and the scale q = v^T M v, M = ∫ m W^T W dx, the eigenfunction is
-φ(x) = W(x) v / √q, and an error dv of the values and the interpolation error e(x) move it by
+φ(x) = W(x) v / √q. To first order, an error dv of the values and the interpolation error e(x) change it by
 
     dφ(x) = J(x) dv + e(x) / √q - φ(x) ∫ m W v e dx / q,     J(x) = W(x) / √q - φ(x) (M v)^T / q
 
-so that its covariance along the structure is J C J^T plus that of e. A band that holds the whole curve, not each point
-by itself, is wider: its width is the quantile of the largest |dφ(x)| / std(x) along the structure, drawn from that
-covariance.
+so its covariance along the structure is J C J^T, C that of the values, plus that of the terms in e. A simultaneous
+band, which contains the whole curve, is wider than a pointwise one: its width is the quantile of the maximum of
+|dφ(x)| / std(x) along the structure, by Monte Carlo from that covariance.
 
 Interpolation error. A linear rule S that is exact for polynomials of degree below p has for any function f the error
 (Peano)
 
     f(x) - S f(x) = ∫ K(x, u) f^(p)(u) du,     K(x, u) = [(x - u)_+^(p-1) - S (· - u)_+^(p-1)] / (p - 1)!
 
-and p = 4 suits a beam: a point mass or a spring is an impulse in φ''''. Taken as white of strength τ² along the
-structure, φ'''' gives S the mean square error τ² ∫ K² du at x, nothing at a sensor and most beyond the last. τ² is the
-upper limit of what the errors of splines through the other sensors allow, beside that sensor's and their noise.
+and p = 4 suits a beam: a point mass or a spring is an impulse in φ''''. With φ'''' white of strength τ² along the
+structure, S has the mean square error τ² ∫ K² du at x, which is zero at a sensor and largest beyond the last. τ² is the
+upper confidence limit from the leave-one-out errors of splines through the other sensors, given the sensors' noise.
 
-Boundary condition check. Splines that do not assume the boundary condition extrapolate the derivatives t that it sets
-to zero. Their covariance is that of the sensors' noise and of the interpolation error, τ² at its upper limit. Over all
-modes and all conditions of one end, Σ t^T Cov^-1 t is chi-square where the end is as stated.
+Boundary condition check. Splines that do not assume the boundary condition extrapolate the derivatives t that the
+condition sets to zero. Their covariance is that of the sensors' noise and of the interpolation error, τ² at its upper
+limit. Over all modes and all conditions of one end, Σ t^T Cov^-1 t is chi-square where the condition holds.
 """
 
 from collections.abc import Sequence
@@ -56,18 +56,18 @@ from workbench.threads import one_blas_thread
 class BandsSettings:
     """Constants of bands and of the boundary condition check."""
 
-    draws: int = 4000  # of the largest error along the structure: a quantile of 0.95 to a hundredth
-    held: float = 1e-6  # of the largest standard error: below it an end holds the curve
-    order: int = 4  # of the derivative taken as white: a point mass or spring is an impulse in it
-    cells: int = 400  # of the structure, on which Peano's kernel is taken
-    # chance that noise alone is taken for interpolation error, and that τ² is larger than its limit
+    draws: int = 4000  # Monte Carlo samples of the largest error: its 0.95 quantile to a hundredth
+    held: float = 1e-6  # of the largest standard error: below it a boundary condition fixes the curve
+    order: int = 4  # p, of the derivative taken as white
+    cells: int = 400  # of the structure, on which Peano's kernel is evaluated
+    # chance that noise alone is taken for interpolation error, and that τ² exceeds its upper limit
     unlikely: float = 0.05
-    # splines of higher degree extrapolate further from fewer sensors, and err more where a mode is short for its
-    # sensors
+    # of the splines of the check, in this order: the higher degree extrapolates further from fewer sensors, and has
+    # larger errors where a mode is short for its sensors
     degrees: tuple[int, ...] = (5, 3)
-    # of the variance of each derivative, independent of the others: the kernel knows their ratio no better
+    # of the variance of each derivative, added independently: the accuracy of their ratio in the kernel's model
     of_its_own: float = 0.01
-    refused: float = 1e-4  # chance that a correct end is refused
+    refused: float = 1e-4  # chance that a correct boundary condition is refused
 
 
 BANDS = BandsSettings()
@@ -77,7 +77,7 @@ DERIVATIVES = ("value", "slope", "curvature", "change of curvature")
 def peano_kernel(
     spline: Spline, x: np.ndarray, positions: np.ndarray, length: float, derivative: int = 0
 ) -> np.ndarray:
-    """K(x, u) √du on a grid of u, (n_points, n_cells): the squares of a row add up to the mean square error for τ² = 1.
+    """K(x, u) √du on a grid of u, (n_points, n_cells); the sum of squares of a row is the mean square error for τ² = 1.
 
     Args:
         spline: through the sensors at `positions`.
@@ -88,15 +88,15 @@ def peano_kernel(
     """
     order = min(BANDS.order, spline.degree + 1)
     u = (np.arange(BANDS.cells) + 0.5) * length / BANDS.cells
-    held = [_power(np.array([at]), u, order, d)[0] for at, d in spline.conditions]
-    along = spline.matrix(x, derivative) @ _power(positions, u, order)
-    if held:
-        along = along + spline.of_held(x, derivative) @ np.array(held)
-    return np.asarray((_power(x, u, order, derivative) - along) * np.sqrt(length / BANDS.cells))
+    of_conditions = [_power(np.array([at]), u, order, d)[0] for at, d in spline.conditions]
+    interpolated = spline.matrix(x, derivative) @ _power(positions, u, order)
+    if of_conditions:
+        interpolated = interpolated + spline.of_held(x, derivative) @ np.array(of_conditions)
+    return np.asarray((_power(x, u, order, derivative) - interpolated) * np.sqrt(length / BANDS.cells))
 
 
 class LeaveOneOut:
-    """How splines of one degree through the other sensors predict each sensor."""
+    """Leave-one-out prediction of each sensor by splines of one degree through the other sensors."""
 
     def __init__(self, positions: np.ndarray, *, length: float, ends: BoundaryConditions, degree: int) -> None:
         n = positions.size
@@ -106,56 +106,59 @@ class LeaveOneOut:
             try:
                 spline = interpolating_spline(positions[others], length=length, ends=ends, degree=degree)
             except ValueError as error:
-                raise ValueError(f"{n} sensors leave none to judge a spline of degree {degree} by: {error}") from error
+                raise ValueError(
+                    f"{n} sensors are too few to cross-validate a spline of degree {degree}: {error}"
+                ) from error
             self.rule[j, j] = 1.0
             self.rule[j, others] = -spline.matrix(positions[j])[0]
             kernels.append(peano_kernel(spline, positions[j : j + 1], positions[others], length)[0])
         self.kernel = np.array(kernels)
 
     def roughness(self, values: np.ndarray, covariance: np.ndarray) -> float:
-        """τ² of a shape (n_sensors,) of known covariance, the upper end of its interval; 0 where it may be noise."""
+        """Upper confidence limit of τ² of a shape (n_sensors,) of known covariance; 0 where its errors may be noise."""
         error, noise, _ = self._errors(values, covariance)
-        by_noise = np.diag(noise)
-        together = np.sum(noise**2 / np.outer(by_noise, by_noise)) / error.size  # χ² of size / together, stretched
-        if (error**2 / by_noise).sum() < together * chi2.isf(BANDS.unlikely, error.size / together):
+        noise_variance = np.diag(noise)
+        # scaled χ² of error.size / scale degrees of freedom (Satterthwaite)
+        scale = np.sum(noise**2 / np.outer(noise_variance, noise_variance)) / error.size
+        if (error**2 / noise_variance).sum() < scale * chi2.isf(BANDS.unlikely, error.size / scale):
             return 0.0
         return self.roughest(values, covariance)
 
     def roughest(self, values: np.ndarray, covariance: np.ndarray) -> float:
-        """The upper end of the interval of τ², noise or not."""
-        error, noise, by_rough = self._errors(values, covariance)
-        by_noise = np.diag(noise)
+        """Upper confidence limit of τ², without the test for noise."""
+        error, noise, unit_variance = self._errors(values, covariance)
+        noise_variance = np.diag(noise)
 
-        def unlikely(log_strength: float) -> float:
-            power = by_noise + np.exp(log_strength) * by_rough
+        def cost(log_strength: float) -> float:
+            power = noise_variance + np.exp(log_strength) * unit_variance
             return float((np.log(power) + error**2 / power).sum())
 
-        highest = np.log((np.maximum(error**2, by_noise) / by_rough).max())
-        best = minimize_scalar(unlikely, bounds=(highest - 20.0, highest), method="bounded")
+        log_upper = np.log((np.maximum(error**2, noise_variance) / unit_variance).max())
+        best = minimize_scalar(cost, bounds=(log_upper - 20.0, log_upper), method="bounded")
         limit = best.fun + chi2.isf(2.0 * BANDS.unlikely, 1)
-        return float(np.exp(brentq(lambda strength: unlikely(strength) - limit, best.x, highest + 20.0)))
+        return float(np.exp(brentq(lambda log_strength: cost(log_strength) - limit, best.x, log_upper + 20.0)))
 
     def _errors(self, values: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The prediction error of each sensor, the covariance of its noise, and its mean square for τ² = 1."""
+        """Prediction error of each sensor, covariance of its noise, and its mean square for τ² = 1."""
         error = self.rule @ values
         noise = self.rule @ covariance @ self.rule.T + 1e-30 * (values**2).max() * np.eye(values.size)
-        by_rough = (self.kernel**2).sum(axis=1)
-        tested = by_rough > 1e-12 * by_rough.max()  # a fixed end predicts the sensor on it
-        return error[tested], noise[np.ix_(tested, tested)], by_rough[tested]
+        unit_variance = (self.kernel**2).sum(axis=1)
+        tested = unit_variance > 1e-12 * unit_variance.max()  # the value at a fixed end is known without error
+        return error[tested], noise[np.ix_(tested, tested)], unit_variance[tested]
 
 
 def _power(x: np.ndarray, u: np.ndarray, order: int, derivative: int = 0) -> np.ndarray:
     """(x - u)_+^k / k! with k = order - 1 - derivative, (n_points, n_cells)."""
-    k, apart = order - 1 - derivative, x[:, None] - u
-    return np.where(apart > 0, np.abs(apart) ** k / factorial(k), 0.0)
+    k, distance = order - 1 - derivative, x[:, None] - u
+    return np.where(distance > 0, np.abs(distance) ** k / factorial(k), 0.0)
 
 
 def check_ends(found: ShapeEstimates, ends: BoundaryConditions, *, length: float) -> None:
-    """Refuse an end that the shapes contradict; of fewer than five sensors or so none is.
+    """Refuse boundary conditions that the shapes contradict; with fewer than about five sensors none is refused.
 
     Args:
         found: shapes at placed sensors, with their covariance.
-        ends: as stated.
+        ends: the stated boundary conditions.
         length: m.
 
     Raises:
@@ -163,65 +166,73 @@ def check_ends(found: ShapeEstimates, ends: BoundaryConditions, *, length: float
     """
     check_along(found.modes)
     values, positions = normalised_shapes(found.modes.shapes).real, found.modes.positions
-    for name, at in (("left", 0.0), ("right", length)):
-        conditions = [d for x, d in ends.zeros if abs(x - at) <= 1e-9 * length]
-        others = BoundaryConditions(tuple(zero for zero in ends.zeros if abs(zero[0] - at) > 1e-9 * length))
-        extrapolated = _extrapolated(positions, others, at, conditions, length) if conditions else None
+    for name, end_x in (("left", 0.0), ("right", length)):
+        conditions = [d for x, d in ends.zeros if abs(x - end_x) <= 1e-9 * length]
+        other_conditions = BoundaryConditions(
+            tuple(zero for zero in ends.zeros if abs(zero[0] - end_x) > 1e-9 * length)
+        )
+        extrapolated = _extrapolated(positions, other_conditions, end_x, conditions, length) if conditions else None
         if extrapolated is None:
             continue
         rows, error, leave_one_out = extrapolated
-        away, std, against = np.zeros((3, values.shape[1], len(conditions)))
+        value, std, statistic = np.zeros((3, values.shape[1], len(conditions)))
         for r, (v, noise) in enumerate(zip(values.T, found.shape_covariance, strict=True)):
             covariance = rows @ noise @ rows.T + leave_one_out.roughest(v, noise) * error @ error.T
-            known = np.linalg.inv(covariance + BANDS.of_its_own * np.diag(np.diag(covariance)))
-            # Each conditional on the others.
-            std[r] = 1.0 / np.sqrt(np.diag(known))
-            away[r] = known @ rows @ v * std[r] ** 2
-            against[r] = rows @ v * (known @ rows @ v)
-        chance = float(chi2.sf(against.sum(), against.size))
+            precision = np.linalg.inv(covariance + BANDS.of_its_own * np.diag(np.diag(covariance)))
+            # Estimate and standard error of each derivative, given that the others are zero.
+            std[r] = 1.0 / np.sqrt(np.diag(precision))
+            value[r] = precision @ rows @ v * std[r] ** 2
+            statistic[r] = rows @ v * (precision @ rows @ v)
+        chance = float(chi2.sf(statistic.sum(), statistic.size))
         if chance < BANDS.refused:
-            r, k = divmod(int(np.argmax(np.abs(away / std))), len(conditions))
+            r, k = divmod(int(np.argmax(np.abs(value / std))), len(conditions))
             rest = ", given the rest" if len(conditions) > 1 else ""
             zero = " and ".join(DERIVATIVES[d] for d in conditions)
             raise ValueError(
                 f"the {name} end is stated to have zero {zero}, and the shapes contradict it"
-                f" (p = {max(chance, 1e-99):.1g}): of its largest entry, along the length, mode {r + 1} has a"
-                f" {DERIVATIVES[conditions[k]]} of {away[r, k]:.3g} ± {std[r, k]:.2g} there{rest}; correct the end, or"
+                f" (p = {max(chance, 1e-99):.1g}): relative to its largest entry and the length, mode {r + 1} has a"
+                f" {DERIVATIVES[conditions[k]]} of {value[r, k]:.3g} ± {std[r, k]:.2g} there{rest}; correct the end, or"
                 " leave it out"
             )
 
 
 def _extrapolated(
-    positions: np.ndarray, others: BoundaryConditions, at: float, conditions: list[int], length: float
+    positions: np.ndarray, other_conditions: BoundaryConditions, at: float, conditions: list[int], length: float
 ) -> tuple[np.ndarray, np.ndarray, LeaveOneOut] | None:
-    """The derivatives stated to be zero by the sensors, (n_conditions, n_sensors), and their interpolation error,
-    (n_conditions, n_cells), the length as unit; and how such splines predict the sensors. None where sensors are too
-    few."""
-    where: dict[str, Any] = {"length": length, "ends": others}
+    """Linear rules by which the sensors extrapolate derivatives to an end; None where the sensors are too few.
+
+    The length is the unit.
+
+    Returns:
+        The rules, (n_conditions, n_sensors); their interpolation error, (n_conditions, n_cells); the leave-one-out
+        prediction of the same splines.
+    """
+    options: dict[str, Any] = {"length": length, "ends": other_conditions}
     x = np.array([at])
     for degree in BANDS.degrees:
         try:
-            spline = interpolating_spline(positions, degree=degree, **where)
-            leave_one_out = LeaveOneOut(positions, degree=degree, **where)
+            spline = interpolating_spline(positions, degree=degree, **options)
+            leave_one_out = LeaveOneOut(positions, degree=degree, **options)
         except ValueError:
             continue
         rows = [spline.matrix(x, d) * length**d for d in conditions]
-        error = [peano_kernel(spline, x, positions, length, d) * length**d for d in conditions]
-        return np.vstack(rows), np.vstack(error), leave_one_out
+        kernel = [peano_kernel(spline, x, positions, length, d) * length**d for d in conditions]
+        return np.vstack(rows), np.vstack(kernel), leave_one_out
     return None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Bands(Printed):
-    """Eigenfunctions along a structure or over a plate, with their uncertainty by noise and by too few sensors.
+    """Eigenfunctions along a structure or over a plate, with confidence bands for noise and interpolation error.
 
     Attributes:
         x: (n_points,) or (n_points, 2) places, m.
         phi: (n_points, n_modes) eigenfunctions, scaled as `eigenfunctions` does.
         std: (n_points, n_modes) standard error at each place.
-        interpolation_std: (n_points, n_modes) the part of it by interpolation error; 0 where the sensors predict each
-            other to within their noise. Where it is most of `std`, more sensors help and longer records do not.
-        width: (n_modes,) standard errors either side that hold the whole curve with probability `level`.
+        interpolation_std: (n_points, n_modes) the part of `std` by interpolation error; 0 where the sensors predict
+            each other to within their noise. Where it is most of `std`, more sensors help and longer records do not.
+        width: (n_modes,) half width, in standard errors, of the band that contains the whole curve with probability
+            `level`.
         level: of both bands.
     """
 
@@ -245,18 +256,18 @@ class Bands(Printed):
 
     @property
     def whole(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper edge of the band that holds each whole curve, (n_points, n_modes) each."""
+        """Lower and upper limit of the simultaneous band, which contains each whole curve, (n_points, n_modes) each."""
         return self.phi - self.width * self.std, self.phi + self.width * self.std
 
     @property
     def pointwise(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper edge of the interval at each place by itself, (n_points, n_modes) each."""
+        """Lower and upper limit of the pointwise interval at each place, (n_points, n_modes) each."""
         width = float(ndtri(0.5 * (1.0 + self.level)))
         return self.phi - width * self.std, self.phi + width * self.std
 
 
 def check_level(level: float) -> None:
-    """Refuse a probability of a confidence band that is none.
+    """Refuse a confidence level outside 0..1.
 
     Raises:
         ValueError: a level outside 0..1.
@@ -266,18 +277,18 @@ def check_level(level: float) -> None:
 
 
 def deviation_and_width(root: np.ndarray, level: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """Standard errors (n_points,) of a curve whose errors have the covariance R Rᵀ, and how many hold it whole.
+    """Standard errors (n_points,) of a curve of error covariance R Rᵀ, and the width of its simultaneous band.
 
     Args:
         root: R, (n_points, any).
-        level: probability with which the whole curve lies within so many standard errors.
+        level: probability that the whole curve lies within so many standard errors.
     """
     std = np.linalg.norm(root, axis=1)
-    unsure = std > BANDS.held * std.max()
-    if not unsure.any():
+    uncertain = std > BANDS.held * std.max()
+    if not uncertain.any():
         return std, 0.0
-    drawn = (root[unsure] / std[unsure, None]) @ rng.standard_normal((root.shape[1], BANDS.draws))
-    return std, float(np.quantile(np.abs(drawn).max(axis=0), level))
+    samples = (root[uncertain] / std[uncertain, None]) @ rng.standard_normal((root.shape[1], BANDS.draws))
+    return std, float(np.quantile(np.abs(samples).max(axis=0), level))
 
 
 @one_blas_thread
@@ -295,16 +306,16 @@ def eigenfunction_bands(
 ) -> Bands:
     """Confidence bands of the eigenfunctions that `eigenfunctions` draws through refined shapes.
 
-    They hold what noise does to real shapes, and the interpolation error between and beyond the sensors as far as the
-    sensors fail to predict each other. Bands too wide for use, about a point mass or towards an end on springs, narrow
-    with more sensors there; the eigenfunctions of `choose_structure(...).structure` know what is attached.
+    They account for the noise of real shapes, and for the interpolation error between and beyond the sensors that
+    cross-validation of the sensors shows. Where bands are too wide, near a point mass or towards an end on springs, use
+    more sensors there, or the eigenfunctions of `choose_structure(...).structure`, which model what is attached.
 
     Args:
         found: modes and the covariance of their shapes, such as `ring_down` gives, at placed sensors.
         x: (n_points,) m.
         length, mass_per_length, point_masses, ends, degree: as `eigenfunctions` takes them.
         level: between 0 and 1.
-        seed: of the draws that set the width of the band of the whole curve.
+        seed: of the Monte Carlo samples for the simultaneous band.
 
     Raises:
         ValueError: a level outside 0..1, places outside the structure, no more sensors than the degree takes, an end
@@ -319,27 +330,27 @@ def eigenfunction_bands(
     if ends is not None:
         check_ends(found, ends, length=length)
     modes, rng = found.modes, np.random.default_rng(seed)
-    where: dict[str, Any] = {"length": length, "ends": ends or BoundaryConditions()}
-    splines = Splines.through(modes, degree=degree, **where)
+    options: dict[str, Any] = {"length": length, "ends": ends or BoundaryConditions()}
+    splines = Splines.through(modes, degree=degree, **options)
     inertia = inertia_of(mass_per_length, point_masses, length)
     values = normalised_shapes(modes.shapes).real
     phi, std, interpolation = (np.zeros((x.size, modes.n_modes)) for _ in range(3))
     width = np.zeros(modes.n_modes)
-    for spline, those in splines.groups:
-        leave_one_out = LeaveOneOut(modes.positions, degree=spline.degree, **where)
-        along, mass = spline.matrix(x), mass_matrix(spline, inertia, length)
-        for r in those:
+    for spline, members in splines.groups:
+        leave_one_out = LeaveOneOut(modes.positions, degree=spline.degree, **options)
+        rule, mass = spline.matrix(x), mass_matrix(spline, inertia, length)
+        for r in members:
             v = values[:, r]
             q = v @ mass @ v
-            phi[:, r] = along @ v / np.sqrt(q)
-            jacobian = along / np.sqrt(q) - np.outer(phi[:, r], mass @ v / q)
+            phi[:, r] = rule @ v / np.sqrt(q)
+            jacobian = rule / np.sqrt(q) - np.outer(phi[:, r], mass @ v / q)
             root = jacobian @ symmetric_root(found.shape_covariance[r])
             roughness = leave_one_out.roughness(v, found.shape_covariance[r])
             if roughness > 0.0:
                 error = peano_kernel(spline, x, modes.positions, length) / np.sqrt(q)
                 for y, weights, derivative in inertia.weighted(spline, length):
-                    there = peano_kernel(spline, y, modes.positions, length, derivative)
-                    error -= np.outer(phi[:, r], (weights * (spline.matrix(y, derivative) @ v)) @ there / q)
+                    kernel = peano_kernel(spline, y, modes.positions, length, derivative)
+                    error -= np.outer(phi[:, r], (weights * (spline.matrix(y, derivative) @ v)) @ kernel / q)
                 error *= np.sqrt(roughness)
                 interpolation[:, r] = np.linalg.norm(error, axis=1)
                 root = np.hstack([root, error])

@@ -1,8 +1,8 @@
-"""From shapes known at the sensors to eigenfunctions known everywhere (3.4): splines that honour the known ends.
+"""Eigenfunctions from shapes at the sensors (3.4), by splines that satisfy the boundary conditions.
 
-An interpolating spline of odd degree d has d - 1 freedoms to spare, shared by its two ends. What is known of an end (a
-hinge holds the value and the curvature at zero, a free end the curvature and its slope) uses some of them; the rest
-go by leaving out the knots nearest that end ("not a knot"), which assumes nothing.
+An interpolating spline of odd degree d has d - 1 further degrees of freedom, shared by its two ends. The boundary
+conditions of an end (zero value and curvature at a hinge, zero curvature and its slope at a free end) take some of
+them; the others are removed by leaving out the knots nearest to that end ("not a knot"), which assumes nothing.
 """
 
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.structure.supports import PointMass
 from workbench.threads import one_blas_thread
 
-# In section 4.4 each two degrees more cut the error of the lowest eigenfunctions by ten, and that of the highest, which
-# vary too fast for their sensors, is made worse at the ends. So every mode takes the degree that best predicts each
-# inner sensor from all the others.
+# In section 4.4 each two degrees more divide the error of the lowest eigenfunctions by ten, and increase that of the
+# highest, which vary too fast for their sensors, at the ends. So the degree of each mode is chosen by cross-validation
+# of the inner sensors.
 DEFAULT_DEGREES = (3, 5, 7, 9)
 
 ZERO_AT = {
@@ -38,7 +38,7 @@ ESSENTIAL_BELOW = {"bar": 1, "beam": 2}
 
 @dataclass(frozen=True)
 class BoundaryConditions:
-    """Where the ends hold an eigenfunction or a derivative of it at zero: ((x, derivative), ...).
+    """Boundary conditions: where an eigenfunction, or a derivative of it, is zero, ((x, derivative), ...).
 
     Attributes:
         zeros: all of them.
@@ -50,9 +50,10 @@ class BoundaryConditions:
 
     @classmethod
     def of(cls, kind: str, *, length: float, left: str | None = None, right: str | None = None) -> "BoundaryConditions":
-        """What "fixed" or "free" ends of a "bar", or "hinged", "clamped", "sliding" or "free" ends of a "beam" imply.
+        """The conditions of "fixed" or "free" bar ends, or "hinged", "clamped", "sliding" or "free" beam ends.
 
-        An end left as None is not known. Leave a free end out where the stiffness vanishes there: it then says nothing.
+        An end left as None is unknown. Leave a free end out where the stiffness vanishes there: no condition holds
+        then.
 
         Raises:
             ValueError: an end of unknown name.
@@ -77,8 +78,8 @@ class Spline:
         knots: (n_functions + degree + 1,) of the B-splines, m.
         degree: odd.
         weights: (n_functions, n_sensors): coefficients = weights @ values.
-        conditions: what the ends hold at zero, (x, derivative) each.
-        held_weights: (n_functions, n_conditions): what the coefficients would gain by what the ends held instead.
+        conditions: boundary conditions used, (x, derivative) each.
+        held_weights: (n_functions, n_conditions): change of the coefficients per unit value of each condition.
     """
 
     knots: np.ndarray
@@ -94,7 +95,7 @@ class Spline:
         return np.asarray(BSpline(self.knots, self.weights, self.degree)(np.atleast_1d(x), derivative))
 
     def of_held(self, x: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """What the values at x would gain by what the ends held instead of zero, (n_points, n_conditions)."""
+        """Change of the values at x per unit value of each boundary condition, (n_points, n_conditions)."""
         return np.asarray(BSpline(self.knots, self.held_weights, self.degree)(np.atleast_1d(x), derivative))
 
 
@@ -105,12 +106,12 @@ def interpolating_spline(
     ends: BoundaryConditions = BoundaryConditions(),
     degree: int,
 ) -> Spline:
-    """The spline through values at the sensors that honours the known ends.
+    """The spline through values at the sensors that satisfies the boundary conditions.
 
     Args:
-        positions: (n_sensors,) m, no two alike; a sensor on a held end adds nothing and is passed over.
+        positions: (n_sensors,) m, all different; a sensor where the value is held at zero is not used.
         length: m.
-        ends: what is known there; at most (degree - 1) / 2 derivatives an end are used, lowest first.
+        ends: boundary conditions; at most (degree - 1) / 2 derivatives an end are used, lowest first.
         degree: 1, 3, 5, ...
 
     Raises:
@@ -120,9 +121,9 @@ def interpolating_spline(
     _check_places(at_sensors, length, degree)
     slack = 1e-9 * length
     conditions = _usable(ends.zeros, degree, length)
-    held = [at for at, derivative in conditions if derivative == 0]
-    read = np.array([all(abs(x - at) > slack for at in held) for x in at_sensors])
-    sites = np.union1d(at_sensors[read], np.array(held))
+    held_places = [at for at, derivative in conditions if derivative == 0]
+    used = np.array([all(abs(x - at) > slack for at in held_places) for x in at_sensors])
+    sites = np.union1d(at_sensors[used], np.array(held_places))
     derivatives = [(at, d) for at, d in conditions if d > 0]
     n_functions = sites.size + len(derivatives)
     if n_functions < degree + 1:
@@ -133,12 +134,12 @@ def interpolating_spline(
     knots = _knots(sites, derivatives, length, degree)
     unit = np.eye(n_functions)
     basis = BSpline(knots, unit, degree)
-    rows = [basis(at_sensors[read])] + [basis(at, d)[None] * length**d for at, d in conditions]
+    rows = [basis(at_sensors[used])] + [basis(at, d)[None] * length**d for at, d in conditions]
     inverse = np.linalg.inv(np.vstack(rows))
     weights = np.zeros((n_functions, at_sensors.size))
-    weights[:, read] = inverse[:, : read.sum()]
+    weights[:, used] = inverse[:, : used.sum()]
     powers = float(length) ** np.array([d for _, d in conditions])
-    return Spline(frozen(knots), degree, frozen(weights), tuple(conditions), frozen(inverse[:, read.sum() :] * powers))
+    return Spline(frozen(knots), degree, frozen(weights), tuple(conditions), frozen(inverse[:, used.sum() :] * powers))
 
 
 @one_blas_thread
@@ -163,14 +164,14 @@ def eigenfunctions(
         sampled: shapes of displacement, (n_outputs, n_modes).
         length: m.
         mass_per_length: kg/m, where known; without it and without `driven_at` the shapes keep ∫ φ_r² dx = length.
-        point_masses: what is attached, kg; left out, a heavy one makes every shape wrong in size by as much as 30 %.
+        point_masses: attached masses; a heavy one left out makes the scale of every shape wrong by up to 30 %.
         driven_at: x0 of a unit impulse at t = 0 that caused `sampled`, m.
-        ends: what the supports hold at zero; it is believed. Of an end on springs only what it holds is known.
+        ends: boundary conditions, taken as exact. An end on springs has only those that it holds at zero.
         degree: of the splines, odd; chosen mode by mode as in `best_degrees` unless given.
         covariance: of (ω, ζ), carried along where `refine` gave one.
 
-    A spline knows nothing between and beyond its sensors; how far off it may be there says `eigenfunction_bands`. Where
-    that is too far, take the eigenfunctions of `choose_structure(...).structure`, which know springs and masses.
+    `eigenfunction_bands` gives the interpolation error of a spline between and beyond its sensors. Where that is too
+    large, take the eigenfunctions of `choose_structure(...).structure`, which model springs and masses.
 
     Raises:
         ValueError: as `interpolating_spline`; both ways of scaling at once; point masses outside, or
@@ -182,9 +183,9 @@ def eigenfunctions(
     if driven_at is None:
         values = normalised_shapes(sampled.shapes).real
         inertia = inertia_of(mass_per_length, point_masses, length)
-        for spline, those in splines.groups:
+        for spline, members in splines.groups:
             mass = mass_matrix(spline, inertia, length)
-            values[:, those] /= np.sqrt(np.einsum("jr,jk,kr->r", values[:, those], mass, values[:, those]))
+            values[:, members] /= np.sqrt(np.einsum("jr,jk,kr->r", values[:, members], mass, values[:, members]))
     else:
         values = _scaled_by_impulse(sampled, splines, driven_at)
     values = frozen(values)
@@ -202,12 +203,12 @@ def eigenfunctions(
 def best_degrees(
     sampled: SampledModes, *, length: float, ends: BoundaryConditions = BoundaryConditions()
 ) -> np.ndarray:
-    """The degree among 3, 5, 7 and 9 that best predicts every inner sensor from the others, (n_modes,).
+    """The spline degree among 3, 5, 7 and 9 that best predicts each inner sensor from the others, (n_modes,).
 
     Args:
         sampled: shapes of displacement at placed sensors.
         length: m.
-        ends: what is known there.
+        ends: boundary conditions.
     """
     check_along(sampled)
     values = normalised_shapes(sampled.shapes).real
@@ -231,7 +232,7 @@ def best_degrees(
 
 @dataclass(frozen=True, eq=False)
 class Splines:
-    """One spline a mode, grouped by degree: [(spline, modes), ...]."""
+    """The spline of each mode, grouped by degree: [(spline, modes), ...]."""
 
     groups: tuple[tuple[Spline, np.ndarray], ...]
 
@@ -240,10 +241,10 @@ class Splines:
         cls, sampled: SampledModes, *, length: float, ends: BoundaryConditions, degree: int | None
     ) -> "Splines":
         check_along(sampled)
-        where: dict[str, Any] = {"length": length, "ends": ends}
-        degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **where)
+        options: dict[str, Any] = {"length": length, "ends": ends}
+        degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **options)
         each = [(int(d), np.flatnonzero(degrees == d)) for d in np.unique(degrees)]
-        return cls(tuple((interpolating_spline(sampled.positions, degree=d, **where), modes) for d, modes in each))
+        return cls(tuple((interpolating_spline(sampled.positions, degree=d, **options), modes) for d, modes in each))
 
     def __call__(self, values: np.ndarray, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Splines through values (n_sensors, n_modes), at x: (n_points, n_modes)."""
@@ -255,15 +256,15 @@ class Splines:
 
 @dataclass(frozen=True)
 class Inertia:
-    """What scales an eigenfunction: mass along the structure and at points."""
+    """The mass along the structure and at points, which scales an eigenfunction."""
 
     density: Profile
     point_masses: tuple[PointMass, ...] = ()
 
     def weighted(self, spline: Spline, length: float) -> list[tuple[np.ndarray, np.ndarray, int]]:
-        """Places, their weights, and whether it is the value or the slope whose square they weigh."""
+        """Quadrature of ∫ m φ² dx + Σ (M_k φ² + J_k φ'²): (places, weights, derivative) of each part."""
         breaks = [b for b in self.density.breaks if 0 < b < length]
-        # exact for products of two splines with a cubic weight
+        # exact for the product of two splines and a cubic mass
         x, weights = gauss_between(np.unique(np.concatenate([spline.knots, breaks])), spline.degree + 3)
         at = np.array([point.at for point in self.point_masses])
         return [
@@ -274,9 +275,9 @@ class Inertia:
 
 
 def inertia_of(mass_per_length: ProfileLike | None, point_masses: Sequence[PointMass], length: float) -> Inertia:
-    """As `eigenfunctions` takes them; without a mass, what gives ∫ φ_r² dx = length."""
+    """The mass as `eigenfunctions` takes it; by default one that gives ∫ φ_r² dx = length."""
     if mass_per_length is None and len(point_masses):
-        raise ValueError("point masses count beside a mass distribution; give mass_per_length too")
+        raise ValueError("point masses are used beside a mass distribution; give mass_per_length too")
     for point in point_masses:
         if not 0.0 <= cast(float, point.at) <= length:
             raise ValueError(f"the point mass at x = {point.at:g} lies outside the structure, 0 to {length:g}")
@@ -284,12 +285,12 @@ def inertia_of(mass_per_length: ProfileLike | None, point_masses: Sequence[Point
 
 
 def mass_matrix(spline: Spline, inertia: Inertia, length: float) -> np.ndarray:
-    """M of v^T M v = ∫ m φ² dx + Σ M_k φ(x_k)² for φ through values v at the sensors, (n_sensors, n_sensors)."""
-    found = np.zeros((spline.weights.shape[1],) * 2)
+    """M of v^T M v = ∫ m φ² dx + Σ (M_k φ² + J_k φ'²) for φ through values v at the sensors, (n_sensors, n_sensors)."""
+    mass = np.zeros((spline.weights.shape[1],) * 2)
     for x, weights, derivative in inertia.weighted(spline, length):
-        along = spline.matrix(x, derivative)
-        found += along.T @ (weights[:, None] * along)
-    return found
+        rule = spline.matrix(x, derivative)
+        mass += rule.T @ (weights[:, None] * rule)
+    return mass
 
 
 def check_along(sampled: SampledModes) -> None:
@@ -314,23 +315,26 @@ def _check_places(positions: np.ndarray, length: float, degree: int) -> None:
     if outside.any():
         raise ValueError(f"the sensor at x = {positions[outside][0]:g} lies outside the structure, 0 to {length:g}")
     ordered = np.sort(positions)
-    alike = np.diff(ordered) <= 1e-6 * length
-    if alike.any():
-        raise ValueError(f"two sensors stand at x = {ordered[:-1][alike][0]:g}; keep one of them")
+    coincident = np.diff(ordered) <= 1e-6 * length
+    if coincident.any():
+        raise ValueError(f"two sensors stand at x = {ordered[:-1][coincident][0]:g}; keep one of them")
 
 
 def _usable(zeros: Sequence[tuple[float, int]], degree: int, length: float) -> list[tuple[float, int]]:
-    """Each end takes its value and at most (degree - 1) / 2 derivatives, below the degree."""
+    """Conditions that a spline can take: of each end the value and at most (degree - 1) / 2 derivatives.
+
+    Lowest first, below the degree.
+    """
     kept = []
     for end in (0.0, length):
-        here = sorted(d for at, d in zeros if abs(at - end) <= 1e-9 * length and d < degree)
-        values, slopes = [d for d in here if d == 0], [d for d in here if d > 0]
+        orders = sorted(d for at, d in zeros if abs(at - end) <= 1e-9 * length and d < degree)
+        values, slopes = [d for d in orders if d == 0], [d for d in orders if d > 0]
         kept += [(end, d) for d in values + slopes[: (degree - 1) // 2]]
     return kept
 
 
 def _knots(sites: np.ndarray, derivatives: list[tuple[float, int]], length: float, degree: int) -> np.ndarray:
-    """Knots at the inner sites but those nearest each end, as many as that end's conditions leave over."""
+    """Knots at the inner sites, except those nearest to each end that its conditions do not determine."""
     slack = 1e-9 * length
     inner = sites[(sites > slack) & (sites < length - slack)]
     known_left = sum(at == 0.0 for at, _ in derivatives) + int(sites[0] <= slack)
@@ -352,8 +356,8 @@ def _scaled_by_impulse(sampled: SampledModes, splines: Splines, x0: float) -> np
             " that mode out"
         )
     values = products / np.sqrt(at_impulse)
-    clear = np.argmax(np.abs(values) > 0.05 * np.abs(values).max(axis=0), axis=0)
-    return np.asarray(values * np.sign(values[clear, np.arange(values.shape[1])]))
+    first_significant = np.argmax(np.abs(values) > 0.05 * np.abs(values).max(axis=0), axis=0)
+    return np.asarray(values * np.sign(values[first_significant, np.arange(values.shape[1])]))
 
 
 def __getattr__(name: str) -> object:

@@ -1,4 +1,4 @@
-"""Mode pairing: which measured modes are those of a model, and which are not."""
+"""Mode pairing: the one-to-one match of measured modes and those of a model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from workbench.identification.signal.modal_estimates import check_finite, check_
 from workbench.structure.modes import Modes, SampledModes, mac
 from workbench.structure.printed import Printed, counted
 
-ITSELF = 1e-3  # weight of a shape by itself beside the subspace of repeated modes: it decides where these agree alike
+PLAIN_WEIGHT = 1e-3  # of the plain MAC beside that of the subspace: it decides among repeated modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -18,11 +18,11 @@ class ModePairing(Printed):
     """Measured modes paired one to one with those of a model.
 
     Attributes:
-        matched: (n_matched,) indices of the measured modes that are the model's, by increasing mode of the model.
-        model: (n_matched,) indices of the model's modes they are.
-        mac: (n_matched,) agreement of the shapes.
-        scaled_hz: (n_matched,) the model's frequencies, scaled to the first match, Hz.
-        others: (n_others,) indices of the measured modes that are not the model's.
+        matched: (n_matched,) indices of the paired measured modes, by increasing mode of the model.
+        model: (n_matched,) indices of the model's modes paired with them.
+        mac: (n_matched,) MAC of each pair.
+        scaled_hz: (n_matched,) the model's frequencies, scaled to the first pair, Hz.
+        others: (n_others,) indices of the measured modes without a pair.
     """
 
     matched: np.ndarray
@@ -34,14 +34,14 @@ class ModePairing(Printed):
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         each = zip(self.matched, self.model, self.mac, self.scaled_hz)
         rows = [(str(r + 1), str(s + 1), f"{m:.4f}", f"{hz:.5g}") for r, s, m, hz in each]
-        lost = ", ".join(str(r + 1) for r in self.others)
-        remarks = (f"measured, and none of the model's: {lost}",) if lost else ()
+        unpaired = ", ".join(str(r + 1) for r in self.others)
+        remarks = (f"measured modes without a mode of the model: {unpaired}",) if unpaired else ()
         headings = ("measured mode", "mode of the model", "MAC", "its frequency, scaled [Hz]")
         return f"{counted(len(rows), 'mode')} paired", headings, rows, remarks
 
 
 def repeated_modes(omega: np.ndarray, repeated: float = 1e-3) -> np.ndarray:
-    """Which modes are repeated: (n_modes,) the same number for those whose frequencies follow within `repeated`.
+    """Cluster number of each mode, (n_modes,), equal for repeated modes: consecutive frequencies within `repeated`.
 
     Args:
         omega: (n_modes,) frequencies, not decreasing.
@@ -53,8 +53,9 @@ def repeated_modes(omega: np.ndarray, repeated: float = 1e-3) -> np.ndarray:
 def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray) -> np.ndarray:
     """Modal assurance criterion in which repeated modes of the second set count as the subspace that they span.
 
-    MAC_rs = |P_s φ_r|² / |φ_r|², P_s the projection on the span of all ψ_t with |ω_t / ω_s - 1| chained below
-    a thousandth: any basis of repeated modes agrees alike. Where ω_s stands alone it is the plain criterion.
+    MAC_rs = |P_s φ_r|² / |φ_r|², P_s the projection on the span of all ψ_t in the cluster of ω_s, whose consecutive
+    frequencies differ by less than a thousandth: it does not depend on the basis of repeated modes. For a single mode
+    it is the plain criterion.
 
     Args:
         first: (n_points, n_first) shapes, real or complex.
@@ -68,44 +69,43 @@ def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray) -> np
 
 
 def _cluster_mac(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
-    agreement = mac(first, second)
-    for each in np.unique(cluster):
-        members = np.flatnonzero(cluster == each)
+    values = mac(first, second)
+    for number in np.unique(cluster):
+        members = np.flatnonzero(cluster == number)
         if members.size > 1:
             basis = np.linalg.qr(second[:, members])[0]
             share = (np.abs(basis.conj().T @ first) ** 2).sum(axis=0) / (np.abs(first) ** 2).sum(axis=0)
-            agreement[:, members] = share[:, None]
-    return agreement
+            values[:, members] = share[:, None]
+    return values
 
 
 def assigned(
     first: np.ndarray, second: np.ndarray, cluster: np.ndarray, *, least: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which shape of the second set each of the first is: rows, columns, and the agreement by `subspace_mac`.
+    """Optimal assignment of two sets of shapes: rows, columns, and the `subspace_mac`, (n_first, n_second).
 
-    Of repeated modes, which agree alike as a subspace, each goes to the one that is most like it by itself.
+    Among repeated modes, of equal subspace MAC, the plain MAC decides.
 
     Args:
         first, second: as `subspace_mac` takes them.
-        cluster: (n_second,) number of the cluster that each of the second belongs to.
-        least: agreement below it counts as none.
+        cluster: (n_second,) cluster number of each shape of the second set.
+        least: MAC below which a pair is none.
     """
     agreement = _cluster_mac(first, second, cluster)
-    alike = np.where(agreement >= least, agreement + ITSELF * mac(first, second), 0.0)
-    return *linear_sum_assignment(-alike), agreement
+    score = np.where(agreement >= least, agreement + PLAIN_WEIGHT * mac(first, second), 0.0)
+    return *linear_sum_assignment(-score), agreement
 
 
 def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, frequency: float = 0.1) -> ModePairing:
-    """Match measured modes with a model of unknown scale of frequency, each at most once, by shape, then frequency.
+    """Pairs of measured modes and those of a model of unknown frequency scale, by shape, then by frequency.
 
-    A measured mode is the model's if its shape agrees with that of a mode that no other measured mode agrees with
-    better, and if the frequencies keep the model's ratios. Repeated modes of the model are matched as the subspace
-    that they span.
+    The shapes are assigned one to one; a pair needs the least MAC, and a frequency ratio near the median of all pairs.
+    Repeated modes of the model are matched as the subspace that they span.
 
     Args:
         measured: shapes at placed sensors, their places those of the model's domain.
-        model: computed modes of the structure it should be; its frequencies count by their ratios only.
-        shape: least MAC of a match.
+        model: computed modes; only the ratios of its frequencies are used.
+        shape: least MAC of a pair.
         frequency: largest relative difference from the median ratio.
 
     Raises:
@@ -113,14 +113,14 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     """
     check_placed(measured)
     check_finite(measured.shapes)
-    own, cluster = model.phi(measured.positions), repeated_modes(model.omega)
-    rows, columns, agreement = assigned(measured.shapes, own, cluster, least=shape)
-    good = agreement[rows, columns] >= shape
-    rows, columns = rows[good], columns[good]
+    model_shapes, cluster = model.phi(measured.positions), repeated_modes(model.omega)
+    rows, columns, agreement = assigned(measured.shapes, model_shapes, cluster, least=shape)
+    paired = agreement[rows, columns] >= shape
+    rows, columns = rows[paired], columns[paired]
     ratio = measured.omega[rows] / model.omega[columns]
     if ratio.size:
-        near = np.abs(ratio / np.median(ratio) - 1.0) <= frequency
-        rows, columns = rows[near], columns[near]
+        consistent = np.abs(ratio / np.median(ratio) - 1.0) <= frequency
+        rows, columns = rows[consistent], columns[consistent]
     order = np.argsort(columns)
     rows, columns = rows[order], columns[order]
     scale = measured.frequencies_hz[rows[0]] / model.frequencies_hz[columns[0]] if rows.size else 1.0

@@ -1,9 +1,10 @@
-"""From shapes known at scattered sensors to eigenfunctions all over a rectangle: polyharmonic splines and their error.
+"""Eigenfunctions over a rectangle from shapes at scattered sensors: polyharmonic splines and their error.
 
 The spline through values v at places p_i is s(p) = Σ a_i |p - p_i|⁷ + a cubic: of all functions that take the values,
-the one with the least energy of a derivative of order 4½ (Duchon 1977). What edges hold at zero is held at points along
-them. A function of white energy of strength τ² has about it the mean square error τ² κ(p), κ the power function of the
-kernel (Wendland, Scattered Data Approximation, 2005, chapter 11); τ² is the upper limit of what the values say of it.
+the one with the least energy of a derivative of order 4½ (Duchon 1977). Edge conditions are imposed at points along the
+edges. For a function whose derivative is white of strength τ², the spline has the mean square error τ² κ(p), κ the
+power function of the kernel (Wendland, Scattered Data Approximation, 2005, chapter 11); τ² is its upper confidence
+limit given the values.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,14 +32,14 @@ from workbench.threads import one_blas_thread
 class SurfaceSettings:
     """Constants of splines over a rectangle."""
 
-    per_edge: int = 11  # points where an edge is held
-    quadrature: int = 49  # modes that the points of integration over the rectangle would serve
-    same_place: float = 1e-6  # of the diagonal: sensors nearer stand at one place
+    per_edge: int = 11  # points of an edge at which its conditions are imposed
+    quadrature: int = 49  # number of modes for which the integration points over the rectangle suffice
+    same_place: float = 1e-6  # of the diagonal: sensors closer than this are at one place
 
 
 SURFACE = SurfaceSettings()
 POWER = 3.5  # of |p|², the kernel |p|⁷
-CUBIC = tuple((i, j) for i in range(4) for j in range(4 - i))  # powers of x and y that cost no energy
+CUBIC = tuple((i, j) for i in range(4) for j in range(4 - i))  # powers of x and y of zero energy
 HELD_BY = {"simply supported": (0,), "clamped": (0, 1), "free": (), "guided": (1,)}
 
 Functional = tuple[np.ndarray, tuple[int, int]]
@@ -47,7 +48,7 @@ Functional = tuple[np.ndarray, tuple[int, int]]
 def _kernel(offset: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
     """∂^(i+j) of |p|⁷ along x and y at offsets p (..., 2), by the chain rule in s = |p|²."""
     s = (offset**2).sum(axis=-1)
-    found = np.zeros(s.shape)
+    derivative_values = np.zeros(s.shape)
     for k in range(derivative[0] // 2 + 1):
         for m in range(derivative[1] // 2 + 1):
             order = sum(derivative) - k - m
@@ -56,12 +57,12 @@ def _kernel(offset: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
                 factor = factor * factorial(n) / (factorial(part) * factorial(n - 2 * part))
                 factor = factor * (2.0 * offset[..., axis]) ** (n - 2 * part)
             with np.errstate(divide="ignore", invalid="ignore"):
-                found += np.where(s > 0, factor * falling * s ** (POWER - order), 0.0)
-    return found
+                derivative_values += np.where(s > 0, factor * falling * s ** (POWER - order), 0.0)
+    return derivative_values
 
 
 def _cubics(at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
-    """The derivative of every cubic monomial at places (n, 2): (n, 10)."""
+    """A derivative of every cubic monomial at places (n, 2): (n, 10)."""
     columns = []
     for powers in CUBIC:
         column = np.ones(len(at))
@@ -81,10 +82,10 @@ class SurfaceSpline:
         domain: the rectangle, m.
         places: (n_places, 2) of the values, m.
         edges: "simply supported", "clamped", "free" or "guided": one for all, or a mapping of left, right, bottom and
-            top. They hold the function or its slope at zero; of a side that is left out nothing is known.
+            top. They set the function or its slope to zero; a side that is left out has no condition.
 
     Raises:
-        ValueError: fewer values and held points than the ten of a cubic, two places that are one, a place outside.
+        ValueError: fewer values and edge points than the ten of a cubic, two coincident places, a place outside.
     """
 
     domain: Rectangle
@@ -113,9 +114,9 @@ class SurfaceSpline:
 
     @cached_property
     def _held(self) -> list[Functional]:
-        """Points along the edges, and the derivative that is zero there."""
+        """Points along the edges, each with the derivative that is zero there."""
         a, b = self.domain.length
-        found: list[Functional] = []
+        conditions: list[Functional] = []
         assert isinstance(self.edges, Mapping)
         for side, edge in self.edges.items():
             i = SIDES.index(side)
@@ -123,8 +124,8 @@ class SurfaceSpline:
             across = np.full(SURFACE.per_edge, float(i % 2))
             points = np.column_stack([across, along] if i < 2 else [along, across]) * (a, b)
             for order in HELD_BY[edge]:
-                found.append((points, ((order, 0) if i < 2 else (0, order))))
-        return found
+                conditions.append((points, ((order, 0) if i < 2 else (0, order))))
+        return conditions
 
     @cached_property
     def _functionals(self) -> list[Functional]:
@@ -132,19 +133,19 @@ class SurfaceSpline:
 
     @cached_property
     def _polynomials(self) -> np.ndarray:
-        """(n_values, 10) of all functionals, in units of the diagonal."""
+        """Cubic monomials under all functionals, (n_values, 10), with the diagonal as unit."""
         return np.vstack([self._cubic(at, derivative) for at, derivative in self._functionals])
 
     def _cubic(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
         return _cubics(at / self.domain.size, derivative)
 
     def _covariance(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
-        """Of a derivative at places with every functional, for τ² = 1: (n_at, n_values)."""
+        """Covariance of a derivative at places with every functional, for τ² = 1: (n_at, n_values)."""
         columns = []
-        for places, own in self._functionals:
-            both = (derivative[0] + own[0], derivative[1] + own[1])
+        for places, order in self._functionals:
+            total = (derivative[0] + order[0], derivative[1] + order[1])
             offset = (at[:, None] - places) / self.domain.size
-            columns.append((-1.0) ** sum(own) * _kernel(offset, both))
+            columns.append((-1.0) ** sum(order) * _kernel(offset, total))
         return np.hstack(columns)
 
     @cached_property
@@ -152,8 +153,8 @@ class SurfaceSpline:
         """The inverse of [[K, P], [Pᵀ, 0]]."""
         k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
         p = self._polynomials
-        whole = np.block([[k, p], [p.T, np.zeros((p.shape[1],) * 2)]])
-        return np.linalg.inv(whole)
+        system = np.block([[k, p], [p.T, np.zeros((p.shape[1],) * 2)]])
+        return np.linalg.inv(system)
 
     def matrix(self, at: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> np.ndarray:
         """Values (or derivatives) at places (n_at, 2) per value at each sensor, (n_at, n_places)."""
@@ -163,43 +164,45 @@ class SurfaceSpline:
         return np.asarray(scale * (rows @ self._system)[:, : len(self.places)])
 
     def error(self, at: np.ndarray, derivatives: Sequence[tuple[int, int]] = ((0, 0),)) -> np.ndarray:
-        """Covariance of what the spline misses between the sensors, for τ² = 1, of one derivative after another at
-        places (n_at, 2): (n_derivatives n_at, n_derivatives n_at)."""
+        """Covariance of the interpolation error for τ² = 1, (n_derivatives n_at, n_derivatives n_at).
+
+        Of one derivative after another, at places (n_at, 2).
+        """
         offset = (at[:, None] - at) / self.domain.size
-        own = np.block(
+        prior_covariance = np.block(
             [[(-1.0) ** (k + m) * _kernel(offset, (i + k, j + m)) for k, m in derivatives] for i, j in derivatives]
         )
         rows = np.vstack([np.hstack([self._covariance(at, d), self._cubic(at, d)]) for d in derivatives])
         scale = np.repeat([self.domain.size ** -sum(d) for d in derivatives], len(at))
-        return np.asarray((own - rows @ self._system @ rows.T) * np.outer(scale, scale))
+        return np.asarray((prior_covariance - rows @ self._system @ rows.T) * np.outer(scale, scale))
 
     def roughness(self, values: np.ndarray, covariance: np.ndarray) -> float:
-        """τ² of values (n_places,) of known covariance: the upper end of its interval; 0 where they may be noise.
+        """Upper confidence limit of τ² of values (n_places,) of known covariance; 0 where they may be noise.
 
-        By the likelihood of what no cubic takes (restricted maximum likelihood).
+        By the likelihood of the contrasts orthogonal to all cubics (restricted maximum likelihood).
         """
         n, size = len(self.places), len(self._polynomials)
         k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
-        free = null_space(self._polynomials.T)
+        contrasts = null_space(self._polynomials.T)
         noise = np.zeros((size, size))
         noise[:n, :n] = covariance
         scale = float(np.abs(values).max()) ** 2
-        by_rough = free.T @ k @ free
-        by_noise = free.T @ noise @ free + 1e-24 * scale * np.eye(free.shape[1])
-        left = free.T @ np.r_[values, np.zeros(size - n)]
+        unit_covariance = contrasts.T @ k @ contrasts
+        noise_covariance = contrasts.T @ noise @ contrasts + 1e-24 * scale * np.eye(contrasts.shape[1])
+        contrast_values = contrasts.T @ np.r_[values, np.zeros(size - n)]
 
-        def unlikely(log_strength: float) -> float:
-            total = by_noise + np.exp(log_strength) * by_rough
+        def cost(log_strength: float) -> float:
+            total = noise_covariance + np.exp(log_strength) * unit_covariance
             sign, logarithm = np.linalg.slogdet(total)
-            return float(logarithm + left @ np.linalg.solve(total, left)) if sign > 0 else 1e300
+            return float(logarithm + contrast_values @ np.linalg.solve(total, contrast_values)) if sign > 0 else 1e300
 
-        usual = float(np.trace(by_rough)) / len(left)
-        span = np.log(scale / usual) + np.array([-40.0, 25.0])
-        best = minimize_scalar(unlikely, bounds=tuple(span), method="bounded")
+        mean_variance = float(np.trace(unit_covariance)) / len(contrast_values)
+        span = np.log(scale / mean_variance) + np.array([-40.0, 25.0])
+        best = minimize_scalar(cost, bounds=tuple(span), method="bounded")
         limit = best.fun + chi2.isf(2.0 * BANDS.unlikely, 1)
-        if unlikely(span[0]) < limit:
+        if cost(span[0]) < limit:
             return 0.0
-        return float(np.exp(brentq(lambda strength: unlikely(strength) - limit, best.x, span[1])))
+        return float(np.exp(brentq(lambda log_strength: cost(log_strength) - limit, best.x, span[1])))
 
 
 @one_blas_thread
@@ -217,10 +220,10 @@ def surface_eigenfunctions(
         sampled: shapes of displacement, (n_outputs, n_modes), at sensors with places (x, y).
         length: (a, b), m.
         mass_per_area: kg/m², where known; without it the mean square of φ_r is 1.
-        edges: what the edges hold, by side, as `SurfaceSpline` takes them.
+        edges: edge conditions by side, as `SurfaceSpline` takes them.
         covariance: of (ω, ζ), carried along.
 
-    How far off the shapes may be between the sensors says `surface_bands`.
+    `surface_bands` gives the error of the shapes between the sensors.
 
     Raises:
         ValueError: as `SurfaceSpline`; a sensor without a place, or with one of another kind.
@@ -237,12 +240,12 @@ def surface_eigenfunctions(
 
 @dataclass(frozen=True, eq=False)
 class SurfaceErrors:
-    """Errors of frequencies, and of the shapes that `surface_eigenfunctions` draws: noise, and what the spline misses.
+    """Errors of frequencies and of the shapes of `surface_eigenfunctions`: noise and interpolation error.
 
     Attributes:
         spline: through the sensors.
         values: (n_places, n_modes) of the shapes at the sensors, largest 1.
-        value_covariance: (n_modes, n_places, n_places) of these, each mode by itself.
+        value_covariance: (n_modes, n_places, n_places) of these, by mode.
         roughness: (n_modes,) τ².
         omega_covariance: (n_modes, n_modes) of the frequencies, (rad/s)².
     """
@@ -254,7 +257,7 @@ class SurfaceErrors:
     omega_covariance: np.ndarray
 
     def select(self, modes: Sequence[int]) -> "SurfaceErrors":
-        """Those of some modes, by zero-based index."""
+        """The errors of some modes, by zero-based index."""
         index = list(modes)
         covariances = self.value_covariance[index], self.roughness[index], self.omega_covariance[np.ix_(index, index)]
         return SurfaceErrors(self.spline, self.values[:, index], *covariances)
@@ -264,7 +267,7 @@ class SurfaceErrors:
 def surface_errors(
     found: ShapeEstimates, *, length: tuple[float, float], edges: str | Mapping[str, str] | None = None
 ) -> SurfaceErrors:
-    """What the eigenfunctions that `surface_eigenfunctions` draws through identified shapes may be off by.
+    """Errors of the eigenfunctions of `surface_eigenfunctions`, from the covariance of identified shapes.
 
     Args:
         found: modes and the covariances of frequencies and shapes, at sensors with places (x, y).
@@ -293,9 +296,9 @@ def surface_bands(
     level: float = 0.95,
     seed: int | np.random.Generator = 0,
 ) -> Bands:
-    """Confidence bands of the eigenfunctions that `surface_eigenfunctions` draws, at places (n_points, 2), m.
+    """Confidence bands of the eigenfunctions of `surface_eigenfunctions`, at places (n_points, 2), m.
 
-    With values v, φ = W v / √q and q = vᵀ M v, an error dv and the interpolation error e move it by
+    With values v, φ = W v / √q and q = vᵀ M v, an error dv and the interpolation error e change φ by
     W dv / √q + e / √q - φ [vᵀ M dv + ∫∫ m W v e dA] / q, as along an interval (`eigenfunction_bands`).
 
     Args:
@@ -303,7 +306,7 @@ def surface_bands(
         at: (n_points, 2) m.
         length, mass_per_area, edges: as `surface_eigenfunctions` takes them.
         level: between 0 and 1.
-        seed: of the draws that set the width of the band of the whole surface.
+        seed: of the Monte Carlo samples for the simultaneous band.
 
     Raises:
         ValueError: a level outside 0..1; as `surface_eigenfunctions`.
@@ -313,21 +316,21 @@ def surface_bands(
     spline, scaled = _scaled(sampled, length, mass_per_area, edges)
     at, rng = spline.domain.locate(at), np.random.default_rng(seed)
     x, weights = _weighted(spline.domain, mass_per_area)
-    along, inside = spline.matrix(at), spline.matrix(x)
+    rule, rule_inside = spline.matrix(at), spline.matrix(x)
     root = _root(spline.error(np.vstack([at, x])))
     phi, std, interpolation = (np.zeros((len(at), sampled.n_modes)) for _ in range(3))
     width = np.zeros(sampled.n_modes)
     values = normalised_shapes(sampled.shapes).real
     for r in range(sampled.n_modes):
         factor = scaled[:, r] @ values[:, r] / (values[:, r] @ values[:, r])  # 1 / √q
-        own = found.shape_covariance[r] * factor**2
-        phi[:, r] = along @ scaled[:, r]
-        weighing = weights * (inside @ scaled[:, r])
-        noise = (along - np.outer(phi[:, r], weighing @ inside)) @ _root(own)
-        missed = root[: len(at)] - np.outer(phi[:, r], weighing @ root[len(at) :])
-        missed = np.sqrt(spline.roughness(scaled[:, r], own)) * missed
-        interpolation[:, r] = np.linalg.norm(missed, axis=1)
-        std[:, r], width[r] = deviation_and_width(np.hstack([noise, missed]), level, rng)
+        value_covariance = found.shape_covariance[r] * factor**2
+        phi[:, r] = rule @ scaled[:, r]
+        mass_weights = weights * (rule_inside @ scaled[:, r])
+        noise = (rule - np.outer(phi[:, r], mass_weights @ rule_inside)) @ _root(value_covariance)
+        interpolation_error = root[: len(at)] - np.outer(phi[:, r], mass_weights @ root[len(at) :])
+        interpolation_error = np.sqrt(spline.roughness(scaled[:, r], value_covariance)) * interpolation_error
+        interpolation[:, r] = np.linalg.norm(interpolation_error, axis=1)
+        std[:, r], width[r] = deviation_and_width(np.hstack([noise, interpolation_error]), level, rng)
     return Bands(frozen(at), frozen(phi), frozen(std), frozen(interpolation), frozen(width), level)
 
 
@@ -337,7 +340,7 @@ def _scaled(
     mass_per_area: FieldLike | None,
     edges: str | Mapping[str, str] | None,
 ) -> tuple[SurfaceSpline, np.ndarray]:
-    """The spline, and values (n_outputs, n_modes) at the sensors that it makes mass-normalised shapes of."""
+    """The spline, and values (n_outputs, n_modes) at the sensors of mass-normalised shapes."""
     check_placed(sampled)
     if sampled.positions.ndim != 2:
         raise ValueError("eigenfunctions over a rectangle take sensors with places (x, y), m; give their channels `at`")
@@ -348,12 +351,12 @@ def _scaled(
 
 
 def _weighted(domain: Rectangle, mass_per_area: FieldLike | None) -> tuple[np.ndarray, np.ndarray]:
-    """Points of integration (n, 2), m, and the mass that each stands for."""
+    """Integration points (n, 2), m, and the mass that each represents."""
     x, weights = domain.quadrature(SURFACE.quadrature)
     density = as_field(1.0 / float(np.prod(domain.length)) if mass_per_area is None else mass_per_area)
     return x, weights * density(x[:, 0], x[:, 1])
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """R with R Rᵀ the covariance, which rounding may have made slightly negative."""
+    """R with R Rᵀ the covariance, whose eigenvalues rounding may have made slightly negative."""
     return symmetric_root(0.5 * (covariance + covariance.T))

@@ -4,15 +4,15 @@ Modes are orthogonal with respect to the mass and to the stiffness, whatever the
 
     ∫ m φ_r φ_s dx = a_r² δ_rs,   ∫ k φ_r^(p) φ_s^(p) dx = a_r² ω_r² δ_rs   (4.6), p = 1 for a bar, 2 for a beam.
 
-With m = m_0 + Σ d_j M_j and k = k_0 + Σ e_j K_j these are linear in d, e and a_r². Each a_r² stands in one mass
-relation only, the one with s = r, so these define a_r² and leave the relations r ≠ s to find d. They say nothing of
-the overall size: the mass must be known somewhere, and is held there exactly. All relations then serve to find e.
+With m = m_0 + Σ d_j M_j and k = k_0 + Σ e_j K_j these relations are linear in d, e and a_r². Each a_r² is in one mass
+relation only, that with s = r, which defines it; the relations r ≠ s determine d up to a common factor. So the mass
+must be known at a point, and is held there exactly. All stiffness relations then determine e.
 
-The relations of the stiffness rest on integration by parts: no force or moment may do work at an end.
+The stiffness relations follow by integration by parts: no force or moment may do work at an end.
 
-Second derivatives of noisy shapes are poor, and modes of a structure with masses or springs that the relations lack
-are at odds with one another. Both show where one mode is left out at a time: how far the distributions move is their
-standard error (the jackknife, Efron & Stein, Ann. Statist. 9, 1981).
+The jackknife gives the standard errors (Efron & Stein, Ann. Statist. 9, 1981): from the scatter of the distributions
+with one mode left out at a time. It shows both the noise in second derivatives of shapes and modes that are
+inconsistent, as those of a structure with masses or springs that the relations do not contain.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,19 +33,19 @@ from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.threads import one_blas_thread
 
 KNOWN_TOLERANCE = 1e-8
-# Mean standard error over mean value of what is taken for known, and what orthogonal modes may share (Ewins, Modal
-# Testing).
-KNOWN = 0.1
-PRINTED = 11  # places along a structure that its distributions are printed at
+# Largest mean standard error over mean value of a reliable distribution, and largest orthogonality error of modes
+# (Ewins, Modal Testing)
+RELIABLE = 0.1
+PRINTED = 11  # number of places at which distributions are printed
 
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Known functions of x whose sum, with coefficients to be found, is a distribution.
+    """Functions of x whose linear combination is a distribution.
 
     Attributes:
         functions: x (n_points,) -> (n_points, n_terms).
-        n_terms: how many.
+        n_terms: number of functions.
         breaks: places where they are not smooth, m.
     """
 
@@ -60,8 +60,7 @@ class Basis:
 
     @classmethod
     def legendre(cls, n_terms: int, *, length: float) -> "Basis":
-        """Legendre polynomials of 2x / length - 1: the same sums as 1, x, x², ..., kept apart by round-off at any
-        number of terms."""
+        """Legendre polynomials of 2x / length - 1: the span of 1, x, x², ..., well conditioned for any n_terms."""
         return cls(lambda x: legvander(2.0 * np.asarray(x, float) / length - 1.0, n_terms)[:, :n_terms], n_terms)
 
     @classmethod
@@ -86,8 +85,8 @@ class Distribution:
         coefficients: (n_terms,) d_j or e_j.
         basis: the functions they multiply.
         prior: m_0 or k_0.
-        misfit: root mean square of the relations left over, relative to the terms in them; 0 for a perfect fit.
-        left_out: (n_modes, n_terms) coefficients that are found without each mode; None where too few modes are left.
+        misfit: rms residual of the relations, relative to the terms in them; 0 for a perfect fit.
+        left_out: (n_modes, n_terms) coefficients estimated without each mode; None where too few modes remain.
     """
 
     coefficients: np.ndarray
@@ -97,7 +96,7 @@ class Distribution:
     left_out: np.ndarray | None = None
 
     def std(self, x: np.ndarray) -> np.ndarray:
-        """Standard error at each x (n_points,); not known, nan, without a mode more than the terms need."""
+        """Jackknife standard error at each x (n_points,); nan where no mode can be left out."""
         x = np.atleast_1d(np.asarray(x, float))
         if self.left_out is None:
             return np.full(x.size, np.nan)
@@ -118,7 +117,7 @@ class Distribution:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Distributions(Printed):
-    """The mass and stiffness of one structure, and the scale of its modes found with them.
+    """The mass and stiffness of one structure, and the scale of its modes.
 
     Attributes:
         mass: kg/m.
@@ -136,8 +135,8 @@ class Distributions(Printed):
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         terms = (
-            f"{what} in {counted(one.basis.n_terms, 'term')}"
-            for what, one in (("mass", self.mass), ("stiffness", self.stiffness))
+            f"{what} in {counted(distribution.basis.n_terms, 'term')}"
+            for what, distribution in (("mass", self.mass), ("stiffness", self.stiffness))
         )
         rows = zip(*columns(self.mass, self.length), *columns(self.stiffness, self.length)[1:])
         line = f"{', '.join(terms)} from {counted(self.scales.size, 'mode')},"
@@ -146,31 +145,31 @@ class Distributions(Printed):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Which distribution is not to be trusted, and what else to try."""
+        """Which distribution is unreliable, and the remedies."""
         x, remarks = np.linspace(0.0, self.length, 101), []
-        for what, one in (("mass", self.mass), ("stiffness", self.stiffness)):
-            error = one.std(x).mean() / np.abs(one(x)).mean()
+        for what, distribution in (("mass", self.mass), ("stiffness", self.stiffness)):
+            error = distribution.std(x).mean() / np.abs(distribution(x)).mean()
             if np.isnan(error):
-                told = "has no standard error, as no mode can be spared: use more modes"
-            elif error > KNOWN:
-                told = (
-                    f"is uncertain by {100 * error:.2g} %, as single modes left out show; up to {100 * KNOWN:g} % it is"
-                    " taken for known. Derivatives of noisy shapes are poor: use more sensors"
+                text = "has no standard error, as no mode can be left out: use more modes"
+            elif error > RELIABLE:
+                text = (
+                    f"is uncertain by {100 * error:.2g} %, as single modes left out show; up to {100 * RELIABLE:g} %"
+                    " it is reliable. Derivatives of noisy shapes are poor: use more sensors"
                 )
             else:
                 continue
-            remarks.append(f"the {what} {told}, fewer terms, or choose_structure")
-        if self.orthogonality > KNOWN:
+            remarks.append(f"the {what} {text}, fewer terms, or choose_structure")
+        if self.orthogonality > RELIABLE:
             remarks.append(
-                f"two modes are orthogonal only to {self.orthogonality:.2g}, at most {KNOWN:g} where mass and shapes"
-                " agree: something that the relations do not have is attached, as a mass at a point, or the mass wants"
-                " other terms; use choose_structure with what is attached in the nominal structure"
+                f"two modes are orthogonal only to {self.orthogonality:.2g}, at most {RELIABLE:g} where mass and"
+                " shapes agree: the mass needs other terms, or something is attached that the relations do not contain,"
+                " as a point mass; use choose_structure with what is attached in the nominal structure"
             )
         return tuple(remarks)
 
 
 def columns(of: Any, length: float) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
-    """What is printed of a distribution with a `std`: places, values there, and their standard errors."""
+    """Columns of a printed distribution with a `std`: places, values and their standard errors."""
     x = np.linspace(0.0, length, PRINTED)
     values, errors = zip(*(rounded(value, error) for value, error in zip(of(x), of.std(x), strict=True)))
     return [f"{at:.4g}" for at in x], values, errors
@@ -195,12 +194,11 @@ def mass_and_stiffness(
         kind: "bar" or "beam".
         mass_basis, stiffness_basis: functions of the series.
         known_mass: ((x, kg/m), ...), at least one place; held exactly.
-        prior_mass, prior_stiffness: first estimates, kg/m and N (N m²); the series then corrects them.
+        prior_mass, prior_stiffness: first estimates, kg/m and N (N m²), which the series corrects.
 
     Raises:
         ValueError: no known mass, more terms than relations, known values that the series cannot take.
-        UserWarning: the mass or the stiffness is uncertain by more than a tenth or by what cannot be told; modes that
-            are not orthogonal.
+        UserWarning: mass or stiffness of a standard error above a tenth or unknown; modes that are not orthogonal.
     """
     return distributions_of(modes, kind, (mass_basis, stiffness_basis), known_mass, (prior_mass, prior_stiffness))
 
@@ -212,22 +210,22 @@ def distributions_of(
     known: Sequence[tuple[float, float]],
     priors: tuple[ProfileLike, ProfileLike],
 ) -> Distributions:
-    """`mass_and_stiffness` without its warnings; bases and priors of mass and stiffness."""
+    """`mass_and_stiffness` without its warnings; `bases` and `priors` are of mass and of stiffness."""
     if kind not in ("bar", "beam"):
         raise ValueError(f"mass and stiffness are those of a bar or a beam; got {kind!r}")
     unit, scale = _unit_mean_square(modes)
-    found = partial(
-        _found,
+    identified = partial(
+        _identified,
         order=1 if kind == "bar" else 2,
         bases=bases,
         known=known,
         priors=(as_profile(priors[0]), as_profile(priors[1])),
     )
-    mass, stiffness, gram = found(unit)
+    mass, stiffness, gram = identified(unit)
     scales = np.sqrt(np.diag(gram))
     orthogonality = float(np.abs(gram / np.outer(scales, scales) - np.eye(scales.size)).max())
     try:
-        others = [found(unit.select([s for s in range(modes.n_modes) if s != r])) for r in range(modes.n_modes)]
+        others = [identified(unit.select([s for s in range(modes.n_modes) if s != r])) for r in range(modes.n_modes)]
         mass = replace(mass, left_out=frozen(np.array([other[0].coefficients for other in others])))
         stiffness = replace(stiffness, left_out=frozen(np.array([other[1].coefficients for other in others])))
     except ValueError:
@@ -235,7 +233,7 @@ def distributions_of(
     return Distributions(mass, stiffness, frozen(scales / scale), modes.length, orthogonality)
 
 
-def _found(
+def _identified(
     unit: Modes,
     *,
     order: int,
@@ -243,7 +241,7 @@ def _found(
     known: Sequence[tuple[float, float]],
     priors: tuple[Profile, Profile],
 ) -> tuple[Distribution, Distribution, np.ndarray]:
-    """Mass, stiffness, and ∫ m φ_r φ_s dx (n_modes, n_modes) of modes of mean square 1."""
+    """Mass, stiffness, and ∫ m φ_r φ_s dx (n_modes, n_modes), of modes of mean square 1."""
     mass = _mass(unit, bases[0], priors[0], known)
     shapes, weights, x = _sampled(unit, 0, mass.profile.breaks)
     gram = (shapes.T * (weights * mass(x))) @ shapes
@@ -285,13 +283,13 @@ def mass_series(
     """Coefficients (n_terms,) of the mass from the relations r ≠ s of (4.6), and their misfit.
 
     Args:
-        shapes: (n_points, n_modes) at points of integration, of one size.
-        weights: (n_points,) of these.
-        functions, prior: (n_points, n_terms) and (n_points,) there.
-        rows, known: (n_known, n_terms) functions where the mass is known, and what it is beyond the prior.
+        shapes: (n_points, n_modes) at integration points, of equal scale.
+        weights: (n_points,) of integration.
+        functions, prior: (n_points, n_terms) and (n_points,) at these points.
+        rows, known: (n_known, n_terms) functions where the mass is known, and its value less the prior.
     """
-    if functions.shape[1] > (most := shapes.shape[1] * (shapes.shape[1] - 1) // 2 + known.size):
-        raise ValueError(_too_many(functions.shape[1], "mass", most, shapes.shape[1]))
+    if functions.shape[1] > (n_relations := shapes.shape[1] * (shapes.shape[1] - 1) // 2 + known.size):
+        raise ValueError(_too_many(functions.shape[1], "mass", n_relations, shapes.shape[1]))
     r, s = np.triu_indices(shapes.shape[1], 1)
     products = weights[:, None] * shapes[:, r] * shapes[:, s]
     u, u0 = products.T @ functions, products.T @ prior  # U_rsj of (4.8), U_rs0 of (4.23)
@@ -310,8 +308,8 @@ def stiffness_series(
     """Coefficients (n_terms,) of the stiffness from all relations of (4.6), and their misfit.
 
     Args:
-        strains: (factor, (n_points, n_modes)): the density of the strain energy of unit stiffness is the sum of factor
-            times squares.
+        strains: (factor, (n_points, n_modes)): the strain energy density at unit stiffness is the sum of factor times
+            square.
         weights, functions, prior: as `mass_series` takes them.
         a_squared, omega: (n_modes,) scales and frequencies.
     """
@@ -321,11 +319,11 @@ def stiffness_series(
     products = sum((weights * factor)[:, None] * strain[:, r] * strain[:, s] for factor, strain in strains)
     v, v0 = np.asarray(products).T @ functions, np.asarray(products).T @ prior
     targets = np.where(r == s, a_squared[r] * omega[r] ** 2, 0.0)
-    # A relation between high modes is larger by ω_r ω_s, and so is its error; divided by it they weigh alike.
+    # A relation and its error grow with ω_r ω_s; divided by it, all have equal weight.
     weight = 1.0 / np.maximum(omega[r] * omega[s], 1e-12 * omega.max() ** 2)
     coefficients = np.linalg.lstsq(weight[:, None] * v, weight * (targets - v0), rcond=None)[0]
-    left = weight * (v @ coefficients + v0 - targets)
-    return coefficients, _misfit(left, weight[:, None] * v, coefficients, weight * v0)
+    residual = weight * (v @ coefficients + v0 - targets)
+    return coefficients, _misfit(residual, weight[:, None] * v, coefficients, weight * v0)
 
 
 def _too_many(n_terms: int, what: str, most: int, n_modes: int) -> str:
@@ -336,14 +334,14 @@ def _too_many(n_terms: int, what: str, most: int, n_modes: int) -> str:
 
 
 def _unit_mean_square(modes: Modes) -> tuple[Modes, np.ndarray]:
-    """The same modes with shapes of mean square 1, so that all relations weigh alike, and the factors applied."""
+    """The modes with shapes of mean square 1, so that all relations have equal weight, and the factors applied."""
     x = (np.arange(2000) + 0.5) / 2000 * modes.length
     scale = 1.0 / np.sqrt((modes.phi(x) ** 2).mean(axis=0))
     return replace(modes, shapes=lambda x, derivative: modes.shapes(x, derivative) * scale), scale
 
 
 def _sampled(modes: Modes, derivative: int, breaks: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shapes (n_points, n_modes), weights and places of a Gauss rule that no break interrupts."""
+    """Shapes (n_points, n_modes), weights and places of a Gauss rule split at the breaks."""
     n_pieces = 16 * (1 + modes.n_modes // 4)
     nodes = np.unique(np.r_[np.linspace(0.0, modes.length, n_pieces + 1), [b for b in breaks if 0 < b < modes.length]])
     x, weights = gauss_between(nodes, 12)
@@ -351,33 +349,33 @@ def _sampled(modes: Modes, derivative: int, breaks: Sequence[float]) -> tuple[np
 
 
 def held_exactly(rows: np.ndarray, values: np.ndarray, what: str, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients c with rows @ c = values, and the directions (n_terms, n_free) that keep it.
+    """A particular solution c of rows @ c = values, and the null space of rows (n_terms, n_free).
 
     Args:
-        what: the values are, in words.
-        size: of them, that their errors are judged by.
+        what: description of the values.
+        size: scale of the values, for the tolerance.
 
     Raises:
         ValueError: values that no coefficients give.
     """
     particular = np.linalg.lstsq(rows, values, rcond=None)[0]
-    left = np.abs(rows @ particular - values).max()
-    if left > KNOWN_TOLERANCE * size:
+    error = np.abs(rows @ particular - values).max()
+    if error > KNOWN_TOLERANCE * size:
         raise ValueError(
-            f"the series with {rows.shape[1]} terms cannot take the {rows.shape[0]} known {what} (off by {left:.3g});"
+            f"the series with {rows.shape[1]} terms cannot take the {rows.shape[0]} known {what} (off by {error:.3g});"
             " use more terms or fewer known places"
         )
     return particular, null_space(rows)
 
 
 def _constrained(matrix: np.ndarray, target: np.ndarray, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Least squares of matrix @ c = target with rows @ c = values held exactly."""
+    """Least squares solution of matrix @ c = target subject to rows @ c = values."""
     particular, free = held_exactly(rows, values, "masses", max(np.abs(values).max(), 1e-300))
     if free.shape[1] == 0:
         return np.asarray(particular)
     return np.asarray(particular + free @ np.linalg.lstsq(matrix @ free, target - matrix @ particular, rcond=None)[0])
 
 
-def _misfit(left: np.ndarray, matrix: np.ndarray, coefficients: np.ndarray, offset: np.ndarray) -> float:
-    terms = np.sqrt(np.mean((np.abs(matrix) @ np.abs(coefficients) + np.abs(offset)) ** 2)) if left.size else 0.0
-    return float(np.sqrt(np.mean(left**2)) / terms) if terms else 0.0
+def _misfit(residual: np.ndarray, matrix: np.ndarray, coefficients: np.ndarray, offset: np.ndarray) -> float:
+    terms = np.sqrt(np.mean((np.abs(matrix) @ np.abs(coefficients) + np.abs(offset)) ** 2)) if residual.size else 0.0
+    return float(np.sqrt(np.mean(residual**2)) / terms) if terms else 0.0

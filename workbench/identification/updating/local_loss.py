@@ -1,12 +1,12 @@
-"""Is stiffness lost over a part of the structure, and where?
+"""Damage detection and localisation: whether stiffness is lost over a part of the structure, and where.
 
-Two explanations of the same modes compete: mass and stiffness that vary smoothly, in as many terms as it takes, and
-the same with a share δ of the stiffness lost between two places. Each is fitted to the measured frequencies and shapes
-in units of their standard errors. A loss is reported where it lowers
+Two models of the same modes are compared: mass and stiffness that vary smoothly, in as many terms as needed, and the
+same with a share δ of the stiffness lost between two places. Each is fitted to the measured frequencies and shapes in
+units of their standard errors. A loss is detected where it lowers
 
     χ² + n_terms ln n_data
 
-below that of the undamaged explanation by more than noise would lower χ² anywhere along the structure, but for the
+below that of the undamaged model by more than noise would lower χ² anywhere along the structure, at the given
 probability of a false alarm. No measurement of the undamaged structure is needed.
 """
 
@@ -37,20 +37,20 @@ from workbench.threads import one_blas_thread
 class LossSettings:
     """Constants of the search for a local loss."""
 
-    places: int = 60  # along the structure, where one is looked for
-    typical_width: float = 0.1  # of the length: so many independent places noise has to imitate a loss at
-    # of the length: a search finds a loss from half and from twice its width, not from any
+    places: int = 60  # along the structure, at which losses are tried
+    typical_width: float = 0.1  # of the length: its inverse is the number of independent places that are tested
+    # of the length: a search converges to a loss from half to twice its width
     widths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
     most_starts: int = 2  # of each width
-    most_looks: int = 4  # after the first
-    first_terms: int = 3  # of mass and stiffness, that the first look is taken with
-    fewer_terms: int = 2  # by which terms are fewer in the next look: many imitate a loss so well
-    draws: int = 20_000  # of a loss as likely as the one found, for intervals
-    # χ² / degrees of freedom up to which standard errors may be too small, here twofold, and a loss is told; true
+    most_looks: int = 4  # searches along the structure after the first, at most
+    first_terms: int = 3  # of mass and stiffness in the first search, at most
+    fewer_terms: int = 2  # by which terms are reduced in the next search: many terms imitate a loss well
+    draws: int = 20_000  # Monte Carlo samples of a loss, for intervals
+    # χ² / degrees of freedom up to which standard errors may be too small, here twofold, and a loss is detected; true
     # losses of the study leave 1.8 at most, a mass of 1 % of the whole that the nominal structure lacks 40
     errors_wrong: float = 4.0
-    mass_places: int = 40  # along the structure, where a point mass is looked for
-    first_mass: float = 1e-3  # of the whole, that its effect is found by
+    mass_places: int = 40  # along the structure, at which point masses are tried
+    first_mass: float = 1e-3  # of the whole mass: step by which the effect of a point mass is computed
 
 
 LOSS = LossSettings()
@@ -59,17 +59,17 @@ FALSE_ALARM = 0.01
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LocatedDamage(Printed):
-    """What the modes say of a local loss of stiffness.
+    """The result of damage detection from modes.
 
     Attributes:
-        undamaged: the best explanation without one, or, where no number of terms comes near, that of most terms.
-        damaged: the best with one, whether or not it is significant.
-        statistic: of the test: what the loss lowers χ² + n_terms ln n_data by; in units of χ² / degrees of freedom
-            where `damaged` does not explain the modes either.
-        threshold: what noise lowers it by with the probability of a false alarm.
-        with_mass: the best without a loss, but with a point mass that the nominal structure lacks, the last of its
-            attachments; its bands take that mass for known. None where it was not looked for: where smooth
-            distributions explain the modes.
+        undamaged: the best fit without a loss, or, where no number of terms comes near, that of the most terms.
+        damaged: the best fit with a loss, whether or not it is significant.
+        statistic: of the test: decrease of χ² + n_terms ln n_data by the loss, over χ² / degrees of freedom where
+            `damaged` does not explain the modes either.
+        threshold: of the statistic, exceeded by noise with the probability of a false alarm.
+        with_mass: the best fit without a loss but with a point mass that the nominal structure lacks, the last of its
+            attachments; its bands take that mass as known. None where it was not searched, as smooth distributions
+            explain the modes.
     """
 
     undamaged: FittedStructure
@@ -83,63 +83,63 @@ class LocatedDamage(Printed):
 
     @property
     def detected(self) -> bool:
-        """Whether there is a loss: one that stands out of the noise, accounts for what the modes differ by, and does so
-        better than a point mass."""
-        return self.statistic > self.threshold and self._accounts(self.damaged) and not self._is_mass
+        """Whether a loss is detected: it is significant, explains the modes, and does so better than a point mass."""
+        return self.statistic > self.threshold and self._explains_roughly(self.damaged) and not self._is_mass
 
     @property
     def _is_mass(self) -> bool:
-        """Whether a point mass accounts for the modes, and better than a loss."""
+        """Whether a point mass explains the modes, and better than a loss."""
         mass = self.with_mass
-        return mass is not None and mass.criterion < self.damaged.criterion and self._accounts(mass)
+        return mass is not None and mass.criterion < self.damaged.criterion and self._explains_roughly(mass)
 
     @staticmethod
-    def _accounts(fit: FittedStructure) -> bool:
-        """Whether a structure explains the modes, or would if their standard errors were somewhat larger."""
+    def _explains_roughly(fit: FittedStructure) -> bool:
+        """Whether a structure explains the modes, or would with standard errors up to twice as large."""
         return fit.explains or fit.chi2 <= LOSS.errors_wrong * fit.degrees_of_freedom
 
     @property
     def loss(self) -> LocalLoss | None:
-        """Share, centre and width; None where there is none."""
+        """The detected loss: share, centre and width; None where none is detected."""
         return self.damaged.loss if self.detected else None
 
     @property
     def best(self) -> FittedStructure:
-        """The explanation to take."""
-        sound = self.with_mass if self.with_mass is not None and self._is_mass else self.undamaged
-        return self.damaged if self.detected else sound
+        """The fit to use."""
+        without_loss = self.with_mass if self.with_mass is not None and self._is_mass else self.undamaged
+        return self.damaged if self.detected else without_loss
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         test = f"statistic {self.statistic:.3g}, threshold {self.threshold:.3g}"
         if not self.detected:
-            known = "no loss of stiffness is detected" if self.best.explains else "whether stiffness is lost is unknown"
-            return f"{known} ({test})", (), (), self.remarks
-        found = zip(("share", "centre [m]", "width [m]"), self.damaged.parameters[-3:], self.interval(), strict=True)
-        rows = [(name, f"{value:.4g}", f"{low:.4g} to {high:.4g}") for name, value, (low, high) in found]
+            text = "no loss of stiffness is detected" if self.best.explains else "whether stiffness is lost is unknown"
+            return f"{text} ({test})", (), (), self.remarks
+        loss = zip(("share", "centre [m]", "width [m]"), self.damaged.parameters[-3:], self.interval(), strict=True)
+        rows = [(name, f"{value:.4g}", f"{low:.4g} to {high:.4g}") for name, value, (low, high) in loss]
         return f"a loss of stiffness is detected ({test})", ("loss", "value", "95 % interval"), rows, self.remarks
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What else explains the modes, and whether anything does."""
-        remarks, loss, lossy = [], self.damaged.loss, self.damaged.chi2
+        """Other explanations of the modes, and whether the modes are explained at all."""
+        remarks, loss, chi2_with_loss = [], self.damaged.loss, self.damaged.chi2
         assert loss is not None, "damaged is an explanation with a loss"
         if self.with_mass is not None and self._is_mass:
             part = self.with_mass.structure.attachments[-1]
             remarks.append(
                 f"a point mass of {part.pair[0]:.3g} kg at {part.at:.4g} m, which the nominal structure lacks,"
-                f" accounts for the modes better than a loss: χ² {self.with_mass.chi2:.4g}, {lossy:.4g} with the loss"
+                f" explains the modes better than a loss: χ² {self.with_mass.chi2:.4g}, {chi2_with_loss:.4g} with the"
+                " loss"
             )
         if not self.best.explains:
             place = f"{100 * loss.share:.2g} % at {loss.centre:.4g} m"
-            told = f"; with a loss of {place} it is {lossy:.4g}: no proof of damage"
-            remarks.append(f"{unexplained(self.best)}{'' if self.detected else told}. {LACKING}")
+            text = f"; with a loss of {place} it is {chi2_with_loss:.4g}: no proof of damage"
+            remarks.append(f"{unexplained(self.best)}{'' if self.detected else text}. {LACKING}")
         return tuple(remarks)
 
     def interval(self, level: float = 0.95) -> np.ndarray:
-        """Confidence intervals of share, centre and width, (3, 2); what of a loss passes an end does not count."""
-        likely, length = self.damaged.parameters[-3:], self.damaged.structure.length
+        """Confidence intervals of share, centre and width of the loss within the structure, (3, 2)."""
+        estimate, length = self.damaged.parameters[-3:], self.damaged.structure.length
         rng, covariance = np.random.default_rng(0), self.damaged.covariance[-3:, -3:]
-        share, centre, width = rng.multivariate_normal(likely, covariance, LOSS.draws, method="eigh").T
+        share, centre, width = rng.multivariate_normal(estimate, covariance, LOSS.draws, method="eigh").T
         begin, end = np.clip([centre - 0.5 * width, centre + 0.5 * width], 0.0, length)
         tail = 0.5 * (1.0 - level)
         return np.asarray(np.quantile([share, 0.5 * (begin + end), end - begin], [tail, 1.0 - tail], axis=1).T)
@@ -157,7 +157,7 @@ def locate_damage(
     false_alarm: float = FALSE_ALARM,
     **known: Any,
 ) -> LocatedDamage:
-    """Whether and where stiffness is lost over a part of the structure, from its modes alone.
+    """Whether stiffness is lost over a part of the structure, and where, from its modes alone.
 
     Args:
         measured, nominal, basis, mass_terms, stiffness_terms: as `choose_structure`.
@@ -166,53 +166,53 @@ def locate_damage(
 
     Raises:
         ValueError: as `fit_structure`.
-        UserWarning: nothing explains the modes, or a point mass does better than a loss.
+        UserWarning: nothing explains the modes, or a point mass explains them better than a loss.
     """
     task = Task.of(measured, nominal, **known)
     basis = basis or partial(Basis.legendre, length=nominal.length)
     terms = sorted(mass_terms), sorted(stiffness_terms)
     if not (terms[0] and terms[1]):
         raise ValueError("no number of terms was given for mass or stiffness; give at least one, 0 to keep the nominal")
-    first = _from_anywhere(Problem.of(task, *(basis(few[: LOSS.first_terms][-1]) for few in terms)), None)
-    damaged = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
-    fewer = 0
+    first = _fit_from_scan(Problem.of(task, *(basis(numbers[: LOSS.first_terms][-1]) for numbers in terms)), None)
+    damaged = choose(task, basis, *terms, _fit_near_last, near=first, exhaust=False)
+    n_fewer = 0
     for _ in range(LOSS.most_looks):
-        if damaged.explains or fewer >= max(damaged.n_terms):
+        if damaged.explains or n_fewer >= max(damaged.n_terms):
             break
-        at_least = (max(n - fewer, few[0]) for n, few in zip(damaged.n_terms, terms, strict=True))
-        again = _from_anywhere(Problem.of(task, *(basis(n) for n in at_least)), damaged)
-        if again.criterion < damaged.criterion - 1.0:
-            damaged, fewer = choose(task, basis, *terms, partial(_near_either, again), near=again), 0
+        fewer_terms = (max(n - n_fewer, numbers[0]) for n, numbers in zip(damaged.n_terms, terms, strict=True))
+        other = _fit_from_scan(Problem.of(task, *(basis(n) for n in fewer_terms)), damaged)
+        if other.criterion < damaged.criterion - 1.0:
+            damaged, n_fewer = choose(task, basis, *terms, partial(_fit_near_either, other), near=other), 0
         else:
-            fewer += LOSS.fewer_terms  # many terms imitate a loss so well that few starts lead to it
-    # three parameters, sought over as many places as stand apart
+            n_fewer += LOSS.fewer_terms  # many terms imitate a loss so well that few starts converge to it
+    # three parameters of a loss, tested at 1 / typical_width independent places
     limit = float(chi2_distribution.isf(false_alarm * LOSS.typical_width, 3))
     undamaged = _undamaged(task, basis, terms, damaged, limit)
     statistic = _statistic(task, undamaged, damaged)
     if statistic <= limit:
-        # few terms may have led to a false place: look once more, beside what explains the modes without a loss
-        again = _from_anywhere(Problem.of(task, *(basis(n) for n in undamaged.n_terms)), damaged)
-        if again.criterion < damaged.criterion - 1.0:
-            damaged = choose(task, basis, *terms, partial(_near_either, again), near=again)
+        # too few terms may have led to a false place: search again with the terms of the undamaged fit
+        other = _fit_from_scan(Problem.of(task, *(basis(n) for n in undamaged.n_terms)), damaged)
+        if other.criterion < damaged.criterion - 1.0:
+            damaged = choose(task, basis, *terms, partial(_fit_near_either, other), near=other)
             undamaged = _undamaged(task, basis, terms, damaged, limit)
             statistic = _statistic(task, undamaged, damaged)
-    # modes that not even a loss explains err by more than their standard errors, and count for less
+    # if not even a loss explains the modes, their standard errors are too small: the statistic is reduced
     return LocatedDamage(
         undamaged,
         damaged,
         statistic if damaged.explains else statistic * damaged.degrees_of_freedom / damaged.chi2,
         limit,
-        None if undamaged.explains else _with_a_mass(task, basis, terms, damaged),
+        None if undamaged.explains else _fit_with_mass(task, basis, terms, damaged),
     )
 
 
 def _statistic(task: Task, undamaged: FittedStructure, damaged: FittedStructure) -> float:
-    """What a loss lowers the criterion by, its own three parameters not counted: its limit allows for them."""
-    return undamaged.criterion - damaged.criterion + _price(task)
+    """Decrease of the criterion by a loss, without the penalty of its parameters, which the threshold accounts for."""
+    return undamaged.criterion - damaged.criterion + _penalty(task)
 
 
-def _price(task: Task) -> float:
-    """What the three parameters of a loss add to the criterion."""
+def _penalty(task: Task) -> float:
+    """Penalty of the three parameters of a loss in the criterion."""
     return 3.0 * float(np.log(task.n_data))
 
 
@@ -223,45 +223,45 @@ def _undamaged(
     damaged: FittedStructure,
     limit: float,
 ) -> FittedStructure:
-    """The best explanation without a loss; where one fit settles that it wins or cannot win, that one."""
+    """The best fit without a loss; a single fit where it suffices to decide the test."""
 
-    def alike(*n_terms: int) -> FittedStructure | None:
+    def fit_of(*n_terms: int) -> FittedStructure | None:
         try:
             return Problem.of(task, *(basis(n) for n in n_terms)).fit(damaged)
         except ValueError:
             return None
 
-    same = alike(*damaged.n_terms)
-    if same is not None and same.chi2 - damaged.chi2 <= limit:
-        return with_spare_terms(same, task, basis)
-    most = alike(terms[0][-1], terms[1][-1])
-    if most is not None and most.chi2 - damaged.criterion + _price(task) > limit:
-        return most
+    equal_terms = fit_of(*damaged.n_terms)
+    if equal_terms is not None and equal_terms.chi2 - damaged.chi2 <= limit:
+        return with_spare_terms(equal_terms, task, basis)
+    most_terms = fit_of(terms[0][-1], terms[1][-1])
+    if most_terms is not None and most_terms.chi2 - damaged.criterion + _penalty(task) > limit:
+        return most_terms
     return choose(task, basis, terms[0], terms[1], lambda problem, near: problem.fit(near))
 
 
-def _with_a_mass(
+def _fit_with_mass(
     task: Task, basis: Callable[[int], Basis], terms: tuple[list[int], list[int]], damaged: FittedStructure
 ) -> FittedStructure | None:
-    """The best explanation without a loss but with one more point mass; None where none is found."""
+    """The best fit without a loss but with one more point mass; None where no fit converges."""
     best: FittedStructure | None = None
-    for n_terms in {tuple(few[: LOSS.first_terms][-1] for few in terms): None, damaged.n_terms: None}:
+    for n_terms in {tuple(numbers[: LOSS.first_terms][-1] for numbers in terms): None, damaged.n_terms: None}:
         problem = Problem.of(task, *(basis(n) for n in n_terms))
-        starts = [(whole, part) for whole in _without_loss(problem) for part in _likely_masses(problem, whole)]
+        starts = [(fitted, part) for fitted in _without_loss(problem) for part in _likely_masses(problem, fitted)]
         if best is not None:
             starts.append((best, cast(PointMass, best.structure.attachments[-1])))
         for near, part in starts:
             try:
-                found = _near_a_mass(problem, near, part)
+                fit = _fit_near_mass(problem, near, part)
             except ValueError:
                 continue
-            if best is None or found.criterion < best.criterion:
-                best = found
+            if best is None or fit.criterion < best.criterion:
+                best = fit
     return best
 
 
-def _having(problem: Problem, at: float, mass: float) -> Problem:
-    """The same with a point mass (kg) at a place (m)."""
+def _with_point_mass(problem: Problem, at: float, mass: float) -> Problem:
+    """The problem with a further point mass (kg) at a place (m)."""
     nominal, series = problem.task.nominal, problem.series
     heavier = replace(nominal, attachments=(*nominal.attachments, PointMass(at, mass)))
     return replace(
@@ -272,50 +272,51 @@ def _having(problem: Problem, at: float, mass: float) -> Problem:
 
 
 def _whole_mass(problem: Problem) -> float:
+    """Mass of the nominal structure without attachments, kg."""
     x = np.linspace(0.0, problem.task.nominal.length, 101)
     return float(problem.task.nominal.length * problem.task.nominal.mass_per_length(x).mean())
 
 
-def _likely_masses(problem: Problem, whole: FittedStructure) -> list[PointMass]:
-    """Those at the peaks of what a small one would lower χ² by, to first order."""
-    z, little = problem.free_near(whole), LOSS.first_mass * _whole_mass(problem)
-    missed, slopes = problem.misses(z)
-    own = np.linalg.qr(slopes)[0]
+def _likely_masses(problem: Problem, intact: FittedStructure) -> list[PointMass]:
+    """Point masses at the peaks of the first-order decrease of χ² along the structure."""
+    z, step = problem.free_near(intact), LOSS.first_mass * _whole_mass(problem)
+    residuals, slopes = problem.residuals(z)
+    basis = np.linalg.qr(slopes)[0]
     places = np.linspace(0.0, problem.task.nominal.length, LOSS.mass_places)
-    effects = np.stack([(_having(problem, at, little).misses(z)[0] - missed) / little for at in places])
-    effects -= (effects @ own) @ own.T
-    size = np.maximum((effects**2).sum(axis=1), 1e-300)
-    masses = -(effects @ missed) / size
-    gain = np.where(masses > 0.0, masses**2 * size, 0.0)
+    effects = np.stack([(_with_point_mass(problem, at, step).residuals(z)[0] - residuals) / step for at in places])
+    effects -= (effects @ basis) @ basis.T
+    squares = np.maximum((effects**2).sum(axis=1), 1e-300)
+    masses = -(effects @ residuals) / squares
+    gain = np.where(masses > 0.0, masses**2 * squares, 0.0)
     peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))
     best = sorted(peaks, key=lambda i: -gain[i])[: LOSS.most_starts]
     return [PointMass(float(places[i]), float(min(masses[i], _whole_mass(problem)))) for i in best]
 
 
-def _near_a_mass(problem: Problem, near: FittedStructure, part: PointMass) -> FittedStructure:
-    """The most likely structure with a point mass, searched from one near this."""
+def _fit_near_mass(problem: Problem, near: FittedStructure, part: PointMass) -> FittedStructure:
+    """The maximum likelihood structure with a point mass, searched from `near` and `part`."""
     scale = np.array([problem.task.nominal.length, _whole_mass(problem)])
     steps = 1e-5 * np.eye(2)
 
-    def misses(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _having(problem, *(z[-2:] * scale)).misses(z[:-2])
+    def residuals(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _with_point_mass(problem, *(z[-2:] * scale)).residuals(z[:-2])
 
     def slopes(z: np.ndarray) -> np.ndarray:
         own = z[-2:]
-        moved = [(np.clip(own - step, 0.0, [1.0, np.inf]), np.clip(own + step, 0.0, [1.0, np.inf])) for step in steps]
+        shifts = [(np.clip(own - step, 0.0, [1.0, np.inf]), np.clip(own + step, 0.0, [1.0, np.inf])) for step in steps]
         columns = [
-            (misses(np.r_[z[:-2], after])[0] - misses(np.r_[z[:-2], before])[0]) / (after - before).sum()
-            for before, after in moved
+            (residuals(np.r_[z[:-2], after])[0] - residuals(np.r_[z[:-2], before])[0]) / (after - before).sum()
+            for before, after in shifts
         ]
-        return np.column_stack([misses(z)[1], *columns])
+        return np.column_stack([residuals(z)[1], *columns])
 
     n_free = problem.n_free
     start = np.r_[problem.free_near(near), np.clip([part.at, part.pair[0]] / scale, 1e-4, [1.0 - 1e-4, np.inf])]
     bounds = np.r_[np.full(n_free, -np.inf), 0.0, 0.0], np.r_[np.full(n_free, np.inf), 1.0, np.inf]
-    found = least_squares(
-        lambda z: misses(z)[0], start, slopes, bounds=bounds, x_scale="jac", ftol=1e-5, max_nfev=PROBLEM.most_steps
+    solution = least_squares(
+        lambda z: residuals(z)[0], start, slopes, bounds=bounds, x_scale="jac", ftol=1e-5, max_nfev=PROBLEM.most_steps
     )
-    fit = _having(problem, *(found.x[-2:] * scale)).report(found.x[:-2])
+    fit = _with_point_mass(problem, *(solution.x[-2:] * scale)).report(solution.x[:-2])
     return replace(
         fit,
         degrees_of_freedom=fit.degrees_of_freedom - 2,
@@ -323,86 +324,94 @@ def _near_a_mass(problem: Problem, near: FittedStructure, part: PointMass) -> Fi
     )
 
 
-def _near_the_last(problem: Problem, near: FittedStructure | None) -> FittedStructure:
-    """The most likely structure with a loss near the one found before."""
+def _fit_near_last(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The maximum likelihood structure with a loss, searched from an earlier one."""
     assert near is not None, "a search along the structure comes first"
     return problem.fit(near, near.loss)
 
 
-def _near_either(other: FittedStructure, problem: Problem, near: FittedStructure | None) -> FittedStructure:
-    """The likelier of two searches, for a loss of few terms may end beside that of many."""
+def _fit_near_either(other: FittedStructure, problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The likelier of two searches, from `near` and from `other`.
+
+    A loss fitted with few terms may lie beside that fitted with many.
+    """
     return _likeliest(problem, [(start, start.loss) for start in (near, other) if start is not None])
 
 
-def _from_anywhere(problem: Problem, near: FittedStructure | None) -> FittedStructure:
-    """The most likely structure with a loss, from the likeliest places and from what was found before."""
-    starts = [(whole, loss) for whole in _without_loss(problem) for loss in _likely_losses(problem, whole)]
+def _fit_from_scan(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The maximum likelihood structure with a loss, searched from the likeliest places and from an earlier fit."""
+    starts = [(fit, loss) for fit in _without_loss(problem) for loss in _likely_losses(problem, fit)]
     return _likeliest(problem, starts if near is None else [*starts, (near, near.loss)])
 
 
 def _without_loss(problem: Problem) -> list[FittedStructure]:
-    """Where to look from: the nominal structure, and the most likely, which may have bent itself to imitate a loss."""
-    found = []
-    for whole in (problem.nominal, problem.fit):
+    """Structures from which losses are searched: the nominal one, and the fitted one, which may imitate a loss."""
+    structures = []
+    for fit in (problem.nominal, problem.fit):
         try:
-            found.append(whole())
+            structures.append(fit())
         except ValueError:
             continue
-    return found
+    return structures
 
 
 def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLoss | None]]) -> FittedStructure:
-    """The most likely of what searches from several starts find; one that ends at no structure is passed over."""
-    found, reason = [], "no structure of so many terms could be fitted, so no loss can be located; use fewer terms"
+    """The likeliest result of searches from several starts; those that fail are skipped."""
+    fits, reason = [], "no structure of so many terms could be fitted, so no loss can be located; use fewer terms"
     for near, loss in starts:
         try:
-            found.append(problem.fit(near, loss))
+            fits.append(problem.fit(near, loss))
         except ValueError as error:
             reason = str(error)
-    if not found:
+    if not fits:
         raise ValueError(reason)
-    return min(found, key=lambda fit: fit.chi2)
+    return min(fits, key=lambda fit: fit.chi2)
 
 
-def _likely_losses(problem: Problem, whole: FittedStructure) -> list[LocalLoss]:
-    """Those that would lower χ² most, of each width the local peaks of `scan`; none where none would."""
+def _likely_losses(problem: Problem, intact: FittedStructure) -> list[LocalLoss]:
+    """Losses at the peaks of `scan`, for each width; none where no loss lowers χ²."""
     length = problem.task.nominal.length
-    places, all_gains = scan(problem, whole)
-    likely = []
+    places, all_gains = scan(problem, intact)
+    losses = []
     for width, gain in zip(LOSS.widths, all_gains, strict=True):
         peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))
         best = sorted(peaks, key=lambda i: -gain[i])[: LOSS.most_starts]
-        likely += [LocalLoss(0.1, float(places[i]), width * length) for i in best]
-    return likely
+        losses += [LocalLoss(0.1, float(places[i]), width * length) for i in best]
+    return losses
 
 
 def scan(problem: Problem, undamaged: FittedStructure) -> tuple[np.ndarray, np.ndarray]:
-    """Places along the structure (n_places,) and what a small loss of each of `LOSS.widths` there would lower χ² by, to
-    first order, (n_widths, n_places)."""
+    """First-order decrease of χ² by a loss of each of `LOSS.widths` at places along the structure.
+
+    Returns:
+        places (n_places,), m; decrease (n_widths, n_places).
+    """
     task, series = problem.task, problem.series
     length = task.nominal.length
     places = (np.arange(LOSS.places) + 0.5) / LOSS.places * length
     d, e = np.split(undamaged.parameters, [undamaged.n_terms[0]])
 
     def with_losses(x: np.ndarray) -> np.ndarray:
-        own = series.stiffness.functions(x)
-        near = np.maximum(1.0 - np.abs(x[:, None] - places) * LOSS.places / length, 0.0)
-        return np.hstack([own, -(1.0 + own @ e)[:, None] * near])
+        basis = series.stiffness.functions(x)
+        hats = np.maximum(1.0 - np.abs(x[:, None] - places) * LOSS.places / length, 0.0)
+        return np.hstack([basis, -(1.0 + basis @ e)[:, None] * hats])
 
     breaks = tuple(np.linspace(0.0, length, 11))
-    wider = Basis(with_losses, e.size + LOSS.places, (*series.stiffness.breaks, *breaks))
+    with_hats = Basis(with_losses, e.size + LOSS.places, (*series.stiffness.breaks, *breaks))
     particular, free = problem.stiffness_held
-    held = np.r_[particular, np.zeros(LOSS.places)], block_diag(free, np.eye(LOSS.places))
+    stiffness_held = np.r_[particular, np.zeros(LOSS.places)], block_diag(free, np.eye(LOSS.places))
     trial = replace(
-        problem, series=SeriesStructure(task.nominal, series.mass, wider, series.positions), stiffness_held=held
+        problem,
+        series=SeriesStructure(task.nominal, series.mass, with_hats, series.positions),
+        stiffness_held=stiffness_held,
     )
-    missed, slopes = trial.misses(np.r_[problem.free_of(d, e), np.zeros(LOSS.places)])
-    # what the smooth series cannot make good
-    own = np.linalg.qr(slopes[:, : -LOSS.places])[0]
-    narrow = slopes[:, -LOSS.places :] - own @ (own.T @ slopes[:, -LOSS.places :])
-    apart = np.abs(places[:, None] - places) / length
+    residuals, slopes = trial.residuals(np.r_[problem.free_of(d, e), np.zeros(LOSS.places)])
+    # the part of each effect orthogonal to the smooth series
+    basis = np.linalg.qr(slopes[:, : -LOSS.places])[0]
+    effects = slopes[:, -LOSS.places :] - basis @ (basis.T @ slopes[:, -LOSS.places :])
+    distance = np.abs(places[:, None] - places) / length
     gains = []
     for width in LOSS.widths:
-        losses = narrow @ (apart < 0.5 * width)
-        gains.append(np.maximum(-losses.T @ missed, 0.0) ** 2 / np.maximum((losses**2).sum(axis=0), 1e-300))
+        losses = effects @ (distance < 0.5 * width)
+        gains.append(np.maximum(-losses.T @ residuals, 0.0) ** 2 / np.maximum((losses**2).sum(axis=0), 1e-300))
     return places, np.array(gains)

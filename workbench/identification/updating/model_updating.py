@@ -1,9 +1,9 @@
 """Model updating: chosen parameters of a model, with standard errors, from measured frequencies and shapes.
 
 Friswell & Mottershead, Finite Element Model Updating in Structural Dynamics (1995), chapter 8: weighted least squares
-on frequencies, modes paired by their shapes at every step. Repeated modes have no derivatives one by one: a measured
-shape is compared with the span of them, and its frequency with Rayleigh's quotient of its projection there. Modes that
-were measured as repeated stay so where the model takes them apart: their shapes say nothing of how they are turned.
+on frequencies, modes paired by their shapes at every step. Repeated modes have no individual derivatives: a measured
+shape is compared with their span, and its frequency with Rayleigh's quotient of its projection on that span. Modes
+measured as repeated stay so where the model separates them, since the directions of their shapes are arbitrary.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,18 +25,16 @@ class UpdatingSettings:
     """Constants of model updating."""
 
     least_mac: float = 0.5  # below it a measured mode is no mode of the model
-    doubtful_mac: float = 0.9  # below it the shapes are said to differ, as Ewins takes correlated modes to be above
-    unlikely: float = 0.01  # chance that frequencies are said not to be explained that are
-    at_edge: float = 0.01  # of χ²: what it would still fall by, to first order, where a search ends short of a minimum
-    # of frequency, between modes that count as repeated: small imperfections mix closer ones
-    repeated: float = 0.01
+    doubtful_mac: float = 0.9  # below it the shapes differ: correlated modes are above (Ewins)
+    unlikely: float = 0.01  # chance of a false remark that the frequencies are not explained
+    at_edge: float = 0.01  # decrease of χ² expected of a further step, above which the search is not at a minimum
+    repeated: float = 0.01  # relative difference of repeated frequencies: small imperfections mix closer modes
     step: float = 1e-4  # of the logarithm of a parameter, for central differences
-    # smallest singular value of the scaled Jacobian over the largest: parameters that do the same
-    indistinct: float = 1e-6
+    indistinct: float = 1e-6  # smallest over largest singular value of the scaled Jacobian, of equivalent parameters
 
 
 UPDATING = UpdatingSettings()
-NO_MODEL = 1e8  # residual, in standard errors, of a trial step that has no such modes: it is taken back
+NO_MODEL = 1e8  # residual, in standard errors, of a trial step without such modes, so that it is rejected
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,9 +43,9 @@ class UpdatedModel(Printed):
 
     Attributes:
         parameters: (n_parameters,) in their own units.
-        covariance: (n_parameters, n_parameters) of them.
+        covariance: (n_parameters, n_parameters) of the parameters.
         modes: of the model at these parameters.
-        paired: (n_measured,) index of the model's mode that each measured mode is.
+        paired: (n_measured,) index of the model's mode paired with each measured mode.
         mac: (n_measured,) of each pair; repeated modes as a subspace.
         residuals: (n_measured,) (model - measured) / standard error, of the frequencies.
         converged: whether the search ended at a minimum.
@@ -78,16 +76,19 @@ class UpdatedModel(Printed):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Why the parameters are not to be trusted: no minimum, frequencies or shapes that the model does not have."""
-        remarks, freedom = [], self.residuals.size - self.parameters.size
+        """Why the parameters are unreliable: no minimum, or frequencies or shapes that the model does not have."""
+        remarks, degrees_of_freedom = [], self.residuals.size - self.parameters.size
         if not self.converged:
             remarks.append(f"not converged: {self.reason}")
-        chi2, limit = float(self.residuals @ self.residuals), float(chi2_distribution.isf(UPDATING.unlikely, freedom))
-        if freedom and chi2 > limit:
+        chi2, limit = (
+            float(self.residuals @ self.residuals),
+            float(chi2_distribution.isf(UPDATING.unlikely, degrees_of_freedom)),
+        )
+        if degrees_of_freedom and chi2 > limit:
             remarks.append(
                 f"the frequencies are not explained: χ² is {chi2:.4g}, and noise alone gives at most {limit:.4g}; the"
-                " standard errors hold for a model of the right form only. Choose other or more parameters, or another"
-                " start; else the standard errors of the frequencies are too small"
+                " standard errors of the parameters assume a model of the right form. Choose other or more parameters,"
+                " or another start; else the standard errors of the frequencies are too small"
             )
         worst = int(np.argmin(self.mac))
         if self.mac[worst] < UPDATING.doubtful_mac:
@@ -116,12 +117,12 @@ def update_model(
 ) -> UpdatedModel:
     """The parameters p > 0 that minimise Σ ((ω_r(p) - ω_r) / σ_r)², and their standard errors.
 
-    The search goes downhill from where it starts; far from there it may end in another minimum, which residuals well
-    beyond one and a low MAC show. The covariance is (Jᵀ J)⁻¹ at the minimum, J = ∂(ω(p) / σ)/∂p: errors of the
-    measurement, not of the model's form.
+    The search is local: from a poor start it may end in another minimum, which residuals well beyond one and a low MAC
+    show. The covariance is (Jᵀ J)⁻¹ at the minimum, J = ∂(ω(p) / σ)/∂p: it accounts for errors of the measurement, not
+    of the model's form.
 
     Args:
-        build: modes of the model with parameters p, at least as many as were measured.
+        build: parameters p -> modes of the model, at least as many as were measured.
         start: (n_parameters,) p to start from, all positive.
         omega, omega_std: (n_measured,) measured frequencies and their standard errors, rad/s.
         shapes: (n_places, n_measured) measured shapes, of any scale, by which modes are paired.
@@ -131,7 +132,7 @@ def update_model(
         ValueError: numbers that are not positive, sizes that do not fit, more parameters than frequencies, a `build`
             that returns no modes, a measured mode that no mode of the model resembles, parameters that the measurements
             cannot distinguish.
-        UserWarning: no minimum was reached, or the model at it has not the frequencies or the shapes measured.
+        UserWarning: no minimum was reached, or the model at it does not have the measured frequencies or shapes.
     """
     first, target = np.atleast_1d(np.asarray(start, float)), np.asarray(omega, float)
     deviation, measured = np.asarray(omega_std, float), np.asarray(shapes)
@@ -149,30 +150,30 @@ def update_model(
         )
 
     def paired(modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of each measured mode: index and MAC of the model's, and the frequency that the model gives its shape."""
+        """For each measured mode: index and MAC of the model's mode, and Rayleigh's frequency of its shape."""
         if not isinstance(modes, Modes):
             raise ValueError(f"build must return modes, as model.modes(8) does; got {type(modes).__name__}")
-        own = modes.phi(places)
-        cluster = _joined(repeated_modes(modes.omega, UPDATING.repeated), own, measured, target)
-        rows, columns, agreement = assigned(measured, own, cluster)
+        model_shapes = modes.phi(places)
+        cluster = _joined(repeated_modes(modes.omega, UPDATING.repeated), model_shapes, measured, target)
+        rows, columns, agreement = assigned(measured, model_shapes, cluster)
         if rows.size < target.size or agreement[rows, columns].min() < UPDATING.least_mac:
-            lost = int(np.argmin(agreement.max(axis=1)))
+            worst = int(np.argmin(agreement.max(axis=1)))
             raise ValueError(
-                f"measured mode {lost + 1}, {target[lost] / (2 * np.pi):.4g} Hz, resembles no mode of the model: the"
-                f" best MAC is {agreement[lost].max():.2f}; start nearer, let the model give more modes, or leave this"
+                f"measured mode {worst + 1}, {target[worst] / (2 * np.pi):.4g} Hz, resembles no mode of the model: the"
+                f" best MAC is {agreement[worst].max():.2f}; start nearer, let the model give more modes, or leave this"
                 " one out"
             )
         quotients = modes.omega[columns]
         for r, s in enumerate(columns):
-            alike = cluster == cluster[s]
-            if alike.sum() > 1:
-                share = np.abs(np.linalg.lstsq(own[:, alike], measured[:, r])[0]) ** 2
-                quotients[r] = np.sqrt(share @ modes.omega[alike] ** 2 / share.sum())
+            members = cluster == cluster[s]
+            if members.sum() > 1:
+                share = np.abs(np.linalg.lstsq(model_shapes[:, members], measured[:, r])[0]) ** 2
+                quotients[r] = np.sqrt(share @ modes.omega[members] ** 2 / share.sum())
         return columns, agreement[rows, columns], quotients
 
-    refused: list[str] = []  # why trial steps of the search are no model: bad steps, not bad data
+    refused: list[str] = []  # reasons why trial steps have no such modes; these steps are rejected
 
-    def at(logarithms: np.ndarray) -> np.ndarray | None:
+    def residuals_at(logarithms: np.ndarray) -> np.ndarray | None:
         try:
             return np.asarray((paired(build(first * np.exp(logarithms)))[2] - target) / deviation)
         except ValueError as error:
@@ -180,24 +181,24 @@ def update_model(
             return None
 
     def residuals(logarithms: np.ndarray) -> np.ndarray:
-        missed = at(logarithms)
-        return np.full(target.size, NO_MODEL) if missed is None else missed
+        values = residuals_at(logarithms)
+        return np.full(target.size, NO_MODEL) if values is None else values
 
     def jacobian(logarithms: np.ndarray) -> np.ndarray:
         columns = []
         for step in UPDATING.step * np.eye(first.size):
-            both = [(side, at(logarithms + side * step)) for side in (-1.0, 1.0)]
-            there = [(side, missed) for side, missed in both if missed is not None]
-            if len(there) < 2:  # beside the edge of where the model has such modes
-                there.append((0.0, residuals(logarithms)))
-            (before, low), (after, high) = there[0], there[-1]
+            sides = [(side, residuals_at(logarithms + side * step)) for side in (-1.0, 1.0)]
+            valid = [(side, values) for side, values in sides if values is not None]
+            if len(valid) < 2:  # at the edge of the domain where the model has such modes: one-sided
+                valid.append((0.0, residuals(logarithms)))
+            (before, low), (after, high) = valid[0], valid[-1]
             columns.append((high - low) / ((after - before or 1.0) * UPDATING.step))
         return np.column_stack(columns)
 
-    paired(build(first))  # a start without such modes is the user's to change
-    found = least_squares(residuals, np.zeros(first.size), jac=jacobian, method="lm")
-    parameters = first * np.exp(found.x)
-    singular = np.linalg.svd(found.jac, compute_uv=False)
+    paired(build(first))  # a start without such modes is an error of the user
+    solution = least_squares(residuals, np.zeros(first.size), jac=jacobian, method="lm")
+    parameters = first * np.exp(solution.x)
+    singular = np.linalg.svd(solution.jac, compute_uv=False)
     if singular[-1] <= UPDATING.indistinct * singular[0]:
         raise ValueError(
             "the measured frequencies cannot distinguish the parameters: some change them alike, as stiffnesses in two"
@@ -205,26 +206,27 @@ def update_model(
         )
     modes = build(parameters)
     columns, agreement, _ = paired(modes)
-    covariance = np.linalg.inv(found.jac.T @ found.jac) * np.outer(parameters, parameters)
-    converged, reason = bool(found.success), str(found.message)
-    if refused and ((np.linalg.qr(found.jac)[0].T @ found.fun) ** 2).sum() > UPDATING.at_edge:
+    covariance = np.linalg.inv(solution.jac.T @ solution.jac) * np.outer(parameters, parameters)
+    converged, reason = bool(solution.success), str(solution.message)
+    if refused and ((np.linalg.qr(solution.jac)[0].T @ solution.fun) ** 2).sum() > UPDATING.at_edge:
         converged = False
         reason = f"beyond these parameters the model has no such modes ({refused[-1]}); choose other parameters"
-    return UpdatedModel(parameters, covariance, modes, columns, agreement, found.fun, converged, reason)
+    return UpdatedModel(parameters, covariance, modes, columns, agreement, solution.fun, converged, reason)
 
 
-def _joined(cluster: np.ndarray, own: np.ndarray, measured: np.ndarray, omega: np.ndarray) -> np.ndarray:
-    """Clusters of the model's modes (n_modes,), those joined that modes measured as repeated are most like together.
+def _joined(cluster: np.ndarray, model_shapes: np.ndarray, measured: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Cluster of each of the model's modes (n_modes,), joined as the modes measured as repeated.
 
-    Without this a model whose parameters part two modes by a little more would no longer have the measured shapes, and
-    the search end at that edge.
+    Each group of measured repeated modes joins the clusters of the modes whose shapes are most nearly in its span.
+    Without this, a model whose parameters separate two modes slightly more would lose the measured shapes, and the
+    search would end there.
     """
     cluster, order = cluster.copy(), np.argsort(omega)
     repeated = np.empty(omega.size, int)
     repeated[order] = repeated_modes(omega[order], UPDATING.repeated)
     for each in np.unique(repeated):
         basis = np.linalg.qr(measured[:, repeated == each])[0]
-        share = (np.abs(basis.conj().T @ own) ** 2).sum(axis=0) / (np.abs(own) ** 2).sum(axis=0)
-        likest = np.argsort(-share, kind="stable")[: basis.shape[1]]
-        cluster[np.isin(cluster, cluster[likest])] = cluster[likest].min()
+        share = (np.abs(basis.conj().T @ model_shapes) ** 2).sum(axis=0) / (np.abs(model_shapes) ** 2).sum(axis=0)
+        closest = np.argsort(-share, kind="stable")[: basis.shape[1]]
+        cluster[np.isin(cluster, cluster[closest])] = cluster[closest].min()
     return cluster

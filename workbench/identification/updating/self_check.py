@@ -1,4 +1,4 @@
-"""The check of section 4.3: does the structure that was identified have the modes it was identified from?"""
+"""The check of section 4.3: whether the identified structure has the modes from which it was identified."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -19,11 +19,11 @@ N_POINTS = 101
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SelfCheck(Printed):
-    """The eigensolution of an identified structure beside the one that was measured.
+    """The eigensolution of an identified structure compared with the measurement.
 
     Attributes:
-        frequency_errors: (n_modes,) relative, identified structure against measurement; infinite where it has none.
-        mac: (n_modes,) agreement of each shape.
+        frequency_errors: (n_modes,) relative, of the identified structure; infinite where it has no such mode.
+        mac: (n_modes,) of each shape.
         refusal: why the identified distributions are no structure; empty if they are.
     """
 
@@ -41,13 +41,13 @@ class SelfCheck(Printed):
 
     @property
     def worst(self) -> float:
-        """Largest relative frequency error, the figure by which identifications are compared."""
+        """Largest relative frequency error, by which identifications are compared."""
         return float(np.abs(self.frequency_errors).max())
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identified(Printed):
-    """A structure identified with the number of terms that passed the self-check best."""
+    """A structure identified with the number of terms of the best self-check."""
 
     distributions: Distributions
     n_terms: tuple[int, int]
@@ -60,7 +60,7 @@ class Identified(Printed):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Those of the distributions."""
+        """The remarks of the distributions."""
         return self.distributions.remarks
 
 
@@ -70,21 +70,26 @@ def structure_of(found: Distributions, *, kind: str, length: float, left: str | 
     Raises:
         ValueError: a distribution that is not positive everywhere.
     """
-    where: dict[str, Any] = {"length": length, "left": left, "right": right, "mass_per_length": found.mass.profile}
+    common: dict[str, Any] = {
+        "length": length,
+        "left": left,
+        "right": right,
+        "mass_per_length": found.mass.profile,
+    }
     if kind == "bar":
-        return Bar(axial_stiffness=found.stiffness.profile, **where)
-    return Beam(bending_stiffness=found.stiffness.profile, **where)
+        return Bar(axial_stiffness=found.stiffness.profile, **common)
+    return Beam(bending_stiffness=found.stiffness.profile, **common)
 
 
 @one_blas_thread
 def self_check(
     found: Distributions, measured: Modes, *, kind: str, left: str | End, right: str | End, first_mode: int = 0
 ) -> SelfCheck:
-    """Solve the eigenproblem of what was identified and compare it with what was measured.
+    """The eigensolution of an identified structure compared with the measurement.
 
     Args:
         found: mass and stiffness.
-        measured: the modes that they were found from, consecutive.
+        measured: the modes they were identified from, consecutive.
         kind: "bar" or "beam".
         left, right: its ends.
         first_mode: index of the first measured mode among all modes of the structure; 2 leaves out the rigid-body
@@ -93,12 +98,12 @@ def self_check(
     n = measured.n_modes
     try:
         structure = structure_of(found, kind=kind, length=measured.length, left=left, right=right)
-        again = structure.modes(first_mode + n, tolerance=1e-6).select(slice(first_mode, None))
+        computed = structure.modes(first_mode + n, tolerance=1e-6).select(slice(first_mode, None))
     except ValueError as error:
         return SelfCheck(np.full(n, np.inf), np.zeros(n), str(error))
     x = np.linspace(0.0, measured.length, N_POINTS)
-    agreement = np.diag(mac(again.phi(x), measured.phi(x)))
-    return SelfCheck(again.omega / measured.omega - 1.0, agreement)
+    agreement = np.diag(mac(computed.phi(x), measured.phi(x)))
+    return SelfCheck(computed.omega / measured.omega - 1.0, agreement)
 
 
 @warns_of_remarks
@@ -115,10 +120,10 @@ def choose_terms(
     prior_mass: ProfileLike = 0.0,
     prior_stiffness: ProfileLike = 0.0,
 ) -> Identified:
-    """Identify with each pair of numbers of terms and keep the one whose own modes agree best with the measured.
+    """The identified structure of the numbers of terms whose modes agree best with the measured ones.
 
-    A pair with more terms must halve the worst frequency error of every smaller one to be preferred, and none is
-    sought beyond the error of the measured frequencies: unneeded terms only fit the noise.
+    A pair of more terms must halve the largest frequency error to be preferred, and none is tried once this is below
+    the standard error of the measured frequencies: further terms would over-fit.
 
     Args:
         measured: as `mass_and_stiffness`.
@@ -134,29 +139,29 @@ def choose_terms(
     """
     ends: dict[str, Any] = {"kind": kind, "left": left, "right": right, "first_mode": first_mode}
     best, tried, reason = None, [], "no number of terms was given"
-    enough = _frequency_error(measured)
+    measurement_error = _frequency_error(measured)
     pairs = sorted(((a, b) for a in terms for b in terms), key=lambda pair: (sum(pair), pair))
     for n_mass, n_stiffness in pairs:
         try:
             bases = basis(n_mass), basis(n_stiffness)
-            found = distributions_of(measured, kind, bases, known_mass, (prior_mass, prior_stiffness))
+            distributions = distributions_of(measured, kind, bases, known_mass, (prior_mass, prior_stiffness))
         except ValueError as error:
             reason = str(error)
             continue
-        check = self_check(found, measured, **ends)
+        check = self_check(distributions, measured, **ends)
         reason = check.refusal or reason
         tried.append((n_mass, n_stiffness, check.worst))
         if np.isfinite(check.worst) and (
-            best is None or (enough < best[1].worst and check.worst < 0.5 * best[1].worst)
+            best is None or (measurement_error < best[1].worst and check.worst < 0.5 * best[1].worst)
         ):
-            best = (found, check, (n_mass, n_stiffness))
+            best = (distributions, check, (n_mass, n_stiffness))
     if best is None:
         raise ValueError(f"no number of terms gives a structure: {reason}")
     return Identified(best[0], best[2], best[1], tuple(tried))
 
 
 def _frequency_error(measured: Modes) -> float:
-    """Largest relative standard error of the measured frequencies; round-off where they were computed."""
+    """Largest relative standard error of the measured frequencies; 1e-9 where they were computed."""
     if measured.covariance is None:
         return 1e-9
     return float((np.sqrt(np.diag(measured.covariance)[: measured.n_modes]) / measured.omega).max())

@@ -1,14 +1,15 @@
-"""Modes of a structure whose mass and stiffness are series, and how they move with every parameter.
+"""Modes of a structure whose mass and stiffness are series, and their sensitivities to every parameter.
 
     m = m_0 (1 + Σ d_j M_j),   k = k_0 (1 + Σ e_j K_j),   on [a, b]: k (1 - δ)
 
-With G_sr = ∂K_sr - λ_r ∂M_sr, what a parameter changes in the modes themselves (Fox & Kapoor, AIAA J. 6, 1968),
+With G_sr = ∂K_sr - λ_r ∂M_sr, the derivatives of the matrices by a parameter between modes (Fox & Kapoor, AIAA J. 6,
+1968),
 
     ∂λ_r = G_rr,   ∂φ_r = Σ_{s≠r} φ_s G_sr / (λ_r - λ_s) - φ_r ∂M_rr / 2,
 
-summed over every mode of the discrete structure. An edge of [a, b] that moves by db turns k⁺ into k⁻ over db; the
-moment is continuous there and the curvature is not, so ∂K_sr = (k⁻ - k⁺) φ_s''⁻ φ_r''⁺. The shape between that edge and
-the nodes next to it has a kink that travels, which the sum follows to a few parts in a hundred; all else is exact.
+summed over every mode of the discrete structure. A shift db of an edge of [a, b] changes k⁺ to k⁻ over db; the moment
+is continuous there and the curvature is not, so ∂K_sr = (k⁻ - k⁺) φ_s''⁻ φ_r''⁺. Between that edge and the nodes next
+to it the derivative of the shape has a kink, which the sum over modes represents to a few per cent; all else is exact.
 """
 
 from collections.abc import Sequence
@@ -24,8 +25,8 @@ from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile
 from workbench.structure.supports import HELD, PointDamper, PointMass
 
-EXTRA_DEGREES = 4
-RIGID = 1e-10  # of the eigenvalue of a half wave
+EXTRA_DEGREES = 4  # margin of the degree of the polynomials
+RIGID = 1e-10  # of the eigenvalue of a half wave, below which a mode is a rigid-body mode
 ROUND_OFF = 1e-15
 
 
@@ -35,7 +36,7 @@ class LocalLoss:
 
     Attributes:
         share: δ of the stiffness there, below 1.
-        centre, width: of the part, m; what of it lies outside the structure does not count.
+        centre, width: of the part, m; the part is cut off at the ends of the structure.
     """
 
     share: float
@@ -43,16 +44,16 @@ class LocalLoss:
     width: float
 
     def edges(self, length: float) -> tuple[float, float]:
-        """Where it begins and ends, m."""
+        """Begin and end of the part within the structure, m."""
         return max(self.centre - 0.5 * self.width, 0.0), min(self.centre + 0.5 * self.width, length)
 
     def within(self, length: float) -> "LocalLoss":
-        """The part of it that lies on the structure."""
+        """The loss with centre and width of its part within the structure."""
         begin, end = self.edges(length)
         return LocalLoss(self.share, 0.5 * (begin + end), end - begin)
 
     def of(self, stiffness: Profile, length: float) -> Profile:
-        """A stiffness with this loss."""
+        """The stiffness with this loss."""
         return stiffness.scaled(1.0 - self.share, *self.edges(length))
 
 
@@ -63,8 +64,8 @@ class Sensitivity:
     Attributes:
         omega: (n_modes,) rad/s.
         shapes: (n_sensors, n_modes), mass-normalised.
-        omega_by: (n_modes, n_parameters).
-        shapes_by: (n_sensors, n_modes, n_parameters).
+        omega_by: (n_modes, n_parameters) derivatives of ω.
+        shapes_by: (n_sensors, n_modes, n_parameters) derivatives of the shapes.
     """
 
     omega: np.ndarray
@@ -80,7 +81,7 @@ class SeriesStructure:
     Attributes:
         nominal: ends, attachments, m_0 and k_0.
         mass, stiffness: M_j and K_j.
-        positions: (n_sensors,) where shapes are wanted, m.
+        positions: (n_sensors,) of the sensors, m.
     """
 
     nominal: Bar | Beam
@@ -91,7 +92,7 @@ class SeriesStructure:
 
     @property
     def order(self) -> int:
-        """Of the derivative that the stiffness resists: 1 for a bar, 2 for a beam."""
+        """Order of the derivative of the shape in the strain energy: 1 for a bar, 2 for a beam."""
         return 2 if isinstance(self.nominal, Beam) else 1
 
     @property
@@ -108,15 +109,15 @@ class SeriesStructure:
         stiffness = mesh.nominal_stiffness * (1.0 + mesh.stiffness_terms @ e)
         if (mass <= 0).any() or (stiffness <= 0).any() or (loss is not None and loss.share >= 1):
             return None
-        # a series of many terms may dip between the points of integration
+        # a series of many terms may be negative between the integration points
         if (1.0 + mesh.checked_mass @ d <= 0).any() or (1.0 + mesh.checked_stiffness @ e <= 0).any():
             return None
-        left = stiffness if loss is None else stiffness * np.where(mesh.inside(loss), 1.0 - loss.share, 1.0)
+        remaining = stiffness if loss is None else stiffness * np.where(mesh.inside(loss), 1.0 - loss.share, 1.0)
         m = mesh.fixed_mass + (mesh.values.T * (mesh.weights * mass)) @ mesh.values
-        k = mesh.fixed_stiffness + (mesh.strains.T * (mesh.weights * left)) @ mesh.strains
+        k = mesh.fixed_stiffness + (mesh.strains.T * (mesh.weights * remaining)) @ mesh.strains
         free = mesh.free
         m, k = m[np.ix_(free, free)], k[np.ix_(free, free)]
-        # As in `member`: the inverse problem keeps the lowest modes exact, the shift keeps rigid-body modes apart.
+        # As in `member`: the inverse problem keeps the lowest modes exact, the shift separates rigid-body modes.
         shift = np.mean(stiffness) / np.mean(mass) * (np.pi / self.nominal.length) ** (2 * self.order)
         nu, vectors = eigh(m, k + shift * m)
         lowest = np.flatnonzero(nu > ROUND_OFF * nu[-1])[::-1]
@@ -137,29 +138,29 @@ class SeriesStructure:
 
 @dataclass(frozen=True, eq=False)
 class SolvedSeries:
-    """Every mode of the discrete structure; only the lowest are those of the true one."""
+    """All modes of the discrete structure, of which only the lowest are converged."""
 
     series: SeriesStructure
     mesh: "_Mesh"
     eigenvalues: np.ndarray
     coefficients: np.ndarray
-    whole: np.ndarray  # stiffness at the points before any loss
+    intact_stiffness: np.ndarray  # (n_points,) without the loss
     n_rigid: int
     loss: LocalLoss | None
 
     @property
     def at_sensors(self) -> np.ndarray:
-        """All shapes, (n_sensors, n_all)."""
+        """All shapes at the sensors, (n_sensors, n_all)."""
         return np.asarray(self.mesh.segments.evaluation(self.series.positions) @ self.coefficients)
 
     def sensitivity(self, which: np.ndarray) -> Sensitivity:
-        """Elastic modes `which` (from 0); parameters d, e and, with a loss, its share, centre and width."""
+        """Elastic modes `which` (from 0), and their derivatives by d, e and share, centre and width of a loss."""
         r = self.n_rigid + which
         mesh, loss = self.mesh, self.loss
         shapes, strains = mesh.values @ self.coefficients, mesh.strains @ self.coefficients
         mass_weights = (mesh.weights * mesh.nominal_mass)[:, None] * mesh.mass_terms
-        left = 1.0 if loss is None else np.where(mesh.inside(loss), 1.0 - loss.share, 1.0)
-        stiffness_weights = (mesh.weights * mesh.nominal_stiffness * left)[:, None] * mesh.stiffness_terms
+        remaining = 1.0 if loss is None else np.where(mesh.inside(loss), 1.0 - loss.share, 1.0)
+        stiffness_weights = (mesh.weights * mesh.nominal_stiffness * remaining)[:, None] * mesh.stiffness_terms
         by_mass = [(shapes.T * w) @ shapes[:, r] for w in mass_weights.T]
         by_stiffness = [(strains.T * w) @ strains[:, r] for w in stiffness_weights.T]
         if loss is not None:
@@ -167,36 +168,36 @@ class SolvedSeries:
         changes = [(g, np.zeros_like(g)) for g in by_stiffness]
         changes = [(-g * self.eigenvalues[r], g) for g in by_mass] + changes
         gaps = self.eigenvalues[r] - self.eigenvalues[:, None]
-        own = (r, np.arange(r.size))
-        gaps[own] = np.inf
+        diagonal = (r, np.arange(r.size))
+        gaps[diagonal] = np.inf
         omega, at_sensors = np.sqrt(self.eigenvalues[r]), self.at_sensors
         omega_by, shapes_by = [], []
-        for g, mass in changes:
+        for g, mass_change in changes:
             mixed = g / gaps
-            mixed[own] = -0.5 * mass[own]
-            omega_by.append(g[own] / (2.0 * omega))
+            mixed[diagonal] = -0.5 * mass_change[diagonal]
+            omega_by.append(g[diagonal] / (2.0 * omega))
             shapes_by.append(at_sensors @ mixed)
         return Sensitivity(omega, at_sensors[:, r], np.stack(omega_by, -1), np.stack(shapes_by, -1))
 
     def _by_loss(self, strains: np.ndarray, r: np.ndarray, loss: LocalLoss) -> list[np.ndarray]:
         """∂K_sr by share, centre and width."""
         mesh, length = self.mesh, self.series.nominal.length
-        weights = mesh.weights * self.whole * mesh.inside(loss)
+        weights = mesh.weights * self.intact_stiffness * mesh.inside(loss)
         by_share = -(strains.T * weights) @ strains[:, r]
         begin, end = edges = loss.edges(length)
         beside = np.clip([begin, begin, end, end] + np.array([-1.0, 1.0, -1.0, 1.0]) * 1e-10 * length, 0.0, length)
-        at_edges = (mesh.segments.evaluation(beside, self.series.order) @ self.coefficients).reshape(2, 2, -1)
-        moved = []
-        for at, outward, (before, after) in zip(edges, (-1.0, 1.0), at_edges, strict=True):
-            # an edge beyond the end of the structure may move without effect
-            jump = -outward * loss.share * float(np.interp(at, mesh.x, self.whole)) * (0.0 < at < length)
-            moved.append(0.5 * jump * (np.outer(before, after[r]) + np.outer(after, before[r])))
-        return [by_share, moved[0] + moved[1], 0.5 * (moved[1] - moved[0])]
+        strains_at_edges = (mesh.segments.evaluation(beside, self.series.order) @ self.coefficients).reshape(2, 2, -1)
+        by_edge = []
+        for at, outward, (before, after) in zip(edges, (-1.0, 1.0), strains_at_edges, strict=True):
+            # the shift of an edge beyond the end of the structure has no effect
+            jump = -outward * loss.share * float(np.interp(at, mesh.x, self.intact_stiffness)) * (0.0 < at < length)
+            by_edge.append(0.5 * jump * (np.outer(before, after[r]) + np.outer(after, before[r])))
+        return [by_share, by_edge[0] + by_edge[1], 0.5 * (by_edge[1] - by_edge[0])]
 
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
-    """Functions and their highest derivatives at the points of a Gauss rule, and what does not change."""
+    """The discretisation: functions and their highest derivatives at Gauss points, and the fixed matrices."""
 
     segments: Segments
     x: np.ndarray
@@ -207,14 +208,14 @@ class _Mesh:
     nominal_stiffness: np.ndarray
     mass_terms: np.ndarray  # (n_points, n_terms)
     stiffness_terms: np.ndarray
-    checked_mass: np.ndarray  # (n_places, n_terms) where a finished structure is checked
+    checked_mass: np.ndarray  # (n_places, n_terms) at the places where `member` checks that it is positive
     checked_stiffness: np.ndarray
     fixed_mass: np.ndarray
     fixed_stiffness: np.ndarray
     free: np.ndarray
 
     def inside(self, loss: LocalLoss) -> np.ndarray:
-        """Which points the loss covers."""
+        """Whether each point lies within the loss, (n_points,)."""
         begin, end = loss.edges(self.segments.nodes[-1])
         return (self.x > begin) & (self.x < end)
 
@@ -231,16 +232,16 @@ class _Mesh:
         if isinstance(nominal, Beam) and nominal.tension:
             fixed_stiffness += nominal.tension * (slopes.T * weights) @ slopes
         terms = series.mass.functions(x), series.stiffness.functions(x)
-        of_mass = checked_places((*m.breaks, *series.mass.breaks), nominal.length)
-        of_stiffness = checked_places((*k.breaks, *series.stiffness.breaks, *edges), nominal.length)
-        checked = series.mass.functions(of_mass), series.stiffness.functions(of_stiffness)
+        mass_places = checked_places((*m.breaks, *series.mass.breaks), nominal.length)
+        stiffness_places = checked_places((*k.breaks, *series.stiffness.breaks, *edges), nominal.length)
+        checked = series.mass.functions(mass_places), series.stiffness.functions(stiffness_places)
         return cls(
             segments, x, weights, values, strains, m(x), k(x), *terms, *checked, fixed_mass, fixed_stiffness, free
         )
 
 
 def _nodes(places: Sequence[float], length: float) -> np.ndarray:
-    """The ends and all places between them, none within a sliver of another."""
+    """The ends and all places between them, without coincident ones."""
     nodes = [0.0]
     for at in sorted(places):
         if nodes[-1] + 1e-6 * length < at < length * (1 - 1e-6):
@@ -249,9 +250,9 @@ def _nodes(places: Sequence[float], length: float) -> np.ndarray:
 
 
 def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass and stiffness of what is attached, and the functions that the ends leave free."""
+    """Mass and stiffness matrices of springs and attachments, and the indices of the unconstrained functions."""
     mass, stiffness = np.zeros((2, segments.n_functions, segments.n_functions))
-    held = []
+    fixed = []
 
     def add(matrix: np.ndarray, at: float, values: Sequence[float]) -> None:
         for derivative, value in enumerate(values[:order]):
@@ -261,9 +262,9 @@ def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndar
 
     for node, at, end in ((0, 0.0, nominal.left), (segments.nodes.size - 1, nominal.length, nominal.right)):
         springs = (end.translation, end.rotation)
-        held += [order * node + derivative for derivative, spring in enumerate(springs[:order]) if spring == HELD]
+        fixed += [order * node + derivative for derivative, spring in enumerate(springs[:order]) if spring == HELD]
         add(stiffness, at, [0.0 if spring == HELD else spring for spring in springs])
     for part in nominal.attachments:
         if not isinstance(part, PointDamper):
             add(mass if isinstance(part, PointMass) else stiffness, cast(float, part.at), part.pair)
-    return mass, stiffness, np.setdiff1d(np.arange(segments.n_functions), held)
+    return mass, stiffness, np.setdiff1d(np.arange(segments.n_functions), fixed)

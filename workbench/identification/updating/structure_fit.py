@@ -1,7 +1,7 @@
-"""How many terms of mass and stiffness the modes of a structure call for: the fewest whose modes cannot be
-distinguished from the measured.
+"""Model order of series for mass and stiffness: the fewest terms whose modes agree with the measured ones.
 
-Schwarz's criterion χ² + n_terms ln n_data (Ann. Statist. 6, 1978) is not lowered by a term that is not needed.
+By the Bayesian information criterion χ² + n_terms ln n_data (Schwarz, Ann. Statist. 6, 1978), which an unneeded term
+does not lower.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +18,7 @@ from workbench.structure.printed import warns_of_remarks
 from workbench.threads import one_blas_thread
 
 MOST_TERMS = 8
-SPARE = 2  # terms next in line that bands leave free too
+SPARE = 2  # further terms that are free in the confidence bands
 
 
 @warns_of_remarks
@@ -35,22 +35,22 @@ def fit_structure(
     stiffness_prior: GaussianPrior | None = None,
     numbers: Sequence[int] | None = None,
 ) -> FittedStructure:
-    """Mass and stiffness as series of given terms, with the covariance that the modes leave them.
+    """Mass and stiffness as series of given terms, with the covariance that the measured modes give.
 
-    Frequencies and shapes of any scale say nothing of the overall size: either mass or stiffness must be known
+    Frequencies and shapes of any scale do not determine a common factor of mass and stiffness: either must be known
     somewhere, or be nominal (no terms), or have a prior.
 
     Args:
         measured: of `refine` or `identify`; sensors must be placed.
-        nominal: ends, attachments, and the first estimates m_0 and k_0; uniform where nothing is known of them.
+        nominal: ends, attachments, and the nominal m_0 and k_0; uniform where nothing is known of them.
         mass, stiffness: functions of the relative changes; `Basis.polynomial(0)` keeps the nominal ones.
         known_mass, known_stiffness: ((x, value), ...), held exactly.
-        mass_prior, stiffness_prior: how far the nominal ones are to be trusted; not at all without.
-        numbers: of the structure's elastic modes, from 1, that the measured are; paired by their shapes unless given.
+        mass_prior, stiffness_prior: deviation expected from the nominal ones; no prior unless given.
+        numbers: of the structure's elastic modes, from 1, that were measured; paired by their shapes unless given.
 
     Raises:
-        ValueError: overall size unknown, more terms than data, known values the series cannot take, unplaced sensors,
-            a measured mode that looks like none of the nominal structure.
+        ValueError: common factor unknown, more terms than data, known values the series cannot take, unplaced sensors,
+            a measured mode that resembles no mode of the nominal structure.
         UserWarning: the structure does not explain the modes, so that its distributions may be far from the truth.
     """
     task = Task.of(measured, nominal, known_mass, known_stiffness, mass_prior, stiffness_prior, numbers)
@@ -94,48 +94,53 @@ def choose(
     near: FittedStructure | None = None,
     exhaust: bool = True,
 ) -> FittedStructure:
-    """The fit of least criterion, from the fewest terms up as long as one or two more of either lower it; of all
-    numbers, with `exhaust`, where that leaves modes unexplained. Each is searched from the best so far, `near` too."""
+    """The fit of the least criterion over the numbers of terms.
+
+    From the fewest terms up, as long as one or two more terms of mass or stiffness lower the criterion; over all
+    numbers, with `exhaust`, where that leaves the modes unexplained. Each fit starts from the best so far, or from
+    `near`.
+    """
     basis = basis or partial(Basis.legendre, length=task.nominal.length)
     tried: dict[tuple[int, int], FittedStructure | None] = {}
     best: FittedStructure | None = None
-    at, ahead, exhausted, reason = (0, 0), 3, False, "no number of terms was given"
+    start, n_ahead, exhausted, reason = (0, 0), 3, False, "no number of terms was given"
     while True:
-        for i in range(at[0], min(at[0] + ahead, len(mass_terms))):
-            for j in range(at[1], min(at[1] + ahead, len(stiffness_terms))):
+        for i in range(start[0], min(start[0] + n_ahead, len(mass_terms))):
+            for j in range(start[1], min(start[1] + n_ahead, len(stiffness_terms))):
                 if (i, j) in tried:
                     continue
-                from_near = best is None or (near is not None and near.criterion < best.criterion)
+                starts_from_near = best is None or (near is not None and near.criterion < best.criterion)
                 try:
                     tried[i, j] = fit(
-                        Problem.of(task, basis(mass_terms[i]), basis(stiffness_terms[j])), near if from_near else best
+                        Problem.of(task, basis(mass_terms[i]), basis(stiffness_terms[j])),
+                        near if starts_from_near else best,
                     )
                 except ValueError as error:
                     tried[i, j], reason = None, str(error)
-        good = {pair: found for pair, found in tried.items() if found is not None}
-        if not good:
+        fits = {pair: result for pair, result in tried.items() if result is not None}
+        if not fits:
             raise ValueError(reason)
-        least = min(good, key=lambda pair: good[pair].criterion)
-        better, best, at = good[least] is not best, good[least], least
+        least = min(fits, key=lambda pair: fits[pair].criterion)
+        better, best, start = fits[least] is not best, fits[least], least
         if better:
             continue
         if best.explains or exhausted or not exhaust:
             return with_spare_terms(best, task, basis)
-        ahead, exhausted = len(mass_terms) + len(stiffness_terms), True
+        n_ahead, exhausted = len(mass_terms) + len(stiffness_terms), True
 
 
 def with_spare_terms(chosen: FittedStructure, task: Task, basis: Callable[[int], Basis]) -> FittedStructure:
-    """The same structure, the terms next in line left free as well in what is said of its errors.
+    """The chosen structure, with confidence bands in which the next `SPARE` terms are free as well.
 
-    They are too small to stand out of the noise, not zero: left out, they would be missed by the bands (undersmoothing,
-    Hall, Ann. Statist. 20, 1992).
+    These terms are below the noise but not zero: without them the bands would be too narrow (undersmoothing, Hall, Ann.
+    Statist. 20, 1992).
     """
     try:
         problem = Problem.of(task, *(basis(n + SPARE if n else 0) for n in chosen.n_terms))
-        wide = problem.report(problem.free_near(chosen))
+        wider = problem.report(problem.free_near(chosen))
     except ValueError:
         return chosen
-    if wide.chi2 > chosen.chi2 + 1.0:  # a basis that does not hold the smaller one
+    if wider.chi2 > chosen.chi2 + 1.0:  # a basis that does not contain the smaller one
         return chosen
     kept = ("n_terms", "chi2", "degrees_of_freedom", "criterion")
-    return replace(wide, **{name: getattr(chosen, name) for name in kept})
+    return replace(wider, **{name: getattr(chosen, name) for name in kept})

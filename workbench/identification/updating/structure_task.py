@@ -1,4 +1,4 @@
-"""A structure to be updated: what was measured and what is known beforehand; and the updated one, with its errors."""
+"""The data and prior knowledge of a structure to be updated, and the updated structure with its errors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,11 +21,11 @@ from workbench.structure.profile import Profile
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """Constants of what a measurement is trusted to."""
+    """Constants of the data of a structure to be updated."""
 
-    trusted: float = 1e-8  # relative: no theory of bars and beams is better than this, however clean the record
-    same_mode: float = 0.6  # least MAC with the nominal structure's mode that a measured one is taken for
-    unlikely: float = 0.01  # chance that a structure is said not to explain modes that are its own
+    trusted: float = 1e-8  # relative error of the model, below which no standard error counts
+    same_mode: float = 0.6  # least MAC of a measured mode with the nominal structure's mode paired with it
+    unlikely: float = 0.01  # chance that a structure is refused as an explanation of its own modes
 
 
 TASK = TaskSettings()
@@ -33,11 +33,11 @@ TASK = TaskSettings()
 
 @dataclass(frozen=True)
 class GaussianPrior:
-    """How far a distribution is believed to deviate from its nominal one: relative, and over what length it varies.
+    """Gaussian prior of the relative deviation of a distribution from its nominal one.
 
     Attributes:
         std: standard deviation of k / k_0 - 1 (or m / m_0 - 1) at any place.
-        correlation: length over which two places deviate alike, m: exp(-Δx² / (2 correlation²)).
+        correlation: length ℓ of the correlation exp(-Δx² / (2 ℓ²)) between two places, m.
     """
 
     std: float
@@ -47,20 +47,20 @@ class GaussianPrior:
         if not (self.std > 0 and self.correlation > 0):
             raise ValueError(
                 f"a prior needs a positive standard deviation and correlation length; got {self.std} and"
-                f" {self.correlation}. What is known exactly is nominal and takes no term"
+                f" {self.correlation}. Keep the nominal distribution, without terms, where it is known exactly"
             )
 
     def root(self, basis: Basis, length: float) -> np.ndarray:
-        """R with |R c|² the prior's χ² of coefficients c."""
+        """R such that |R c|² is the prior's χ² of coefficients c."""
         x = (np.arange(200) + 0.5) / 200 * length
-        onto = np.linalg.pinv(basis.functions(x))
+        projection = np.linalg.pinv(basis.functions(x))
         kernel = self.std**2 * np.exp(-0.5 * ((x[:, None] - x) / self.correlation) ** 2)
-        return _unit(onto @ kernel @ onto.T, 1e-8)
+        return _whitening_matrix(projection @ kernel @ projection.T, 1e-8)
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What was measured, in units of its standard errors, and what is known beforehand."""
+    """The measured modes, in units of their standard errors, and what is known beforehand."""
 
     measured: Refined
     nominal: Bar | Beam
@@ -71,8 +71,8 @@ class Task:
     which: np.ndarray  # elastic modes, from 0
     reference: np.ndarray  # (n_modes,) the sensor where each shape is 1
     shapes: np.ndarray  # (n_sensors, n_modes) real
-    unit_omega: np.ndarray  # differences of ω to standard errors, (n_modes, n_modes)
-    unit_shapes: tuple[np.ndarray, ...]  # the same for the shape of each mode at all sensors but its reference
+    unit_omega: np.ndarray  # (n_modes, n_modes) whitening matrix of errors of ω
+    unit_shapes: tuple[np.ndarray, ...]  # of the shape of each mode at all sensors but its reference
 
     @classmethod
     def of(
@@ -90,14 +90,18 @@ class Task:
         n, m = modes.n_modes, modes.n_outputs
         if m < 2:
             raise ValueError("one sensor shows no shape; use two or more")
-        # The entry that a shape is measured by has no error of its own.
+        # The entry that a shape is normalised by has no error.
         reference = np.argmin(measured.shape_std, axis=0)
         shapes = (modes.shapes / modes.shapes[reference, np.arange(n)]).real
-        spread = measured.covariance[:n, :n] + np.diag((TASK.trusted * modes.omega) ** 2)
-        units = []
+        omega_covariance = measured.covariance[:n, :n] + np.diag((TASK.trusted * modes.omega) ** 2)
+        whitening = []
         for r in range(n):
             others = np.arange(m) != reference[r]
-            units.append(_unit(measured.shape_covariance[r][np.ix_(others, others)] + TASK.trusted**2 * np.eye(m - 1)))
+            whitening.append(
+                _whitening_matrix(
+                    measured.shape_covariance[r][np.ix_(others, others)] + TASK.trusted**2 * np.eye(m - 1)
+                )
+            )
         known = [np.array(pairs, float).reshape(-1, 2) for pairs in (known_mass, known_stiffness)]
         for name, pairs in zip(("mass", "stiffness"), known, strict=True):
             outside = (pairs[:, 0] < 0) | (pairs[:, 0] > nominal.length) | ~(pairs[:, 1] > 0)
@@ -119,48 +123,48 @@ class Task:
             which=which,
             reference=reference,
             shapes=shapes,
-            unit_omega=_unit(spread),
-            unit_shapes=tuple(units),
+            unit_omega=_whitening_matrix(omega_covariance),
+            unit_shapes=tuple(whitening),
         )
 
     @property
     def n_data(self) -> int:
-        """Frequencies, and shapes but for their scale."""
+        """Number of frequencies and of shape entries, less one per shape for its scale."""
         return self.shapes.size
 
 
 def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
-    """Which elastic mode of the nominal structure each measured one is, from 0, by their shapes."""
+    """Index of the nominal structure's elastic mode paired with each measured one by shape, (n_modes,), from 0."""
     modes = measured.modes
-    nothing = Basis.polynomial(0)
+    none = Basis.polynomial(0)
     n = modes.n_modes + 4
-    solved = SeriesStructure(nominal, nothing, nothing, modes.positions).solve(np.zeros(0), np.zeros(0), n_modes=n)
+    solved = SeriesStructure(nominal, none, none, modes.positions).solve(np.zeros(0), np.zeros(0), n_modes=n)
     assert solved is not None, "a nominal structure has positive mass and stiffness"
     shapes = solved.at_sensors[:, solved.n_rigid : solved.n_rigid + n]
     agreement = mac(normalised_shapes(modes.shapes).real, shapes)
-    which = linear_sum_assignment(-agreement)[1]
-    least = int(np.argmin(agreement[np.arange(modes.n_modes), which]))
-    if agreement[least, which[least]] < TASK.same_mode:
+    pairs = linear_sum_assignment(-agreement)[1]
+    worst = int(np.argmin(agreement[np.arange(modes.n_modes), pairs]))
+    if agreement[worst, pairs[worst]] < TASK.same_mode:
         raise ValueError(
-            f"measured mode {least + 1} at {modes.frequencies_hz[least]:.4g} Hz looks like no mode of the nominal"
-            f" structure (best MAC {agreement[least].max():.2f}); leave it out, correct the ends, or give numbers"
+            f"measured mode {worst + 1} at {modes.frequencies_hz[worst]:.4g} Hz resembles no mode of the nominal"
+            f" structure (best MAC {agreement[worst].max():.2f}); leave it out, correct the ends, or give numbers"
         )
-    return np.asarray(which)
+    return np.asarray(pairs)
 
 
-def _unit(covariance: np.ndarray, least: float = 1e-12) -> np.ndarray:
-    """W with W^T W the inverse of a covariance, no eigenvalue of which counts as less than a share of the largest."""
+def _whitening_matrix(covariance: np.ndarray, least: float = 1e-12) -> np.ndarray:
+    """Whitening matrix W, W^T W the inverse of a covariance whose eigenvalues are at least a share of the largest."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors / np.sqrt(np.maximum(values, least * values.max()))).T)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainProfile(Printed):
-    """A distribution along the structure and how far it is to be trusted.
+    """A distribution along the structure, with its uncertainty.
 
     Attributes:
-        profile: the most likely one.
-        others: x (n_points,) -> (n_draws, n_points), as likely as the measurement leaves them.
+        profile: the maximum likelihood estimate.
+        others: x (n_points,) -> (n_draws, n_points), Monte Carlo samples of the distribution.
         length: of the structure, m.
     """
 
@@ -175,7 +179,7 @@ class UncertainProfile(Printed):
 
     @property
     def extent(self) -> tuple[float, float]:
-        """The least and the largest value, of 101 places."""
+        """The minimum and the maximum, of 101 places."""
         values = self(np.linspace(0.0, self.length, 101))
         return float(values.min()), float(values.max())
 
@@ -188,7 +192,7 @@ class UncertainProfile(Printed):
         return np.asarray(self.others(np.atleast_1d(np.asarray(x, float))).std(axis=0))
 
     def band(self, x: np.ndarray, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-        """Limits at each x (n_points,), lower and upper, that hold the truth there with this probability."""
+        """Pointwise confidence limits at each x (n_points,), lower and upper."""
         tail = 0.5 * (1.0 - level)
         lower, upper = np.quantile(self.others(np.atleast_1d(np.asarray(x, float))), [tail, 1.0 - tail], axis=0)
         return lower, upper
@@ -196,7 +200,7 @@ class UncertainProfile(Printed):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FittedStructure(Printed):
-    """The structure whose own modes come nearest to the measured, in units of their standard errors.
+    """The maximum likelihood structure, given measured modes.
 
     Attributes:
         structure: a `Bar` or `Beam`, with ends and attachments of the nominal one.
@@ -204,14 +208,14 @@ class FittedStructure(Printed):
         stiffness: EA in N or EI in N m², with its band.
         n_terms: of mass, of stiffness.
         loss: of stiffness over a part of the structure, where one was fitted.
-        chi2: squares of what its modes miss of the measured, in standard errors; those of the prior with them.
-        degrees_of_freedom: data less parameters; `chi2` is about as large where the structure explains its modes.
-        criterion: χ² + n_parameters ln n_data; the least among numbers of terms is the one to take.
+        chi2: sum of squares of the residuals of its modes and of the prior, in standard errors.
+        degrees_of_freedom: data less parameters; the expected value of `chi2` where the structure explains its modes.
+        criterion: χ² + n_parameters ln n_data (BIC), to be minimised over the numbers of terms.
         parameters: d, e and, with a loss, its share, centre and width.
         covariance: of the parameters, the Cramér-Rao bound at the estimate; larger by χ² / `degrees_of_freedom` where
             the structure does not explain its modes.
-        numbers: (n_modes,) of the structure's elastic modes, from 1, that the measured ones are.
-        check: frequencies and shapes of the structure beside the measured.
+        numbers: (n_modes,) number of the structure's elastic mode, from 1, paired with each measured one.
+        check: frequencies and shapes of the structure compared with the measured ones.
     """
 
     structure: Bar | Beam
@@ -230,10 +234,10 @@ class FittedStructure(Printed):
     freedom = Renamed("degrees_of_freedom")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        told = "explains" if self.explains else "does not explain"
+        verb = "explains" if self.explains else "does not explain"
         line = (
             f"mass in {counted(self.n_terms[0], 'term')} and stiffness in {counted(self.n_terms[1], 'term')}:"
-            f" {told} the {counted(self.numbers.size, 'mode')} measured (χ² {self.chi2:.4g}, at most {self.limit:.4g})"
+            f" {verb} the {counted(self.numbers.size, 'mode')} measured (χ² {self.chi2:.4g}, at most {self.limit:.4g})"
         )
         k = "EI [N m²]" if isinstance(self.structure, Beam) else "EA [N]"
         length = self.structure.length
@@ -242,35 +246,35 @@ class FittedStructure(Printed):
 
     @property
     def limit(self) -> float:
-        """χ² that noise alone exceeds in one measurement of a hundred."""
+        """The 0.99 quantile of `chi2` by noise alone."""
         return float(chi2_distribution.isf(TASK.unlikely, self.degrees_of_freedom))
 
     @property
     def explains(self) -> bool:
-        """Whether noise alone would miss the measured modes by as much, in one measurement of a hundred or more."""
+        """Whether the structure explains the measured modes: `chi2` is at most `limit`."""
         return self.chi2 <= self.limit
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Why the distributions are not to be trusted; empty where they explain the modes."""
+        """Why the distributions are unreliable; empty where they explain the modes."""
         if self.explains:
             return ()
         (m, most_m), (k, most_k) = self.mass.extent, self.stiffness.extent
         unit = "N m²" if isinstance(self.structure, Beam) else "N"
         return (
-            f"{unexplained(self)}. The distributions make up for what they lack and may be wrong by any factor, their"
-            f" standard errors too small: mass {m:.4g} to {most_m:.4g} kg/m, stiffness {k:.4g} to {most_k:.4g} {unit}."
-            f" {LACKING}",
+            f"{unexplained(self)}. The distributions compensate for what the model lacks and may be wrong by any"
+            f" factor, with standard errors too small: mass {m:.4g} to {most_m:.4g} kg/m,"
+            f" stiffness {k:.4g} to {most_k:.4g} {unit}. {LACKING}",
         )
 
 
 LACKING = (
     "Put point masses, springs and the true ends into the nominal structure, give a basis that jumps where the section"
-    " does, or more terms, and see in `numbers` which modes the measured ones are; else their standard errors are too"
-    " small"
+    " does, or more terms, and check in `numbers` with which modes the measured ones are paired; else the standard"
+    " errors of the measured modes are too small"
 )
 
 
-def unexplained(found: FittedStructure) -> str:
-    """That a structure does not explain its modes, with the figure and its limit."""
-    return f"the modes are not explained: χ² is {found.chi2:.4g}, and noise alone gives at most {found.limit:.4g}"
+def unexplained(fit: FittedStructure) -> str:
+    """The remark that a structure does not explain its modes, with χ² and its limit."""
+    return f"the modes are not explained: χ² is {fit.chi2:.4g}, and noise alone gives at most {fit.limit:.4g}"

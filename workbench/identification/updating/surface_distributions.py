@@ -5,12 +5,12 @@ Modes are orthogonal with respect to the mass and to the strain energy, whatever
     ∫∫ m φ_r φ_s dA = a_r² δ_rs,   ∫∫ D [φ_r, φ_s] dA = a_r² ω_r² δ_rs,
     [φ_r, φ_s] = ½(1+ν) ∇²φ_r ∇²φ_s + ½(1-ν) (φ_r,xx - φ_r,yy)(φ_s,xx - φ_s,yy) + 2(1-ν) φ_r,xy φ_s,xy
 
-which are linear in m, D and a_r², as along an interval (`distributions`): the relations r ≠ s find the mass but for its
-size, all of them then the stiffness. No edge may do work: springs along edges and masses on the plate are not known.
+which are linear in m, D and a_r², as along an interval (`distributions`): the relations r ≠ s determine the mass up to
+a factor, all relations then the stiffness. No edge may do work: springs along edges and attached masses are excluded.
 
-Errors dφ and dω unbalance the relations by ρ, to first order ∫∫ m (dφ_r φ_s + φ_r dφ_s) dA, and likewise of D. The
-coefficients of the series U c then move by dc = -U⁺ ρ, which gives those of D a covariance. The mean of the second
-order, ∫∫ D [dφ_r, dφ_r] dA, is added to it squared.
+Errors dφ and dω give the relations the residual ρ, to first order ∫∫ m (dφ_r φ_s + φ_r dφ_s) dA, and likewise for D.
+The coefficients c of the series U c change by dc = -U⁺ ρ, which gives those of D a covariance. The square of the mean
+of the second-order term, ∫∫ D [dφ_r, dφ_r] dA, is added to it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,19 +31,19 @@ from workbench.structure.profile import Field, FieldLike, as_field
 from workbench.structure.supports import Edge
 from workbench.threads import one_blas_thread
 
-QUADRATURE = 144  # modes that the points of integration would serve: what squares of second derivatives take
-QUADRATURE_OF_ERRORS = 16  # likewise, to a per cent of a standard error
+QUADRATURE = 144  # number of modes for which the integration points suffice: for squares of second derivatives
+QUADRATURE_OF_ERRORS = 16  # likewise, for standard errors to one per cent
 DERIVATIVES = ((0, 0), (2, 0), (0, 2), (1, 1))  # of shapes, in the relations
-PER_SIDE = 21  # points each way where shapes are compared
+PER_SIDE = 21  # points along each side, at which shapes are compared
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceBasis:
-    """Known functions over a rectangle whose sum, with coefficients to be found, is a distribution.
+    """Functions over a rectangle whose linear combination is a distribution.
 
     Attributes:
         functions: x, y (n_points,) each -> (n_points, n_terms).
-        n_terms: how many.
+        n_terms: number of functions.
     """
 
     functions: Callable[[np.ndarray, np.ndarray], np.ndarray] = field(repr=False)
@@ -76,7 +76,7 @@ class SurfaceDistribution:
         coefficients: (n_terms,).
         basis: the functions they multiply.
         prior: m_0 or D_0.
-        misfit: root mean square of the relations left over, relative to the terms in them; 0 for a perfect fit.
+        misfit: rms residual of the relations, relative to the terms in them; 0 for a perfect fit.
         covariance: (n_terms, n_terms) of the coefficients of a stiffness; None where the errors of the modes are not
             known, and of a mass.
     """
@@ -88,15 +88,15 @@ class SurfaceDistribution:
     covariance: np.ndarray | None = None
 
     def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Values at (x, y), in the shape that x and y have together."""
+        """Values at (x, y), in the broadcast shape of x and y."""
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         series = self.basis.functions(x.ravel(), y.ravel()) @ self.coefficients
         return np.asarray(self.prior(x, y) + series.reshape(x.shape))
 
     def std(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Standard errors at (x, y), in the shape that x and y have together.
+        """Standard errors at (x, y), in the broadcast shape of x and y.
 
-        They hold the errors of the modes, not that the series may have too few terms.
+        They account for the errors of the modes, not for too few terms of the series.
 
         Raises:
             ValueError: no covariance: the errors of the modes were not given, or it is a mass.
@@ -117,7 +117,7 @@ class SurfaceDistribution:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDistributions:
-    """The mass and stiffness of one plate, and the scale of its modes found with them.
+    """The mass and stiffness of one plate, and the scale of its modes.
 
     Attributes:
         mass: kg/m².
@@ -149,7 +149,7 @@ def plate_mass_and_stiffness(
         poisson_ratio: ν.
         mass_basis, stiffness_basis: functions of the series.
         known_mass: (((x, y), kg/m²), ...), at least one place; held exactly.
-        prior_mass, prior_stiffness: first estimates, kg/m² and N m; the series then corrects them.
+        prior_mass, prior_stiffness: first estimates, kg/m² and N m, which the series corrects.
         errors: of these modes, as `surface_errors` gives them; the stiffness then has standard errors.
 
     Raises:
@@ -198,7 +198,7 @@ def plate_mass_and_stiffness(
     )
     stiffness = SurfaceDistribution(frozen(coefficients), stiffness_basis, prior_stiffness, misfit)
     if errors is not None:
-        # not that of the mass: near a free edge splines err alike in all modes, and the mass by twice as much
+        # none for the mass: near a free edge splines have the same error in all modes, and the mass twice that
         covariance = _stiffness_covariance(
             modes, errors, mass, stiffness, poisson_ratio, mass_basis.functions(*places.T)
         )
@@ -214,10 +214,10 @@ def _stiffness_covariance(
     poisson_ratio: float,
     known: np.ndarray,
 ) -> np.ndarray:
-    """Of the coefficients of the stiffness, (n_terms, n_terms), from the errors of the modes.
+    """Covariance (n_terms, n_terms) of the coefficients of the stiffness, from the errors of the modes.
 
     Args:
-        known: (n_known, n_terms) functions of the mass where it is held.
+        known: (n_known, n_terms) functions of the mass at the places where it is held.
     """
     assert isinstance(modes.domain, Rectangle)
     at, weights = modes.domain.quadrature(QUADRATURE_OF_ERRORS)
@@ -226,10 +226,10 @@ def _stiffness_covariance(
     fields = np.stack([modes.phi(at, d) for d in DERIVATIVES])  # (n_derivatives, n_at, n_modes)
     size = np.sqrt((fields[0] ** 2).mean(axis=0))
     fields = fields / size
-    # errors are of shapes whose largest entry is 1
-    drawn = errors.spline.matrix(at) @ errors.values
-    scale = (fields[0] * drawn).sum(axis=0) / (drawn**2).sum(axis=0)
-    # the density of an energy is Σ ab form[a, b] φ^(a) φ^(b), of the kinetic one and of that of bending
+    # the errors are those of shapes whose largest entry is 1
+    spline_shapes = errors.spline.matrix(at) @ errors.values
+    scale = (fields[0] * spline_shapes).sum(axis=0) / (spline_shapes**2).sum(axis=0)
+    # the densities of kinetic and of bending energy are Σ_ab form[a, b] φ^(a) φ^(b)
     bending = np.zeros((4, 4))
     for square in bending_squares(Field.constant(1.0), poisson_ratio):
         factors = np.zeros(4)
@@ -237,57 +237,59 @@ def _stiffness_covariance(
             factors[DERIVATIVES.index((i, j))] = factor
         bending += float(square.weight(x[:1], y[:1])[0]) * np.outer(factors, factors)
     inertia = np.diag([1.0, 0.0, 0.0, 0.0])
-    off, both = np.triu_indices(n, 1), np.triu_indices(n)
-    own = np.flatnonzero(both[0] == both[1])
+    different, every = np.triu_indices(n, 1), np.triu_indices(n)
+    diagonal = np.flatnonzero(every[0] == every[1])
     m, d = weights * mass(x, y), weights * stiffness(x, y)
-    weigh = 1.0 / np.maximum(omega[both[0]] * omega[both[1]], 1e-12 * omega.max() ** 2)
+    weight = 1.0 / np.maximum(omega[every[0]] * omega[every[1]], 1e-12 * omega.max() ** 2)
 
-    def unbalanced(form: np.ndarray, density: np.ndarray, pairs: tuple[np.ndarray, ...]) -> np.ndarray:
-        """(n_modes, n_pairs, n_derivatives n_at): what an error of each mode's shape does to each relation."""
-        away = np.einsum("ab,bpr,p->rap", form, fields, density).reshape(n, -1)
-        rows = np.zeros((n, pairs[0].size, away.shape[1]))
+    def change_of_relations(form: np.ndarray, density: np.ndarray, pairs: tuple[np.ndarray, ...]) -> np.ndarray:
+        """Change of each relation per error of each mode's shape, (n_modes, n_pairs, n_derivatives n_at)."""
+        change = np.einsum("ab,bpr,p->rap", form, fields, density).reshape(n, -1)
+        rows = np.zeros((n, pairs[0].size, change.shape[1]))
         for k, (r, s) in enumerate(zip(*pairs)):
-            rows[r, k] += away[s]
-            rows[s, k] += away[r]
+            rows[r, k] += change[s]
+            rows[s, k] += change[r]
         return rows
 
     def series(form: np.ndarray, basis: SurfaceBasis, pairs: tuple[np.ndarray, ...]) -> np.ndarray:
-        """(n_pairs, n_terms) of the relations."""
+        """Coefficient matrix U of the relations, (n_pairs, n_terms)."""
         functions = weights[:, None] * basis.functions(x, y)
         return np.asarray(
             np.einsum("ab,apk,bpk,pj->kj", form, fields[:, :, pairs[0]], fields[:, :, pairs[1]], functions)
         )
 
     free = null_space(known)
-    of_mass = -free @ np.linalg.pinv(series(inertia, mass.basis, off) @ free)
-    of_stiffness = -np.linalg.pinv(weigh[:, None] * series(bending, stiffness.basis, both)) * weigh
-    # the scale a_r² stands in one relation of the stiffness, and moves with the shape and with the mass
-    alone = (np.arange(n), np.arange(n))
-    by_mass = np.zeros((both[0].size, mass.basis.n_terms))
-    by_mass[own] = -(omega**2)[:, None] * series(inertia, mass.basis, alone)
-    by_shape = unbalanced(bending, d, both)
-    by_shape[:, own] -= (omega**2)[:, None] * unbalanced(inertia, m, alone)
-    by_omega = np.zeros((both[0].size, n))
-    by_omega[own] = -np.diag(2.0 * omega * (m @ fields[0] ** 2))
-    in_mass = of_mass @ unbalanced(inertia, m, off)
-    moved = of_stiffness @ (by_shape + by_mass @ in_mass)
-    through = np.stack([errors.spline.matrix(at, d) for d in DERIVATIVES])
+    mass_by_residual = -free @ np.linalg.pinv(series(inertia, mass.basis, different) @ free)
+    stiffness_by_residual = -np.linalg.pinv(weight[:, None] * series(bending, stiffness.basis, every)) * weight
+    # the scale a_r² is in one stiffness relation, and changes with the shape and with the mass
+    same_mode = (np.arange(n), np.arange(n))
+    by_mass = np.zeros((every[0].size, mass.basis.n_terms))
+    by_mass[diagonal] = -(omega**2)[:, None] * series(inertia, mass.basis, same_mode)
+    by_shape = change_of_relations(bending, d, every)
+    by_shape[:, diagonal] -= (omega**2)[:, None] * change_of_relations(inertia, m, same_mode)
+    by_omega = np.zeros((every[0].size, n))
+    by_omega[diagonal] = -np.diag(2.0 * omega * (m @ fields[0] ** 2))
+    mass_change = mass_by_residual @ change_of_relations(inertia, m, different)
+    stiffness_change = stiffness_by_residual @ (by_shape + by_mass @ mass_change)
+    spline_rows = np.stack([errors.spline.matrix(at, d) for d in DERIVATIVES])
     noise = scale[:, None, None] ** 2 * errors.value_covariance
-    missed, rough = errors.spline.error(at, DERIVATIVES), scale**2 * errors.roughness
-    by_noise = moved @ through.reshape(-1, through.shape[2])
+    interpolation_error, roughness = errors.spline.error(at, DERIVATIVES), scale**2 * errors.roughness
+    by_noise = stiffness_change @ spline_rows.reshape(-1, spline_rows.shape[2])
     covariance = (by_noise @ noise @ by_noise.swapaxes(1, 2)).sum(axis=0)
-    covariance += np.einsum("r,rij->ij", rough, moved @ missed @ moved.swapaxes(1, 2))
-    # what errors have of energy themselves adds up over the modes, and is as large where curvatures are poor
-    here = np.einsum("apbp->pab", missed.reshape(4, len(at), 4, len(at)))
+    covariance += np.einsum(
+        "r,rij->ij", roughness, stiffness_change @ interpolation_error @ stiffness_change.swapaxes(1, 2)
+    )
+    # the energy of the errors themselves adds up over the modes, and matters where curvatures are inaccurate
+    local_error = np.einsum("apbp->pab", interpolation_error.reshape(4, len(at), 4, len(at)))
     energies = [
         (
-            np.einsum("ab,p,api,rij,bpj->r", form, density, through, noise, through, optimize=True),
-            rough * np.einsum("ab,p,pab->", form, density, here),
+            np.einsum("ab,p,api,rij,bpj->r", form, density, spline_rows, noise, spline_rows, optimize=True),
+            roughness * np.einsum("ab,p,pab->", form, density, local_error),
         )
         for form, density in ((bending, d), (inertia, m))
     ]
     second = np.array(energies[0]) - omega**2 * np.array(energies[1])  # by noise, and between the sensors
-    by_energy, by_frequency = of_stiffness[:, own] @ second.T, of_stiffness @ by_omega
+    by_energy, by_frequency = stiffness_by_residual[:, diagonal] @ second.T, stiffness_by_residual @ by_omega
     covariance += by_energy @ by_energy.T + by_frequency @ errors.omega_covariance @ by_frequency.T
     return np.asarray(covariance)
 
@@ -302,13 +304,13 @@ def check_plate(
     first_mode: int = 0,
     tolerance: float = 1e-4,
 ) -> SelfCheck:
-    """Solve the eigenproblem of what was identified and compare it with what was measured, as `self_check` does.
+    """The eigensolution of an identified plate compared with the measurement, as `self_check` does.
 
-    Frequencies say little of D where the plate hardly bends, at a free edge say: it may be further off there.
+    Frequencies hardly depend on D where the plate hardly bends, as at a free edge: its error may be larger there.
 
     Args:
         found: mass and stiffness.
-        measured: the modes that they were found from, consecutive.
+        measured: the modes they were identified from, consecutive.
         poisson_ratio, edges: of the plate.
         first_mode: index of the first measured mode among all modes of the plate; 3 leaves out rigid-body modes.
         tolerance: of the frequencies of the eigenproblem.
@@ -328,10 +330,10 @@ def check_plate(
     )
     try:
         plate = replace(plate, mass_per_area=found.mass.field, bending_stiffness=found.stiffness.field)
-        again = plate.modes(first_mode + n, tolerance=tolerance).select(slice(first_mode, None))
+        computed = plate.modes(first_mode + n, tolerance=tolerance).select(slice(first_mode, None))
     except ValueError as error:
         return SelfCheck(np.full(n, np.inf), np.zeros(n), str(error))
     share = np.linspace(0.0, 1.0, PER_SIDE)
     grid = np.stack(np.meshgrid(*(side * share for side in measured.domain.length), indexing="ij"), axis=-1)
-    agreement = subspace_mac(measured.phi(grid.reshape(-1, 2)), again.phi(grid.reshape(-1, 2)), again.omega)
-    return SelfCheck(again.omega / measured.omega - 1.0, np.diag(agreement))
+    agreement = subspace_mac(measured.phi(grid.reshape(-1, 2)), computed.phi(grid.reshape(-1, 2)), computed.omega)
+    return SelfCheck(computed.omega / measured.omega - 1.0, np.diag(agreement))
