@@ -237,7 +237,7 @@ def test_lone_wrong_samples_are_replaced_and_named():
     outputs[1, 420] -= outputs[1].std()
     told, plain = ring_down(replace(record, outputs=outputs)), ring_down(record)
     assert told.notes == tuple(
-        f"output {name!r} leaps at {at:g} s for one sample, replaced by what its neighbours say"
+        f"output {name!r} has a spike of one sample at {at:g} s, replaced by interpolation"
         for name, at in (("y2", 420 * 0.02), ("y1", 300 * 0.02))
     )
     assert told.records[0].n_samples == record.n_samples and not plain.notes
