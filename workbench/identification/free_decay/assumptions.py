@@ -147,9 +147,8 @@ def _segments(
         begins, ends = record.start_time + record.sample_time * np.array([first, last - 1])
         if significant.size == 0 or last - first < 4 * (significant.size + 1):
             continue
-        if any(
-            since <= ends and until >= begins for since, until in dropped
-        ):  # a dropout would look like a change of the modes
+        # A dropout would look like a change of the modes.
+        if any(since <= ends and until >= begins for since, until in dropped):
             continue
         segment = record.between(begins, ends)
         if (segment.outputs.std(axis=1) < least_rms).any():  # quantisation distorts so small a motion
