@@ -403,7 +403,7 @@ def test_outputs_that_a_filter_delays_are_put_in_time(quantity, late):
     np.testing.assert_allclose(found.modes.omega, modes.omega[1:4], rtol=1e-3)
     assert far_from_real(found.modes).max() < 0.02
     assert np.abs(found.fitted - h * turn).max() < 0.02 * np.abs(h).max()
-    assert "are late beside the inputs, by " in found.remarks[0] and "y1 0.00" in found.remarks[0]
+    assert "are delayed relative to the inputs, by " in found.remarks[0] and "y1 0.00" in found.remarks[0]
     assert [s.delay for s in rig_from(found, inputs=["h1"], outputs=channels).sensors] == list(found.delays)
 
 

@@ -455,7 +455,7 @@ def _for_other_delays(other: KnownInputs, data: KnownInputs, fit: Fit) -> Fit:
 
 
 def _any_acts_later(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
-    """Whether any input acts later than in `data`, beside the selected modes."""
+    """Whether any input acts later than in `data`, given the selected modes."""
     other, trial = _with_free_fraction(data, selected.fit, data.delays, budget)
     return bool(act_later(other, trial).any())
 
@@ -535,25 +535,23 @@ def _select(
     data = data.with_distorted(strongest.distorted)
     uncorrelated = data.apart(strongest.fit)
     if uncorrelated is None:
-        return _select_beside_noise(data, strongest, options)
+        return _select_weighted(data, strongest, options)
     # Correlated noise makes peaks in all outputs. Modes not found yet add to its estimate, hence the repetition.
     for _ in range(DRIVEN.decorrelation_rounds):
         again = _select_strongest(uncorrelated, strongest.fit, **options)
-        uncorrelated, found = _select_beside_noise(uncorrelated, again, options)
-        further = uncorrelated.apart(found.fit)
-        if further is None or budget.spent("search beside noise that outputs share"):
+        uncorrelated, selected = _select_weighted(uncorrelated, again, options)
+        further = uncorrelated.apart(selected.fit)
+        if further is None or budget.spent("search in outputs of uncorrelated noise"):
             break
-        uncorrelated, strongest = further, found
+        uncorrelated, strongest = further, selected
     data = data.beside_as(uncorrelated)
-    fit = settled(data, projected(data, found.fit.poles, found.fit.participation), budget=budget)
+    fit = settled(data, projected(data, selected.fit.poles, selected.fit.participation), budget=budget)
     data = data.weighted_by(data.noise_spectrum(fit))
     fit = settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget)
-    return data, found.refitted(fit)
+    return data, selected.refitted(fit)
 
 
-def _select_beside_noise(
-    data: KnownInputs, strongest: Selected, options: dict[str, Any]
-) -> tuple[KnownInputs, Selected]:
+def _select_weighted(data: KnownInputs, strongest: Selected, options: dict[str, Any]) -> tuple[KnownInputs, Selected]:
     """The modes of outputs of uncorrelated noise, weighted by the spectrum of the residual.
 
     Coloured noise may be taken for modes. A false mode fits noise at its lines, so that the noise there is
@@ -586,7 +584,7 @@ def _as_time_invariant(
     """The modes refitted as time-invariant, without the columns of changing modes, and the poles that change.
 
     Noise, standard errors and responses are then those of the model returned. No mode counts as changing if these
-    columns, beside all modes, explain no more than they would of noise.
+    columns, in addition to all modes, explain no more than they would of noise.
     """
     if not data.changing:
         return data, selected, ()

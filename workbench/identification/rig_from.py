@@ -127,11 +127,11 @@ def _channels(identified: Any, name: str, given: Sequence[Channel | str] | None,
         count: number of channels required.
     """
     records = getattr(identified, "records", ()) or getattr(identified, "correlations", ())
-    found = given if given is not None else getattr(identified, name, getattr(next(iter(records), None), name, None))
+    chosen = given if given is not None else getattr(identified, name, getattr(next(iter(records), None), name, None))
     side = name.split("_")[0] + "s"
-    if found is None:
+    if chosen is None:
         raise ValueError(f"{type(identified).__name__} does not keep its {side}; give {side}= with {count} channels")
-    channels = tuple(Channel(c) if isinstance(c, str) else c for c in found)
+    channels = tuple(Channel(c) if isinstance(c, str) else c for c in chosen)
     if len(channels) != count:
         raise ValueError(f"{side}= must name the {count} {side} of the identified modes; got {len(channels)}")
     return channels

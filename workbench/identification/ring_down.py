@@ -139,7 +139,7 @@ def ring_down(
         )
         _check_undriven(decay)
     try:
-        identified, decays, drift_notes = _identify_beside_drift(decays, n_modes, budget)
+        identified, decays, drift_notes = _identify_with_drift(decays, n_modes, budget)
     except np.linalg.LinAlgError:
         identified = _by_stabilisation(decays, budget)
         drift_notes = ["model order from the stabilisation diagram, because selection by likelihood failed"]
@@ -193,7 +193,7 @@ def _cut_to_decay(record: Record, start: float | None) -> tuple[Record, list[str
     return record.between(start), notes
 
 
-def _identify_beside_drift(
+def _identify_with_drift(
     records: list[Record], n_modes: int | None, budget: Budget
 ) -> tuple[Identified, list[Record], list[str]]:
     """The modes, the records without drift, and notes; modes and drift are estimated alternately until both settle."""

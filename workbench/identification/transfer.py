@@ -243,35 +243,37 @@ def _in_bands(
             max_modes=min(max_modes, f[inside].size // lines_a_mode),
             false_alarm=false_alarm / n_bands,
         )
-        return _modes_of(*selected, channels, edges, f[first:last], band_budget)
+        return _modes_of(*selected, channels, edges, f[first:last])
 
-    budgets, found = [], []
+    budgets, results = [], []
     for k in range(n_bands):
         budgets.append(budget.apart(1.0 / (n_bands - k)))
-        found.append(band(k, budgets[k]))
+        results.append(band(k, budgets[k]))
     # A band of modes that change takes many times its share of the time; other bands hardly use theirs.
     ended = [k for k in range(n_bands) if budgets[k].unfinished]
     for remaining, k in zip(range(len(ended), 0, -1), ended, strict=True):
         again = budget.apart(1.0 / remaining)
         if (again.seconds or 0.0) > (budgets[k].seconds or 0.0):
-            found[k], budgets[k] = band(k, again), again
+            results[k], budgets[k] = band(k, again), again
         budget.counted(budgets[k])
-    return _joined(found, channels) if n_bands > 1 else found[0]
+    return _joined(results, channels) if n_bands > 1 else results[0]
 
 
-def _output_delays(found: TransferModes, channels: Sequence[Channel], least: float) -> Floats:
+def _output_delays(estimate: TransferModes, channels: Sequence[Channel], least: float) -> Floats:
     """Delay of each output relative to the inputs, (n_outputs,) s, by `late_outputs`; 0 for outputs of no motion."""
     delays, known = np.zeros(len(channels)), np.array([channel.quantity in MEASURED for channel in channels])
-    if known.any() and found.modes.n_modes:
-        residues = 1j * found.modes.shapes.T[:, known, None] * found.participation[:, None, :]
-        delays[known] = late_outputs(residues, found.modes.poles, least)
+    if known.any() and estimate.modes.n_modes:
+        residues = 1j * estimate.modes.shapes.T[:, known, None] * estimate.participation[:, None, :]
+        delays[known] = late_outputs(residues, estimate.modes.poles, least)
     return delays
 
 
 def _delay_remarks(delays: Floats, channels: Sequence[Channel]) -> tuple[str, ...]:
     late = [f"{c.name} {d:.3g} s" for c, d in zip(channels, delays, strict=True) if d]
     return (
-        (f"outputs are late beside the inputs, by {', '.join(late)}: the modes are of outputs in time",) if late else ()
+        (f"outputs are delayed relative to the inputs, by {', '.join(late)}: the modes are corrected for it",)
+        if late
+        else ()
     )
 
 
@@ -281,12 +283,12 @@ def _select_in_band(
     """The lines of a band with weights, and their modes; noise not stated is estimated from the strongest modes."""
     lines, options = Lines(h, omega, powers, noise), {**options, "budget": budget}
     if noise is not None:
-        return _beside_changing(lines, options)
+        return _select_with_changing(lines, options)
     few = options | {"max_modes": min(TRANSFER.strongest, options["max_modes"])}
     selected = select_modes(lines, **few)
     guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
     if guessed is None:  # noise proportional to the response would look like modes that change
-        lines, selected = _beside_changing(lines, few, selected)
+        lines, selected = _select_with_changing(lines, few, selected)
         guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
     residual = lines.left(selected.fit)
     # Correlation of noise is tested in second differences over the lines (Hann's window of the impulse response): they
@@ -297,10 +299,10 @@ def _select_in_band(
     differences = np.diff(scaled, 2)
     mixing = mixing_of(correlation_of_lines([differences.reshape(len(h), -1)]))
     if mixing is None:
-        return _select_beside_noise(lines, selected, options)
+        return _select_weighted(lines, selected, options)
     # Correlated noise makes peaks in all outputs; modes are selected in combinations of uncorrelated noise.
     mixed = np.tensordot(mixing / np.sqrt((np.abs(residual) ** 2).mean(axis=(1, 2))), h, 1)
-    uncorrelated, selected = _select_beside_noise(*_beside_changing(lines.of(mixed), few), options)
+    uncorrelated, selected = _select_weighted(*_select_with_changing(lines.of(mixed), few), options)
     lines = uncorrelated.of(h)
     fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
     guessed = relative_noise(lines.left(fit), lines.fitted(fit), lines.omega)
@@ -310,16 +312,18 @@ def _select_in_band(
     return lines, selected.refitted(fit)
 
 
-def _beside_changing(lines: Lines, options: dict[str, Any], selected: Selected | None = None) -> tuple[Lines, Selected]:
+def _select_with_changing(
+    lines: Lines, options: dict[str, Any], selected: Selected | None = None
+) -> tuple[Lines, Selected]:
     """The lines with columns for the motion of modes that change, and the modes, one for each that changes."""
     selected = select_modes(lines, **options) if selected is None else selected
-    while (found := beside_changing(lines, selected.fit, selected.limit, options["budget"])) is not None:
-        lines, start = found
+    while (change := beside_changing(lines, selected.fit, selected.limit, options["budget"])) is not None:
+        lines, start = change
         selected = select_modes(lines, start=start, **options)
     return lines, selected
 
 
-def _select_beside_noise(lines: Lines, selected: Selected, options: dict[str, Any]) -> tuple[Lines, Selected]:
+def _select_weighted(lines: Lines, selected: Selected, options: dict[str, Any]) -> tuple[Lines, Selected]:
     """The lines and their modes, with alternating estimates of noise and modes, for outputs of uncorrelated noise."""
     budget = options["budget"]
     before: np.ndarray | None = None
@@ -335,13 +339,13 @@ def _select_beside_noise(lines: Lines, selected: Selected, options: dict[str, An
         weighted = lines.without_columns().weighted_by(guessed)
         # The selection starts from the modes found: with noise proportional to the response, lines between modes have
         # the largest weights, and the least information.
-        weighted, reselected = _beside_changing(
+        weighted, reselected = _select_with_changing(
             weighted, options, select_modes(weighted, start=selected.fit, **options)
         )
         if budget.spent("estimation of the noise") and reselected.fit.poles.size < selected.fit.poles.size:
             return lines, selected
         lines, selected = weighted, reselected
-    return (lines, selected) if lines.guessed else _beside_changing(lines, options)
+    return (lines, selected) if lines.guessed else _select_with_changing(lines, options)
 
 
 def _modes_of(
@@ -350,7 +354,6 @@ def _modes_of(
     channels: Sequence[Channel],
     edges_hz: tuple[float, float],
     shown_hz: np.ndarray,
-    budget: Budget,
 ) -> TransferModes:
     """The result for a band.
 
@@ -360,7 +363,6 @@ def _modes_of(
         channels: of the outputs.
         edges_hz: frequencies between which modes are reported, Hz.
         shown_hz: (n_frequencies,) lines at which the fit is reported, Hz.
-        budget: time limit.
     """
     fit, cluster_hz = _clustered(lines, selected, channels)
     peak_shapes = peaks(lines, fit)
@@ -427,13 +429,15 @@ def _residual_terms(
     terms, errors = (x[:size].reshape(lines.refs, len(scale), -1) * scale[:, None] for x in (fit.coefficients[n:], std))
     below, below_std, above = (np.zeros((len(derivative), lines.refs)) for _ in range(3))
     # For each derivative: terms in s^(k - 2) of the poles below the band, less those of the poles within it.
-    beside = np.stack([fit.amplitudes * x for x in (low * fit.poles, low, (low - 1.0) / fit.poles)]) @ fit.participation
+    pole_terms = (
+        np.stack([fit.amplitudes * x for x in (low * fit.poles, low, (low - 1.0) / fit.poles)]) @ fit.participation
+    )
     for j, order in enumerate(derivative):
         if order in lines.powers:
             above[j] = terms[:, lines.powers.index(order), j]
         if order - 2 in lines.powers:
             power = lines.powers.index(order - 2)
-            below[j], below_std[j] = terms[:, power, j] + beside[order, j].real, errors[:, power, j]
+            below[j], below_std[j] = terms[:, power, j] + pole_terms[order, j].real, errors[:, power, j]
     return below, below_std, above
 
 
@@ -510,34 +514,34 @@ def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) ->
     return settled(lines, projected(lines, mean_poles[kept], fit.participation[kept])), cluster_hz
 
 
-def _joined(found: Sequence[TransferModes], channels: Sequence[Channel]) -> TransferModes:
+def _joined(bands: Sequence[TransferModes], channels: Sequence[Channel]) -> TransferModes:
     """The results of all bands in one."""
-    each = [band.modes for band in found]
-    n = [modes.n_modes for modes in each]
-    covariance = block_diag(*(band.covariance for band in found))
+    modes_by_band = [band.modes for band in bands]
+    n = [modes.n_modes for modes in modes_by_band]
+    covariance = block_diag(*(band.covariance for band in bands))
     first = np.concatenate([np.arange(k) + 2 * sum(n[:i]) for i, k in enumerate(n)]).astype(int)
-    both = np.r_[first, first + np.repeat(n, n)]
-    omega, zeta = (np.concatenate([getattr(modes, name) for modes in each]) for name in ("omega", "zeta"))
-    shapes = np.hstack([modes.shapes for modes in each])
-    share = np.array([band.frequencies_hz.size for band in found]) / sum(band.frequencies_hz.size for band in found)
+    kept = np.r_[first, first + np.repeat(n, n)]
+    omega, zeta = (np.concatenate([getattr(modes, name) for modes in modes_by_band]) for name in ("omega", "zeta"))
+    shapes = np.hstack([modes.shapes for modes in modes_by_band])
+    share = np.array([band.frequencies_hz.size for band in bands]) / sum(band.frequencies_hz.size for band in bands)
     return TransferModes(
         modes=SampledModes(omega, zeta, shapes, _places(channels)),
-        covariance=frozen(covariance[np.ix_(both, both)]),
-        vector_covariance=frozen(np.concatenate([band.vector_covariance for band in found])),
-        participation=frozen(np.vstack([band.participation for band in found]), complex),
-        misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in found]) ** 2)),
-        statistic=frozen(np.concatenate([band.statistic for band in found])),
-        converged=all(band.converged for band in found),
-        cluster_hz=tuple(parts for band in found for parts in band.cluster_hz),
-        scatter_hz=frozen(np.concatenate([band.scatter_hz for band in found])),
-        order_limited_hz=tuple(full for band in found for full in band.order_limited_hz),
-        fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
-        frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
-        lower_residual=found[0].lower_residual,
-        lower_residual_std=found[0].lower_residual_std,
-        upper_residual=found[-1].upper_residual,
-        delays=found[0].delays,
-        remarks=tuple(dict.fromkeys(remark for band in found for remark in band.remarks)),
+        covariance=frozen(covariance[np.ix_(kept, kept)]),
+        vector_covariance=frozen(np.concatenate([band.vector_covariance for band in bands])),
+        participation=frozen(np.vstack([band.participation for band in bands]), complex),
+        misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in bands]) ** 2)),
+        statistic=frozen(np.concatenate([band.statistic for band in bands])),
+        converged=all(band.converged for band in bands),
+        cluster_hz=tuple(parts for band in bands for parts in band.cluster_hz),
+        scatter_hz=frozen(np.concatenate([band.scatter_hz for band in bands])),
+        order_limited_hz=tuple(full for band in bands for full in band.order_limited_hz),
+        fitted=frozen(np.concatenate([band.fitted for band in bands], axis=-1), complex),
+        frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in bands])),
+        lower_residual=bands[0].lower_residual,
+        lower_residual_std=bands[0].lower_residual_std,
+        upper_residual=bands[-1].upper_residual,
+        delays=bands[0].delays,
+        remarks=tuple(dict.fromkeys(remark for band in bands for remark in band.remarks)),
     )
 
 

@@ -28,7 +28,7 @@ def notes(modes):
 @pytest.mark.parametrize(("seconds", "said"), [(0.006, "6 ms late"), (-0.0021, "2.1 ms early")])
 def test_the_late_sensor_is_named(seconds, said):
     (note,) = notes(late(seconds))
-    assert note.startswith(f"output 'y2' is {said} beside the others")
+    assert note.startswith(f"output 'y2' is {said} relative to the others")
 
 
 def test_shapes_that_no_clock_explains_are_said_to_be_complex():

@@ -142,11 +142,11 @@ class _Band:
         """Fourier lines of the real, and of the imaginary parts of motions (n_motions, n_times), (2 n_lines, n_motions)
         each."""
         m = self.time.size
-        found = fft(motions, axis=1) * np.sqrt(self.step / (0.5 * m))
-        one, other = found[:, self.lines % m].T, np.zeros(())
+        spectra = fft(motions, axis=1) * np.sqrt(self.step / (0.5 * m))
+        positive, negative = spectra[:, self.lines % m].T, np.zeros(())
         if self.step == 1:
-            other = found[:, -self.lines].conj().T
-        real, imaginary = 0.5 * (one + other), -0.5j * (one - other)
+            negative = spectra[:, -self.lines].conj().T
+        real, imaginary = 0.5 * (positive + negative), -0.5j * (positive - negative)
         return np.vstack([real.real, real.imag]), np.vstack([imaginary.real, imaginary.imag])
 
     def without_others(self, columns: Floats) -> Floats:
@@ -193,13 +193,13 @@ class _Modes:
 
     def residuals(self, unknowns: Floats) -> list[tuple[Floats, Floats]]:
         """Residual and Jacobian of each record, without weights."""
-        poles, found = unknowns[: unknowns.size // 2] + 1j * unknowns[unknowns.size // 2 :], []
+        poles, results = unknowns[: unknowns.size // 2] + 1j * unknowns[unknowns.size // 2 :], []
         for band in self.bands:
             with np.errstate(over="ignore", invalid="ignore"):
                 motions = np.exp(np.outer(poles, band.time))
                 slopes = band.time * motions
-                found.append(band.residual(motions, np.vstack([slopes, 1j * slopes]), [*range(poles.size)] * 2))
-        return found
+                results.append(band.residual(motions, np.vstack([slopes, 1j * slopes]), [*range(poles.size)] * 2))
+        return results
 
     def fitted(self, unknowns: Floats) -> tuple[Floats, Floats]:
         """Weighted residual and Jacobian of all records."""
@@ -282,25 +282,27 @@ def _envelopes(real: Floats, powers: Floats, t: Floats, faded: float, died: floa
 def _integrals(u: Floats, rates: Floats, powers: Floats, time: Floats, h: float, faded: float) -> Floats:
     """∫ r^p_k dt at samples, (n_rows, n, 3), of u and u' (n_rows, n_times), by cubic Hermite interpolation."""
     n_rows, n_times = u.shape
-    found = np.empty((n_rows, time.size, powers.size))
-    value, slope, until = np.empty(n_times), np.empty(n_times), np.empty(n_times)
+    integrals = np.empty((n_rows, time.size, powers.size))
+    value, slope, integral_to = np.empty(n_times), np.empty(n_times), np.empty(n_times)
     for i in range(n_rows):
         for k in range(powers.size):
             for j in range(n_times):
                 value[j] = np.exp(-min(max(u[i, j], -1.0), faded) * powers[k])
                 slope[j] = -powers[k] * value[j] * rates[i, j] * h if u[i, j] < faded else 0.0
-            until[0] = 0.0
+            integral_to[0] = 0.0
             for j in range(n_times - 1):
-                until[j + 1] = until[j] + h * (0.5 * (value[j] + value[j + 1]) + (slope[j] - slope[j + 1]) / 12.0)
+                integral_to[j + 1] = integral_to[j] + h * (
+                    0.5 * (value[j] + value[j + 1]) + (slope[j] - slope[j + 1]) / 12.0
+                )
             for m in range(time.size):
                 j = min(int(time[m] / h), n_times - 2)
                 x = time[m] / h - j
                 rise = value[j + 1] - value[j]
                 square, cube = 3.0 * rise - 2.0 * slope[j] - slope[j + 1], slope[j] + slope[j + 1] - 2.0 * rise
-                found[i, m, k] = until[j] + h * x * (
+                integrals[i, m, k] = integral_to[j] + h * x * (
                     value[j] + x * (slope[j] / 2.0 + x * (square / 3.0 + x * cube / 4.0))
                 )
-    return found
+    return integrals
 
 
 def backbone_integrals(real: np.ndarray, powers: np.ndarray, time: np.ndarray) -> list[Floats]:

@@ -190,11 +190,11 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
     """
     records = of_same_sensors(records)
     basis = signal_subspace(records, 2 * max(orders), delays=delays)
-    found = []
+    by_order = []
     for n in orders:
         mu, shapes = shift_eigenpairs(basis[:, : 2 * n], records[0].n_outputs)
-        found.append(as_modes(mu, shapes, records[0]))
-    return Stabilisation(tuple(orders), tuple(found))
+        by_order.append(as_modes(mu, shapes, records[0]))
+    return Stabilisation(tuple(orders), tuple(by_order))
 
 
 def stable_modes(

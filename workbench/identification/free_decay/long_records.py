@@ -44,7 +44,7 @@ class LongSettings:
     ratio: float = 4.0  # of each decay rate to the one before
     life: float = 8.0  # time constants after which an exponential is cut off
     at_once: int = 16  # outputs transformed together
-    beside: int = 64  # least number of cells on either side of a peak, from which the noise about it is estimated
+    half_window: int = 64  # least number of cells on either side of a peak, from which the noise about it is estimated
     # quantiles that estimate it: the residual about a mode that depends on amplitude is not smooth
     quantiles: tuple[float, ...] = (0.5, 0.9)
     leaked: float = 2.0  # least ratio of a peak to the leakage of stronger peaks
@@ -89,7 +89,16 @@ def identify_long(
 
 
 class _Search:
-    """The state of the search: current poles, their fit and residual, and rejected candidates."""
+    """The state of the search: current poles, their fit and residual, and rejected candidates.
+
+    Attributes:
+        rates: decay rates of the search, 1/s.
+        enter: χ² from which on a peak enters.
+        limit: χ² from which on a mode stays, in white noise.
+        origins: poles of the modes as they entered, rad/s.
+        rejected: poles of rejected candidates as they entered, with their statistic.
+        fine: χ² of the lowest decay rate in the residual, by frequency.
+    """
 
     def __init__(self, records: Sequence[Record], false_alarm: float, budget: Budget) -> None:
         self.records, self.budget = records, budget
@@ -106,7 +115,6 @@ class _Search:
         self.limit = float(chi2.isf(false_alarm / cells, self.signals + 2))
         # The round-off level of sums over so many samples.
         self.floor = 1e-11 * np.sqrt(np.mean([(r.outputs**2).mean() for r in records]))
-        # Poles of the candidates as they entered: of the current modes, and of the rejected ones with their statistic.
         self.origins = np.zeros(0, complex)
         self.rejected: list[tuple[complex, float]] = []
         self.weights = np.ones((len(records), records[0].n_outputs))
@@ -151,9 +159,9 @@ class _Search:
     def peaks(self) -> np.ndarray:
         """Poles of the significant peaks of the residual, strongest first."""
         self.fine = self._strengths(self.rates[0])
-        found = [self._peaks(self.rates[0], self.fine)]
-        found += [self._peaks(rate, self._strengths(rate)) for rate in self.rates[1:]]
-        height, poles = np.concatenate([h for h, _ in found]), np.concatenate([p for _, p in found])
+        by_rate = [self._peaks(self.rates[0], self.fine)]
+        by_rate += [self._peaks(rate, self._strengths(rate)) for rate in self.rates[1:]]
+        height, poles = np.concatenate([h for h, _ in by_rate]), np.concatenate([p for _, p in by_rate])
         taken, heights = np.zeros(0, complex), np.zeros(0)
         for r in np.argsort(-height):
             leaked = np.sqrt(heights * self._overlap(taken, poles[r])).sum() ** 2
@@ -176,7 +184,7 @@ class _Search:
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
                 near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
-                if near.size > 1 and self._statistic_beside(r, near) < limit[r]:
+                if near.size > 1 and self._orthogonal_statistic(r, near) < limit[r]:
                     statistic[r] = self._gain(r, near)
                     out[r] = statistic[r] < limit[r]
         for r in map(int, np.flatnonzero(out)):
@@ -200,14 +208,14 @@ class _Search:
 
     def _strength(self, r: int, without: np.ndarray) -> float:
         """χ² of the amplitudes of mode r orthogonal to some directions (n_outputs, n_directions)."""
-        strength, both = 0.0, [r, self.poles.size + r]
+        strength, rows = 0.0, [r, self.poles.size + r]
         for fit, weights in zip(self.fits, self.weights, strict=True):
-            a = fit.coefficients[both] * weights
+            a = fit.coefficients[rows] * weights
             a = a - (a @ without) @ without.T
-            strength += float((a * np.linalg.solve(fit.spread[np.ix_(both, both)], a)).sum())
+            strength += float((a * np.linalg.solve(fit.spread[np.ix_(rows, rows)], a)).sum())
         return strength
 
-    def _statistic_beside(self, r: int, near: np.ndarray) -> float:
+    def _orthogonal_statistic(self, r: int, near: np.ndarray) -> float:
         """χ² of mode r in combinations of the outputs that are orthogonal to the shapes of its neighbours."""
         shapes = np.hstack(np.split(self._shapes[:, near[near != r]], len(self.fits)))
         return self._strength(r, np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0])
@@ -255,9 +263,9 @@ class _Search:
     def _noise_ratio(self, pole: complex) -> float:
         """Noise about a pole over white noise, 1 or more, by quantiles of the last χ² of the lowest decay rate."""
         step = np.pi / (self.fine.size * self.dt)
-        at, half = round(pole.imag / step), max(int(abs(pole.real) / step), LONG.beside)
-        beside = self.fine[max(at - half, 0) : at + half + 1]
-        return max(1.0, float((np.quantile(beside, LONG.quantiles) / self.white).max()))
+        at, half = round(pole.imag / step), max(int(abs(pole.real) / step), LONG.half_window)
+        nearby = self.fine[max(at - half, 0) : at + half + 1]
+        return max(1.0, float((np.quantile(nearby, LONG.quantiles) / self.white).max()))
 
     def _peaks(self, rate: float, strengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """χ² and poles of the local maxima of one decay rate that exceed white noise."""
@@ -281,18 +289,18 @@ class _Search:
         """Share of each candidate, sorted by frequency, outside the span of the current modes, (n_candidates,)."""
         share = np.ones(poles.size)
         reach = 3.0 * (2.0 * self.bin_width + np.abs(self.poles.real))
-        for first in range(0, poles.size, LONG.beside):
-            block = slice(first, first + LONG.beside)
+        for first in range(0, poles.size, LONG.half_window):
+            block = slice(first, first + LONG.half_window)
             candidates = poles[block]
             wider = reach + 3.0 * np.abs(candidates[0].real)
             near = self.poles[
                 (self.poles.imag > candidates[0].imag - wider) & (self.poles.imag < candidates[-1].imag + wider)
             ]
             if near.size:
-                both = self._products(near, candidates)
+                products = self._products(near, candidates)
                 gram = self._products(near, near)
                 factor = cho_factor(gram + LONG.ridge * np.diag(np.diag(gram)))
-                shared = (both.conj() * cho_solve(factor, both)).sum(axis=0).real
+                shared = (products.conj() * cho_solve(factor, products)).sum(axis=0).real
                 share[block] = 1.0 - shared / np.diag(self._products(candidates[:1], candidates[:1])).real
         return share
 

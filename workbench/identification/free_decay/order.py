@@ -49,7 +49,7 @@ from workbench.threads import one_blas_thread
 
 @dataclass(frozen=True)
 class OrderSettings:
-    """Constants of the selection of modes of a free decay, beside those of every selection (`searches.SELECTION`)."""
+    """Constants of the selection of modes of a free decay, in addition to those of `searches.SELECTION`."""
 
     long: int = 100_000  # total number of values above which many modes enter at a time
     max_modes: int = 40  # unless given: a joint fit of more takes minutes
@@ -60,8 +60,8 @@ class OrderSettings:
     # consecutive candidates below the threshold, and candidates that split a mode, after which the search ends
     most_weak: int = 2
     most_splits: int = 6
-    # The transform for a decay rate has a frequency step of at most this fraction, 1/4, of the rate; the exponential
-    # has decayed to e^-25 at the end of the shorter transform.
+    # Least ratio of a decay rate to the frequency step of its transform: the exponential has decayed to e^-25 at the
+    # end of the transform.
     coarser: float = 4.0
     decided: float = 0.1  # predicted decrease of χ² below which a fit is precise enough to decide on a mode
     least_independent: float = 1e-7  # least share of a candidate outside the span of the model, to be distinguishable
@@ -176,6 +176,7 @@ def _select(
     measured: Sequence[Record],
     verdicts: "Verdicts",
 ) -> tuple["_FreeDecay", "_Model"]:
+    """The problem and the selected model for records, whitened or as measured; `measured` are those as measured."""
     problem = _FreeDecay(records, false_alarm, measured, budget, verdicts)
     selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, False, budget, alone=True)
     model = selection.select(problem.nothing)
@@ -206,7 +207,7 @@ class _Model:
 
     @property
     def residuals(self) -> list[Floats]:
-        """One (n_samples, n_outputs) a record."""
+        """Residual (n_samples, n_outputs) of each record."""
         return [fit.residual for fit in self.fits]
 
     @cached_property
@@ -218,7 +219,16 @@ class _Model:
 
 
 class _FreeDecay:
-    """The `searches.Selection` of free decays."""
+    """The `searches.Selection` of free decays: a candidate is a pole of the grid.
+
+    Attributes:
+        records: free decays, whitened or as measured.
+        measured: the same as measured, for the test of one nonlinear mode.
+        enter: χ² from which on a candidate is tried.
+        limit: gain from which on it stays, in white noise.
+        split_off: candidates rejected for splitting a mode, with their gain.
+        nothing: the model without modes.
+    """
 
     def __init__(
         self,
@@ -288,8 +298,7 @@ class _FreeDecay:
         return self.fitted(np.append(model.poles, candidate), model.weights, TO_DECIDE)
 
     def gain(self, smaller: _Model, larger: _Model) -> float:
-        """The log-likelihood ratio for noise of unknown variance: Σ_ij N_i log(s²_smaller / s²_larger), records i,
-        sensors j."""
+        """Twice the log-likelihood ratio, noise unknown: Σ_ij N_i log(s²_smaller / s²_larger), records i, sensors j."""
         n = np.array([residual.shape[0] for residual in larger.residuals])
         before, after = (_squares(model.residuals) + self.round_off for model in (smaller, larger))
         differing = differ(after, n)
@@ -482,14 +491,14 @@ class _Grid:
     def _of_length(self, n: int) -> list[tuple[Floats, float, Complexes, Complexes, Complexes]]:
         """For each rate, over n samples: its decay, Σ|w|^2t, and w = e^{λΔt}, Σ w*^2t and w^n at its frequencies."""
         if n not in self._sums:
-            dt, found = self.record.sample_time, []
-            once, end = np.exp(1j * dt * self.omega), np.exp(1j * n * dt * self.omega)
+            dt, tables = self.record.sample_time, []
+            step, last = np.exp(1j * dt * self.omega), np.exp(1j * n * dt * self.omega)
             for rate, cells, stride in zip(self.rates, self.cells, self.strides, strict=True):
                 decay = np.exp(-rate * dt * np.arange(min(n, self.size // stride)))
-                w, ends = np.exp(-rate * dt) * once[cells], np.exp(-rate * dt * n) * end[cells]
+                w, ends = np.exp(-rate * dt) * step[cells], np.exp(-rate * dt * n) * last[cells]
                 double = (1.0 - ends.conj() ** 2) / (1.0 - w.conj() ** 2)
-                found.append((decay, float(decay @ decay), w, double, ends))
-            self._sums[n] = found
+                tables.append((decay, float(decay @ decay), w, double, ends))
+            self._sums[n] = tables
         return self._sums[n]
 
     def near(self, pole: complex, bins: float) -> np.ndarray:
@@ -516,7 +525,7 @@ class _Grid:
             power = (np.abs(spectrum) ** 2).sum(axis=1)
             conjugate_power = (spectrum.conj() ** 2).sum(axis=1)
             p, q = np.full(power.shape, energy), double.copy()
-            at = self._beside(poles, k) & allowed
+            at = self._overlapping(poles, k) & allowed
             if at.any():
                 dp, dq = modes.shared(w[at], ends[at])
                 p[at] -= dp
@@ -527,7 +536,7 @@ class _Grid:
             chi_square[k, cells] = np.where(good, top / np.where(good, det, 1.0), 0.0)
         return chi_square
 
-    def _beside(self, poles: np.ndarray, k: int) -> np.ndarray:
+    def _overlapping(self, poles: np.ndarray, k: int) -> np.ndarray:
         """Which frequencies of rate k overlap with a mode of the model."""
         omega = self.omega[self.cells[k]]
         overlaps = np.zeros(omega.size, bool)

@@ -32,15 +32,15 @@ class StartSettings:
     memory: int = 4  # of the predictor's coefficients, in orders
     level_memory: int = 2  # of the level of its errors, in orders
     most_signals: int = 8  # combinations of outputs that the predictor is estimated from
-    most_samples: int = 40_000  # at the highest rate that is tested; longer records are tested at lower rates
+    most_samples: int = 40_000  # per rate; longer records are tested at lower rates only
     most_sensors: int = 256  # that are combined, evenly spaced among all: more take minutes
     coarser: int = 4  # ratio of one rate to the next
     # Squared prediction error over its level that is a break: alone; where the energy of the motion also rises by the
-    # factor `rise`; or within `near` samples of another break, for a force that dies away.
+    # factor `rise`; or, `lesser`, within `near` samples of another break, for a force that dies away.
     alone: float = 100.0
     rising: float = 25.0
     rise: float = 4.0
-    beside: float = 16.0
+    lesser: float = 16.0
     near: int = 8
     rates: int = 8  # of exponential settling in one round of the search
     rounds: int = 4  # of that search, each about the best rate of the one before
@@ -205,7 +205,7 @@ def _triangular(rows: np.ndarray) -> np.ndarray:
 def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
     """Breaks (n_samples,), with lesser breaks that follow closely on another: a force that dies away."""
     broken, last = broken.copy(), -START.near - 1
-    for t in np.flatnonzero(ratio > START.beside).tolist():
+    for t in np.flatnonzero(ratio > START.lesser).tolist():
         if broken[t] or t - last <= START.near:
             broken[t], last = True, t
     return broken
@@ -253,7 +253,7 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     if highest < 1:
         return no_drift
 
-    def beside(drift_columns: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def factored_with(drift_columns: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """R and Q^T y of a constant, the modes and the columns of the drift."""
 
         def columns(at: np.ndarray) -> np.ndarray:
@@ -273,14 +273,14 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
         return np.asarray(n * np.log(before / after).sum(axis=1))
 
     # Each column after those of the constant and the modes adds one degree.
-    r, along = beside(lambda at: _polynomials(at, n, highest)[:, 1:])
+    r, along = factored_with(lambda at: _polynomials(at, n, highest)[:, 1:])
     ratio = gain(np.vstack([np.zeros(m), along[fixed:] ** 2]).cumsum(axis=0), along)
     degree = int(np.argmax(ratio - penalty * m * np.arange(highest + 1)))
     likely = degree > 0 and ratio[degree] >= chi2.isf(FALSE_ALARM / highest, m * degree)
 
     rates = np.geomspace(2.0, START.fastest * n, START.rates) / (n * dt)
     for _ in range(START.rounds):
-        decays, tried = beside(_decays(dt * rates))
+        decays, tried = factored_with(_decays(dt * rates))
         drift_part = decays[fixed:, fixed:]
         each = (drift_part.T @ tried[fixed:]) ** 2 / np.maximum((drift_part**2).sum(axis=0), 1e-300)[:, None]
         settles = gain(each, tried)
@@ -292,7 +292,7 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     of_polynomial = ratio[degree] - penalty * m * degree if likely else 0.0
     if criterion > of_polynomial and settling > chi2.isf(FALSE_ALARM / START.rates, m + 1):
         decay = _decays(dt * rate)
-        return _removed(record, fixed, *beside(decay), decay, 1.0 / float(rate))
+        return _removed(record, fixed, *factored_with(decay), decay, 1.0 / float(rate))
     if not likely:
         return no_drift
     kept = fixed + degree

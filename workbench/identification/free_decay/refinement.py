@@ -343,8 +343,8 @@ def search(
     """
     problem = _Poles(records, weights, offset, hold, enough)
     start = _Fitted(poles, [project(record, poles, offset) for record in records])
-    found = minimise(problem, start, most_steps=most_steps, round_off=problem.start_from(start), budget=budget)
-    return found.state.poles, found.state.fits, found.converged, found.steps
+    minimum = minimise(problem, start, most_steps=most_steps, round_off=problem.start_from(start), budget=budget)
+    return minimum.state.poles, minimum.state.fits, minimum.converged, minimum.steps
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,24 +116,24 @@ class Subspace:
             jackknife.append(self._poles_without(b, modes))
         n, freedom = len(jackknife), len(jackknife) - 1
         scale = (student.ppf(0.975, freedom) / student.ppf(0.975, np.inf)) ** 2 * (SUBSPACE.blocks - 1) / n
-        found = []
+        estimates = []
         for r, mode in enumerate(modes):
-            each = np.array([one[r] for one in jackknife])
-            deviation = each - each.mean(axis=0)
+            replicates = np.array([one[r] for one in jackknife])
+            deviation = replicates - replicates.mean(axis=0)
             # A low order has bias, a high order variance by over-fitting.
             error = scale * (np.abs(deviation) ** 2).sum(axis=0) + np.abs(np.array(mode.poles) - mode.pole) ** 2
             best = np.argsort(error)[: SUBSPACE.averaged]
             deviation = deviation[:, best].mean(axis=1)
-            both = np.stack([deviation.real, deviation.imag])
+            parts = np.stack([deviation.real, deviation.imag])
             pole = complex(np.array(mode.poles)[best].mean())
             block = 2.0 * abs(pole.real) * self.n_samples * self.sample_time / SUBSPACE.blocks
-            variance = scale / (1.0 - (1.0 - np.exp(-block)) / block) * both @ both.T
-            found.append(replace(mode, pole=pole, variance=variance))
-        return found
+            variance = scale / (1.0 - (1.0 - np.exp(-block)) / block) * parts @ parts.T
+            estimates.append(replace(mode, pole=pole, variance=variance))
+        return estimates
 
     def _poles_without(self, block: int, modes: Sequence[StablePole]) -> list[np.ndarray]:
         """The poles of each mode at its orders, (n_orders,) each, from the record without one block."""
-        found = [np.zeros(0)] * len(modes)
+        poles = [np.zeros(0)] * len(modes)
         for decimation in {mode.decimation for mode in modes}:
             remaining, dt = self._outputs[decimation].copy(), decimation * self.sample_time
             first, last = (remaining.shape[1] * b // SUBSPACE.blocks for b in (block, block + 1))
@@ -143,8 +143,8 @@ class Subspace:
             poles_by_order = {n: model.poles(n)[0] / dt for n in {n for r in of_rate for n in modes[r].orders}}
             for r in of_rate:
                 targets = zip(modes[r].orders, modes[r].poles, strict=True)
-                found[r] = np.array([_nearest(poles_by_order[n], pole) for n, pole in targets])
-        return found
+                poles[r] = np.array([_nearest(poles_by_order[n], pole) for n, pole in targets])
+        return poles
 
     def _at_one_rate(self, decimation: int) -> list[StablePole]:
         """The poles that are stable over the orders at one sampling rate."""
@@ -257,5 +257,5 @@ def _covariances(outputs: np.ndarray, n_lags: int) -> np.ndarray:
     """
     n = outputs.shape[1]
     lines = np.fft.rfft(outputs, next_fast_len(n + n_lags, real=True))
-    found = np.fft.irfft(lines[:, None] * lines.conj(), next_fast_len(n + n_lags, real=True))
-    return np.ascontiguousarray(found[..., :n_lags].transpose(2, 0, 1) / n)
+    covariances = np.fft.irfft(lines[:, None] * lines.conj(), next_fast_len(n + n_lags, real=True))
+    return np.ascontiguousarray(covariances[..., :n_lags].transpose(2, 0, 1) / n)

@@ -38,9 +38,9 @@ def far_from_real(modes: SampledModes) -> np.ndarray:
     return np.sqrt(0.5 * np.maximum(1.0 - np.sqrt(modes.phase_collinearity), 0.0))
 
 
-def shape_errors(found: ShapeEstimates) -> np.ndarray:
+def shape_errors(estimates: ShapeEstimates) -> np.ndarray:
     """Standard error of the real part of each shape over the norm of the shape, (n_modes,)."""
-    return np.asarray(np.linalg.norm(found.shape_std, axis=0) / np.linalg.norm(found.modes.shapes, axis=0))
+    return np.asarray(np.linalg.norm(estimates.shape_std, axis=0) / np.linalg.norm(estimates.modes.shapes, axis=0))
 
 
 def are_far(far: np.ndarray, error: np.ndarray) -> np.ndarray:
@@ -53,19 +53,19 @@ def are_far(far: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.flatnonzero(far > np.maximum(CLOCKS.far, SURE * error))
 
 
-def shape_remarks(found: ShapeEstimates, names: Sequence[str], only: Sequence[int]) -> tuple[str, ...]:
+def shape_remarks(estimates: ShapeEstimates, names: Sequence[str], only: Sequence[int]) -> tuple[str, ...]:
     """A remark where shapes are complex beyond their errors; it names a delayed sensor where that is the cause.
 
     Args:
-        found: modes, and the covariance of their shapes.
+        estimates: modes with the covariance of their shapes.
         names: (n_outputs,) of the sensors.
         only: the modes to examine, from 0.
     """
-    far = far_from_real(found.modes)
-    which = np.intersect1d(only, are_far(far, shape_errors(found))).tolist()
+    far = far_from_real(estimates.modes)
+    which = np.intersect1d(only, are_far(far, shape_errors(estimates))).tolist()
     if not which:
         return ()
-    late = _delayed_sensor(found.modes.select(list(only)))
+    late = _delayed_sensor(estimates.modes.select(list(only)))
     if late is None:
         which_modes = ("mode " if len(which) == 1 else "modes ") + ", ".join(str(r + 1) for r in which)
         return (
@@ -75,7 +75,7 @@ def shape_remarks(found: ShapeEstimates, names: Sequence[str], only: Sequence[in
     j, seconds = late
     side = "late" if seconds > 0 else "early"
     return (
-        f"output {names[j]!r} is {abs(1e3 * seconds):.3g} ms {side} beside the others, by its phase in every mode:"
+        f"output {names[j]!r} is {abs(1e3 * seconds):.3g} ms {side} relative to the others, by its phase in every mode:"
         " correct its time, or its part of the shapes is wrong",
     )
 
@@ -112,7 +112,7 @@ def late_outputs(residues: np.ndarray, poles: np.ndarray, least: float = CLOCKS.
     """Delay of each output relative to the inputs, (n_outputs,) s; 0 where the phases of its modes do not show one.
 
     One delay for all outputs is tried first, then one for each. Neighbours within a half-power bandwidth count as one
-    mode: with a delayed direct term further modes are fitted beside the true ones.
+    mode: a delayed direct term adds spurious modes near the true ones.
 
     Args:
         residues: (n_modes, n_outputs, n_inputs) of displacement, times i: real for real modes without delay.

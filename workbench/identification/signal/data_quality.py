@@ -21,9 +21,7 @@ class DataSettings:
     # Likewise for inputs, whose impacts are short: rounded sines and pulses have more in 3 of a thousand.
     least_piled_input: int = 4
     piled_input: float = 4.0
-    turning: float = (
-        1e-6  # rounding difference of the samples beside a turning point of a sine, over the signal's range
-    )
+    turning: float = 1e-6  # rounding difference between the neighbours of a sine's turning point, over the range
     held: float = 0.5  # share of repeated samples in the outer half of an input's range from which on it has levels
     whole: float = 1e-3  # deviation of rounded readings from multiples of the step, in steps
     fewest_changes: int = 16  # of an output, to detect the rate at which it was held
@@ -31,9 +29,7 @@ class DataSettings:
     copied: float = 1e-2  # largest difference between copies, relative to the standard deviation of the innovation
     predictor_order: int = 16  # samples that predict the next
     longest: int = 20_000  # samples that are compared to detect copies
-    noise_free: float = (
-        1e-9  # innovation over the signal below which sensors of a single mode are alike without copying
-    )
+    noise_free: float = 1e-9  # innovation over the signal below which sensors of a single mode may be alike
     fewest_equal: int = 4  # consecutive samples of a dropout, at least; a turning point has fewer
     about: int = 32  # samples on either side of a dropout, which show the motion there
     straight: float = 1e-9  # rounding deviation of samples from a straight line, relative to the output's range
@@ -162,7 +158,7 @@ def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
         for each, sorted by output and time: name of the output, time of the first sample in s, number of samples, and
         "stays at one value" or "runs straight".
     """
-    found = []
+    result = []
     for name, row in zip(record.output_names, record.outputs, strict=True):
         rounding, ends = DATA.straight * np.ptp(row), (row.min(), row.max())
         resolution, taken, lost = 0.0, np.zeros(row.size, bool), []
@@ -181,8 +177,8 @@ def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
                 if moving > DATA.moves * resolution and row[first] not in ends and not taken[first : last + 1].any():
                     taken[first : last + 1] = True
                     lost.append((name, float(record.time[first]), last - first + 1, how))
-        found += sorted(lost)
-    return tuple(found)
+        result += sorted(lost)
+    return tuple(result)
 
 
 def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tuple[str, ...]:
@@ -193,11 +189,11 @@ def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tup
         after: second sentence of the remark: the consequence, and the way out.
         before: s, dropouts that begin later are ignored.
     """
-    found = [lost for lost in dropouts(record) if lost[1] < before]
-    if not found:
+    early = [dropout for dropout in dropouts(record) if dropout[1] < before]
+    if not early:
         return ()
-    name, at, count, how = found[0]
-    more = f" (and {len(found) - 1} more like that)" if len(found) > 1 else ""
+    name, at, count, how = early[0]
+    more = f" (and {len(early) - 1} more like that)" if len(early) > 1 else ""
     return (
         f"in record {record.name!r} output {name!r} {how} for {count} samples from {at:.6g} s on{more}: lost data?"
         f" {after}",
@@ -209,13 +205,13 @@ def steps(record: Record) -> np.ndarray:
 
     Rounding is noise of a standard deviation of step/√12 at least, as long as the output moves by steps.
     """
-    found = np.zeros(record.n_outputs)
+    result = np.zeros(record.n_outputs)
     for j, row in enumerate(record.outputs):
         differences = np.diff(np.unique(row))
         step = float(differences.min(initial=np.inf))
         if np.isfinite(step) and np.abs(differences / step - np.round(differences / step)).max() < DATA.whole:
-            found[j] = step
-    return found
+            result[j] = step
+    return result
 
 
 def _dead(record: Record) -> Iterator[DataFault]:

@@ -74,8 +74,8 @@ class Distortion:
     def rms(self) -> Mapping[str, np.ndarray]:
         """Rms of each output (n_outputs,) on excited, odd and even lines, and of the noise of one period."""
         kinds = {"excited": self.excited, "odd": self.odd, "even": self.even}
-        found = {kind: np.sqrt((self.amplitudes[:, lines] ** 2).sum(axis=1)) for kind, lines in kinds.items()}
-        return found | {"noise": np.sqrt(self.n_periods * (self.noise**2).sum(axis=1))}
+        values = {kind: np.sqrt((self.amplitudes[:, lines] ** 2).sum(axis=1)) for kind, lines in kinds.items()}
+        return values | {"noise": np.sqrt(self.n_periods * (self.noise**2).sum(axis=1))}
 
 
 def distortion_of(record: Record) -> Distortion:

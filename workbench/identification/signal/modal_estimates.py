@@ -247,13 +247,13 @@ class Identified(OfRefined):
         )
 
 
-def rows_of(found: ModalEstimates) -> Iterator[tuple[str, ...]]:
+def rows_of(estimates: ModalEstimates) -> Iterator[tuple[str, ...]]:
     """One row per mode under `HEADINGS`, values to the second digit of their standard errors."""
-    modes = found.modes
+    modes = estimates.modes
     collinearity = modes.phase_collinearity
     for r in range(modes.n_modes):
-        frequency = rounded(modes.frequencies_hz[r], found.omega_std[r] / (2.0 * np.pi))
-        damping = rounded(100 * modes.zeta[r], 100 * found.zeta_std[r])
+        frequency = rounded(modes.frequencies_hz[r], estimates.omega_std[r] / (2.0 * np.pi))
+        damping = rounded(100 * modes.zeta[r], 100 * estimates.zeta_std[r])
         yield str(r + 1), *frequency, *damping, f"{collinearity[r]:.4f}"
 
 
@@ -278,13 +278,13 @@ def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, n
     return np.asarray(~growing & (omega_std < modes.omega) & (modes.omega < nyquist))
 
 
-def repeated_remarks(found: "ModalEstimates") -> tuple[str, ...]:
+def repeated_remarks(estimates: "ModalEstimates") -> tuple[str, ...]:
     """A remark on neighbours of equal frequency and damping within their errors: a repeated root."""
-    modes, pairs = found.modes, []
+    modes, pairs = estimates.modes, []
     for r in range(modes.n_modes - 1):
-        apart = np.abs(np.diff([modes.omega[r : r + 2], modes.zeta[r : r + 2]], axis=1)).ravel()
-        errors = np.hypot(*np.array([found.omega_std[r : r + 2], found.zeta_std[r : r + 2]]).T)
-        if (apart < SURE * errors).all() and apart[0] < modes.zeta[r] * modes.omega[r]:
+        differences = np.abs(np.diff([modes.omega[r : r + 2], modes.zeta[r : r + 2]], axis=1)).ravel()
+        errors = np.hypot(*np.array([estimates.omega_std[r : r + 2], estimates.zeta_std[r : r + 2]]).T)
+        if (differences < SURE * errors).all() and differences[0] < modes.zeta[r] * modes.omega[r]:
             pairs.append(f"{r + 1} and {r + 2} ({modes.frequencies_hz[r]:.4g} Hz)")
     if not pairs:
         return ()
@@ -294,17 +294,17 @@ def repeated_remarks(found: "ModalEstimates") -> tuple[str, ...]:
     )
 
 
-def clock_remarks(found: "ModalEstimates", only: Sequence[int]) -> tuple[str, ...]:
+def clock_remarks(estimates: "ModalEstimates", only: Sequence[int]) -> tuple[str, ...]:
     """A remark where all modes form pairs of equal damping and one ratio of frequencies: the sample rates differ.
 
     Args:
-        found: modes of several outputs or records, sorted by frequency.
+        estimates: modes of several outputs or records, sorted by frequency.
         only: the modes to examine, from 0.
     """
     if len(only) < 4 or len(only) % 2:
         return ()
-    omega, zeta = (values[list(only)].reshape(-1, 2).T for values in (found.modes.omega, found.modes.zeta))
-    omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in (found.omega_std, found.zeta_std))
+    omega, zeta = (values[list(only)].reshape(-1, 2).T for values in (estimates.modes.omega, estimates.modes.zeta))
+    omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in (estimates.omega_std, estimates.zeta_std))
     ratio, error = omega[1] / omega[0] - 1.0, np.hypot(*(omega_std / omega))
     mean = np.average(ratio, weights=error**-2)
     separate = (SURE * error < ratio) & (ratio < CLOCK_RATIO)
@@ -317,14 +317,14 @@ def clock_remarks(found: "ModalEstimates", only: Sequence[int]) -> tuple[str, ..
     )
 
 
-def set_up_remarks(found: ParticipatingModes) -> tuple[str, ...]:
+def set_up_remarks(estimates: ParticipatingModes) -> tuple[str, ...]:
     """A remark on neighbours that the same inputs excite but that no sensor shows both: one mode in two set-ups.
 
     Roving sensors load the structure at other places in each set-up and so shift its frequencies. Two different modes
     that an input excites would both be seen by a sensor near that input.
     """
-    modes, pairs = found.modes, []
-    shapes, inputs = np.abs(modes.shapes.T), np.abs(found.participation)
+    modes, pairs = estimates.modes, []
+    shapes, inputs = np.abs(modes.shapes.T), np.abs(estimates.participation)
     shapes, inputs = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (shapes, inputs))
     for r in range(modes.n_modes - 1):
         near = np.ptp(modes.omega[r : r + 2]) < NEAR * modes.omega[r]

@@ -273,7 +273,7 @@ class _Exponentials:
 
     def sums(self) -> tuple[Floats, Floats]:
         """The products Φᵀy and (tΦ)ᵀy, (2 n_modes, n_outputs) each."""
-        found = np.zeros((2, self.order.size, self.record.n_outputs), complex)
+        totals = np.zeros((2, self.order.size, self.record.n_outputs), complex)
         for part, begin, far in self._parts():
             y = self.record.outputs[:, part]
             y = np.pad(y, ((0, 0), (0, begin.size * self.tau.size - y.shape[1]))).reshape(-1, self.tau.size)
@@ -281,20 +281,20 @@ class _Exponentials:
             both = np.hstack([near, self.tau[:, None] * near])
             inner = (y @ both.view(float)).view(complex).reshape(-1, begin.size, 2, far.shape[1])
             level, rising = inner[:, :, 0], inner[:, :, 1] + begin[:, None] * inner[:, :, 0]
-            for total, each in zip(found, (level, rising), strict=True):
+            for total, each in zip(totals, (level, rising), strict=True):
                 total[self.order[: far.shape[1]]] += np.einsum("jbr,br->rj", each, far)
-        return np.concatenate([found[0].real, found[0].imag]), np.concatenate([found[1].real, found[1].imag])
+        return np.concatenate([totals[0].real, totals[0].imag]), np.concatenate([totals[1].real, totals[1].imag])
 
     def motion(self, amplitudes: Complexes) -> Floats:
         """The motion Re Σ_r a_jr e^{λ_r t} of amplitudes (n_outputs, n_modes), (n_samples, n_outputs)."""
-        found = np.zeros((self.record.n_samples, len(amplitudes)))
+        samples = np.zeros((self.record.n_samples, len(amplitudes)))
         for part, _, far in self._parts():
-            alive = far.shape[1]
-            turned = (amplitudes[:, None, self.order[:alive]] * far).reshape(-1, alive)
-            near = self.near[:, :alive]
-            moved = turned.real @ near.real.T - turned.imag @ near.imag.T
-            found[part] = moved.reshape(len(amplitudes), -1)[:, : part.stop - part.start].T
-        return found
+            n_left = far.shape[1]
+            rotated = (amplitudes[:, None, self.order[:n_left]] * far).reshape(-1, n_left)
+            near = self.near[:, :n_left]
+            moved = rotated.real @ near.real.T - rotated.imag @ near.imag.T
+            samples[part] = moved.reshape(len(amplitudes), -1)[:, : part.stop - part.start].T
+        return samples
 
 
 def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | None:
