@@ -213,8 +213,8 @@ def test_a_long_record_is_compared_at_fewer_samples_with_the_same_result(monkeyp
     z = np.exp(pair * 1e-4)
     turns = z / np.exp(2j * np.pi * np.outer(few.lines, [1.0, 1.0]) / time.size)
     exact = 0.5 * (1.0 - z**time.size) / (1.0 - turns) / np.sqrt(0.5 * time.size)
-    found = few.seen(np.exp(np.outer(pair, few.time)))[0]
-    wanted = few.apart(np.vstack([exact.real, exact.imag]))
-    np.testing.assert_allclose(few.apart(found), wanted, atol=1e-7 * np.abs(wanted).max())
+    found = few.lines_of(np.exp(np.outer(pair, few.time)))[0]
+    wanted = few.without_others(np.vstack([exact.real, exact.imag]))
+    np.testing.assert_allclose(few.without_others(found), wanted, atol=1e-7 * np.abs(wanted).max())
     one, other = (_modes_misfit([band], pair)[0] for band in (few, each))
     assert one == pytest.approx(other, rel=1e-5)
