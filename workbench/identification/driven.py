@@ -76,7 +76,7 @@ class DrivenSettings:
     decorrelation_rounds: int = 2  # selections of modes in combinations of outputs whose noise is uncorrelated
     spare_states: int = 20  # of a subspace model beyond two per mode: these fit noise
     drift_share: float = 0.2  # of the time left, for each selection that decides on a drift
-    driven_share: float = 0.3  # least share of a mode's motion that the inputs excite, unless it is undriven
+    driven_share: float = 0.3  # share of the motion of a mode due to the inputs, below which they do not drive it
     final_seconds: float = 5.0  # of processor time for the last check of modes, even after the search used up its time
 
 
