@@ -315,7 +315,7 @@ def test_inputs_that_act_late(delays, straight, feedthrough, close, at_rest):
     assert found.modes.n_modes == 4
     assert np.abs(found.delays / DT - delays).max() < close
     assert "inputs act late, by u0" in " ".join(found.remarks)
-    with pytest.warns(UserWarning, match="no output stands where an input acts"):
+    with pytest.warns(UserWarning, match="no output is at the place of an input"):
         assert [actuator.delay for actuator in rig_from(found).actuators] == list(found.delays)
     assert np.abs((found.modes.omega - OMEGA) / found.omega_std).max() < 4
     further = measured_late(plant, fresh, delays, straight=straight)

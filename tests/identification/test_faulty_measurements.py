@@ -215,7 +215,7 @@ def test_transfer_functions_of_the_other_sign_are_remarked():
 def test_noise_stated_ten_times_off_is_remarked(factor):
     h, lines, channels = transfer_functions(0.01)
     found = identify_transfer(h, lines, noise_std=0.01 * factor, **channels)
-    said = [float(remark.split()[4]) for remark in found.remarks if "times noise_std" in remark]
+    said = [float(remark.split()[3]) for remark in found.remarks if "times noise_std" in remark]
     assert said == ([] if factor == 1.0 else [pytest.approx(1.0 / factor, rel=0.15)])
 
 

@@ -146,9 +146,9 @@ def test_the_strongest_modes_leave_time_for_the_check_of_those_that_change(monke
     moves = lfilter([0.0, z.imag], [1.0, -2.0 * z.real, abs(z) ** 2], force) + 0.01 * rng.standard_normal(n)
     record = Record(dt, moves[None], (Channel("v", "velocity"),), force[None], (Channel("f", "force"),))
     data, given = KnownInputs([record], at_rest=True, hold="zero", feedthrough=False), []
-    strongest = driven._strongest
+    strongest = driven._select_strongest
     monkeypatch.setattr(
-        driven, "_strongest", lambda *args, **how: given.append(how["budget"].seconds) or strongest(*args, **how)
+        driven, "_select_strongest", lambda *args, **how: given.append(how["budget"].seconds) or strongest(*args, **how)
     )
-    driven._selected(data, Budget(20.0), None, max_modes=4, false_alarm=1e-3)
+    driven._select(data, Budget(20.0), None, max_modes=4, false_alarm=1e-3)
     assert 5.0 < given[0] <= 10.0

@@ -410,7 +410,7 @@ def test_outputs_that_a_filter_delays_are_put_in_time(quantity, late):
     np.testing.assert_allclose(found.modes.omega, modes.omega[1:4], rtol=1e-3)
     assert far_from_real(found.modes).max() < 0.02
     assert np.abs(found.fitted - h * turn).max() < 0.02 * np.abs(h).max()
-    assert "are late beside the inputs, by " in found.remarks[0] and "y1 0.00" in found.remarks[0]
+    assert "are delayed relative to the inputs, by " in found.remarks[0] and "y1 0.00" in found.remarks[0]
     assert [s.delay for s in rig_from(found, inputs=["h1"], outputs=channels).sensors] == list(found.delays)
 
 
@@ -442,7 +442,7 @@ def test_a_band_that_ended_early_is_searched_in_the_time_that_others_leave(monke
     f = np.arange(1.0, 33.0, 0.02)
     s, poles = 2j * np.pi * f, 2.0 * np.pi * np.array([5.0, 15.0, 28.0]) * (-0.01 + 1j)
     h = sum(1.0 / (s - pole) + 1.0 / (s - pole.conjugate()) for pole in poles)[None]
-    rng, searched, selected = np.random.default_rng(0), [], transfer._selected
+    rng, searched, selected = np.random.default_rng(0), [], transfer._select_in_band
     h = h + 1e-4 * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
 
     def ended_once(budget, h, omega, *args, **how):
@@ -453,7 +453,7 @@ def test_a_band_that_ended_early_is_searched_in_the_time_that_others_leave(monke
             budget.unfinished["search for further modes"] = 0.1
         return found
 
-    monkeypatch.setattr(transfer, "_selected", ended_once)
+    monkeypatch.setattr(transfer, "_select_in_band", ended_once)
     found = identify_transfer(h, f, channels=(Channel("v", "velocity"),), seconds=60.0)
     assert [begin for begin, _ in searched] == sorted({begin for begin, _ in searched}) + [searched[0][0]]
     assert searched[-1][1] > 2.0 * searched[0][1]

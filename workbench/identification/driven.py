@@ -69,18 +69,19 @@ from workbench.threads import one_blas_thread
 
 @dataclass(frozen=True)
 class DrivenSettings:
-    """Constants of the course of an identification from known inputs."""
+    """Constants of the stages of an identification from known inputs."""
 
     strongest: int = 8  # modes for the first estimate of the noise
-    learnt: int = 4  # times that noise and modes are estimated in turn
-    apart: int = 2  # times that modes are looked for in combinations of outputs that share no noise
-    spare: int = 20  # states of a subspace model beyond two for each of the most modes: for noise
-    drifting: float = 0.2  # of the time left, for each look at what is a drift
-    undriven: float = 0.3  # of the motion of a mode, what the inputs make of it: less is none of theirs
-    final: float = 5.0  # s of processor time for the last check of modes, whatever the search has left
+    noise_rounds: int = 4  # alternations between noise and modes
+    decorrelation_rounds: int = 2  # selections of modes in combinations of outputs whose noise is uncorrelated
+    spare_states: int = 20  # of a subspace model beyond two per mode: these fit noise
+    drift_share: float = 0.2  # of the time left, for each selection that decides on a drift
+    driven_share: float = 0.3  # share of the motion of a mode due to the inputs, below which they do not drive it
+    final_seconds: float = 5.0  # of processor time for the last check of modes, even after the search used up its time
 
 
 DRIVEN = DrivenSettings()
+DELAY_SEARCH = "search for delays of the inputs"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -102,9 +103,9 @@ class Driven(ParticipatingModes):
         initial: one (n_modes,) complex a record: z_r at its first sample, where y = Re Σ 2 c_r z_r; zero if at rest.
         noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
         statistic: (n_modes,) χ² of each mode in the noise.
-        threshold: what a mode fitted to noise alone exceeds with the chance of a false alarm.
-        converged: whether the search ended because the step was small.
-        remarks: what is doubtful, and what was left undone where the time was up.
+        threshold: value that a mode fitted to noise alone exceeds with the probability of a false alarm.
+        converged: whether the fit ended because its step was negligible.
+        remarks: doubts about modes and data, and searches that the time limit ended early.
         output_channels, input_channels: of the records.
     """
 
@@ -126,7 +127,7 @@ class Driven(ParticipatingModes):
 
     @property
     def noise_std(self) -> np.ndarray:
-        """Of each output (n_outputs,), root mean square over the records."""
+        """Noise of each output (n_outputs,), root mean square over the records."""
         return np.asarray(np.sqrt((self.noise**2).mean(axis=0)))
 
     @property
@@ -135,9 +136,10 @@ class Driven(ParticipatingModes):
 
     @property
     def state_space(self) -> control.StateSpace:
-        """The model from inputs late by `delays` to outputs in real modal form, two states a mode, named as the record.
+        """The model from inputs delayed by `delays` to outputs in real modal form, two states per mode.
 
-        z = re + i im of each mode: A has blocks [[Re λ, -Im λ], [Im λ, Re λ]], and y = Re Σ 2 c z + D u.
+        With z = re + i im of each mode, A has blocks [[Re λ, -Im λ], [Im λ, Re λ]], and y = Re Σ 2 c z + D u. Inputs
+        and outputs have the names of the record's channels.
         """
         n, poles = self.modes.n_modes, self.modes.poles
         a = np.zeros((2 * n, 2 * n))
@@ -159,11 +161,11 @@ class Driven(ParticipatingModes):
         )
 
     def response(self, inputs: ArrayLike, *, record: int | None = None) -> np.ndarray:
-        """Outputs (n_outputs, n_samples) to inputs sampled as the records were, delays included; no constants.
+        """Outputs (n_outputs, n_samples) of the model to inputs, delays included, without the constants of the records.
 
         Args:
-            inputs: (n_inputs, n_samples), zero before the first.
-            record: that begins as this one did; from rest unless given.
+            inputs: (n_inputs, n_samples) at the sample time of the records, zero before the first sample.
+            record: index of the record whose initial state is taken; from rest unless given.
         """
         u = np.atleast_2d(np.asarray(inputs, float))
         if u.ndim != 2 or len(u) != len(self.input_channels):
@@ -211,32 +213,31 @@ def identify_driven(
 ) -> Driven:
     """The modes between inputs and outputs, their number selected, with participation factors and standard errors.
 
-    Any excitation serves that moves the modes: noise, multisine, PRBS, an impulse. Each mode enters if it raises the
-    likelihood by more than noise would in one record of a thousand. Inputs that are impacts count as zero between them,
-    with a remark: what their channels read there is noise.
+    Any excitation of the modes serves: noise, multisine, PRBS, an impulse. A mode is included if it raises the
+    likelihood by more than noise would in one record of a thousand. Impact forces are set to zero between the impacts,
+    with a remark, as their channels hold only noise there.
 
     Args:
         records: with the same inputs and outputs at one rate; each output may hold a constant, another in each record.
-        at_rest: that nothing moves at the first sample; otherwise each record has an initial state of its own.
-        input_hold: how inputs run between samples: "zero" for a zero-order hold, as of the command that a converter
-            gives out; "band-limited" for what holds nothing beyond half of the sample rate, as a force measured behind
-            the anti-alias filter of a logger; "first" for a first-order hold, straight from sample to sample, as a
-            force nearly runs that is slow against the sample rate. As the records say unless given; where these show
-            that another is true, a remark says which.
+        at_rest: whether all modes are at rest at the first sample; otherwise each record has its own initial state.
+        input_hold: the inputs between samples: "zero" for a zero-order hold, such as the output of a D/A converter;
+            "band-limited" for a signal without content above half the sample rate, such as a force behind an anti-alias
+            filter; "first" for a first-order hold, linear from sample to sample, close to a force that is slow against
+            the sample rate. As stated in the records unless given; a remark says where the data contradict it.
         feedthrough: whether there is a direct term: of accelerations, and of modes beyond the sample rate.
-        delays: (n_inputs,) s, by which each input acts late; estimated unless given, up to 60 samples. Of inputs held
-            between samples, with a direct term, the fraction of a sample is the one that makes the modes most nearly
-            real, for their response is the same whatever it is.
-        max_modes: where to stop at the latest.
-        false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
+        delays: (n_inputs,) s, delay of each input; estimated unless given, up to 60 samples. For inputs held between
+            samples, with a direct term, the response does not determine the fraction of a sample; it is the one that
+            makes the modes most nearly real.
+        max_modes: largest number of modes.
+        false_alarm: probability that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
             limit.
         progress: called with the search under way and the share of the time that is spent.
         straight: former name of `input_hold="first"`; it warns.
 
     Returns:
-        `Driven`. Its standard errors hold in noise of any smooth spectrum, and beside white noise of the inputs, which
-        is found where two modes or more show it, and remarked.
+        `Driven`. Its standard errors hold in noise of any smooth spectrum. They include white noise of the inputs,
+        which is detected where two or more modes show it, with a remark.
 
     Raises:
         ValueError: no inputs, inputs that never move or move alike; records that differ; too few samples; no mode.
@@ -269,70 +270,70 @@ def identify_driven(
         raise ValueError(
             f"record {records[0].name!r}: {rows} samples are too few for {records[0].n_inputs} inputs; measure longer"
         )
-    most = min(max_modes, (rows - columns) // 6)
-    how = {"max_modes": most, "false_alarm": false_alarm}
-    looks: list[Budget] = []
+    most_modes = min(max_modes, (rows - columns) // 6)
+    options = {"max_modes": most_modes, "false_alarm": false_alarm}
+    trials: list[Budget] = []
 
-    def looked(each: KnownInputs) -> Selected:
-        looks.append(budget.aside(DRIVEN.drifting))
-        return _strongest(each, **how, budget=looks[-1])
+    def selected_in(trial: KnownInputs) -> Selected:
+        trials.append(budget.aside(DRIVEN.drift_share))
+        return _select_strongest(trial, **options, budget=trials[-1])
 
-    data, strongest, drift = beside_drift(data, looked)
-    if any(look.unfinished for look in looks):
+    data, strongest, drift = beside_drift(data, selected_in)
+    if any(trial.unfinished for trial in trials):
         strongest = None
-    search = _with_delays if delays is None else _selected
-    data, selected = search(data, budget, strongest, **how)
+    search = _select_with_delays if delays is None else _select
+    data, selected = search(data, budget, strongest, **options)
     if selected.fit.poles.size == 0:
         raise ValueError(
             f"record {records[0].name!r}: no mode between inputs {', '.join(records[0].input_names)} and outputs"
-            f" {', '.join(records[0].output_names)} rises above the noise; excite harder or longer, or look whether"
+            f" {', '.join(records[0].output_names)} rises above the noise; excite harder or longer, or check whether"
             " inputs and outputs belong together"
         )
-    data, selected, changing = _as_constant(data, selected, budget)
-    selected = _predictive(data, selected, Budget(DRIVEN.final))
+    data, selected, changing = _as_time_invariant(data, selected, budget)
+    selected = _without_unpredictive(data, selected, Budget(DRIVEN.final_seconds))
     selected, remarks = _without_artefacts(data, selected, budget)
     if delays is None:
-        remarks = (*_late_remarks(data), *remarks)
+        remarks = (*_delay_remarks(data), *remarks)
     fit = joined(data, selected.fit, budget)
     selected = selected if fit is selected.fit else selected.refitted(fit)
     holds = hold_remarks(data, selected.fit, selected.limit, budget)
     bursts = burst_remarks(logged, data.left(fit), fit.noise)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
-    late = budget.spent("check of modes that change within the record")
+    out_of_time = budget.spent("check of modes that change within the record")
     in_decay = by_amplitude.among(fit.poles)
-    changes, named = ((), in_decay) if late else change_remarks(data, fit, changing, in_decay)
-    beside = (*selected.distorted, *left_about(data, fit))
-    left = [pole for pole in beside if pole not in (*named, *by_amplitude.changing)]
-    changes = (*changes, *unpredictive_remarks(fit, left))
-    found = _report(
+    changes, explained = ((), in_decay) if out_of_time else change_remarks(data, fit, changing, in_decay)
+    distorted = (*selected.distorted, *left_about(data, fit))
+    unexplained = [pole for pole in distorted if pole not in (*explained, *by_amplitude.changing)]
+    changes = (*changes, *unpredictive_remarks(fit, unexplained))
+    driven = _report(
         logged,
         records,
         data,
         selected,
         (*clipped, *bursts, *windowed, *drift, *holds, *remarks, *overlap, *changes, *budget.remarks),
     )
-    deviation = found.modes.omega * found.zeta_std + 1j * found.omega_std
-    decays = by_amplitude.remarks(fit.poles, _sizes(data, fit), deviation)
-    # a response to the inputs may have a constant amplitude too
-    undamped = np.flatnonzero(found.modes.zeta < SURE * found.zeta_std).tolist()
-    lasting = [r for r in undamped if _goes_on_undriven(data, fit, r)]
+    deviation = driven.modes.omega * driven.zeta_std + 1j * driven.omega_std
+    decays = by_amplitude.remarks(fit.poles, _response_sizes(data, fit), deviation)
+    # The response of a mode to the inputs may have a constant amplitude without being harmonic excitation.
+    undamped = np.flatnonzero(driven.modes.zeta < SURE * driven.zeta_std).tolist()
+    lasting = [r for r in undamped if _is_steady_and_undriven(data, fit, r)]
     doubtful = (*harmonic_remarks(records, fit.poles, undamped, lasting), *unexcited_remarks(records, fit.poles))
-    return replace(found, remarks=(*decays, *doubtful, *found.remarks))
+    return replace(driven, remarks=(*decays, *doubtful, *driven.remarks))
 
 
-def _goes_on_undriven(data: KnownInputs, fit: Fit, r: int) -> bool:
-    """Whether a mode goes on through the records and is not of the inputs, whose response may hide how steady it is."""
+def _is_steady_and_undriven(data: KnownInputs, fit: Fit, r: int) -> bool:
+    """Whether mode r does not decay within a record and the inputs excite only a small share of its motion."""
     pole, l_r = fit.poles[r], fit.participation[r].copy()
     responses = data.responses(pole)
-    whole = np.linalg.norm(modal_coordinate(responses, l_r))
+    norm = np.linalg.norm(modal_coordinate(responses, l_r))
     l_r[data.n_inputs :] = 0.0
     by_inputs = np.linalg.norm(modal_coordinate(responses, l_r))
     decays = -pole.real * 2.0 * np.pi / data.resolution
-    return bool(decays < 1.0 and by_inputs < DRIVEN.undriven * whole)
+    return bool(decays < 1.0 and by_inputs < DRIVEN.driven_share * norm)
 
 
-def _sizes(data: KnownInputs, fit: Fit) -> Floats:
-    """Of the response of each mode over the records, outputs in units of their noise, (n_modes,)."""
+def _response_sizes(data: KnownInputs, fit: Fit) -> Floats:
+    """Norm of the response of each mode over all records, outputs in units of their noise, (n_modes,)."""
     each = zip(fit.poles, fit.participation, fit.amplitudes.T, strict=True)
     return np.array(
         [
@@ -342,155 +343,167 @@ def _sizes(data: KnownInputs, fit: Fit) -> Floats:
     )
 
 
-def _with_delays(
-    data: KnownInputs, budget: Budget, strongest: Selected | None, **how: Any
+def _select_with_delays(
+    data: KnownInputs, budget: Budget, strongest: Selected | None, **options: Any
 ) -> tuple[KnownInputs, Selected]:
-    """The modes, and how late each input acts.
+    """The data with estimated input delays, and the modes.
 
-    Lateness by a fraction of a sample is searched where the first response of an input is later than without delay, or
-    where the modes leave what the inputs a sample earlier explain.
+    A delay by a fraction of a sample is estimated where the first response to an input is later than without delay, or
+    where the input a sample earlier explains part of the residual.
     """
     first = first_lags(data.records)
     if data.hold == "band-limited":
-        return _with_any_delays(data, first, budget, strongest, **how)
+        return _select_with_band_limited_delays(data, first, budget, strongest, **options)
     whole = np.maximum(first - (0 if data.hold == "first" else 1), 0)
-    in_time: tuple[KnownInputs, Selected] | None = None
+    without_delay: tuple[KnownInputs, Selected] | None = None
     if data.hold == "zero" and not first.any():
-        return _selected(data, budget, strongest, **how)
-    late = data.delayed_by(whole, any_fraction=True)
-    strongest = _strongest(late, budget=budget, **how)
+        return _select(data, budget, strongest, **options)
+    delayed = data.delayed_by(whole, any_fraction=True)
+    strongest = _select_strongest(delayed, budget=budget, **options)
     if not whole.any():
         if strongest.fit.poles.size == 0:
-            return _selected(data, budget, **how)
-        if not act_later(late, strongest.fit).any():
-            in_time = punctual, selected = _selected(
-                data, budget, _strongest(data, strongest.fit, budget=budget, **how), **how
+            return _select(data, budget, **options)
+        if not act_later(delayed, strongest.fit).any():
+            without_delay = undelayed, selected = _select(
+                data, budget, _select_strongest(data, strongest.fit, budget=budget, **options), **options
             )
-            further = selected.fit.poles.size > strongest.fit.poles.size
-            if not (further and _late(punctual, selected, budget)) or budget.spent("search for delays of the inputs"):
-                return in_time
-    punctual = data
-    data, selected = _selected(late, budget, strongest, **how)
+            more_modes = selected.fit.poles.size > strongest.fit.poles.size
+            if not (more_modes and _any_acts_later(undelayed, selected, budget)) or budget.spent(DELAY_SEARCH):
+                return without_delay
+    undelayed = data
+    data, selected = _select(delayed, budget, strongest, **options)
     fit = selected.fit
     if fit.poles.size == 0:
-        return in_time if in_time is not None else (data.delayed_by(whole), selected)
-    whole, fraction = _lateness(data, fit, whole, budget)
-    if not whole.any() and not fraction.any() and not budget.spent("search for delays of the inputs"):
-        if in_time is not None:
-            return in_time
-        return _selected(punctual, budget, _strongest(punctual, fit, budget=budget, **how), **how)
-    late = data.delayed_by(whole + fraction)
-    return late, selected.refitted(settled(late, _moved_to(late, data, fit), budget=budget))
+        return without_delay if without_delay is not None else (data.delayed_by(whole), selected)
+    whole, fraction = _whole_and_fraction(data, fit, whole, budget)
+    if not whole.any() and not fraction.any() and not budget.spent(DELAY_SEARCH):
+        if without_delay is not None:
+            return without_delay
+        return _select(undelayed, budget, _select_strongest(undelayed, fit, budget=budget, **options), **options)
+    delayed = data.delayed_by(whole + fraction)
+    return delayed, selected.refitted(settled(delayed, _for_other_delays(delayed, data, fit), budget=budget))
 
 
-def _with_any_delays(
-    data: KnownInputs, first: Floats, budget: Budget, strongest: Selected | None, **how: Any
+def _select_with_band_limited_delays(
+    data: KnownInputs, first: Floats, budget: Budget, strongest: Selected | None, **options: Any
 ) -> tuple[KnownInputs, Selected]:
-    """The modes, and how late each band-limited input acts, beside which no two columns stand for any fraction."""
-    late = data.delayed_by(first) if first.any() else data
-    for _ in range(DRIVEN.learnt):  # before any mode is looked for in what the delay makes
-        few, before = _start(late, **how), late
+    """The data with estimated delays of band-limited inputs, and the modes.
+
+    The fraction of a sample is a parameter of its own here: no pair of fixed columns can represent it.
+    """
+    delayed = data.delayed_by(first) if first.any() else data
+    for _ in range(DRIVEN.noise_rounds):  # so that no mode is fitted to the effect of a delay
+        few, before = _subspace_start(delayed, **options), delayed
         if few.poles.size:
-            late, _ = _in_time(late, few, budget)
-        if late is before:
+            delayed, _ = _with_best_delays(delayed, few, budget)
+        if delayed is before:
             break
-    late, selected = _selected(late, budget, strongest if late is data else None, **how)
+    delayed, selected = _select(delayed, budget, strongest if delayed is data else None, **options)
     if not selected.fit.poles.size:
-        return late, selected
-    found, fit = _in_time(late, selected.fit, budget)
-    return (late, selected) if found is late else (found, selected.refitted(settled(found, fit, budget=budget)))
+        return delayed, selected
+    improved, fit = _with_best_delays(delayed, selected.fit, budget)
+    if improved is delayed:
+        return delayed, selected
+    return improved, selected.refitted(settled(improved, fit, budget=budget))
 
 
-def _in_time(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit]:
-    """Band-limited inputs late by the delays that are the most likely, and the modes turned to them."""
+def _with_best_delays(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit]:
+    """The data with the most likely delays of band-limited inputs, and the fit with participation factors to match."""
 
     def moved(delays: Floats) -> tuple[KnownInputs, Fit]:
         other = data.delayed_by(delays)
-        return other, _moved_to(other, data, fit)
+        return other, _for_other_delays(other, data, fit)
 
     derivative = time_derivatives(data.records[0].output_channels)[:, None]
     delays = best_delays(data.delays, moved, derivative, budget)
     return (data, fit) if (delays == data.delays).all() else moved(delays)
 
 
-def _lateness(data: KnownInputs, fit: Fit, whole: Floats, budget: Budget) -> tuple[Floats, Floats]:
-    """Whole samples and the fraction of one by which each input acts late, from modes beside any fraction.
+def _whole_and_fraction(data: KnownInputs, fit: Fit, whole: Floats, budget: Budget) -> tuple[Floats, Floats]:
+    """Delay of each input: whole samples, and the fraction of a sample, (n_inputs,) each, from a fit with any fraction.
 
-    The first response seen comes a sample too late where the one before was too faint to be seen.
+    The first response detected is a sample late where the response before it was below the noise.
     """
-    fraction = _fraction(data, fit)
+    fraction = _fractional_delays(data, fit)
     doubtful = (whole > 0) & (fraction == 0)
-    while doubtful.any() and not budget.spent("search for delays of the inputs"):
-        data, fit = _beside_any_fraction(data, fit, whole - doubtful, budget)
-        found = _fraction(data, fit)
-        taken = doubtful & (found < 1.0)
-        whole, fraction = whole - taken, np.where(taken, found, fraction)
-        doubtful = taken & (whole > 0) & (fraction == 0)
+    while doubtful.any() and not budget.spent(DELAY_SEARCH):
+        data, fit = _with_free_fraction(data, fit, whole - doubtful, budget)
+        fraction_before = _fractional_delays(data, fit)
+        reduced = doubtful & (fraction_before < 1.0)
+        whole, fraction = whole - reduced, np.where(reduced, fraction_before, fraction)
+        doubtful = reduced & (whole > 0) & (fraction == 0)
     return whole, fraction
 
 
-def _fraction(data: KnownInputs, fit: Fit) -> Floats:
-    """Of a sample by which each input acts later than `data` says, 0 where it does not, (n_inputs,)."""
+def _fractional_delays(data: KnownInputs, fit: Fit) -> Floats:
+    """Fraction of a sample by which each input acts later than in `data`, (n_inputs,); 0 where it does not."""
     derivative = time_derivatives(data.records[0].output_channels)[:, None]
     return np.where(act_later(data, fit), fractions(data, fit, derivative), 0.0)
 
 
-def _beside_any_fraction(data: KnownInputs, fit: Fit, delays: Floats, budget: Budget) -> tuple[KnownInputs, Fit]:
-    """The inputs delayed by whole samples and any fraction, and the modes fitted to these as far as decides."""
+def _with_free_fraction(data: KnownInputs, fit: Fit, delays: Floats, budget: Budget) -> tuple[KnownInputs, Fit]:
+    """The data with inputs delayed by whole samples and any fraction, and a fit just precise enough for decisions."""
     other = data.delayed_by(delays, any_fraction=True)
-    return other, settled(other, _moved_to(other, data, fit), SELECTION.few_steps, budget, ORDER.decided)
+    return other, settled(other, _for_other_delays(other, data, fit), SELECTION.few_steps, budget, ORDER.decided)
 
 
-def _moved_to(other: KnownInputs, data: KnownInputs, fit: Fit) -> Fit:
-    """Modes of inputs of one delay, turned to those of another."""
+def _for_other_delays(other: KnownInputs, data: KnownInputs, fit: Fit) -> Fit:
+    """The fit to `data` with participation factors changed to the input delays of `other`."""
     turned = fit.participation.copy()
     turned[:, : data.n_inputs] *= np.exp(np.outer(fit.poles, other.delays - data.delays) * data.dt)
     return projected(other, fit.poles, turned)
 
 
-def _late(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
-    """Whether these modes leave what the inputs a sample earlier explain."""
-    other, trial = _beside_any_fraction(data, selected.fit, data.delays, budget)
+def _any_acts_later(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
+    """Whether any input acts later than in `data`, given the selected modes."""
+    other, trial = _with_free_fraction(data, selected.fit, data.delays, budget)
     return bool(act_later(other, trial).any())
 
 
-def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selected:
-    """Those of a start, or else of a subspace model, and as many more as the first estimate of the noise needs."""
-    start = _start(data, **how) if start is None else start
-    few = _few(how)
+def _select_strongest(data: KnownInputs, start: Fit | None = None, **options: Any) -> Selected:
+    """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN.strongest`."""
+    start = _subspace_start(data, **options) if start is None else start
+    few = _few_modes(options)
     few["max_modes"] = max(few["max_modes"], start.poles.size)
-    return _predictive(data, select_modes(data, start=start, **few), how["budget"])
+    return _without_unpredictive(data, select_modes(data, start=start, **few), options["budget"])
 
 
-def _start(data: KnownInputs, **how: Any) -> Fit:
-    """The modes of a subspace model."""
-    poles = subspace_poles(data.records, data.whole, 2 * how["max_modes"] + DRIVEN.spare)
+def _subspace_start(data: KnownInputs, **options: Any) -> Fit:
+    """The significant modes of a subspace model, at most `max_modes`."""
+    poles = subspace_poles(data.records, data.whole, 2 * options["max_modes"] + DRIVEN.spare_states)
     poles = np.append(poles[~is_about_distorted(data, poles)], data.free)
-    fit = fit_of_poles(data, poles, how["false_alarm"])
-    if fit.poles.size <= how["max_modes"]:
+    fit = fit_of_poles(data, poles, options["false_alarm"])
+    if fit.poles.size <= options["max_modes"]:
         return fit
-    return only(data, fit, np.argsort(statistic_of_each(fit))[-how["max_modes"] :])
+    return only(data, fit, np.argsort(statistic_of_each(fit))[-options["max_modes"] :])
 
 
-def _predictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
-    """Without modes that make the prediction of what is held out worse; about these no further mode is looked for."""
+def _without_unpredictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
+    """The selected modes without those that make the prediction of held-out data worse.
+
+    These are marked as distorted: no further mode is searched near them.
+    """
     fit, distorted = without_unpredictive(data, selected.fit, selected.statistic, budget)
     selected = selected if fit is selected.fit else selected.refitted(fit)
     return replace(selected, distorted=(*data.distorted, *distorted))
 
 
-def _few(how: dict[str, Any]) -> dict[str, Any]:
-    return {**how, "max_modes": min(DRIVEN.strongest, how["max_modes"])}
+def _few_modes(options: dict[str, Any]) -> dict[str, Any]:
+    return {**options, "max_modes": min(DRIVEN.strongest, options["max_modes"])}
 
 
-def _late_remarks(data: KnownInputs) -> tuple[str, ...]:
+def _delay_remarks(data: KnownInputs) -> tuple[str, ...]:
     names = data.records[0].input_names
     late = [f"{names[i]} {d:.2f} samples ({d * data.dt:.3g} s)" for i, d in enumerate(data.delays) if d > 0]
-    return (f"inputs act late, by {', '.join(late)}: the model is of the delayed inputs",) if late else ()
+    return (f"inputs act late, by {', '.join(late)}: the model takes the delayed inputs",) if late else ()
 
 
 def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.ndarray | None:
-    """Samples by which each input acts late."""
+    """Delay of each input in samples, (n_inputs,), from delays in s; None where none are given.
+
+    Raises:
+        ValueError: a delay that is negative or longer than a quarter of the shortest record.
+    """
     if delays is None:
         return None
     dt, given = records[0].sample_time, np.broadcast_to(np.asarray(delays, float), (records[0].n_inputs,))
@@ -499,84 +512,94 @@ def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.n
         raise ValueError(
             f"delays must lie between 0 and {longest:.3g} s, a quarter of the record, one per input; got {delays!s}"
         )
-    near = np.round(given / dt)
-    return np.where(np.abs(given / dt - near) < 1e-6, near, given / dt)
+    whole = np.round(given / dt)
+    return np.where(np.abs(given / dt - whole) < 1e-6, whole, given / dt)
 
 
-def _selected(
-    data: KnownInputs, budget: Budget, strongest: Selected | None = None, **how: Any
+def _select(
+    data: KnownInputs, budget: Budget, strongest: Selected | None = None, **options: Any
 ) -> tuple[KnownInputs, Selected]:
-    """The modes, the strongest first; in combinations of the outputs that share no noise where these share some."""
-    how["budget"] = budget
-    start = _start(data, **how) if strongest is None else strongest.fit
-    sure = sure_modes(data, start, how["false_alarm"], budget)
+    """The modes, estimated with the strongest first; where noise of the outputs is correlated, in combinations without.
+
+    Returns:
+        the data, weighted by their noise, and the modes.
+    """
+    options["budget"] = budget
+    start = _subspace_start(data, **options) if strongest is None else strongest.fit
+    sure = sure_modes(data, start, options["false_alarm"], budget)
     noise = None if budget.spent("search for noise of the inputs") else input_noise(data, sure)
     if noise is not None:
-        (data, start), strongest = with_white_noise(data, sure, noise, how["false_alarm"], budget), None
+        (data, start), strongest = with_white_noise(data, sure, noise, options["false_alarm"], budget), None
     if strongest is None:
-        strongest = _strongest(data, start, **{**how, "budget": budget.share(SELECTION.search_share)})
+        strongest = _select_strongest(data, start, **{**options, "budget": budget.share(SELECTION.search_share)})
     data = data.with_distorted(strongest.distorted)
-    apart = data.apart(strongest.fit)
-    if apart is None:
-        return _in_noise(data, strongest, how)
-    # noise that outputs share makes peaks in all of them; what was not found yet may have looked like it
-    for _ in range(DRIVEN.apart):
-        apart, found = _in_noise(apart, _strongest(apart, strongest.fit, **how), how)
-        again = apart.apart(found.fit)
-        if again is None or budget.spent("search beside noise that outputs share"):
+    uncorrelated = data.apart(strongest.fit)
+    if uncorrelated is None:
+        return _select_weighted(data, strongest, options)
+    # Correlated noise makes peaks in all outputs. Modes not found yet add to its estimate, hence the repetition.
+    for _ in range(DRIVEN.decorrelation_rounds):
+        again = _select_strongest(uncorrelated, strongest.fit, **options)
+        uncorrelated, selected = _select_weighted(uncorrelated, again, options)
+        further = uncorrelated.apart(selected.fit)
+        if further is None or budget.spent("search in outputs of uncorrelated noise"):
             break
-        apart, strongest = again, found
-    data = data.beside_as(apart)
-    fit = settled(data, projected(data, found.fit.poles, found.fit.participation), budget=budget)
+        uncorrelated, strongest = further, selected
+    data = data.beside_as(uncorrelated)
+    fit = settled(data, projected(data, selected.fit.poles, selected.fit.participation), budget=budget)
     data = data.weighted_by(data.noise_spectrum(fit))
     fit = settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget)
-    return data, found.refitted(fit)
+    return data, selected.refitted(fit)
 
 
-def _in_noise(data: KnownInputs, strongest: Selected, how: dict[str, Any]) -> tuple[KnownInputs, Selected]:
-    """The modes of outputs that share no noise, in that of their residual's spectrum: coloured noise passes for modes.
+def _select_weighted(data: KnownInputs, strongest: Selected, options: dict[str, Any]) -> tuple[KnownInputs, Selected]:
+    """The modes of outputs of uncorrelated noise, weighted by the spectrum of the residual.
 
-    A false mode explains its lines, so that their noise is underestimated and the mode seems true. The noise is thus
-    estimated anew without all doubtful modes; they stay if that makes modes and noise together less likely.
+    Coloured noise may be taken for modes. A false mode fits noise at its lines, so that the noise there is
+    underestimated and the mode appears significant. The noise is therefore estimated again without all doubtful modes;
+    they stay if modes and noise together are less likely without them.
     """
-    budget, few = how["budget"], _few(how)
+    budget, few = options["budget"], _few_modes(options)
     few["max_modes"] = max(few["max_modes"], strongest.fit.poles.size)
-    data, selected = _with_noise(data, strongest, few, how, budget)
-    doubtful = (selected.statistic < SELECTION.weak * selected.limit) | ~_oscillate(data, selected)
+    data, selected = _alternate_with_noise(data, strongest, few, options, budget)
+    doubtful = (selected.statistic < SELECTION.weak * selected.limit) | ~_are_oscillatory(data, selected)
     if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
         return data, selected
     sure = settled(data, only(data, selected.fit, ~doubtful), budget=budget)
     other = data.weighted_by(data.noise_spectrum(sure))
-    other, fewer = _with_noise(other, select_modes(other, start=sure, **how), how, how, budget)
+    other, fewer = _alternate_with_noise(other, select_modes(other, start=sure, **options), options, options, budget)
     if budget.spent("check of doubtful modes"):
         return data, selected
-    worth = selected.limit * (selected.fit.poles.size - fewer.fit.poles.size)
-    strange = (~_oscillate(data, selected)).sum() > (~_oscillate(other, fewer)).sum()
-    return (other, fewer) if strange or other.cost(fewer.fit) - data.cost(selected.fit) <= worth else (data, selected)
+    threshold = selected.limit * (selected.fit.poles.size - fewer.fit.poles.size)
+    less_oscillatory = (~_are_oscillatory(data, selected)).sum() > (~_are_oscillatory(other, fewer)).sum()
+    return (
+        (other, fewer)
+        if less_oscillatory or other.cost(fewer.fit) - data.cost(selected.fit) <= threshold
+        else (data, selected)
+    )
 
 
-def _as_constant(
+def _as_time_invariant(
     data: KnownInputs, selected: Selected, budget: Budget
 ) -> tuple[KnownInputs, Selected, tuple[complex, ...]]:
-    """The same modes as constant ones, where the motion of modes that change was fitted beside them, and these modes.
+    """The modes refitted as time-invariant, without the columns of changing modes, and the poles that change.
 
-    Noise, standard errors and responses are then those of the model returned. No mode changes if, all modes being
-    known, that motion explains no more than it would of noise.
+    Noise, standard errors and responses are then those of the model returned. No mode counts as changing if these
+    columns, in addition to all modes, explain no more than they would of noise.
     """
     if not data.changing:
         return data, selected, ()
     plain, before = data.without_columns(), selected.fit
     fit = settled(plain, projected(plain, before.poles, before.participation), budget=budget)
-    worth = added_misfit(fit, before, before.noise)
+    decrease = added_misfit(fit, before, before.noise)
     columns = (data.fixed.shape[1] - plain.fixed.shape[1]) * before.noise.size
-    changing = data.changing if worth > chi2.isf(FALSE_ALARM, columns) else ()
+    changing = data.changing if decrease > chi2.isf(FALSE_ALARM, columns) else ()
     data = plain.weighted_by(plain.noise_spectrum(fit))
     fit = settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget)
     return data, selected.refitted(fit), changing
 
 
 def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) -> tuple[Selected, tuple[str, ...]]:
-    """Without poles that cannot be modes, the others fitted anew, and a remark on them."""
+    """The modes refitted without poles that cannot be modes, and a remark on the poles left out."""
     out: list[float] = []
     fit = selected.fit
     while fit.poles.size > 1:
@@ -597,39 +620,47 @@ def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) ->
     return selected.refitted(fit), (remark,)
 
 
-def _oscillate(data: KnownInputs, selected: Selected) -> np.ndarray:
-    """Which modes oscillate within a record and hardly grow; others may be noise that is not white."""
+def _are_oscillatory(data: KnownInputs, selected: Selected) -> np.ndarray:
+    """Whether each mode oscillates within a record and does not grow, (n_modes,); others may be coloured noise."""
     poles, span = selected.fit.poles, 2.0 * np.pi / data.resolution
     return np.asarray((np.abs(poles) > data.resolution) & (poles.real * span < SELECTION.most_growth))
 
 
-def _with_noise(
-    data: KnownInputs, selected: Selected, once: dict[str, Any], how: dict[str, Any], budget: Budget
+def _alternate_with_noise(
+    data: KnownInputs, selected: Selected, first_options: dict[str, Any], options: dict[str, Any], budget: Budget
 ) -> tuple[KnownInputs, Selected]:
-    """Modes and noise estimated in turn until both stay the same; `once` is how `selected` was selected."""
-    for _ in range(DRIVEN.learnt):
-        for _ in range(DRIVEN.learnt):
+    """Modes and noise spectrum, estimated alternately until both settle.
+
+    Args:
+        data: known inputs and outputs.
+        selected: the modes to start from.
+        first_options: options by which `selected` was selected.
+        options: those of the selections that follow.
+        budget: of time.
+    """
+    for _ in range(DRIVEN.noise_rounds):
+        for _ in range(DRIVEN.noise_rounds):
             changing = beside_changing(data, selected.fit, selected.limit, budget)
             if changing is None:
                 break
-            fewer = select_modes(changing[0], start=changing[1], **once)
-            # Modes that are truly close fit better than one that changes; rivals of one output were compared before.
-            rivals = data.values.shape[1] * data.n_inputs == 1
-            worth = selected.limit * max(selected.fit.poles.size - fewer.fit.poles.size, 0) if rivals else 0.0
-            if changing[0].cost(fewer.fit) >= data.cost(selected.fit) + worth:
+            fewer = select_modes(changing[0], start=changing[1], **first_options)
+            # Close modes fit better than one changing mode. With one input and output both models were compared before.
+            compared = data.values.shape[1] * data.n_inputs == 1
+            allowed = selected.limit * max(selected.fit.poles.size - fewer.fit.poles.size, 0) if compared else 0.0
+            if changing[0].cost(fewer.fit) >= data.cost(selected.fit) + allowed:
                 break
             data, selected = changing[0], fewer
         line_std = data.noise_spectrum(selected.fit)
-        if alike(line_std, data.line_std) and not (selected.full and once["max_modes"] < how["max_modes"]):
+        if alike(line_std, data.line_std) and not (selected.full and first_options["max_modes"] < options["max_modes"]):
             break
         if budget.spent("estimation of the noise spectrum"):
             break
         weighted = data.with_distorted(selected.distorted).weighted_by(line_std)
-        anew = _predictive(weighted, select_modes(weighted, start=selected.fit, **how), budget)
-        # A search that was ended early is no better than the one before.
-        if budget.spent("estimation of the noise spectrum") and anew.fit.poles.size < selected.fit.poles.size:
+        reselected = _without_unpredictive(weighted, select_modes(weighted, start=selected.fit, **options), budget)
+        # A search that the time limit ended early does not replace the one before.
+        if budget.spent("estimation of the noise spectrum") and reselected.fit.poles.size < selected.fit.poles.size:
             break
-        data, selected, once = weighted, anew, how
+        data, selected, first_options = weighted, reselected, options
     return data, selected
 
 
@@ -640,33 +671,33 @@ def _report(
     selected: Selected,
     remarks: tuple[str, ...],
 ) -> Driven:
-    fit, n, further = selected.fit, selected.fit.poles.size, None
+    fit, n, from_inputs = selected.fit, selected.fit.poles.size, None
     if data.measured is None:
-        noise_ratio, beside = data.noise_ratios(fit)
+        noise_ratio, fixed_ratio = data.noise_ratios(fit)
         shared, std = data.disturbed(fit), blow_noise(logged, records)
         if std.any():
-            further = spread_by_inputs(data, fit, std, [record.inputs != 0.0 for record in records])
+            from_inputs = spread_by_inputs(data, fit, std, [record.inputs != 0.0 for record in records])
     else:
         data = data.as_measured()
         fit = settled(data, projected(data, fit.poles, fit.participation))
         noise = noise_levels(data, fit, records)
         own = (noise.outputs / fit.noise)[:, None] ** 2
-        noise_ratio, beside, shared = np.tile(own, n), np.tile(own.T, (data.fixed.shape[1], 1)), np.ones(n)
-        everywhere = [np.ones(record.inputs.shape, bool) for record in records]
-        further = spread_by_inputs(data, fit, noise.inputs, everywhere)
+        noise_ratio, fixed_ratio, shared = np.tile(own, n), np.tile(own.T, (data.fixed.shape[1], 1)), np.ones(n)
+        all_samples = [np.ones(record.inputs.shape, bool) for record in records]
+        from_inputs = spread_by_inputs(data, fit, noise.inputs, all_samples)
         remarks = (*noise_remarks(records, noise), *remarks)
     channels, n_inputs = records[0].output_channels, records[0].n_inputs
     derivative = time_derivatives(channels)[:, None]
     shapes, participation = scaled_vectors(fit, np.arange(n), derivative)
-    vectors = vector_covariance(fit, noise_ratio, derivative, np.arange(n), shapes, n_inputs, further)
+    vectors = vector_covariance(fit, noise_ratio, derivative, np.arange(n), shapes, n_inputs, from_inputs)
     direct = np.zeros((len(channels), n_inputs))
     direct_std = np.zeros_like(direct)
     if data.feedthrough:
         direct = fit.coefficients[2 * n : 2 * n + n_inputs].T
-        direct_std = fixed_std(fit, noise_ratio, beside, further)[:n_inputs].T
+        direct_std = fixed_std(fit, noise_ratio, fixed_ratio, from_inputs)[:n_inputs].T
     return Driven(
         modes=SampledModes.of_poles(fit.poles, shapes, records[0].positions),
-        covariance=frozen(pole_covariance(fit, noise_ratio * shared, further)),
+        covariance=frozen(pole_covariance(fit, noise_ratio * shared, from_inputs)),
         vector_covariance=frozen(vectors),
         participation=frozen(participation[:, :n_inputs], complex),
         feedthrough=frozen(direct),

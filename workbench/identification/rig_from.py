@@ -1,4 +1,4 @@
-"""A rig from the modes that were identified on a bench: known at its inputs and outputs, and nowhere else."""
+"""A rig from identified modes, known at the measured inputs and outputs only."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -20,12 +20,14 @@ from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.domain import NamedPoints, place_array
 from workbench.structure.modes import Modes, PointShapes, SampledModes
 
-# of the direct term of accelerations: what modes may leave of it, and standard errors of it, that are no rigid motion
-LEFT, SURE = 0.1, 5.0
-# of the response at the lowest line: what modes below it may make unsaid, and from what on they are rigid motion. Of a
-# free beam it makes 1 there; the first mode of one that is held 0.03, where lines begin at four times its frequency
-SLIGHT, MOST = 0.02, 0.5
-STEP = 1e-3  # of a standard error: of the differences that its propagation takes
+# A residual of the direct term of accelerations above this share of it, and above so many standard errors, may be
+# rigid-body motion.
+RIGID_SHARE, RIGID_ERRORS = 0.1, 5.0
+# Share of the response at the lowest line due to modes below it: neglected up to the first value; taken for rigid-body
+# modes above the second. It is 1 for a free beam, and 0.03 for the first mode of a supported beam where lines begin at
+# four times its frequency.
+NEGLIGIBLE, DOMINANT = 0.02, 0.5
+STEP = 1e-3  # of the finite differences in the propagation of errors, in standard errors
 
 
 def rig_from(
@@ -36,17 +38,18 @@ def rig_from(
     driving_point: tuple[str, str] | None = None,
     modal_masses: ArrayLike | None = None,
 ) -> Rig:
-    """The rig of identified modes, each the nearest real one, mass-normalised where the scale is known.
+    """The rig of identified modes, each replaced by the nearest real one, mass-normalised where the scale is known.
 
-    The residue of output j and input i at the pole λ is A_ji / (2 i ω_d), and A_ji = φ_j φ_i for a real mode: its
-    nearest one is the largest singular value of Re A. The product is what a simulation needs. Its parts, to which
-    masses and springs answer, follow from a driving point, where φ_i = φ_j, or from modal masses. What the modes leave
-    of the direct term of accelerations, D - Σ_r φ_j φ_i, is the motion of a body that no spring holds: a mode at 0 Hz,
-    as far as the inputs move it. Of transfer functions it is the residual term of modes below the band.
+    The residue of output j and input i at the pole λ is A_ji / (2 i ω_d), and A_ji = φ_j φ_i for a real mode: the
+    nearest real mode is the largest singular value of Re A with its vectors. The product φ_j φ_i suffices to simulate
+    responses to the inputs. The shapes themselves, needed to attach masses and springs, follow from a driving point,
+    where φ_i = φ_j, or from modal masses. The residual of the direct term of accelerations, D - Σ_r φ_j φ_i, is
+    rigid-body motion: modes at 0 Hz, as far as the inputs excite them. For transfer functions it is the residual term
+    of modes below the band.
 
     Args:
-        identified: of `identify_driven` or `identify_transfer`, or of `identify_ambient`, `ring_down` or `identify`,
-            which tell no input.
+        identified: from `identify_driven` or `identify_transfer`, or from `identify_ambient`, `ring_down` or
+            `identify`, which know no inputs.
         inputs: channels of the inputs: not needed from `identify_driven`; where no input was measured, the names of
             outputs where forces are to act.
         outputs: channels of the outputs, not needed from `identify_driven`.
@@ -58,52 +61,52 @@ def rig_from(
         damping and shapes (of output-only modes that of shapes where it is known).
 
     Raises:
-        ValueError: channels that are missing, shapes that nothing scales, a driving point where a mode would have a
-            negative mass.
+        ValueError: missing channels, shapes of unknown scale without any input, a driving point where a mode would have
+            a negative mass.
 
     Warns:
-        UserWarning: modes far from real; modes that nothing scales, so that only responses to these inputs are right;
-            several rigid modes, likewise; a direct term that is left out, as it is not of modes, or as not all outputs
-            are accelerations; modes beyond the band of transfer functions that are left out, or taken as rigid.
+        UserWarning: complex modes; shapes of unknown scale, so that only responses to these inputs are right; several
+            rigid modes, likewise; a direct term that is left out, as it is not one of modes, or as not all outputs are
+            accelerations; modes outside the band of transfer functions that are left out, or taken as rigid.
 
     Source: Ewins, Modal Testing, 2nd ed., sections 2.4 and 4.4.
     """
     modes = identified.modes
-    out = _channels(identified, "output_channels", outputs, modes.shapes.shape[0])
-    measured = [channel.quantity for channel in out]
-    for channel in out:
+    out_channels = _channels(identified, "output_channels", outputs, modes.shapes.shape[0])
+    measured = [channel.quantity for channel in out_channels]
+    for channel in out_channels:
         if channel.quantity not in MEASURED:
             raise ValueError(
                 f"output {channel.name!r} measures {channel.quantity or 'an unnamed quantity'}; give outputs= with one"
                 f" of {', '.join(MEASURED)}"
             )
     if isinstance(identified, Driven | TransferModes):
-        into = _channels(identified, "input_channels", inputs, identified.participation.shape[1])
-        shapes = _of_residues(identified, out, into, driving_point, modal_masses)
-        delays = identified.delays if isinstance(identified, Driven) else np.zeros(len(into))
+        in_channels = _channels(identified, "input_channels", inputs, identified.participation.shape[1])
+        shapes = _shapes_of_residues(identified, out_channels, in_channels, driving_point, modal_masses)
+        delays = identified.delays if isinstance(identified, Driven) else np.zeros(len(in_channels))
         actuators = tuple(
             Actuator(c.name, c.name, kind="moment" if c.quantity == "moment" else "force", delay=float(delay))
-            for c, delay in zip(into, delays, strict=True)
+            for c, delay in zip(in_channels, delays, strict=True)
         )
     else:
-        shapes = _of_shapes(identified, out, modal_masses)
+        shapes = _shapes_of_outputs(identified, out_channels, modal_masses)
         names = [channel if isinstance(channel, str) else channel.name for channel in inputs or ()]
         shapes.points.locate(names)
         actuators = tuple(Actuator(f"force at {name}", name) for name in names)
-    noise = getattr(identified, "noise_std", [channel.noise_std or 0.0 for channel in out])
-    late = identified.delays if isinstance(identified, TransferModes) else np.zeros(len(out))
+    noise = getattr(identified, "noise_std", [channel.noise_std or 0.0 for channel in out_channels])
+    late = identified.delays if isinstance(identified, TransferModes) else np.zeros(len(out_channels))
     sensors = tuple(
         Sensor(c.name, c.name, quantity, noise_std=float(std), delay=float(delay))
-        for c, quantity, std, delay in zip(out, measured, np.atleast_1d(noise), late, strict=True)
+        for c, quantity, std, delay in zip(out_channels, measured, np.atleast_1d(noise), late, strict=True)
     )
     n = modes.n_modes
-    # rigid modes stand behind the others
+    # rigid modes come last in `shapes`
     omega, zeta = (np.append(figure, np.zeros(shapes.values.shape[1] - n)) for figure in (modes.omega, modes.zeta))
     covariance, known = np.zeros((2 * omega.size,) * 2), np.r_[:n, omega.size : omega.size + n]
     covariance[np.ix_(known, known)] = identified.covariance
     order = np.argsort(omega, kind="stable")
     both = np.r_[order, order + order.size]
-    found = Modes(
+    modes_found = Modes(
         omega=omega[order],
         damping=zeta[order],
         shapes=PointShapes(shapes.values[:, order]),
@@ -111,16 +114,24 @@ def rig_from(
         covariance=covariance[np.ix_(both, both)],
         shape_covariance=None if shapes.covariance is None else shapes.covariance[order],
     )
-    return Rig(found, actuators, sensors)
+    return Rig(modes_found, actuators, sensors)
 
 
 def _channels(identified: Any, name: str, given: Sequence[Channel | str] | None, count: int) -> tuple[Channel, ...]:
+    """The channels of inputs or outputs, given or as kept by the identification.
+
+    Args:
+        identified: the result of an identification.
+        name: "input_channels" or "output_channels".
+        given: channels or names; None to take those of the identification.
+        count: number of channels required.
+    """
     records = getattr(identified, "records", ()) or getattr(identified, "correlations", ())
-    found = given if given is not None else getattr(identified, name, getattr(next(iter(records), None), name, None))
+    chosen = given if given is not None else getattr(identified, name, getattr(next(iter(records), None), name, None))
     side = name.split("_")[0] + "s"
-    if found is None:
+    if chosen is None:
         raise ValueError(f"{type(identified).__name__} does not keep its {side}; give {side}= with {count} channels")
-    channels = tuple(Channel(c) if isinstance(c, str) else c for c in found)
+    channels = tuple(Channel(c) if isinstance(c, str) else c for c in chosen)
     if len(channels) != count:
         raise ValueError(f"{side}= must name the {count} {side} of the identified modes; got {len(channels)}")
     return channels
@@ -128,8 +139,13 @@ def _channels(identified: Any, name: str, given: Sequence[Channel | str] | None,
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Mass-normalised shapes (n_points, n_modes) and their covariance (n_modes, n_points, n_points), if it is known;
-    rigid modes stand behind those identified."""
+    """Mass-normalised shapes at points, identified modes first, then rigid modes.
+
+    Attributes:
+        values: (n_points, n_modes).
+        points: the points.
+        covariance: (n_modes, n_points, n_points); None where it is unknown.
+    """
 
     values: np.ndarray
     points: NamedPoints
@@ -137,33 +153,41 @@ class _Shapes:
 
 
 @dataclass(frozen=True, eq=False)
-class _Below:
-    """Σ φ_j φ_i of rigid modes and its standard errors, (n_outputs, n_inputs) each, and what of it is none."""
+class _RigidTerm:
+    """The sum Σ φ_j φ_i of rigid modes.
 
-    left: np.ndarray
+    Attributes:
+        term: (n_outputs, n_inputs).
+        error: (n_outputs, n_inputs) standard errors.
+        least: norm up to which a part of it is insignificant.
+    """
+
+    term: np.ndarray
     error: np.ndarray
     least: float
 
 
-def _of_residues(
+def _shapes_of_residues(
     identified: Driven | TransferModes,
     out: tuple[Channel, ...],
     into: tuple[Channel, ...],
     driving_point: tuple[str, str] | None,
     modal_masses: ArrayLike | None,
 ) -> _Shapes:
-    """Shapes at inputs and outputs, an input of the name of an output being the same point."""
+    """Shapes at inputs and outputs from residues; an input and an output of the same name are the same point."""
     modes = identified.modes
     residues = _residues(modes, modes.shapes, identified.participation)
     sizes = np.linalg.svd(residues.real, compute_uv=False)
-    cost = np.sqrt(np.maximum(1.0 - sizes[:, 0] ** 2 / np.sum(np.abs(residues) ** 2, axis=(1, 2)), 0.0))
-    turned = np.linalg.norm(identified.participation_std, axis=1) / np.linalg.norm(identified.participation, axis=1)
-    _warn_of_complex(modes, cost, np.hypot(shape_errors(identified), turned), "residues")
+    complexity = np.sqrt(np.maximum(1.0 - sizes[:, 0] ** 2 / np.sum(np.abs(residues) ** 2, axis=(1, 2)), 0.0))
+    participation_error = np.linalg.norm(identified.participation_std, axis=1) / np.linalg.norm(
+        identified.participation, axis=1
+    )
+    _warn_of_complex(modes, complexity, np.hypot(shape_errors(identified), participation_error), "residues")
     for remark in set_up_remarks(identified):
         warnings.warn(remark, stacklevel=3)
-    pair = _pair(out, into, driving_point)
+    pair = _driving_point(out, into, driving_point)
     masses = None if modal_masses is None else _masses(modal_masses, modes.n_modes)
-    at_out, at_in = np.split(_scaled(residues.real, pair, masses), [len(out)], axis=1)
+    at_out, at_in = np.split(_mass_normalised(residues.real, pair, masses), [len(out)], axis=1)
     if pair is not None and not (at_out[:, pair[0]] * at_in[:, pair[1]] > 0).all():
         worst = int(np.argmin(at_out[:, pair[0]] * at_in[:, pair[1]]))
         raise ValueError(
@@ -172,81 +196,85 @@ def _of_residues(
         )
     if pair is None and masses is None:
         warnings.warn(
-            "no output stands where an input acts, so the shapes have no scale: responses to these inputs are right,"
+            "no output is at the place of an input, so the shapes have no scale: responses to these inputs are right,"
             " those to masses, springs or forces elsewhere are not; name an input and the output at its place as the"
             " driving point (driving_point, --driving-point), or give modal_masses",
             stacklevel=3,
         )
     rows = {channel.name: (channel, i) for i, channel in enumerate((*into, *out), start=-len(into))}
     kept = [i % (len(out) + len(into)) for _, i in rows.values()]
-    spread = _spread(identified, lambda residues: _scaled(residues.real, pair, masses)[:, kept])
+    covariance = _propagated(identified, lambda residues: _mass_normalised(residues.real, pair, masses)[:, kept])
     values = np.hstack([at_out, at_in])[:, kept]
     if isinstance(identified, Driven):
-        below = _left_of_direct(identified, out, pair, at_out.T @ at_in)
+        rigid_term = _rigid_of_direct_term(identified, out, pair, at_out.T @ at_in)
     else:
-        below = _below_the_band(identified, out, pair)
-    shape, error = _rigid(below, pair, len(out), len(into))
+        rigid_term = _rigid_of_residual_term(identified, out, pair)
+    shape, error = _rigid_modes(rigid_term, pair, len(out), len(into))
     values = np.vstack([values, shape[:, kept]])
-    spread = np.concatenate([spread, [np.diag(row[kept] ** 2) for row in error]]) if len(error) else spread
-    return _Shapes(values.T, _points([channel for channel, _ in rows.values()]), spread)
+    covariance = np.concatenate([covariance, [np.diag(row[kept] ** 2) for row in error]]) if len(error) else covariance
+    return _Shapes(values.T, _points([channel for channel, _ in rows.values()]), covariance)
 
 
-def _left_of_direct(
+def _rigid_of_direct_term(
     identified: Driven, out: tuple[Channel, ...], pair: tuple[int, int] | None, elastic: np.ndarray
-) -> _Below | None:
-    """What the modes leave of the direct term of accelerations, where it is rigid motion.
+) -> _RigidTerm | None:
+    """The residual of the direct term of accelerations, where it is rigid-body motion; None where it is not.
 
     Args:
         identified: the modes and the direct term.
-        out: of the rig.
+        out: outputs of the rig.
         pair: indices of an output and the input at its place.
         elastic: (n_outputs, n_inputs) direct term of the accelerations of the other modes.
     """
-    falls = np.array([channel.quantity == "acceleration" for channel in out])
-    direct, error = identified.feedthrough[falls], identified.feedthrough_std[falls]
-    left, least = direct - elastic[falls], max(LEFT * np.linalg.norm(direct), SURE * np.linalg.norm(error))
-    if not direct.any() or np.linalg.norm(left) <= least:
+    accelerations = np.array([channel.quantity == "acceleration" for channel in out])
+    direct, error = identified.feedthrough[accelerations], identified.feedthrough_std[accelerations]
+    residual = direct - elastic[accelerations]
+    least = max(RIGID_SHARE * np.linalg.norm(direct), RIGID_ERRORS * np.linalg.norm(error))
+    if not direct.any() or np.linalg.norm(residual) <= least:
         return None
-    if falls.all() and (pair is None or left[pair] > 0):
-        return _Below(left, error, float(least))
-    share = 100.0 * np.linalg.norm(left) / np.linalg.norm(direct)
-    why = "is not that of modes" if falls.all() else "may be rigid motion, which outputs of other kinds do not show"
+    only = accelerations.all()
+    if only and (pair is None or residual[pair] > 0):
+        return _RigidTerm(residual, error, float(least))
+    share = 100.0 * np.linalg.norm(residual) / np.linalg.norm(direct)
+    why = "is not that of modes" if only else "may be rigid-body motion, which outputs of other quantities do not show"
     warnings.warn(
         f"{share:.0f} % of the direct term of accelerations {why}, and is left out of the rig; simulate by"
-        " response() of what was identified, or identify from accelerations alone",
+        " response() of the identified modes, or identify from accelerations alone",
         stacklevel=4,
     )
     return None
 
 
-def _below_the_band(identified: TransferModes, out: tuple[Channel, ...], pair: tuple[int, int] | None) -> _Below | None:
-    """The residual term of modes below the band, where it is rigid motion: where it makes most of the lowest line.
+def _rigid_of_residual_term(
+    identified: TransferModes, out: tuple[Channel, ...], pair: tuple[int, int] | None
+) -> _RigidTerm | None:
+    """The residual term of modes below the band, where it is rigid-body motion: where it dominates the lowest line.
 
     Args:
         identified: the modes and the residual terms.
-        out: of the rig.
+        out: outputs of the rig.
         pair: indices of an output and the input at its place.
     """
     order, hz = np.array([MEASURED[channel.quantity][1] for channel in out])[:, None], identified.frequencies_hz
     above = identified.upper_residual[:, :, None] * (2.0 * np.pi * hz) ** order[:, :, None]
-    if (share := np.linalg.norm(above) / np.linalg.norm(identified.fitted)) > LEFT:
+    if (share := np.linalg.norm(above) / np.linalg.norm(identified.fitted)) > RIGID_SHARE:
         warnings.warn(
             f"modes above {hz[-1]:.4g} Hz make {100.0 * share:.0f} % of the response, and are left out of the rig;"
             " identify up to a higher line",
             stacklevel=4,
         )
     below, error = identified.lower_residual, identified.lower_residual_std
-    least = float(SURE * np.linalg.norm(error))
+    least = float(RIGID_ERRORS * np.linalg.norm(error))
     share = np.linalg.norm(below * (2.0 * np.pi * hz[0]) ** (order - 2)) / np.linalg.norm(identified.fitted[:, :, 0])
-    if np.linalg.norm(below) <= least or share <= SLIGHT:
+    if np.linalg.norm(below) <= least or share <= NEGLIGIBLE:
         return None
-    if share > MOST and (pair is None or below[pair] > 0):
+    if share > DOMINANT and (pair is None or below[pair] > 0):
         warnings.warn(
-            f"what moves below the lowest line, {hz[0]:.4g} Hz, is taken for a body that no spring holds, a mode at"
-            " 0 Hz; if the structure is held, identify from a lower line",
+            f"the motion below the lowest line, {hz[0]:.4g} Hz, is taken for rigid-body modes at 0 Hz; if the structure"
+            " is supported, identify from a lower line",
             stacklevel=4,
         )
-        return _Below(below, error, max(least, LEFT * float(np.linalg.norm(below))))
+        return _RigidTerm(below, error, max(least, RIGID_SHARE * float(np.linalg.norm(below))))
     warnings.warn(
         f"modes below the lowest line, {hz[0]:.4g} Hz, rigid or elastic, make {100.0 * share:.0f} % of the response"
         " there, and are left out of the rig; identify from a lower line",
@@ -255,36 +283,38 @@ def _below_the_band(identified: TransferModes, out: tuple[Channel, ...], pair: t
     return None
 
 
-def _rigid(below: _Below | None, pair: tuple[int, int] | None, m: int, q: int) -> tuple[np.ndarray, np.ndarray]:
-    """Shapes of rigid modes, as far as the inputs move them, and standard errors, (n_rigid, n_outputs + n_inputs) each.
+def _rigid_modes(
+    rigid_term: _RigidTerm | None, pair: tuple[int, int] | None, m: int, q: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes of the rigid modes that the inputs excite, and standard errors, (n_rigid, n_outputs + n_inputs) each.
 
     Args:
-        below: what they make, if anything.
+        rigid_term: their sum Σ φ_j φ_i; None where there is none.
         pair: indices of an output and the input at its place.
         m, q: number of outputs and of inputs.
     """
-    if below is None:
+    if rigid_term is None:
         return np.zeros((0, m + q)), np.zeros((0, m + q))
-    u, sizes, v = np.linalg.svd(below.left, full_matrices=False)
-    count = next(k for k in range(1, sizes.size + 1) if np.linalg.norm(sizes[k:]) <= below.least)
+    u, sizes, v = np.linalg.svd(rigid_term.term, full_matrices=False)
+    count = next(k for k in range(1, sizes.size + 1) if np.linalg.norm(sizes[k:]) <= rigid_term.least)
     if count > 1:
         warnings.warn(
             f"the measurement shows {count} rigid modes: responses to these inputs are right, those to masses, springs"
             " or forces elsewhere are not; for these take the rigid modes from the body's mass and inertia",
             stacklevel=3,
         )
-    shape = _scaled(np.einsum("jk,k,ki->kji", u, sizes, v)[:count], pair, None)
-    rms = np.sqrt((below.error**2).mean(axis=1)), np.sqrt((below.error**2).mean(axis=0))
+    shape = _mass_normalised(np.einsum("jk,k,ki->kji", u, sizes, v)[:count], pair, None)
+    rms = np.sqrt((rigid_term.error**2).mean(axis=1)), np.sqrt((rigid_term.error**2).mean(axis=0))
     norms = (np.linalg.norm(part, axis=1, keepdims=True) for part in (shape[:, m:], shape[:, :m]))
     return shape, np.hstack([own / norm for own, norm in zip(rms, norms)])
 
 
 def _residues(modes: SampledModes, shapes: np.ndarray, participation: np.ndarray) -> np.ndarray:
-    """A_ji (n_modes, n_outputs, n_inputs) complex, of displacement, whatever the outputs measure."""
+    """Residues A_ji (n_modes, n_outputs, n_inputs) complex of displacement, for outputs of any quantity."""
     return np.asarray(np.einsum("jr,ri,r->rji", shapes, participation, 2j * modes.poles.imag))
 
 
-def _scaled(residues: np.ndarray, pair: tuple[int, int] | None, masses: np.ndarray | None) -> np.ndarray:
+def _mass_normalised(residues: np.ndarray, pair: tuple[int, int] | None, masses: np.ndarray | None) -> np.ndarray:
     """Shapes (n_modes, n_outputs + n_inputs) of the nearest real modes, mass-normalised where the scale is known.
 
     Args:
@@ -304,30 +334,35 @@ def _scaled(residues: np.ndarray, pair: tuple[int, int] | None, masses: np.ndarr
     return np.hstack([at_out * np.sqrt(ratio)[:, None], at_in / np.sqrt(ratio)[:, None]])
 
 
-def _spread(identified: Driven | TransferModes, figures: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Covariance (n_modes, n_figures, n_figures) of what `figures` makes of residues, to first order.
+def _propagated(identified: Driven | TransferModes, values: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Covariance (n_modes, n_values, n_values) of a function of the residues, to first order.
 
-    Errors of ω_d are left out: against those of shapes they are nothing.
+    Errors of ω_d are neglected, which are small against those of the shapes.
+
+    Args:
+        identified: the modes with their covariance.
+        values: function of residues (n_modes, n_outputs, n_inputs) that returns (n_modes, n_values).
     """
     modes, errors = identified.modes, identified.vector_covariance
     m, q = modes.shapes.shape[0], identified.participation.shape[1]
     steps = STEP * symmetric_root(errors)
     largest = modes.shapes[np.abs(modes.shapes).argmax(axis=0), np.arange(modes.n_modes)]
-    middle = figures(_residues(modes, modes.shapes, identified.participation))
+    nominal = values(_residues(modes, modes.shapes, identified.participation))
     slopes = []
     for step in np.moveaxis(steps, 2, 0):
-        shape, turn = step[:, :m].T * largest, step[:, m : m + q] + 1j * step[:, m + q :]
+        shape, participation_step = step[:, :m].T * largest, step[:, m : m + q] + 1j * step[:, m + q :]
         both = [
-            figures(_residues(modes, modes.shapes + sign * shape, identified.participation + sign * turn))
+            values(_residues(modes, modes.shapes + sign * shape, identified.participation + sign * participation_step))
             for sign in (1.0, -1.0)
         ]
-        # a singular vector has no sign of its own
-        above, below = (f * np.where(np.sum(f * middle, axis=1, keepdims=True) < 0, -1.0, 1.0) for f in both)
+        # the sign of a singular vector is arbitrary
+        above, below = (f * np.where(np.sum(f * nominal, axis=1, keepdims=True) < 0, -1.0, 1.0) for f in both)
         slopes.append((above - below) / (2.0 * STEP))
     return np.asarray(np.einsum("kri,krj->rij", slopes, slopes))
 
 
-def _of_shapes(identified: Any, out: tuple[Channel, ...], modal_masses: ArrayLike | None) -> _Shapes:
+def _shapes_of_outputs(identified: Any, out: tuple[Channel, ...], modal_masses: ArrayLike | None) -> _Shapes:
+    """Shapes at the outputs from output-only modes, scaled by modal masses."""
     modes = identified.modes
     if modal_masses is None:
         raise ValueError(
@@ -351,26 +386,35 @@ def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:
     return masses
 
 
-def _warn_of_complex(modes: SampledModes, cost: np.ndarray, error: np.ndarray, what: str) -> None:
-    """Warn of modes of which the nearest real one leaves a share, (n_modes,), that is neither small nor their error."""
-    for r in are_far(cost, error):
+def _warn_of_complex(modes: SampledModes, distance: np.ndarray, error: np.ndarray, what: str) -> None:
+    """Warn of modes that are complex beyond their errors.
+
+    Args:
+        modes: the modes.
+        distance: (n_modes,) relative distance from the nearest real mode.
+        error: (n_modes,) its standard error.
+        what: that is complex, "residues" or "shape".
+    """
+    for r in are_far(distance, error):
         warnings.warn(
-            f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz is complex: the nearest real mode leaves"
-            f" {100 * cost[r]:.0f} % of its {what}",
+            f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz is complex: the nearest real mode differs from its"
+            f" {what} by {100 * distance[r]:.0f} %",
             stacklevel=4,
         )
 
 
-def _pair(
+def _driving_point(
     out: tuple[Channel, ...], into: tuple[Channel, ...], driving_point: tuple[str, str] | None
 ) -> tuple[int, int] | None:
-    """Indices of an output and the input at its place."""
+    """Indices of an output and the input at its place; None where there is no driving point."""
     if driving_point is not None:
-        acts = [channel.name for channel in into]
-        reads = [channel.name for channel in out]
-        if driving_point[0] not in acts or driving_point[1] not in reads:
-            raise ValueError(f"driving_point is (input, output), of {', '.join(acts)} and {', '.join(reads)}")
-        return reads.index(driving_point[1]), acts.index(driving_point[0])
+        input_names = [channel.name for channel in into]
+        output_names = [channel.name for channel in out]
+        if driving_point[0] not in input_names or driving_point[1] not in output_names:
+            raise ValueError(
+                f"driving_point is (input, output), of {', '.join(input_names)} and {', '.join(output_names)}"
+            )
+        return output_names.index(driving_point[1]), input_names.index(driving_point[0])
     for j, measured in enumerate(out):
         for i, acting in enumerate(into):
             same_place = measured.at is not None and measured.at == acting.at
@@ -380,7 +424,7 @@ def _pair(
 
 
 def _points(channels: Sequence[Channel]) -> NamedPoints:
-    """The channels as named points, with positions where all stand along an interval, or on a plate: it moves in z."""
+    """The channels as named points, with positions where all have coordinates; motion is transverse, z on a plate."""
     names, at = tuple(channel.name for channel in channels), place_array([channel.at for channel in channels])
     if at.dtype == object or not np.isfinite(at).all():
         return NamedPoints(names)

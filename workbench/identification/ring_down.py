@@ -42,23 +42,25 @@ from workbench.threads import one_blas_thread
 
 @dataclass(frozen=True)
 class RingDownSettings:
-    """Constants of what is said of a ring-down."""
+    """Constants of the identification of a ring-down and of its remarks."""
 
-    max_modes: int = 20  # of a stabilisation diagram
-    drift_rounds: int = 3  # of modes and drift
-    parabola: int = 2  # degree of a drift before any mode is known
-    dominant: float = 0.5  # share of the variance that it must leave at most, to be removed
-    as_strong: float = 0.5  # energy of the second half over that of the first, either way, of what does not decay
-    correlated: float = 0.5  # least correlation of a free decay as strong at its end, after a third of it
-    uncorrelated: float = 3.0  # correlation of noise, times the root of its samples, is 1; more is an oscillation
-    residual_share: float = 0.1  # share of the energy about the modes that the residual may have
-    most_left: float = 0.25  # likewise of all, if it is not white
-    about: float = 0.05  # of the frequency of a sure mode, within which so many others
-    crowd: int = 2  # of no sure damping are the work of forces
-    other_shape: float = 0.1  # of a mode's motion in all records, what its best one shape leaves, to be remarked
-    stands_out: float = 5.0  # times the residual beside them that it may stand out by
-    band: int = 6  # bins about a mode
-    beside: int = 60  # bins beside it
+    max_modes: int = 20  # highest model order of the stabilisation diagram
+    drift_rounds: int = 3  # alternations between modes and drift
+    parabola: int = 2  # degree of the drift removed before any mode is known
+    dominant: float = 0.5  # share of an output's variance that remains without a dominant drift, at most
+    undecayed: float = 0.5  # least ratio of the energies of the two halves of a record that does not decay
+    correlated: float = 0.5  # least correlation of an undecayed free decay after a third of the record
+    uncorrelated: float = 3.0  # correlation times √n_samples above which a signal oscillates; white noise has 1
+    residual_share: float = 0.1  # largest share of the energy in the bands of the modes that is residual
+    most_residual: float = 0.25  # likewise over all frequencies, where the residual is coloured
+    # undamped estimates within so much of the frequency of a mode, relative, and their number, from which on ambient
+    # forces are suspected
+    cluster_band: float = 0.05
+    cluster_size: int = 2
+    second_shape: float = 0.1  # rms share of a mode's motion in all records outside one common shape, to be remarked
+    peak_ratio: float = 5.0  # largest ratio of the residual in the bands of the modes to that beside them
+    band: int = 6  # least half width of the band of a mode, bins
+    side_band: int = 60  # bins on either side of it
 
 
 RING_DOWN = RingDownSettings()
@@ -74,11 +76,11 @@ class RingDown(OfRefined):
         refined: their modes.
         remarks: one per mode, empty where there is none.
         noise_modes: candidates rejected as noise.
-        noise_statistic: (n_noise,) theirs, below `threshold`.
-        threshold: statistic from which on a mode counts.
+        noise_statistic: (n_noise,) test statistics of these, below `threshold`.
+        threshold: least test statistic of a mode.
         by_amplitude: the modes of each segment of the decay.
         proportional: g1 and g2 of the modes without remark; None where they are fewer than two.
-        notes: what was done to the records, and what remains unexplained.
+        notes: how the records were prepared, and where the model does not explain them.
     """
 
     records: tuple[Record, ...]
@@ -107,14 +109,14 @@ def ring_down(
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
 ) -> RingDown:
-    """The modes of records that become free decay.
+    """The modes of records that end in a free decay.
 
-    Each is cut where free decay begins and no sample is clipped any more, and a drift is removed. Unless their number
-    is given, the modes are those that rise above the noise of all records together.
+    Each record is cut to its free decay after the last clipped sample, and its drift is removed. Unless `n_modes` is
+    given, the modes are those that are significant in the noise of all records together.
 
     Args:
         records: of the same sensors at one rate, of any length before the decay.
-        start: where the decay is free, s, in every record; found in each unless given.
+        start: time from which every record decays freely, s; detected in each unless given.
         n_modes: number of modes; selected unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a note; None for no
             limit.
@@ -126,55 +128,55 @@ def ring_down(
     """
     budget = Budget(seconds, progress)
     records = of_same_sensors(records)
-    cut, notes = [], []
+    decays, notes = [], []
     for record in records:
-        decay, notes_here = _decay(record, start)
-        cut.append(decay)
-        notes += notes_here if len(records) == 1 else [f"{record.name}: {note}" for note in notes_here]
+        decay, own_notes = _cut_to_decay(record, start)
+        decays.append(decay)
+        notes += own_notes if len(records) == 1 else [f"{record.name}: {note}" for note in own_notes]
         check_data_quality(decay)
         notes += dropout_remark(
             decay, "Frequencies by amplitude are not compared there; leave it out, or cut the record"
         )
-        _check_undriven(cut[-1])
+        _check_undriven(decay)
     try:
-        found, cut, more = _without_drift(cut, n_modes, budget)
+        identified, decays, drift_notes = _identify_with_drift(decays, n_modes, budget)
     except np.linalg.LinAlgError:
-        found = _by_stabilisation(cut, budget)
-        more = ["model order by the stabilisation diagram, for selection by likelihood failed"]
-    found = found.without_artefacts(np.pi / cut[0].sample_time, growing=True)
-    _check_decays(cut, found.refined)
-    found = found.without_artefacts(np.pi / cut[0].sample_time)
-    left = [project(record, found.modes.poles, True).residual.T for record in cut]
-    coloured = _coloured_residual(cut, left)
-    doubtful = _unexplained(cut, left, found.refined, bool(coloured))
-    doubts = remarks(found.refined, cut)
-    sure = [r for r, doubt in enumerate(doubts) if not doubt]
+        identified = _by_stabilisation(decays, budget)
+        drift_notes = ["model order from the stabilisation diagram, because selection by likelihood failed"]
+    identified = identified.without_artefacts(np.pi / decays[0].sample_time, growing=True)
+    _check_decays(decays, identified.refined)
+    identified = identified.without_artefacts(np.pi / decays[0].sample_time)
+    residuals = [project(record, identified.modes.poles, True).residual.T for record in decays]
+    coloured = _coloured_residual(decays, residuals)
+    unexplained = _large_residual(decays, residuals, identified.refined, bool(coloured))
+    mode_remarks = remarks(identified.refined, decays)
+    sure = [r for r, remark in enumerate(mode_remarks) if not remark]
     return RingDown(
-        tuple(cut),
-        found.refined,
-        doubts,
-        found.noise_modes,
-        found.noise_statistic,
-        found.threshold,
-        amplitude_dependence(cut, found.refined, budget=budget),
-        proportional_fit(found.refined, sure) if len(sure) > 1 else None,
+        tuple(decays),
+        identified.refined,
+        mode_remarks,
+        identified.noise_modes,
+        identified.noise_statistic,
+        identified.threshold,
+        amplitude_dependence(decays, identified.refined, budget=budget),
+        proportional_fit(identified.refined, sure) if len(sure) > 1 else None,
         (
             *notes,
-            *more,
+            *drift_notes,
             *budget.remarks,
-            *_goes_on(found.refined, cut),
-            *_shaken(found.refined, doubts),
-            *clock_remarks(found.refined, sure),
-            *_of_other_shapes(found.refined, cut, sure),
-            *shape_remarks(found.refined, cut[0].output_names, sure),
-            *doubtful,
+            *_undecaying(identified.refined, decays),
+            *_ambient_excitation(identified.refined, mode_remarks),
+            *clock_remarks(identified.refined, sure),
+            *_inconsistent_shapes(identified.refined, decays, sure),
+            *shape_remarks(identified.refined, decays[0].output_names, sure),
+            *unexplained,
             *coloured,
         ),
     )
 
 
-def _decay(record: Record, start: float | None) -> tuple[Record, list[str]]:
-    """From where free decay begins and nothing is clipped any more, less lone samples that are wrong, with remarks."""
+def _cut_to_decay(record: Record, start: float | None) -> tuple[Record, list[str]]:
+    """The free decay of a record after the last clipped sample, single spikes repaired, and notes."""
     if start is not None:
         record, _, spikes = without_spikes(record.between(start))
         return record, list(spikes)
@@ -184,73 +186,73 @@ def _decay(record: Record, start: float | None) -> tuple[Record, list[str]]:
         notes.append(f"free decay from {start:.6g} s on; --start sets another time")
         notes += dropout_remark(record, "Only what follows is used; leave the output out to use all", before=start)
     clipped = [a for a in data_faults(record.between(start)) if a.until is not None]
-    behind = max((a.until or start for a in clipped), default=start) + record.sample_time
-    if clipped and behind - start < 0.5 * (record.start_time + record.sample_time * (record.n_samples - 1) - start):
-        notes.append(f"output {clipped[0].outputs[0]!r} is clipped: used from {behind:.6g} s on")
-        start = behind
+    unclipped = max((a.until or start for a in clipped), default=start) + record.sample_time
+    if clipped and unclipped - start < 0.5 * (record.start_time + record.sample_time * (record.n_samples - 1) - start):
+        notes.append(f"output {clipped[0].outputs[0]!r} is clipped: used from {unclipped:.6g} s on")
+        start = unclipped
     return record.between(start), notes
 
 
-def _without_drift(
+def _identify_with_drift(
     records: list[Record], n_modes: int | None, budget: Budget
 ) -> tuple[Identified, list[Record], list[str]]:
-    """Modes and drifts in turn, as each disturbs the other, until neither changes."""
+    """The modes, the records without drift, and notes; modes and drift are estimated alternately until both settle."""
     poles = np.zeros(0, complex)
-    taken: list[Drift] = []  # one a record, where they are less their drifts
-    # A drift larger than the modes would be searched for modes first; a parabola is none.
+    taken: list[Drift] = []  # one per record once drift is removed
+    # Modes would be fitted to a drift that is larger than they are; no mode is a parabola.
     drifts = [without_drift(record, poles, most=RING_DOWN.parabola) for record in records]
     variances = [(d.record.outputs.var(axis=1), r.outputs.var(axis=1)) for d, r in zip(drifts, records, strict=True)]
-    dominant = any((left < RING_DOWN.dominant * whole).any() for left, whole in variances)
-    if dominant and not any(_is_swing(drift) for drift in drifts):
+    dominant = any((remaining < RING_DOWN.dominant * total).any() for remaining, total in variances)
+    if dominant and not any(_settles_within_a_period(drift) for drift in drifts):
         taken = drifts
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(RING_DOWN.drift_rounds):
-        found = _identified([drift.record for drift in taken] or records, n_modes, budget)
-        before, poles = poles, found.modes.poles
+        identified = _identify([drift.record for drift in taken] or records, n_modes, budget)
+        before, poles = poles, identified.modes.poles
         poles = poles[np.abs(poles) * span > 2.0 * np.pi]
         drifts = [without_drift(record, poles) for record in records]
-        drifting = any(drift.size.any() for drift in drifts)
-        if not drifting and taken and not budget.unfinished:
+        any_drift = any(drift.size.any() for drift in drifts)
+        if not any_drift and taken and not budget.unfinished:
             taken = []
             continue
-        if not drifting or budget.unfinished:
+        if not any_drift or budget.unfinished:
             break
-        # What settles is found better beside better modes.
+        # Better modes improve the estimate of an exponential settling.
         settles = any(drift.time_constant is not None for drift in drifts)
-        if taken and poles.size == before.size and not (settles and _moved(drifts, taken, found)):
+        if taken and poles.size == before.size and not (settles and _drift_changed(drifts, taken, identified)):
             break
         taken = drifts
     if not any(drift.size.any() for drift in taken):
-        return found, records, []
-    cleared = [drift.record for drift in taken]
-    in_noise = np.array([drift.size for drift in taken]) / found.refined.noise
-    if not (in_noise >= 1.0).any():
-        return found, cleared, []
-    i, j = np.unravel_index(int(np.argmax(in_noise)), in_noise.shape)
+        return identified, records, []
+    without = [drift.record for drift in taken]
+    size_over_noise = np.array([drift.size for drift in taken]) / identified.refined.noise
+    if not (size_over_noise >= 1.0).any():
+        return identified, without, []
+    i, j = np.unravel_index(int(np.argmax(size_over_noise)), size_over_noise.shape)
     name, drift = records[0].output_names[j], taken[int(i)]
-    return found, cleared, [f"{drift.words} of {drift.size[j]:.3g} was removed from output {name!r}"]
+    return identified, without, [f"{drift.words} of {drift.size[j]:.3g} was removed from output {name!r}"]
 
 
-def _moved(drifts: list[Drift], before: list[Drift], found: Identified) -> bool:
-    """Whether drifts are others than before by more than a standard error: by a χ² of one."""
-    each = zip(drifts, before, found.refined.noise, strict=True)
-    changes = ((now.record.outputs - then.record.outputs) / noise[:, None] for now, then, noise in each)
+def _drift_changed(drifts: list[Drift], before: list[Drift], identified: Identified) -> bool:
+    """Whether drifts changed by more than a standard error: χ² of the change above one."""
+    each = zip(drifts, before, identified.refined.noise, strict=True)
+    changes = ((new.record.outputs - old.record.outputs) / noise[:, None] for new, old, noise in each)
     return sum(float(np.vdot(change, change)) for change in changes) > 1.0
 
 
-def _is_swing(drift: Drift) -> bool:
-    """Whether what settles is over within a period of the motion left: the first swing of heavily damped modes."""
-    left = drift.record.outputs - drift.record.outputs.mean(axis=1, keepdims=True)
-    omega = np.linalg.norm(np.diff(left)) / max(float(np.linalg.norm(left)), 1e-300) / drift.record.sample_time
+def _settles_within_a_period(drift: Drift) -> bool:
+    """Whether a settling is shorter than a period of the other motion: then it is part of heavily damped modes."""
+    motion = drift.record.outputs - drift.record.outputs.mean(axis=1, keepdims=True)
+    omega = np.linalg.norm(np.diff(motion)) / max(float(np.linalg.norm(motion)), 1e-300) / drift.record.sample_time
     return drift.time_constant is not None and bool(drift.time_constant * omega < 2.0 * np.pi)
 
 
-def _identified(records: list[Record], n_modes: int | None, budget: Budget) -> Identified:
+def _identify(records: list[Record], n_modes: int | None, budget: Budget) -> Identified:
     if n_modes is None:
         return identify_within(records, budget)
     if n_modes < 1:
         raise ValueError(f"at least one mode must be asked for; got {n_modes}")
-    return _as_identified(stacked_delays(records, n_modes=n_modes), records, budget)
+    return _refine_given(stacked_delays(records, n_modes=n_modes), records, budget)
 
 
 def _by_stabilisation(records: list[Record], budget: Budget) -> Identified:
@@ -259,38 +261,41 @@ def _by_stabilisation(records: list[Record], budget: Budget) -> Identified:
     if start.n_modes == 0:
         name = records[0].name
         raise ValueError(f"record {name!r} holds no mode that is stable over the model order: is it a free decay?")
-    return _as_identified(start, records, budget)
+    return _refine_given(start, records, budget)
 
 
-def _as_identified(start: SampledModes, records: list[Record], budget: Budget) -> Identified:
-    """Modes of given number: no test, none rejected."""
+def _refine_given(start: SampledModes, records: list[Record], budget: Budget) -> Identified:
+    """The modes of `start`, refined, without any test: no mode is rejected."""
     refined, none = in_coloured_noise(refine(records, start, offset=True, budget=budget), records), np.zeros(0)
     return Identified(refined, none, 0.0, unshaped(none.astype(complex), records[0]), none)
 
 
 def _check_undriven(record: Record) -> None:
-    """Refuse a record that is as strong at its end as at its beginning and not correlated over its length.
+    """Refuse a record of random vibration: it does not decay, and is uncorrelated at long lags.
 
-    A free decay that hardly decays stays correlated at any lag; random vibration does not. Of
-    records of twenty decay times three in four are detected, of a hundred nine in ten.
+    A free decay of very low damping stays correlated at any lag. Of records of random vibration that are twenty decay
+    times long three in four are detected, of a hundred decay times nine in ten.
+
+    Raises:
+        ValueError: such a record.
     """
     # Drifts may be strong at both ends, and do not oscillate.
     n = record.n_samples
-    about = without_polynomial(record.outputs)
-    about /= np.maximum(about.std(axis=1, keepdims=True), 1e-300)
-    energy = [float(np.vdot(part, part)) for part in np.array_split(about, 2, axis=1)]
+    outputs = without_polynomial(record.outputs)
+    outputs /= np.maximum(outputs.std(axis=1, keepdims=True), 1e-300)
+    energy = [float(np.vdot(part, part)) for part in np.array_split(outputs, 2, axis=1)]
     # In single precision: in double, the transforms of a long record are four times its size.
-    about = about.astype(np.float32)
-    correlation = irfft(_power(about, 2 * n), 2 * n)[1:n] / (n - np.arange(1, n)) / len(about)
+    outputs = outputs.astype(np.float32)
+    correlation = irfft(_power(outputs, 2 * n), 2 * n)[1:n] / (n - np.arange(1, n)) / len(outputs)
     forget_transforms(n)
-    stretches = correlation[: n // 20 + 1], correlation[n // 3 : n // 2]
-    soon, late = (float(np.sqrt((part**2).mean())) for part in stretches)
-    # Noise is uncorrelated, and holds no mode; other checks say so.
-    oscillates = soon > RING_DOWN.uncorrelated / np.sqrt(n)
+    lags = correlation[: n // 20 + 1], correlation[n // 3 : n // 2]
+    short, long = (float(np.sqrt((part**2).mean())) for part in lags)
+    # White noise has no mode; the selection refuses it.
+    oscillates = short > RING_DOWN.uncorrelated / np.sqrt(n)
     if (
         oscillates
-        and RING_DOWN.as_strong < energy[1] / max(energy[0], 1e-300) < 1.0 / RING_DOWN.as_strong
-        and late < RING_DOWN.correlated * soon
+        and RING_DOWN.undecayed < energy[1] / max(energy[0], 1e-300) < 1.0 / RING_DOWN.undecayed
+        and long < RING_DOWN.correlated * short
     ):
         raise ValueError(
             f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and not"
@@ -299,7 +304,7 @@ def _check_undriven(record: Record) -> None:
 
 
 def _power(rows: np.ndarray, size: int) -> np.ndarray:
-    """|·|² of the transforms of rows, padded to a length, summed over them."""
+    """Power spectrum |·|² of signals (n_rows, n_samples), zero-padded to `size`, summed over the signals."""
     power = power_of(rows[0], size)
     for row in rows[1:]:
         power += power_of(row, size)
@@ -313,7 +318,11 @@ WAY_OUT = (
 
 
 def _check_decays(records: list[Record], refined: Refined) -> None:
-    """Refuse records whose strongest mode grows."""
+    """Refuse records whose strongest mode has negative damping.
+
+    Raises:
+        ValueError: naming the mode.
+    """
     strongest = int(np.argmax(_energy(refined, records)))
     zeta = refined.modes.zeta[strongest]
     if zeta < -SURE * refined.zeta_std[strongest]:
@@ -323,75 +332,87 @@ def _check_decays(records: list[Record], refined: Refined) -> None:
         )
 
 
-def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined, coloured: bool) -> tuple[str, ...]:
-    """A remark where the residual is large about the modes: forces excite them throughout.
+def _large_residual(
+    records: list[Record], residuals: list[np.ndarray], refined: Refined, coloured: bool
+) -> tuple[str, ...]:
+    """A remark where the residual is large in the bands of the modes: forces excite them throughout.
 
-    Noise of sensors is no larger there than beside.
+    Sensor noise is no larger in these bands than beside them.
     """
-    for record, residual, noise in zip(records, left, refined.noise, strict=True):
+    for record, residual, noise in zip(records, residuals, refined.noise, strict=True):
         # in single precision, as transforms of a long record are several times its size
         scaled = ((part / noise[:, None]).astype(np.float32) for part in (residual, record.outputs))
         power, motion = (_power(part, record.n_samples)[1:] for part in scaled)
         bin_width = 2.0 * np.pi / (record.n_samples * record.sample_time)
         inside, beside = np.zeros((2, power.size), bool)
         for pole in refined.modes.poles:
-            away = np.abs(np.arange(1, power.size + 1) - pole.imag / bin_width)
-            narrow = max(RING_DOWN.band, abs(pole.real) / bin_width)
-            inside |= away < narrow
-            beside |= (away > 2.0 * narrow) & (away < RING_DOWN.beside + narrow)
+            distance = np.abs(np.arange(1, power.size + 1) - pole.imag / bin_width)
+            half_width = max(RING_DOWN.band, abs(pole.real) / bin_width)
+            inside |= distance < half_width
+            beside |= (distance > 2.0 * half_width) & (distance < RING_DOWN.side_band + half_width)
         beside &= ~inside
-        share, whole = (float(power[k].sum() / motion[k].sum()) for k in (inside, slice(None)))
+        share, total_share = (float(power[k].sum() / motion[k].sum()) for k in (inside, slice(None)))
         level = np.median(power[beside]) if beside.any() else 0.0
-        about = share > RING_DOWN.residual_share and power[inside].mean() > RING_DOWN.stands_out * level
-        if about or (whole > RING_DOWN.most_left and coloured):
+        near_modes = share > RING_DOWN.residual_share and power[inside].mean() > RING_DOWN.peak_ratio * level
+        if near_modes or (total_share > RING_DOWN.most_residual and coloured):
             return (
-                f"in record {record.name!r} the residual is {100 * np.sqrt(share):.0f} % of the motion about the"
-                f" modes, {100 * np.sqrt(whole):.0f} % of all: it is driven, or depends strongly on amplitude."
-                f" {WAY_OUT}",
+                f"in record {record.name!r} the residual is {100 * np.sqrt(share):.0f} % of the motion in the bands of"
+                f" the modes, {100 * np.sqrt(total_share):.0f} % of all: it is driven, or depends strongly on"
+                f" amplitude. {WAY_OUT}",
             )
     return ()
 
 
 def _energy(refined: Refined, records: list[Record]) -> np.ndarray:
-    """Of each mode in all records, (n_modes,), each output in units of its noise."""
-    found = np.zeros(refined.modes.n_modes)
+    """Energy of each mode over all records, (n_modes,), outputs in units of their noise."""
+    energy = np.zeros(refined.modes.n_modes)
     for record, amplitudes, noise in zip(records, refined.amplitudes, refined.noise, strict=True):
-        lasts = power_sums(np.exp(2.0 * record.sample_time * refined.modes.poles.real), record.n_samples)[0].real
-        found += (np.abs(amplitudes / noise[:, None]) ** 2).sum(axis=0) * lasts
-    return found
+        energy += (np.abs(amplitudes / noise[:, None]) ** 2).sum(axis=0) * _envelope_energy(record, refined)
+    return energy
 
 
-def _of_other_shapes(refined: Refined, records: list[Record], only: Sequence[int]) -> tuple[str, ...]:
-    """A remark on modes of which records have shapes that are not one, beyond noise: their amplitudes are of rank two.
+def _envelope_energy(record: Record, refined: Refined) -> np.ndarray:
+    """Σ_t e^{-2σt} over a record for each mode, (n_modes,)."""
+    return power_sums(np.exp(2.0 * record.sample_time * refined.modes.poles.real), record.n_samples)[0].real
 
-    A mode of several records is one pole; two of the same pole are any mixture of two shapes in each.
+
+def _inconsistent_shapes(refined: Refined, records: list[Record], only: Sequence[int]) -> tuple[str, ...]:
+    """A remark on modes whose shapes differ between records beyond noise: their amplitudes have rank two.
+
+    Two modes of the same pole are fitted as one pole, with a different mixture of their shapes in each record.
+
+    Args:
+        refined: the modes.
+        records: the free decays.
+        only: the modes to test, from 0.
     """
-    rates, found = refined.modes.poles.real, []
-    lasts = [power_sums(np.exp(2.0 * r.sample_time * rates), r.n_samples)[0].real for r in records]
-    each = zip(refined.amplitudes, refined.noise, lasts, strict=True)
+    inconsistent = []
+    energies = [_envelope_energy(record, refined) for record in records]
+    each = zip(refined.amplitudes, refined.noise, energies, strict=True)
     # real and imaginary parts in units of their standard errors
-    seen = np.stack([a / noise[:, None] * np.sqrt(0.5 * last) for a, noise, last in each])
-    n_records, n_outputs, n_modes = seen.shape
-    limit = chi2.isf(FALSE_ALARM / n_modes, 2 * (n_records - 1) * (n_outputs - 1))
+    scaled = np.stack([a / noise[:, None] * np.sqrt(0.5 * energy) for a, noise, energy in each])
+    n_records, n_outputs, n_modes = scaled.shape
+    threshold = chi2.isf(FALSE_ALARM / n_modes, 2 * (n_records - 1) * (n_outputs - 1))
     for r in only:
-        squares = np.linalg.svd(seen[:, :, r], compute_uv=False) ** 2
+        squares = np.linalg.svd(scaled[:, :, r], compute_uv=False) ** 2
         share = np.sqrt(squares[1:].sum() / squares.sum())
-        if share > RING_DOWN.other_shape and squares[1:].sum() > limit:
-            found.append(mode_text(r, refined.modes.frequencies_hz[r], f", {100 * share:.0f} %"))
-    if not found:
+        if share > RING_DOWN.second_shape and squares[1:].sum() > threshold:
+            inconsistent.append(mode_text(r, refined.modes.frequencies_hz[r], f", {100 * share:.0f} %"))
+    if not inconsistent:
         return ()
     return (
-        f"the records have no one shape of {', '.join(found)}: two modes of one frequency, of which only the plane of"
-        " their shapes is determined, not the shape that is given; or sensors that were moved or gained otherwise",
+        f"the shape differs between the records for {', '.join(inconsistent)}: two modes of the same frequency, of"
+        " which only the plane of their shapes is determined, not the shape that is given; or sensors that were moved"
+        " or whose gain changed",
     )
 
 
-def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
-    """A remark where most of the motion does not decay."""
+def _undecaying(refined: Refined, records: list[Record]) -> tuple[str, ...]:
+    """A remark where most of the motion does not decay within the record."""
     span = max(record.n_samples * record.sample_time for record in records)
-    lasting = refined.modes.zeta * refined.modes.omega * span < 0.1
+    undecaying = refined.modes.zeta * refined.modes.omega * span < 0.1
     energy = _energy(refined, records)
-    share = float(energy[lasting].sum() / energy.sum())
+    share = float(energy[undecaying].sum() / energy.sum())
     if share < 0.5:
         return ()
     return (
@@ -400,61 +421,62 @@ def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
     )
 
 
-def _shaken(refined: Refined, doubts: Sequence[str]) -> tuple[str, ...]:
-    """A remark where modes of no sure damping crowd about a sure one, as ambient forces make them."""
-    f, sure = refined.modes.frequencies_hz, np.array([not doubt for doubt in doubts])
+def _ambient_excitation(refined: Refined, mode_remarks: Sequence[str]) -> tuple[str, ...]:
+    """A remark where modes of insignificant damping cluster about a significant one, an effect of ambient forces."""
+    f, sure = refined.modes.frequencies_hz, np.array([not remark for remark in mode_remarks])
     undamped = refined.modes.zeta < SURE * refined.zeta_std
     for r in np.flatnonzero(sure):
-        about = np.flatnonzero(undamped & ~sure & (np.abs(f - f[r]) < RING_DOWN.about * f[r]))
-        if about.size >= RING_DOWN.crowd:
-            which = ", ".join(str(k + 1) for k in about)
+        cluster = np.flatnonzero(undamped & ~sure & (np.abs(f - f[r]) < RING_DOWN.cluster_band * f[r]))
+        if cluster.size >= RING_DOWN.cluster_size:
+            which = ", ".join(str(k + 1) for k in cluster)
             return (
-                f"modes {which} crowd about mode {r + 1} and have no sure damping: forces drive this decay throughout,"
-                f" and frequencies and damping are less sure than they are said to be. {WAY_OUT}",
+                f"modes {which} cluster about mode {r + 1} and have no significant damping: forces drive this decay"
+                " throughout, and the errors of frequencies and damping are larger than their standard errors."
+                f" {WAY_OUT}",
             )
     return ()
 
 
-def _coloured_residual(records: list[Record], left: list[np.ndarray]) -> tuple[str, ...]:
-    """A remark where the residual is not white."""
-    about = sum(float(r.outputs.var(axis=1).sum()) * r.n_samples for r in records)
-    squares = sum(float(row @ row) for residual in left for row in residual)
-    following = sum(float(row[1:] @ row[:-1]) for residual in left for row in residual)
-    size = sum(residual.size for residual in left)
-    if squares < 1e-12 * about or abs(following) < SURE * squares / np.sqrt(size):
+def _coloured_residual(records: list[Record], residuals: list[np.ndarray]) -> tuple[str, ...]:
+    """A remark where the residual is not white, by its correlation at lag one."""
+    energy = sum(float(r.outputs.var(axis=1).sum()) * r.n_samples for r in records)
+    squares = sum(float(row @ row) for residual in residuals for row in residual)
+    lag_one = sum(float(row[1:] @ row[:-1]) for residual in residuals for row in residual)
+    size = sum(residual.size for residual in residuals)
+    if squares < 1e-12 * energy or abs(lag_one) < SURE * squares / np.sqrt(size):
         return ()
-    share = 100 * np.sqrt(squares / about)
+    share = 100 * np.sqrt(squares / energy)
     return (
-        f"the residual, {share:.3g} % of the motion, is not white: standard errors by its spectrum about each mode",
+        f"the residual, {share:.3g} % of the motion, is not white: standard errors take its spectrum about each mode",
     )
 
 
 def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, ...]:
-    """One remark a mode, empty where there is none.
+    """One remark per mode, empty where there is none.
 
-    Slower than the record is long: a drift. A damping ratio not three standard errors above zero: a hum, if it goes on
-    to the end, or, three below zero, a growth. A whole multiple of the frequency of a mode thirty times as strong:
-    perhaps only the distortion of that one (a mode may stand there too: those of a hinged beam do). Damped more than
-    0.3: it hardly rings, and may stand for a drift.
+    A period longer than the record: a drift. A damping ratio not three standard errors above zero: mains hum, if the
+    motion lasts to the end of the record; three below zero, a growing motion. A whole multiple of the frequency of a
+    mode thirty times as strong: perhaps its harmonic distortion (a hinged beam has modes at such frequencies too). A
+    damping ratio above 0.3: perhaps a drift.
     """
-    modes, found = refined.modes, []
+    modes, texts = refined.modes, []
     size = np.abs(np.stack(refined.amplitudes) / refined.noise[:, :, None]).max(axis=(0, 1))
     records = as_records(records)
     span = max(record.n_samples * record.sample_time for record in records)
     for r in range(modes.n_modes):
-        f, zeta, doubt = modes.frequencies_hz[r], modes.zeta[r], SURE * refined.zeta_std[r]
+        f, zeta, error = modes.frequencies_hz[r], modes.zeta[r], SURE * refined.zeta_std[r]
         base, times = multiple_of(modes.frequencies_hz, size, r)
         if f * span < 1.0:
-            found.append("period longer than the record: a drift?")
-        elif zeta < -doubt:
-            found.append("grows")
+            texts.append("period longer than the record: a drift?")
+        elif zeta < -error:
+            texts.append("grows")
         elif base is not None:
-            found.append(f"{times} × mode {base + 1}: its harmonic?")
-        elif zeta < doubt:
-            goes_on = zeta * modes.omega[r] * span < 1.0
-            found.append("does not decay: mains hum?" if goes_on else "damping no larger than its error")
+            texts.append(f"{times} × mode {base + 1}: its harmonic?")
+        elif zeta < error:
+            lasts = zeta * modes.omega[r] * span < 1.0
+            texts.append("does not decay: mains hum?" if lasts else "damping no larger than its error")
         elif zeta > SELECTION.most_damped:
-            found.append("hardly rings: a drift?")
+            texts.append("hardly rings: a drift?")
         else:
-            found.append("")
-    return tuple(found)
+            texts.append("")
+    return tuple(texts)

@@ -1,10 +1,11 @@
-"""Modes from measured transfer functions, between whatever lines they were measured.
+"""Modes from measured transfer functions (FRFs) at lines of any spacing.
 
     H_ji(s) = e^{-sτ_j} (Σ_r [c_jr l_ri / (s - λ_r) + conjugate] + s^k (D_ji + E_ji / s²))      at s = iω
 
 for outputs that are the k-th time derivative of a displacement: D is the residual term of the modes above the band, E
-of those below it. Each mode has one shape and one participation factor a reference. A delay τ_j, that of a filter or of
-a clock, turns the residues of real modes by e^{-λ_r τ_j}: their phases grow with frequency, and tell it.
+of those below it. Each mode has one shape and one participation factor per reference. A delay τ_j, of a filter or a
+clock, multiplies the residues of real modes by e^{-λ_r τ_j}: it is estimated from their phases, which grow with
+frequency.
 """
 
 from collections.abc import Sequence
@@ -44,19 +45,19 @@ from workbench.threads import one_blas_thread
 
 @dataclass(frozen=True)
 class TransferSettings:
-    """Constants of the course of an identification from transfer functions."""
+    """Constants of the stages of an identification from transfer functions."""
 
-    most_lines: int = 1500  # that are fitted together
-    band: int = 600  # of more, the lines of a band
-    beside_band: int = 75  # lines beyond each of its edges
-    lines_a_mode: int = 50  # of a band, at least
-    unsure: float = 0.01  # relative standard error of a frequency from which on a mode is not reported
+    most_lines: int = 1500  # that are fitted together; more are fitted band by band
+    band: int = 600  # lines of a band
+    overlap_lines: int = 75  # lines added beyond each edge of a band
+    lines_a_mode: int = 50  # least number of lines of a band per mode
+    most_error: float = 0.01  # largest relative standard error of the frequency of a mode that is reported
     strongest: int = 4  # modes for the first estimate of the noise
-    reweighted: int = 2  # times that it is estimated
-    acausal: float = 10.0  # energy of impulse responses before the impulse, times that after it
-    disagrees: float = 1.5  # factor between the noise found and that stated, from which on it is remarked
-    resolved: float = 4.0  # lines in a half-power bandwidth, from which on Hann's window adds less than 5 % of damping
-    alike: float = 0.2  # rms of the logarithm by which two estimates may differ and be one
+    noise_rounds: int = 2  # estimates of the noise
+    acausal: float = 10.0  # least ratio of the energy of impulse responses before the impulse to that after it
+    disagrees: float = 1.5  # least factor between estimated and stated noise that is remarked
+    resolved: float = 4.0  # lines per half-power bandwidth above which Hann's window adds less than 5 % of damping
+    alike: float = 0.2  # rms log ratio of two estimates of the noise that agree
 
 
 TRANSFER = TransferSettings()
@@ -75,22 +76,22 @@ class TransferModes(ParticipatingModes):
         misfit: (n_outputs,) rms of the residual: in units of the stated noise (1 where it is noise alone), or, where
             none was stated, of real and imaginary part each, in the unit of the output.
         statistic: (n_modes,) χ² of each mode in the noise.
-        converged: whether the search ended because the step was small.
-        cluster_hz: of each mode the other members of its cluster (`peak_shape`), Hz: points measured one after
+        converged: whether the fit ended because its step was negligible.
+        cluster_hz: for each mode the other members of its cluster (`peak_shape`), Hz: points measured one after
             another are inconsistent there, or the mode drifts or depends on amplitude.
-        scatter_hz: (n_modes,) rms by which the frequency of a mode scatters where its peak is not that of one pole
-            (`peak_shape`), Hz; else 0: it drifts, depends on amplitude, or a window blurs it.
-        order_limited_hz: bands (lowest, highest line) in which the search stopped at the most modes allowed: the
+        scatter_hz: (n_modes,) rms scatter of the frequency of a mode whose peak is not that of one pole
+            (`peak_shape`), Hz; else 0. Such a mode drifts, depends on amplitude, or is blurred by a window.
+        order_limited_hz: bands (lowest, highest line) in which the search stopped at the largest number of modes: the
             residual is not noise there; modes are missing, or the points are inconsistent.
         fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
         frequencies_hz: (n_frequencies,) those lines.
-        lower_residual: (n_outputs, n_references) E, of displacement, 1/kg: a body that nothing holds, and elastic modes
-            far below the band. 0 where an output has no such term.
+        lower_residual: (n_outputs, n_references) E, of displacement, 1/kg: rigid-body modes, and elastic modes far
+            below the band. 0 where an output has no such term.
         lower_residual_std: (n_outputs, n_references) standard errors.
         upper_residual: (n_outputs, n_references) D, m/N: the flexibility of modes above the band.
-        delays: (n_outputs,) s, τ by which each output is late beside the inputs; all but `fitted` is of outputs in
-            time.
-        remarks: what is doubtful, and what was left undone where the time was up.
+        delays: (n_outputs,) s, delay τ of each output relative to the inputs; everything but `fitted` is corrected
+            for it.
+        remarks: doubts about modes and data, and searches that the time limit ended early.
     """
 
     misfit: np.ndarray
@@ -117,10 +118,10 @@ def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int)
     Args:
         transfer: complex, of any shape.
         coherence: γ², of the same shape, in (0, 1].
-        averages: n, independent averages behind both.
+        averages: n, number of independent averages.
 
     Raises:
-        ValueError: a coherence that is none, fewer than two averages.
+        ValueError: a coherence outside (0, 1] or of another shape, fewer than two averages.
 
     Source: Bendat & Piersol, Random Data, 4th ed., section 9.1.
     """
@@ -149,23 +150,23 @@ def identify_transfer(
 ) -> TransferModes:
     """The modes of measured transfer functions, their number selected, each with its standard error.
 
-    More than 1500 lines are fitted band by band, with overlap. Outputs that the phases of the modes show to be late are
-    put in time, with a remark.
+    More than 1500 lines are fitted band by band, with overlap. Delays of outputs that the phases of the modes show are
+    corrected, with a remark.
 
     Args:
         transfer: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
             input; of receptance, mobility or accelerance by the quantity of each channel.
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
         channels: one per output; where no quantity is stated, the residual terms are those of any motion.
-        band_hz: lowest and highest line to fit; modes beyond are held by residual terms.
+        band_hz: lowest and highest line to fit; modes outside the band are represented by residual terms.
         noise_std: standard error of real and imaginary part, one or of the shape of `transfer`: from repeated
-            measurements, or by `coherence_noise`. It weighs the lines; how large it is as a whole is found from what is
-            left, and remarked where that disagrees. Without it, noise is taken to be the same at all lines of an
-            output, or, where neighbouring lines differ so, to differ between references, along frequency, and with the
-            size of the lines (`relative_noise`), and standard errors grow with the residual about each mode where that
+            measurements, or by `coherence_noise`. It sets the relative weights of the lines; its overall level is
+            estimated from the residual, and remarked where that disagrees. Without it, noise is taken to be the same at
+            all lines of an output, or, where neighbouring lines show it, to depend on reference, frequency and modulus
+            of the lines (`relative_noise`). Standard errors then increase with the residual about each mode where that
             is larger than elsewhere.
-        max_modes: of a band, where to stop at the latest.
-        false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
+        max_modes: largest number of modes of a band.
+        false_alarm: probability that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
             limit.
         progress: called with the search under way and the share of the time that is spent.
@@ -176,34 +177,41 @@ def identify_transfer(
     check_count("max_modes", max_modes)
     budget = Budget(seconds, progress)
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
-    how: dict[str, Any] = {"channels": channels, "noise": noise, "max_modes": max_modes, "false_alarm": false_alarm}
-    whole, s = _in_bands(h, f, budget, **how), 2j * np.pi * f
+    options: dict[str, Any] = {"channels": channels, "noise": noise, "max_modes": max_modes, "false_alarm": false_alarm}
+    estimate, s = _in_bands(h, f, budget, **options), 2j * np.pi * f
     for least in (CLOCKS.phase, CLOCKS.refined):
-        late = _late(whole, channels, least)
+        late = _output_delays(estimate, channels, least)
         if not late.any() or budget.spent("search for delays of the outputs"):
             break
-        delays = whole.delays + late
-        whole = _in_bands(h * np.exp(s * delays[:, None, None]), f, budget, **how)
-        whole = replace(
-            whole, delays=frozen(delays), fitted=frozen(whole.fitted * np.exp(-s * delays[:, None, None]), complex)
+        delays = estimate.delays + late
+        estimate = _in_bands(h * np.exp(s * delays[:, None, None]), f, budget, **options)
+        estimate = replace(
+            estimate,
+            delays=frozen(delays),
+            fitted=frozen(estimate.fitted * np.exp(-s * delays[:, None, None]), complex),
         )
-    overlap = overlap_remarks(whole.modes.poles, h.shape[0] * h.shape[1])
-    deviation = whole.modes.omega * whole.zeta_std + 1j * whole.omega_std
-    overtones = overtone_remarks(whole.modes.poles, np.sqrt(whole.statistic), 2.0 * np.pi * whole.scatter_hz, deviation)
-    about = (
-        *_acausal(h, f),
-        *_of_delays(whole.delays, channels),
-        *repeated_remarks(whole),
-        *set_up_remarks(whole),
-        *([] if noise is None else _of_stated_noise(whole.misfit)),
+    overlap = overlap_remarks(estimate.modes.poles, h.shape[0] * h.shape[1])
+    deviation = estimate.modes.omega * estimate.zeta_std + 1j * estimate.omega_std
+    overtones = overtone_remarks(
+        estimate.modes.poles, np.sqrt(estimate.statistic), 2.0 * np.pi * estimate.scatter_hz, deviation
     )
-    whole = replace(whole, remarks=(*about, *whole.remarks, *overlap, *_uneven(whole), *overtones, *budget.remarks))
-    if whole.modes.n_modes == 0:
+    checks = (
+        *_acausal_remark(h, f),
+        *_delay_remarks(estimate.delays, channels),
+        *repeated_remarks(estimate),
+        *set_up_remarks(estimate),
+        *([] if noise is None else _noise_remark(estimate.misfit)),
+    )
+    estimate = replace(
+        estimate,
+        remarks=(*checks, *estimate.remarks, *overlap, *_scatter_remark(estimate), *overtones, *budget.remarks),
+    )
+    if estimate.modes.n_modes == 0:
         raise ValueError(
             f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
             " averages"
         )
-    return whole
+    return estimate
 
 
 def _in_bands(
@@ -216,83 +224,86 @@ def _in_bands(
     max_modes: int,
     false_alarm: float,
 ) -> TransferModes:
-    """The modes of all lines, of more than are fitted together band by band."""
-    n_bands, each_own = (
+    """The modes of all lines; more than `TRANSFER.most_lines` are fitted band by band."""
+    n_bands, lines_a_mode = (
         (1, 3) if f.size <= TRANSFER.most_lines else (-(-f.size // TRANSFER.band), TRANSFER.lines_a_mode)
     )
     share = f.size / n_bands
 
-    def band(k: int, own: Budget) -> TransferModes:
+    def band(k: int, band_budget: Budget) -> TransferModes:
         first, last = round(k * share), round((k + 1) * share)
-        inside = slice(max(first - TRANSFER.beside_band, 0), last + TRANSFER.beside_band)
+        inside = slice(max(first - TRANSFER.overlap_lines, 0), last + TRANSFER.overlap_lines)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
-        selected = _selected(
-            own,
+        selected = _select_in_band(
+            band_budget,
             h[..., inside],
             2.0 * np.pi * f[inside],
             _residual_powers(channels),
             None if noise is None else noise[..., inside],
-            max_modes=min(max_modes, f[inside].size // each_own),
+            max_modes=min(max_modes, f[inside].size // lines_a_mode),
             false_alarm=false_alarm / n_bands,
         )
-        return _modes_of(*selected, channels, edges, f[first:last], own)
+        return _modes_of(*selected, channels, edges, f[first:last])
 
-    each, found = [], []
+    budgets, results = [], []
     for k in range(n_bands):
-        each.append(budget.apart(1.0 / (n_bands - k)))
-        found.append(band(k, each[k]))
-    # Where modes change a band takes many times its share of the time, which others hardly touch.
-    ended = [k for k in range(n_bands) if each[k].unfinished]
-    for left, k in zip(range(len(ended), 0, -1), ended, strict=True):
-        again = budget.apart(1.0 / left)
-        if (again.seconds or 0.0) > (each[k].seconds or 0.0):
-            found[k], each[k] = band(k, again), again
-        budget.counted(each[k])
-    return _together(found, channels) if n_bands > 1 else found[0]
+        budgets.append(budget.apart(1.0 / (n_bands - k)))
+        results.append(band(k, budgets[k]))
+    # A band of modes that change takes many times its share of the time; other bands hardly use theirs.
+    ended = [k for k in range(n_bands) if budgets[k].unfinished]
+    for remaining, k in zip(range(len(ended), 0, -1), ended, strict=True):
+        again = budget.apart(1.0 / remaining)
+        if (again.seconds or 0.0) > (budgets[k].seconds or 0.0):
+            results[k], budgets[k] = band(k, again), again
+        budget.counted(budgets[k])
+    return _joined(results, channels) if n_bands > 1 else results[0]
 
 
-def _late(found: TransferModes, channels: Sequence[Channel], least: float) -> Floats:
-    """By how much each output of a known quantity is late, (n_outputs,) s; see `late_outputs`."""
-    late, known = np.zeros(len(channels)), np.array([channel.quantity in MEASURED for channel in channels])
-    if known.any() and found.modes.n_modes:
-        residues = 1j * found.modes.shapes.T[:, known, None] * found.participation[:, None, :]
-        late[known] = late_outputs(residues, found.modes.poles, least)
-    return late
+def _output_delays(estimate: TransferModes, channels: Sequence[Channel], least: float) -> Floats:
+    """Delay of each output relative to the inputs, (n_outputs,) s, by `late_outputs`; 0 for outputs of no motion."""
+    delays, known = np.zeros(len(channels)), np.array([channel.quantity in MEASURED for channel in channels])
+    if known.any() and estimate.modes.n_modes:
+        residues = 1j * estimate.modes.shapes.T[:, known, None] * estimate.participation[:, None, :]
+        delays[known] = late_outputs(residues, estimate.modes.poles, least)
+    return delays
 
 
-def _of_delays(delays: Floats, channels: Sequence[Channel]) -> tuple[str, ...]:
+def _delay_remarks(delays: Floats, channels: Sequence[Channel]) -> tuple[str, ...]:
     late = [f"{c.name} {d:.3g} s" for c, d in zip(channels, delays, strict=True) if d]
     return (
-        (f"outputs are late beside the inputs, by {', '.join(late)}: the modes are of outputs in time",) if late else ()
+        (f"outputs are delayed relative to the inputs, by {', '.join(late)}: the modes are corrected for it",)
+        if late
+        else ()
     )
 
 
-def _selected(
-    budget: Budget, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, **how: Any
+def _select_in_band(
+    budget: Budget, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, **options: Any
 ) -> tuple[Lines, Selected]:
-    """The modes of a band; where no noise is stated, it is estimated from the residual of the strongest modes."""
-    lines, how = Lines(h, omega, powers, noise), {**how, "budget": budget}
+    """The lines of a band with weights, and their modes; noise not stated is estimated from the strongest modes."""
+    lines, options = Lines(h, omega, powers, noise), {**options, "budget": budget}
     if noise is not None:
-        return _beside_changing(lines, how)
-    few = how | {"max_modes": min(TRANSFER.strongest, how["max_modes"])}
+        return _select_with_changing(lines, options)
+    few = options | {"max_modes": min(TRANSFER.strongest, options["max_modes"])}
     selected = select_modes(lines, **few)
     guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
-    if guessed is None:  # noise that goes with size is largest in the peaks, and looks like modes that change
-        lines, selected = _beside_changing(lines, few, selected)
+    if guessed is None:  # noise proportional to the response would look like modes that change
+        lines, selected = _select_with_changing(lines, few, selected)
         guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
-    left = lines.left(selected.fit)
-    # What the modes miss of the response is smooth from line to line, noise is not: so second differences, Hann's
-    # window of the impulse response, are asked. Among lines of all sizes a few large ones show any correlation.
-    even = left if guessed is None else left / guessed
-    lines.window_rate = window_rate(even, omega)
-    rough = np.diff(even, 2)
-    mixing = mixing_of(correlation_of_lines([rough.reshape(len(h), -1)]))
+    residual = lines.left(selected.fit)
+    # Correlation of noise is tested in second differences over the lines (Hann's window of the impulse response): they
+    # suppress modelling errors, which are smooth over the lines. The residual is scaled first, because a few large
+    # lines among small ones would show some correlation in any case.
+    scaled = residual if guessed is None else residual / guessed
+    lines.window_rate = window_rate(scaled, omega)
+    differences = np.diff(scaled, 2)
+    mixing = mixing_of(correlation_of_lines([differences.reshape(len(h), -1)]))
     if mixing is None:
-        return _in_noise(lines, selected, how)
-    # noise that outputs share makes peaks in all of them
-    mixed = np.tensordot(mixing / np.sqrt((np.abs(left) ** 2).mean(axis=(1, 2))), h, 1)
-    apart, selected = _in_noise(*_beside_changing(lines.of(mixed), few), how)
-    lines = apart.of(h)
+        return _select_weighted(lines, selected, options)
+    # Correlated noise makes peaks in all outputs; modes are selected in combinations of uncorrelated noise.
+    mixed = np.tensordot(mixing / np.sqrt((np.abs(residual) ** 2).mean(axis=(1, 2))), h, 1)
+    uncorrelated, selected = _select_weighted(*_select_with_changing(lines.of(mixed), few), options)
+    lines = uncorrelated.of(h)
     fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
     guessed = relative_noise(lines.left(fit), lines.fitted(fit), lines.omega)
     if guessed is not None:
@@ -301,35 +312,40 @@ def _selected(
     return lines, selected.refitted(fit)
 
 
-def _beside_changing(lines: Lines, how: dict[str, Any], selected: Selected | None = None) -> tuple[Lines, Selected]:
-    """The modes, one for each that changes, and the lines with what such modes move."""
-    selected = select_modes(lines, **how) if selected is None else selected
-    while (found := beside_changing(lines, selected.fit, selected.limit, how["budget"])) is not None:
-        lines, start = found
-        selected = select_modes(lines, start=start, **how)
+def _select_with_changing(
+    lines: Lines, options: dict[str, Any], selected: Selected | None = None
+) -> tuple[Lines, Selected]:
+    """The lines with columns for the motion of modes that change, and the modes, one for each that changes."""
+    selected = select_modes(lines, **options) if selected is None else selected
+    while (change := beside_changing(lines, selected.fit, selected.limit, options["budget"])) is not None:
+        lines, start = change
+        selected = select_modes(lines, start=start, **options)
     return lines, selected
 
 
-def _in_noise(lines: Lines, selected: Selected, how: dict[str, Any]) -> tuple[Lines, Selected]:
-    """The modes, and their noise estimated in turn, from the strongest; where outputs share no noise."""
-    budget = how["budget"]
+def _select_weighted(lines: Lines, selected: Selected, options: dict[str, Any]) -> tuple[Lines, Selected]:
+    """The lines and their modes, with alternating estimates of noise and modes, for outputs of uncorrelated noise."""
+    budget = options["budget"]
     before: np.ndarray | None = None
-    for _ in range(TRANSFER.reweighted):
+    for _ in range(TRANSFER.noise_rounds):
         guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
         if guessed is None or (
-            before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < TRANSFER.alike  # but for size
+            before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < TRANSFER.alike  # up to a factor
         ):
             break
         if budget.spent("estimation of the noise"):
             return lines, selected
         before = guessed
         weighted = lines.without_columns().weighted_by(guessed)
-        # from those found: where noise goes with size, lines between modes weigh most, and tell least
-        weighted, anew = _beside_changing(weighted, how, select_modes(weighted, start=selected.fit, **how))
-        if budget.spent("estimation of the noise") and anew.fit.poles.size < selected.fit.poles.size:
+        # The selection starts from the modes found: with noise proportional to the response, lines between modes have
+        # the largest weights, and the least information.
+        weighted, reselected = _select_with_changing(
+            weighted, options, select_modes(weighted, start=selected.fit, **options)
+        )
+        if budget.spent("estimation of the noise") and reselected.fit.poles.size < selected.fit.poles.size:
             return lines, selected
-        lines, selected = weighted, anew
-    return (lines, selected) if lines.guessed else _beside_changing(lines, how)
+        lines, selected = weighted, reselected
+    return (lines, selected) if lines.guessed else _select_with_changing(lines, options)
 
 
 def _modes_of(
@@ -338,35 +354,42 @@ def _modes_of(
     channels: Sequence[Channel],
     edges_hz: tuple[float, float],
     shown_hz: np.ndarray,
-    budget: Budget,
 ) -> TransferModes:
-    """The modes of a band between its edges; the fit at the lines shown."""
+    """The result for a band.
+
+    Args:
+        lines: of the band and its overlap.
+        selected: their modes.
+        channels: of the outputs.
+        edges_hz: frequencies between which modes are reported, Hz.
+        shown_hz: (n_frequencies,) lines at which the fit is reported, Hz.
+    """
     fit, cluster_hz = _clustered(lines, selected, channels)
-    found = peaks(lines, fit)
-    scatter = np.where(found.uneven, found.scatter, 0.0)
+    peak_shapes = peaks(lines, fit)
+    scatter = np.where(peak_shapes.uneven, peak_shapes.scatter, 0.0)
     for pole, by in lines.changing:
         r = int(np.argmin(np.abs(fit.poles - pole)))
         scatter[r] = max(scatter[r], by)
     damped_hz = fit.poles.imag / (2.0 * np.pi)
     noise_ratio = np.tile(lines.noise_ratio_near(fit), (len(channels), 1))
     stated = lines.weights is not None and not lines.guessed
-    shared = None if stated else correlation_of_lines([lines.left(fit).reshape(len(channels), -1)])
-    covariance = pole_covariance(fit, noise_ratio * disturbed(shared, fit.amplitudes / fit.noise[:, None]))
-    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < TRANSFER.unsure * np.abs(fit.poles)
+    correlation = None if stated else correlation_of_lines([lines.left(fit).reshape(len(channels), -1)])
+    covariance = pole_covariance(fit, noise_ratio * disturbed(correlation, fit.amplitudes / fit.noise[:, None]))
+    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < TRANSFER.most_error * np.abs(fit.poles)
     sure &= fit.poles.real < SURE * np.sqrt(np.diag(covariance)[fit.poles.size :]) * np.abs(fit.poles)
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
     within &= (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1])
     inside = np.flatnonzero(within & sure)
-    out = ", ".join(f"{f:.4g}" for f in damped_hz[within & ~sure])
+    left_out = ", ".join(f"{f:.4g}" for f in damped_hz[within & ~sure])
     derivative, poles = time_derivatives(channels)[:, None], fit.poles[inside]
     shapes, participation = scaled_vectors(fit, inside, derivative)
     vectors = vector_covariance(fit, noise_ratio, derivative, inside, shapes, participation.shape[1])
-    both = np.r_[inside, fit.poles.size + inside]
+    kept = np.r_[inside, fit.poles.size + inside]
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
     below, below_std, above = _residual_terms(lines, fit, noise_ratio, derivative[:, 0])
     return TransferModes(
         modes=SampledModes.of_poles(poles, shapes, _places(channels)),
-        covariance=frozen(covariance[np.ix_(both, both)]),
+        covariance=frozen(covariance[np.ix_(kept, kept)]),
         vector_covariance=frozen(vectors),
         participation=frozen(participation, complex),
         misfit=frozen(lines.misfit(fit)),
@@ -382,8 +405,8 @@ def _modes_of(
         upper_residual=frozen(above),
         delays=frozen(np.zeros(len(channels))),
         remarks=(
-            *([f"left out, as negatively damped or of unknown frequency: poles at {out} Hz"] if out else []),
-            *_windowed(lines.window_rate),
+            *([f"left out, as negatively damped or of unknown frequency: poles at {left_out} Hz"] if left_out else []),
+            *_window_remark(lines.window_rate),
         ),
     )
 
@@ -391,33 +414,35 @@ def _modes_of(
 def _residual_terms(
     lines: Lines, fit: Fit, noise_ratio: Floats, derivative: np.ndarray
 ) -> tuple[Floats, Floats, Floats]:
-    """E, its standard errors, and D, (n_outputs, n_references) each, whatever the outputs measure.
+    """E, its standard errors, and D, (n_outputs, n_references) each, for outputs of any quantity.
 
-    A mode's acceleration φ_j φ_i s² / (s² + ω²) is its pair of poles and φ_j φ_i, which E of the fit holds. A pole
-    below the band, at the lines a l / 2 (1/s + λ/s²) and its conjugate, is part of the residual term.
+    The acceleration of a mode φ_j φ_i s² / (s² + ω²) is the sum of its pair of poles and of φ_j φ_i, which E of the fit
+    includes. A pole below the band, a l / 2 (1/s + λ/s²) and its conjugate at the lines, is part of the residual term.
     """
     n, size = 2 * fit.poles.size, lines.refs * len(lines.powers)
     scale = lines.omega[-1] ** -np.array(lines.powers, float)
     std = fixed_std(fit, noise_ratio, np.ones((fit.coefficients.shape[0] - n, len(derivative))))
     low = fit.poles.imag < lines.omega[0]
-    if low.any():  # of what these and E make together, not of either
+    if low.any():  # the error of the sum of these poles and E, as they are not determined separately
         weights = np.ones((len(lines.fixed), 1)) if lines.weights is None else lines.weights
         std = fit.noise / np.sqrt((lines.fixed**2).T @ weights**2)
     terms, errors = (x[:size].reshape(lines.refs, len(scale), -1) * scale[:, None] for x in (fit.coefficients[n:], std))
     below, below_std, above = (np.zeros((len(derivative), lines.refs)) for _ in range(3))
-    # by order: what the pairs below the band have of s^(k - 2), less what those in it leave in E
-    beside = np.stack([fit.amplitudes * x for x in (low * fit.poles, low, (low - 1.0) / fit.poles)]) @ fit.participation
+    # For each derivative: terms in s^(k - 2) of the poles below the band, less those of the poles within it.
+    pole_terms = (
+        np.stack([fit.amplitudes * x for x in (low * fit.poles, low, (low - 1.0) / fit.poles)]) @ fit.participation
+    )
     for j, order in enumerate(derivative):
         if order in lines.powers:
             above[j] = terms[:, lines.powers.index(order), j]
         if order - 2 in lines.powers:
             power = lines.powers.index(order - 2)
-            below[j], below_std[j] = terms[:, power, j] + beside[order, j].real, errors[:, power, j]
+            below[j], below_std[j] = terms[:, power, j] + pole_terms[order, j].real, errors[:, power, j]
     return below, below_std, above
 
 
-def _acausal(h: np.ndarray, f: np.ndarray) -> tuple[str, ...]:
-    """A remark where impulse responses grow towards the impulse: transfer functions of the other sign convention."""
+def _acausal_remark(h: np.ndarray, f: np.ndarray) -> tuple[str, ...]:
+    """A remark where impulse responses precede the impulse: transfer functions of the opposite sign convention."""
     step = np.diff(f)
     if np.ptp(step) > 1e-6 * step.max():
         return ()
@@ -426,13 +451,13 @@ def _acausal(h: np.ndarray, f: np.ndarray) -> tuple[str, ...]:
     if before < TRANSFER.acausal * after:
         return ()
     return (
-        "the impulse responses come before the impulse: these are transfer functions of e^(-iωt)? Then take their"
+        "the impulse responses come before the impulse: are these transfer functions for e^(-iωt)? Then take their"
         " complex conjugates",
     )
 
 
-def _windowed(rate: float) -> tuple[str, ...]:
-    """A remark where noise shows an exponential window."""
+def _window_remark(rate: float) -> tuple[str, ...]:
+    """A remark where the noise shows an exponential window of decay rate `rate`, 1/s; 0 for none."""
     if rate == 0.0:
         return ()
     return (
@@ -441,25 +466,25 @@ def _windowed(rate: float) -> tuple[str, ...]:
     )
 
 
-def _of_stated_noise(misfit: Floats) -> tuple[str, ...]:
-    """A remark where what is left is not as large as the noise stated, the median of all outputs."""
+def _noise_remark(misfit: Floats) -> tuple[str, ...]:
+    """A remark where the residual, as the median of all outputs, is not as large as the stated noise."""
     ratio = float(np.median(misfit))
     if 1.0 / TRANSFER.disagrees < ratio < TRANSFER.disagrees:
         return ()
-    return (f"what is left is {ratio:.2g} times noise_std; standard errors go by what is left",)
+    return (f"the residual is {ratio:.2g} times noise_std; standard errors are based on the residual",)
 
 
-def _uneven(whole: TransferModes) -> tuple[str, ...]:
-    """A remark on the modes whose peaks are not those of one pole."""
+def _scatter_remark(estimate: TransferModes) -> tuple[str, ...]:
+    """A remark on modes whose peak in the FRFs is not that of a single pole."""
     which = [
-        mode_text(r, whole.modes.frequencies_hz[r], f", by {scatter:.3g} Hz rms")
-        for r, scatter in enumerate(whole.scatter_hz)
+        mode_text(r, estimate.modes.frequencies_hz[r], f", by {scatter:.3g} Hz rms")
+        for r, scatter in enumerate(estimate.scatter_hz)
         if scatter > 0
     ]
     if not which:
         return ()
-    lines = 2.0 * whole.modes.zeta * whole.modes.frequencies_hz / np.diff(whole.frequencies_hz).min()
-    narrow = [str(r + 1) for r in np.flatnonzero((whole.scatter_hz > 0) & (lines < TRANSFER.resolved))]
+    lines = 2.0 * estimate.modes.zeta * estimate.modes.frequencies_hz / np.diff(estimate.frequencies_hz).min()
+    narrow = [str(r + 1) for r in np.flatnonzero((estimate.scatter_hz > 0) & (lines < TRANSFER.resolved))]
     leaks = (
         f". Fewer than {TRANSFER.resolved:g} lines lie in the half-power bandwidth of mode{'s' * (len(narrow) > 1)}"
         f" {', '.join(narrow)}: if"
@@ -467,61 +492,61 @@ def _uneven(whole: TransferModes) -> tuple[str, ...]:
     )
     return (
         f"frequencies scatter in the peaks of {', '.join(which)}: such a mode changes with time or amplitude, or a"
-        " window blurs it, and its figures are means; measure at one level, and longer segments"
+        " window blurs it, and its frequency and damping are means; measure at one level, and longer segments"
         + (leaks if narrow else ""),
     )
 
 
 def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) -> tuple[Fit, list[tuple[float, ...]]]:
-    """The fit with one mode a cluster, and the frequencies of its other members, Hz."""
+    """The fit with one mode per cluster, and for each mode the frequencies of the other members, Hz."""
     fit = selected.fit
     shapes = fit.amplitudes / fit.poles ** time_derivatives(channels)[:, None]
-    seen = SampledModes.of_poles(fit.poles, shapes, _places(channels))
-    parts = parts_of(fit.poles, seen.phase_collinearity, selected.statistic)
-    kept = np.setdiff1d(np.arange(fit.poles.size), [r for each in parts.values() for r in each])
-    cluster_hz = [tuple(sorted(fit.poles.imag[parts.get(int(r), [])] / (2.0 * np.pi))) for r in kept]
-    if not parts:
+    estimates = SampledModes.of_poles(fit.poles, shapes, _places(channels))
+    members = parts_of(fit.poles, estimates.phase_collinearity, selected.statistic)
+    kept = np.setdiff1d(np.arange(fit.poles.size), [r for each in members.values() for r in each])
+    cluster_hz = [tuple(sorted(fit.poles.imag[members.get(int(r), [])] / (2.0 * np.pi))) for r in kept]
+    if not members:
         return fit, cluster_hz
-    middle = fit.poles.copy()
-    for r, others in parts.items():
+    mean_poles = fit.poles.copy()
+    for r, others in members.items():
         cluster = [r, *(k for k in others if np.abs(fit.poles.real[k]) < PEAKS.narrow * np.abs(fit.poles.real[r]))]
-        middle[r] = np.average(fit.poles[cluster], weights=selected.statistic[cluster])
-    return settled(lines, projected(lines, middle[kept], fit.participation[kept])), cluster_hz
+        mean_poles[r] = np.average(fit.poles[cluster], weights=selected.statistic[cluster])
+    return settled(lines, projected(lines, mean_poles[kept], fit.participation[kept])), cluster_hz
 
 
-def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> TransferModes:
-    """The modes of all bands, each fitted in its own."""
-    each = [band.modes for band in found]
-    n = [modes.n_modes for modes in each]
-    covariance = block_diag(*(band.covariance for band in found))
+def _joined(bands: Sequence[TransferModes], channels: Sequence[Channel]) -> TransferModes:
+    """The results of all bands in one."""
+    modes_by_band = [band.modes for band in bands]
+    n = [modes.n_modes for modes in modes_by_band]
+    covariance = block_diag(*(band.covariance for band in bands))
     first = np.concatenate([np.arange(k) + 2 * sum(n[:i]) for i, k in enumerate(n)]).astype(int)
-    both = np.r_[first, first + np.repeat(n, n)]
-    omega, zeta = (np.concatenate([getattr(modes, name) for modes in each]) for name in ("omega", "zeta"))
-    shapes = np.hstack([modes.shapes for modes in each])
-    share = np.array([band.frequencies_hz.size for band in found]) / sum(band.frequencies_hz.size for band in found)
+    kept = np.r_[first, first + np.repeat(n, n)]
+    omega, zeta = (np.concatenate([getattr(modes, name) for modes in modes_by_band]) for name in ("omega", "zeta"))
+    shapes = np.hstack([modes.shapes for modes in modes_by_band])
+    share = np.array([band.frequencies_hz.size for band in bands]) / sum(band.frequencies_hz.size for band in bands)
     return TransferModes(
         modes=SampledModes(omega, zeta, shapes, _places(channels)),
-        covariance=frozen(covariance[np.ix_(both, both)]),
-        vector_covariance=frozen(np.concatenate([band.vector_covariance for band in found])),
-        participation=frozen(np.vstack([band.participation for band in found]), complex),
-        misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in found]) ** 2)),
-        statistic=frozen(np.concatenate([band.statistic for band in found])),
-        converged=all(band.converged for band in found),
-        cluster_hz=tuple(parts for band in found for parts in band.cluster_hz),
-        scatter_hz=frozen(np.concatenate([band.scatter_hz for band in found])),
-        order_limited_hz=tuple(full for band in found for full in band.order_limited_hz),
-        fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
-        frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
-        lower_residual=found[0].lower_residual,
-        lower_residual_std=found[0].lower_residual_std,
-        upper_residual=found[-1].upper_residual,
-        delays=found[0].delays,
-        remarks=tuple(dict.fromkeys(remark for band in found for remark in band.remarks)),
+        covariance=frozen(covariance[np.ix_(kept, kept)]),
+        vector_covariance=frozen(np.concatenate([band.vector_covariance for band in bands])),
+        participation=frozen(np.vstack([band.participation for band in bands]), complex),
+        misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in bands]) ** 2)),
+        statistic=frozen(np.concatenate([band.statistic for band in bands])),
+        converged=all(band.converged for band in bands),
+        cluster_hz=tuple(parts for band in bands for parts in band.cluster_hz),
+        scatter_hz=frozen(np.concatenate([band.scatter_hz for band in bands])),
+        order_limited_hz=tuple(full for band in bands for full in band.order_limited_hz),
+        fitted=frozen(np.concatenate([band.fitted for band in bands], axis=-1), complex),
+        frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in bands])),
+        lower_residual=bands[0].lower_residual,
+        lower_residual_std=bands[0].lower_residual_std,
+        upper_residual=bands[-1].upper_residual,
+        delays=bands[0].delays,
+        remarks=tuple(dict.fromkeys(remark for band in bands for remark in band.remarks)),
     )
 
 
 def _residual_powers(channels: Sequence[Channel]) -> list[int]:
-    """Of s, in the residual terms of modes above and below the band."""
+    """Powers of s in the residual terms of modes above and below the band."""
     measured = {k for k, c in zip(time_derivatives(channels), channels, strict=True) if c.quantity in MEASURED}
     above = measured or {0, 2}
     return sorted({int(power) for k in above for power in (k, k - 2)})

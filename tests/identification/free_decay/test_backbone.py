@@ -12,10 +12,10 @@ from workbench.identification.free_decay.backbone import (
     _Backbone,
     _Band,
     _envelopes,
-    _left_by_modes,
+    _modes_misfit,
     are_two,
-    left_by_backbone,
-    left_by_common_backbone,
+    backbone_misfit,
+    common_backbone_misfit,
 )
 from workbench.identification.free_decay.order import identify
 from workbench.identification.ring_down import ring_down
@@ -50,7 +50,7 @@ def test_a_mode_on_a_backbone_leaves_noise_and_no_more():
     record = Record(DT, record.outputs + beside, record.output_channels)
     pair = np.array([-0.15 + 20.3j, -0.3 + 20.05j])
     band = _Band(record, pair, np.array([-0.1 + 50.0j]))
-    assert left_by_backbone(band, pair) == pytest.approx(band.y.size * noise**2, rel=0.4)
+    assert backbone_misfit(band, pair) == pytest.approx(band.y.size * noise**2, rel=0.4)
 
 
 @pytest.mark.parametrize("powers", POWERS)
@@ -74,7 +74,7 @@ def test_each_backbone_that_is_tried_is_followed_once(monkeypatch):
 
     monkeypatch.setattr(_Backbone, "fitted", counted)
     pair = np.array([-0.15 + 20.3j, -0.3 + 20.05j])
-    left_by_backbone(_Band(noisy(bent(), 0.01, 0), pair, np.zeros(0, complex)), pair)
+    backbone_misfit(_Band(noisy(bent(), 0.01, 0), pair, np.zeros(0, complex)), pair)
     assert asked and all(one != after for one, after in zip(asked, asked[1:]))
 
 
@@ -196,7 +196,7 @@ def test_the_amplitude_of_each_record_is_found_on_the_common_backbone():
     noise = 0.01 * np.array([record.outputs.std() for record in records])
     pair = np.array([-0.15 + 20.3j, -0.3 + 20.05j])
     bands = [_Band(record, pair, np.zeros(0, complex)) for record in records]
-    left = left_by_common_backbone(bands, 1.0 / noise, pair)
+    left = common_backbone_misfit(bands, 1.0 / noise, pair)
     np.testing.assert_allclose(left / (bands[0].y.size * noise**2), 1.0, atol=0.4)
 
 
@@ -213,8 +213,8 @@ def test_a_long_record_is_compared_at_fewer_samples_with_the_same_result(monkeyp
     z = np.exp(pair * 1e-4)
     turns = z / np.exp(2j * np.pi * np.outer(few.lines, [1.0, 1.0]) / time.size)
     exact = 0.5 * (1.0 - z**time.size) / (1.0 - turns) / np.sqrt(0.5 * time.size)
-    found = few.seen(np.exp(np.outer(pair, few.time)))[0]
-    wanted = few.apart(np.vstack([exact.real, exact.imag]))
-    np.testing.assert_allclose(few.apart(found), wanted, atol=1e-7 * np.abs(wanted).max())
-    one, other = (_left_by_modes([band], pair)[0] for band in (few, each))
+    found = few.lines_of(np.exp(np.outer(pair, few.time)))[0]
+    wanted = few.without_others(np.vstack([exact.real, exact.imag]))
+    np.testing.assert_allclose(few.without_others(found), wanted, atol=1e-7 * np.abs(wanted).max())
+    one, other = (_modes_misfit([band], pair)[0] for band in (few, each))
     assert one == pytest.approx(other, rel=1e-5)

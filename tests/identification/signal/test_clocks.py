@@ -22,13 +22,13 @@ def late(seconds, sensor=1, shapes=MODES.shapes):
 
 def notes(modes):
     record = free_decay(modes, sample_time=0.002, n_samples=1500, noise_std=0.003, seed=1)
-    return [note for note in ring_down(record, start=0.0).notes if "beside" in note or "complex" in note]
+    return [note for note in ring_down(record, start=0.0).notes if "relative to" in note or "complex" in note]
 
 
 @pytest.mark.parametrize(("seconds", "said"), [(0.006, "6 ms late"), (-0.0021, "2.1 ms early")])
 def test_the_late_sensor_is_named(seconds, said):
     (note,) = notes(late(seconds))
-    assert note.startswith(f"output 'y2' is {said} beside the others")
+    assert note.startswith(f"output 'y2' is {said} relative to the others")
 
 
 def test_shapes_that_no_clock_explains_are_said_to_be_complex():

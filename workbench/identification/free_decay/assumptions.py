@@ -1,8 +1,8 @@
-"""Do two assumptions hold in a free decay: modes that do not depend on amplitude, and proportional damping?
+"""Tests of two assumptions on a free decay: modes independent of amplitude, and proportional damping.
 
-Amplitude: segments double in length as the motion dies away. In each, the modes still there are refined by themselves;
-in a linear structure all segments agree within their errors, Σ_w ((ω_w - ω̄) / s_w)² being chi-square. Damping: the
-constants g1 and g2 of (3.32), and whether they explain what was measured.
+Amplitude: the record is divided into segments, each twice as long as the one before, and the modes that are still
+significant are refined in each. In a linear structure all segments agree within their errors: Σ_w ((ω_w - ω̄) / s_w)²
+is chi-square. Damping: the constants g1 and g2 of (3.32), and whether they explain the damping ratios.
 """
 
 from collections.abc import Sequence
@@ -27,12 +27,13 @@ class AssumptionsSettings:
     """Constants of the test for dependence on amplitude."""
 
     segments: int = 4  # of a record, each twice as long as the one before
-    least_statistic: float = 100.0  # χ² of a mode in a segment, for its frequency there to mean something
-    least_cycles: float = 3.0  # likewise
-    least_sure: float = 0.01  # relative standard error of a frequency up to which a segment counts
-    rounded: float = 3.0  # steps of an output, that its rms in a segment has at least
-    shown: tuple[float, float] = (1e-5, 1e-3)  # of a frequency, a damping ratio: less is not seen in their figures
-    chance: float = 1e-3  # that a linear structure is said to depend on amplitude
+    least_statistic: float = 100.0  # least χ² of a mode in a segment that is compared
+    least_cycles: float = 3.0  # least number of its cycles there
+    most_error: float = 0.01  # largest relative standard error of its frequency there
+    rounded: float = 3.0  # least rms of an output in a segment, in quantisation steps
+    # relative changes of frequency and of damping ratio that are too small for the digits printed
+    resolution: tuple[float, float] = (1e-5, 1e-3)
+    false_alarm: float = 1e-3  # probability that a linear structure seems to depend on amplitude
 
 
 ASSUMPTIONS = AssumptionsSettings()
@@ -40,18 +41,18 @@ ASSUMPTIONS = AssumptionsSettings()
 
 @dataclass(frozen=True, eq=False)
 class AmplitudeDependence:
-    """Each mode by amplitude; nan where a segment does not determine it.
+    """Frequency and damping of each mode by segment of the decays; nan where a segment does not determine them.
 
     Attributes:
-        record: (n_stretches,) which record each is of, from 0.
-        start: (n_stretches,) of each, s.
-        amplitude: (n_stretches, n_modes) root mean square over a stretch of the mode's envelope, largest output.
+        record: (n_stretches,) index of the record of each segment, from 0.
+        start: (n_stretches,) start of each segment, s.
+        amplitude: (n_stretches, n_modes) root mean square of the mode's envelope in a segment, largest output.
         omega: (n_stretches, n_modes) rad/s.
         omega_std: (n_stretches, n_modes) standard errors.
         zeta: (n_stretches, n_modes) damping ratios.
         zeta_std: (n_stretches, n_modes) standard errors.
-        probability: (2, n_modes) of frequencies, and damping ratios, that differ so in a linear structure; 1 where
-            fewer than two segments determine it.
+        probability: (2, n_modes) that frequencies, and damping ratios, of a linear structure differ so much; 1 where
+            fewer than two segments determine them.
     """
 
     record: np.ndarray
@@ -65,19 +66,19 @@ class AmplitudeDependence:
 
     @property
     def depends(self) -> np.ndarray:
-        """Modes (n_modes,) that depend on amplitude: chance under one in a thousand over all that was compared."""
-        return np.asarray(np.any(self.probability < ASSUMPTIONS.chance / self.probability.size, axis=0))
+        """Whether each mode depends on amplitude, (n_modes,), at a significance of 0.001 over all comparisons."""
+        return np.asarray(np.any(self.probability < ASSUMPTIONS.false_alarm / self.probability.size, axis=0))
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """One on each mode that depends on amplitude, or on time, as a decay tells one from the other by nothing."""
+        """A remark on each mode that depends on amplitude or on time; a decay does not distinguish these."""
         return tuple(
             f"mode {r + 1} depends on amplitude or time: {self.figures(r)}"
             for r in np.flatnonzero(self.depends).tolist()
         )
 
     def figures(self, r: int) -> str:
-        """Frequency and damping of mode r by amplitude, in words."""
+        """Frequency, damping and amplitude of mode r in each segment, as text."""
         seen = np.flatnonzero(np.isfinite(self.omega[:, r]))
         each = zip(self.omega[seen, r] / (2.0 * np.pi), self.zeta[seen, r], self.amplitude[seen, r], strict=True)
         return "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at {size:.3g}" for f, zeta, size in each)
@@ -91,16 +92,16 @@ def amplitude_dependence(
     stretches: int = ASSUMPTIONS.segments,
     budget: Budget | None = None,
 ) -> AmplitudeDependence:
-    """Frequency and damping of each mode of free decays, stretch by stretch.
+    """Frequency and damping of each mode of free decays by amplitude, in segments of the records.
 
     Args:
-        records: the free decays that `refined` was found in.
+        records: the free decays that `refined` was identified from.
         refined: their modes.
-        stretches: how many of each record, each twice as long as the one before.
-        budget: of time, after which no further stretch is looked at; none unless given.
+        stretches: number of segments of each record, each twice as long as the one before.
+        budget: time limit, after which no further segment is analysed; none unless given.
 
     Raises:
-        ValueError: fewer than two stretches.
+        ValueError: fewer than two segments.
     """
     if stretches < 2:
         raise ValueError(f"amplitudes are compared over two stretches or more; got {stretches}")
@@ -110,74 +111,86 @@ def amplitude_dependence(
     values = [_segments(record, refined, np.abs(a), noise, stretches, budget) for record, a, noise in each]
     start = np.concatenate([each[0] for each in values])
     amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in values]))
-    alike = np.stack(
+    probability = np.stack(
         [
-            _alike(omega, np.hypot(omega_std, ASSUMPTIONS.shown[0] * omega)),
-            _alike(zeta, np.hypot(zeta_std, ASSUMPTIONS.shown[1] * zeta)),
+            _equality(omega, np.hypot(omega_std, ASSUMPTIONS.resolution[0] * omega)),
+            _equality(zeta, np.hypot(zeta_std, ASSUMPTIONS.resolution[1] * zeta)),
         ]
     )
     which = np.repeat(np.arange(len(records)), stretches)
     return AmplitudeDependence(
-        frozen(which, int), frozen(start), amplitude, omega, omega_std, zeta, zeta_std, frozen(alike)
+        frozen(which, int), frozen(start), amplitude, omega, omega_std, zeta, zeta_std, frozen(probability)
     )
 
 
 def _segments(
     record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int, budget: Budget
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Starts (n_stretches,), and (5, n_stretches, n_modes) of amplitude, ω and its error, ζ and its error."""
+    """Starts of the segments of a record, (n_stretches,) s, and the modes in each, (5, n_stretches, n_modes).
+
+    These are amplitude, ω and its standard error, ζ and its standard error.
+    """
     modes = refined.modes
     edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
     figures = np.full((5, stretches, modes.n_modes), np.nan)
-    apart = np.abs(np.subtract.outer(modes.omega, modes.omega))
-    lost = [(at, at + (count - 1) * record.sample_time) for _, at, count, _ in dropouts(record)]
-    coarse = ASSUMPTIONS.rounded * steps(record)
-    beats = np.where(np.eye(modes.n_modes, dtype=bool), np.inf, apart).min(axis=1)
+    spacing = np.abs(np.subtract.outer(modes.omega, modes.omega))
+    dropped = [(at, at + (count - 1) * record.sample_time) for _, at, count, _ in dropouts(record)]
+    least_rms = ASSUMPTIONS.rounded * steps(record)
+    beats = np.where(np.eye(modes.n_modes, dtype=bool), np.inf, spacing).min(axis=1)
     for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
         span, decay = (last - first) * record.sample_time, -modes.poles.real
-        begun = size * np.exp(-decay * first * record.sample_time)
-        # Mean over the stretch of the squared envelope.
-        mean = begun**2 * _mean_of_decay(2.0 * decay * span)
-        statistic = (0.5 * (last - first) * mean / noise[:, None] ** 2).sum(axis=0)
-        there = np.flatnonzero(statistic > ASSUMPTIONS.least_statistic)
+        initial = size * np.exp(-decay * first * record.sample_time)
+        # Mean over the segment of the squared envelope.
+        mean_square = initial**2 * _mean_of_decay(2.0 * decay * span)
+        statistic = (0.5 * (last - first) * mean_square / noise[:, None] ** 2).sum(axis=0)
+        significant = np.flatnonzero(statistic > ASSUMPTIONS.least_statistic)
         begins, ends = record.start_time + record.sample_time * np.array([first, last - 1])
-        if there.size == 0 or last - first < 4 * (there.size + 1):
+        if significant.size == 0 or last - first < 4 * (significant.size + 1):
             continue
-        if any(since <= ends and until >= begins for since, until in lost):  # would look like a change of the modes
+        # A dropout would look like a change of the modes.
+        if any(since <= ends and until >= begins for since, until in dropped):
             continue
-        stretch = record.between(begins, ends)
-        if (stretch.outputs.std(axis=1) < coarse).any():  # what rounding leaves of so little is not the motion
+        segment = record.between(begins, ends)
+        if (segment.outputs.std(axis=1) < least_rms).any():  # quantisation distorts so small a motion
             continue
         if budget.spent("comparison of modes by amplitude"):
             break
         try:
-            found = in_coloured_noise(refine(stretch, modes.select(list(there)), offset=True, budget=budget), stretch)
+            refitted = in_coloured_noise(
+                refine(segment, modes.select(list(significant)), offset=True, budget=budget), segment
+            )
         except np.linalg.LinAlgError:
             continue
-        if not found.converged:
+        if not refitted.converged:
             continue
-        # One pole may have wandered off, and another taken its place in the order.
-        away = np.abs(np.subtract.outer(found.modes.poles, modes.poles[there]))
-        own = away.argmin(axis=1)
-        sure = away.argmin(axis=0)[own] == np.arange(own.size)
-        sure &= found.omega_std < ASSUMPTIONS.least_sure * found.modes.omega
-        sure &= found.modes.frequencies_hz * span > ASSUMPTIONS.least_cycles
-        there = there[own]
-        sure &= beats[there] * span > 2.0 * np.pi  # of two that beat more slowly, one looks like a mode that changes
-        values = (found.modes.omega, found.omega_std, found.modes.zeta, found.zeta_std)
-        figures[0, w, there[sure]] = np.sqrt(mean[:, there[sure]].max(axis=0))
-        figures[1:, w, there[sure]] = np.stack(values)[:, sure]
+        # A pole may have drifted to another frequency, and another one taken its place in the order.
+        distance = np.abs(np.subtract.outer(refitted.modes.poles, modes.poles[significant]))
+        nearest = distance.argmin(axis=1)
+        sure = distance.argmin(axis=0)[nearest] == np.arange(nearest.size)
+        sure &= refitted.omega_std < ASSUMPTIONS.most_error * refitted.modes.omega
+        sure &= refitted.modes.frequencies_hz * span > ASSUMPTIONS.least_cycles
+        significant = significant[nearest]
+        # Two modes whose beat is longer than the segment look like one that changes.
+        sure &= beats[significant] * span > 2.0 * np.pi
+        values = (refitted.modes.omega, refitted.omega_std, refitted.modes.zeta, refitted.zeta_std)
+        figures[0, w, significant[sure]] = np.sqrt(mean_square[:, significant[sure]].max(axis=0))
+        figures[1:, w, significant[sure]] = np.stack(values)[:, sure]
     return record.start_time + record.sample_time * edges[:-1], figures
 
 
 def _mean_of_decay(x: np.ndarray) -> np.ndarray:
-    """(1 - e^-x) / x, 1 at 0."""
+    """Mean of e^-t over 0 < t < x: (1 - e^-x) / x, 1 at 0."""
     near = np.abs(x) < 1e-9
     return np.where(near, 1.0, -np.expm1(-x) / np.where(near, 1.0, x))
 
 
-def _alike(values: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Probability of values so far apart, (n_modes,), if each column is one number and its errors."""
+def _equality(values: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Probability of a scatter of values as large as in each column, (n_modes,), if only their errors differ.
+
+    Args:
+        values: (n_segments, n_modes), nan where unknown.
+        std: (n_segments, n_modes) standard errors.
+    """
     weights = np.where(np.isfinite(values), 1.0 / std**2, 0.0)
     known = np.where(np.isfinite(values), values, 0.0)
     mean = (weights * known).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-300)
@@ -187,13 +200,13 @@ def _alike(values: np.ndarray, std: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class ProportionalFit:
-    """The best g1 and g2, and how well they do.
+    """The least squares g1 and g2 of proportional damping, and their goodness of fit.
 
     Attributes:
         damping: g1 in s and g2 in 1/s.
         standard_errors: (2,) of g1 and g2.
         standardised_residuals: (n_modes,) ζ_r minus the fit, in standard errors of ζ_r.
-        probability: of so bad a fit if the damping is proportional; below 0.01 it hardly is.
+        probability: of so large a misfit if the damping is proportional; below 0.01 it hardly is.
     """
 
     damping: ProportionalDamping

@@ -1,17 +1,17 @@
-"""Ibrahim's time domain method: free decay in, frequencies, damping ratios and shapes out (Ch. 3).
+"""Ibrahim's time domain method: frequencies, damping ratios and shapes from free decays (Ch. 3).
 
-Every sensor sees the same decaying exponentials, u(t) = Σ b_r e^{λ_r t} (3.29). Stack the signals at a few delays to
-a column, put many instants beside one another to a matrix A, and the same one step later to Â. Then Â = G A, and G
-has eigenvalues e^{λ_r Δt} and eigenvectors that begin with b_r. The normal matrix A A^T of (3.34) would square the
+Every sensor measures the same decaying exponentials, u(t) = Σ b_r e^{λ_r t} (3.29). The columns of a matrix A are the
+signals at a few delays, one column per instant; those of Â are the same one sample later. Then Â = G A, and G has the
+eigenvalues e^{λ_r Δt} and eigenvectors whose first block is b_r. The normal matrix A A^T of (3.34) would square the
 condition number; an orthogonal factorisation of A gives the same least squares solution without it.
 
-Two forms are offered. `two_delays` is the one of 1981: each signal and its copy one step later, so m sensors give
-exactly m modes, those that the structure does not have included. `stacked_delays` takes as many copies as the modes
-need and keeps only the dominant directions of A: six sensors find twenty modes, and noise stays behind.
+Two forms: `two_delays` is that of 1981, with each signal and its copy one sample later, so that m sensors give exactly
+m modes, spurious ones included. `stacked_delays` takes as many delays as the modes need and keeps only the dominant
+directions of A: six sensors identify twenty modes, and most noise is rejected.
 
 Stabilisation diagrams: a physical mode is stable over the model order. It appears at every order, with the same
-frequency and a shape that is real but for its scale; poles that only fit the noise, or small inconsistencies between
-points measured one after the other, change with the order or are complex.
+frequency and a shape that is real up to a factor. Poles that fit noise, or small inconsistencies between points
+measured one after the other, change with the order or have complex shapes.
 """
 
 from collections.abc import Sequence
@@ -67,15 +67,15 @@ def stacked_delays(
 ) -> SampledModes:
     """The `n_modes` strongest modes, from many delayed copies of each signal and a truncated SVD.
 
-    A is the block Hankel matrix of the record (those of several records stand side by side); its 2 n_modes leading
-    left singular vectors U span the modes. U without its last block, times G, is U without its first: the least
-    squares G has the eigenvalues e^{λ_r Δt} and the first block of U times its eigenvectors holds the shapes. Equal
-    to `two_delays` where there are two delays and no truncation.
+    A is the block Hankel matrix of the record (those of several records side by side); its 2 n_modes leading left
+    singular vectors U span the modes. G is the least squares solution of U without its last block, times G, equal to U
+    without its first block. It has the eigenvalues e^{λ_r Δt}; the first block of U times its eigenvectors holds the
+    shapes. Equal to `two_delays` for two delays without truncation.
 
     Args:
         records: free decay of the same sensors at one sample rate.
-        n_modes: how many; a stabilisation diagram (`stabilise`, `stable_modes`) helps to choose.
-        delays: copies of each signal; by default a third of the record, within what a matrix can hold.
+        n_modes: number of modes; a stabilisation diagram (`stabilise`, `stable_modes`) helps to choose it.
+        delays: copies of each signal; by default a third of the record, up to 4,000,000 entries of A.
         branch: k of (3.23): frequencies lie between k and k + 1 times the Nyquist frequency.
 
     Returns:
@@ -110,7 +110,7 @@ def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None
     hankel = np.hstack([_hankel(r.outputs, delays) for r in records])
     if min(hankel.shape) < 4 * order:
         return np.asarray(svd(hankel, full_matrices=False, lapack_driver="gesdd")[0][:, :order])
-    # an orthogonal factorisation of the longer side first
+    # An orthogonal factorisation first makes the matrix square.
     if hankel.shape[1] > hankel.shape[0]:
         hankel = np.asarray(np.linalg.qr(hankel.T, mode="r")).T
     return np.asarray(svd(hankel, full_matrices=False)[0][:, :order])
@@ -124,13 +124,13 @@ def shift_eigenpairs(basis: np.ndarray, n_outputs: int) -> tuple[np.ndarray, np.
 
 
 def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 0) -> SampledModes:
-    """Modes from eigenvalues of one step, λ = (log μ + 2πi k)/Δt (3.23); real eigenvalues are no modes."""
+    """Modes from eigenvalues μ of one step in time, λ = (log μ + 2πi k)/Δt (3.23); real eigenvalues are left out."""
     upper = (mu.imag > 0) & (np.abs(mu) > 0)
-    # Above Nyquist every second branch folds the spectrum over: the conjugate is the one that is seen.
-    seen = mu[upper] if branch % 2 == 0 else mu[upper].conj()
+    # On every second branch above Nyquist aliasing mirrors the spectrum: the conjugate eigenvalue is observed.
+    observed = mu[upper] if branch % 2 == 0 else mu[upper].conj()
     vectors = vectors[:, upper] if branch % 2 == 0 else vectors[:, upper].conj()
     turns = (branch + 1) // 2
-    poles = (np.log(seen) + 2j * np.pi * turns) / record.sample_time
+    poles = (np.log(observed) + 2j * np.pi * turns) / record.sample_time
     order = np.argsort(np.abs(poles))
     shapes = normalised_shapes(vectors / poles ** time_derivatives(record.output_channels)[:, None])
     return SampledModes.of_poles(poles[order], shapes[:, order], record.positions)
@@ -152,11 +152,11 @@ def _hankel(outputs: np.ndarray, delays: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Stabilisation:
-    """The modes identified at each order, from the lowest to the highest.
+    """The modes identified at each model order, from the lowest to the highest.
 
     Attributes:
-        orders: numbers of modes asked for.
-        found: the `SampledModes` of each.
+        orders: numbers of modes.
+        found: the `SampledModes` of each order.
     """
 
     orders: tuple[int, ...]
@@ -168,8 +168,8 @@ class StableModes:
     """The stable modes of a diagram.
 
     Attributes:
-        modes: each as identified at the order where its phase collinearity is highest.
-        presence: (n_modes,) share of the orders at which it was found.
+        modes: each from the order at which its phase collinearity is highest.
+        presence: (n_modes,) share of the orders at which each was found.
     """
 
     modes: SampledModes
@@ -190,11 +190,11 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
     """
     records = of_same_sensors(records)
     basis = signal_subspace(records, 2 * max(orders), delays=delays)
-    found = []
+    by_order = []
     for n in orders:
         mu, shapes = shift_eigenpairs(basis[:, : 2 * n], records[0].n_outputs)
-        found.append(as_modes(mu, shapes, records[0]))
-    return Stabilisation(tuple(orders), tuple(found))
+        by_order.append(as_modes(mu, shapes, records[0]))
+    return Stabilisation(tuple(orders), tuple(by_order))
 
 
 def stable_modes(
@@ -210,17 +210,17 @@ def stable_modes(
 
     Args:
         diagram: from `stabilise`.
-        frequency: relative difference up to which two poles are one mode.
-        shape: MAC from which on they are.
+        frequency: largest relative difference of frequency between the poles of one mode.
+        shape: least MAC between them.
         standing: least phase collinearity of a shape.
         presence: least share of the orders.
-        largest_damping: ratios above are noise, as are negative ones.
+        largest_damping: damping ratio above which a pole is noise, as below zero.
     """
     groups: list[list[tuple[SampledModes, int]]] = []
     for modes in diagram.found:
         keep = (modes.zeta > 0) & (modes.zeta < largest_damping) & (modes.phase_collinearity >= standing)
         taken = set()
-        # The most collinear shapes choose first, so that a split of a mode does not take its place.
+        # The most collinear shapes are assigned first: a mode precedes poles that split off it.
         for r in sorted(np.flatnonzero(keep), key=lambda r: -modes.phase_collinearity[r]):
             near = _nearest(groups, modes, int(r), frequency, shape)
             if near is None:
@@ -246,11 +246,11 @@ def stable_modes(
 def _nearest(
     groups: list[list[tuple[SampledModes, int]]], modes: SampledModes, r: int, frequency: float, shape: float
 ) -> int | None:
-    """The group whose last member is this mode, if any."""
+    """Index of the group whose last member agrees best with mode r in frequency and shape; None if none agrees."""
     nearest, distance = None, frequency
     for i, group in enumerate(groups):
         last, k = group[-1]
-        apart = abs(modes.omega[r] / last.omega[k] - 1.0)
-        if apart <= distance and mac(modes.shapes[:, [r]], last.shapes[:, [k]])[0, 0] >= shape:
-            nearest, distance = i, apart
+        difference = abs(modes.omega[r] / last.omega[k] - 1.0)
+        if difference <= distance and mac(modes.shapes[:, [r]], last.shapes[:, [k]])[0, 0] >= shape:
+            nearest, distance = i, difference
     return nearest

@@ -1,16 +1,17 @@
-"""Which modes a long record of many sensors holds, at a cost that grows with its samples and no faster.
+"""Model order selection for long records of many sensors, at a cost proportional to the number of samples.
 
-As `order` decides it, but many at a time. What the modes so far leave of the record, weighted by its noise, is compared
-with damped exponentials e^{λt} by fast transforms, each rate of decay over as many samples as it lasts,
+The tests are those of `order`, but many modes enter at a time. The residual r_j, weighted by its noise s_j, is
+correlated with damped exponentials e^{λt} by fast Fourier transforms, for each decay rate over as many samples as the
+exponential lasts,
 
-    χ²(λ) = 2 Σ_j |Σ_t e^{λ* t} r_j(t)|² / (s_j² Σ_t |e^{λt}|² (1 - o)),    o the share that the modes so far explain,
+    χ²(λ) = 2 Σ_j |Σ_t e^{λ* t} r_j(t)|² / (s_j² Σ_t |e^{λt}|² (1 - o)),    o the share that current modes explain.
 
-and every peak enters that rises above the noise about it and above the leakage of stronger peaks,
+Every peak enters that exceeds the noise about it and the leakage of stronger peaks,
 
     |<e^{λt}, e^{κt}>|² / (‖e^{λt}‖² ‖e^{κt}‖²) = 4 σ_λ σ_κ / ((σ_λ + σ_κ)² + (ω_λ - ω_κ)²).
 
-All poles are then fitted together, on the whole record, and those leave again that are no modes. What was masked by
-strong ones shows in the next round; the search ends when no peak is higher than noise makes it.
+All poles are then fitted together to the whole record, and those that fail the tests leave again. Modes masked by
+stronger ones show in the next round; the search ends when no peak exceeds the noise.
 """
 
 from collections.abc import Sequence
@@ -39,22 +40,22 @@ from workbench.threads import cores
 class LongSettings:
     """Constants of the search in long records."""
 
-    slowest: float = 0.7  # nepers over the record: the slowest rate of decay that is searched
-    ratio: float = 4.0  # of each rate to the one before
-    life: float = 8.0  # time constants after which a damped exponential is left out
+    slowest: float = 0.7  # lowest decay rate of the search, nepers over the record
+    ratio: float = 4.0  # of each decay rate to the one before
+    life: float = 8.0  # time constants after which an exponential is cut off
     at_once: int = 16  # outputs transformed together
-    beside: int = 64  # cells on either side from which the noise about a peak is taken
-    # its quantiles: the residual about a mode that depends on amplitude is not smooth
-    shares: tuple[float, ...] = (0.5, 0.9)
-    leaked: float = 2.0  # times the leakage of stronger peaks that a peak must be
-    least_independent: float = 0.05  # share of a candidate outside the modes so far
-    overlaps: float = 0.5  # share of energy from which two modes overlap
-    ridge: float = 1e-10  # of the energy of each mode, lest modes that overlap be singular
+    half_window: int = 64  # least number of cells on either side of a peak, from which the noise about it is estimated
+    # quantiles that estimate it: the residual about a mode that depends on amplitude is not smooth
+    quantiles: tuple[float, ...] = (0.5, 0.9)
+    leaked: float = 2.0  # least ratio of a peak to the leakage of stronger peaks
+    least_independent: float = 0.05  # least share of a candidate outside the span of the current modes
+    overlaps: float = 0.5  # least share of common energy of two modes that overlap
+    ridge: float = 1e-10  # regularisation for overlapping modes, relative to the energy of each
     steps: int = 6  # of least squares after peaks entered
     most_rounds: int = 60
-    most_rejections: int = 2  # of a peak: one rejected so often is noise, once may be for poles not converged
-    # rounds that leave no more modes than before: where noise is not white, or modes depend on amplitude, they would
-    # not end
+    most_rejections: int = 2  # of a peak that is tried again: the first may be due to poles that have not converged
+    # rounds without a further mode after which the search ends: in coloured noise, or where modes depend on amplitude,
+    # it might not end otherwise
     most_fruitless: int = 3
 
 
@@ -64,21 +65,21 @@ LONG = LongSettings()
 def identify_long(
     records: Sequence[Record], *, max_modes: int, false_alarm: float = FALSE_ALARM, budget: Budget | None = None
 ) -> Identified | None:
-    """The modes of long records, as many as there are; None where none rises above the noise.
+    """The modes of long records, their number selected; None where none is significant.
 
     Args:
         records: free decay in white noise, of the same sensors at one rate; each output may hold a constant.
-        max_modes: where to stop at the latest.
-        false_alarm: chance that noise alone is taken for a mode.
-        budget: of time; none unless given.
+        max_modes: largest number of modes.
+        false_alarm: probability that noise alone is taken for a mode.
+        budget: time limit; none unless given.
     """
     measured = _Search(records, false_alarm, budget or Budget())
     measured.run(max_modes)
-    apart = independent(records, [fit.residual.T for fit in measured.fits]) if measured.poles.size else None
-    if apart is None:
+    uncorrelated = independent(records, [fit.residual.T for fit in measured.fits]) if measured.poles.size else None
+    if uncorrelated is None:
         return measured.report(measured.statistic()) if measured.poles.size else None
-    # noise that outputs share makes peaks in all of them
-    mixed = _Search(apart[0], false_alarm, measured.budget)
+    # Correlated noise makes peaks in all outputs; combinations of uncorrelated noise do without them.
+    mixed = _Search(uncorrelated[0], false_alarm, measured.budget)
     mixed.origins = measured.origins
     mixed.settle(measured.poles, LONG.steps)
     mixed.run(max_modes)
@@ -88,7 +89,16 @@ def identify_long(
 
 
 class _Search:
-    """Poles so far, their residual, and what was rejected."""
+    """The state of the search: current poles, their fit and residual, and rejected candidates.
+
+    Attributes:
+        rates: decay rates of the search, 1/s.
+        enter: χ² from which on a peak enters.
+        limit: χ² from which on a mode stays, in white noise.
+        origins: poles of the modes as they entered, rad/s.
+        rejected: poles of rejected candidates as they entered, with their statistic.
+        fine: χ² of the lowest decay rate in the residual, by frequency.
+    """
 
     def __init__(self, records: Sequence[Record], false_alarm: float, budget: Budget) -> None:
         self.records, self.budget = records, budget
@@ -98,14 +108,13 @@ class _Search:
         count = 1 + int(np.log(max(0.1 * np.pi * self.longest / LONG.slowest, 1.0)) / np.log(LONG.ratio))
         self.rates = LONG.slowest / self.span * LONG.ratio ** np.arange(count)
         self.signals = 2 * sum(r.n_outputs for r in records)
-        self.white = chi2.ppf(LONG.shares, self.signals)
+        self.white = chi2.ppf(LONG.quantiles, self.signals)
         cells = sum(self._size(rate)[1] // 2 for rate in self.rates)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, self.signals))
-        # A mode is two amplitudes a signal and its pole, chosen among all cells.
+        # A mode has two amplitudes per signal and a pole, chosen among all cells.
         self.limit = float(chi2.isf(false_alarm / cells, self.signals + 2))
-        # Sums over so many samples are no more exact than this.
+        # The round-off level of sums over so many samples.
         self.floor = 1e-11 * np.sqrt(np.mean([(r.outputs**2).mean() for r in records]))
-        # Candidates as they entered, of the modes and of what was rejected.
         self.origins = np.zeros(0, complex)
         self.rejected: list[tuple[complex, float]] = []
         self.weights = np.ones((len(records), records[0].n_outputs))
@@ -113,28 +122,29 @@ class _Search:
         self.settle(np.zeros(0, complex), 0)
 
     def run(self, max_modes: int) -> None:
-        """Take in peaks, and leave out what is no mode, until none is higher than noise makes it."""
+        """Add peaks and remove modes that fail the tests, until no peak exceeds the noise."""
         fruitless = 0
         for _ in range(LONG.most_rounds):
             before = self.poles.size
-            # The first modes are worth the wait.
+            # The first modes are searched whatever the time.
             ended = fruitless >= LONG.most_fruitless or (before > 0 and self.budget.spent(FURTHER))
             peaks = np.zeros(0) if ended else self.peaks()[: max(max_modes - before, 0)]
             if peaks.size:
-                self.take_in(peaks)
-                self.prune()
+                self.add(peaks)
+                self.remove()
                 fruitless = 0 if self.poles.size > before else fruitless + 1
             else:
                 self.settle(self.poles, FIT.most_steps)
-                if not self.prune(thoroughly=not self.budget.spent("check of each mode")):
+                if not self.remove(thoroughly=not self.budget.spent("check of each mode")):
                     break
 
-    def take_in(self, peaks: np.ndarray) -> None:
+    def add(self, peaks: np.ndarray) -> None:
+        """Add poles (n_peaks,) to the current ones and fit all together."""
         self.origins = np.append(self.origins, peaks)
         self.settle(np.append(self.poles, peaks), LONG.steps)
 
     def settle(self, poles: np.ndarray, most_steps: int) -> None:
-        """All poles fitted together, outputs weighted by the residual before."""
+        """Fit all poles together, outputs weighted by the residual of the fit before."""
         self.converged, self.steps = True, 0
         if poles.size:
             poles, fits, self.converged, self.steps = search(
@@ -147,11 +157,11 @@ class _Search:
         self.weights = 1.0 / self.noise
 
     def peaks(self) -> np.ndarray:
-        """Candidates that stand out of the residual, strongest first."""
+        """Poles of the significant peaks of the residual, strongest first."""
         self.fine = self._strengths(self.rates[0])
-        found = [self._peaks(self.rates[0], self.fine)]
-        found += [self._peaks(rate, self._strengths(rate)) for rate in self.rates[1:]]
-        height, poles = np.concatenate([h for h, _ in found]), np.concatenate([p for _, p in found])
+        by_rate = [self._peaks(self.rates[0], self.fine)]
+        by_rate += [self._peaks(rate, self._strengths(rate)) for rate in self.rates[1:]]
+        height, poles = np.concatenate([h for h, _ in by_rate]), np.concatenate([p for _, p in by_rate])
         taken, heights = np.zeros(0, complex), np.zeros(0)
         for r in np.argsort(-height):
             leaked = np.sqrt(heights * self._overlap(taken, poles[r])).sum() ** 2
@@ -159,8 +169,13 @@ class _Search:
                 taken, heights = np.append(taken, poles[r]), np.append(heights, height[r])
         return taken
 
-    def prune(self, thoroughly: bool = False) -> bool:
-        """Leave out what is no mode and, thoroughly, what its neighbours explain as well; whether any left."""
+    def remove(self, thoroughly: bool = False) -> bool:
+        """Remove poles that are spurious or insignificant; whether any was.
+
+        Args:
+            thoroughly: whether to also remove modes that are insignificant once overlapping modes are refitted without
+                them.
+        """
         if self.poles.size == 0:
             return False
         statistic = self.statistic()
@@ -169,11 +184,11 @@ class _Search:
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
                 near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
-                if near.size > 1 and self._statistic_beside(r, near) < limit[r]:
+                if near.size > 1 and self._orthogonal_statistic(r, near) < limit[r]:
                     statistic[r] = self._gain(r, near)
                     out[r] = statistic[r] < limit[r]
         for r in map(int, np.flatnonzero(out)):
-            # Of two that overlap the weaker goes first: the other may then stand.
+            # Of two overlapping modes the weaker leaves first: the other may then be significant.
             weaker = out & (statistic < statistic[r]) & (self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
             out[r] = not weaker.any()
         if out.any():
@@ -184,76 +199,76 @@ class _Search:
 
     @property
     def _shapes(self) -> np.ndarray:
-        """Amplitudes over the noise, (n_signals, n_modes), of one record below the other."""
+        """Amplitudes over the noise, (n_signals, n_modes), a signal being an output of a record."""
         return np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(self.fits, self.weights, strict=True)])
 
     def statistic(self) -> np.ndarray:
-        """χ² of each mode's amplitudes, poles held, (n_modes,)."""
+        """χ² of the amplitudes of each mode at fixed poles, (n_modes,)."""
         return np.array([self._strength(r, np.zeros((self.weights.shape[1], 0))) for r in range(self.poles.size)])
 
     def _strength(self, r: int, without: np.ndarray) -> float:
-        """χ² of the amplitudes of mode r, less what lies along some directions (n_outputs, n_directions)."""
-        strength, both = 0.0, [r, self.poles.size + r]
+        """χ² of the amplitudes of mode r orthogonal to some directions (n_outputs, n_directions)."""
+        strength, rows = 0.0, [r, self.poles.size + r]
         for fit, weights in zip(self.fits, self.weights, strict=True):
-            a = fit.coefficients[both] * weights
+            a = fit.coefficients[rows] * weights
             a = a - (a @ without) @ without.T
-            strength += float((a * np.linalg.solve(fit.spread[np.ix_(both, both)], a)).sum())
+            strength += float((a * np.linalg.solve(fit.spread[np.ix_(rows, rows)], a)).sum())
         return strength
 
-    def _statistic_beside(self, r: int, near: np.ndarray) -> float:
-        """χ² of mode r in combinations of the outputs that see none of its neighbours."""
+    def _orthogonal_statistic(self, r: int, near: np.ndarray) -> float:
+        """χ² of mode r in combinations of the outputs that are orthogonal to the shapes of its neighbours."""
         shapes = np.hstack(np.split(self._shapes[:, near[near != r]], len(self.fits)))
         return self._strength(r, np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0])
 
     def report(self, statistic: np.ndarray) -> Identified:
         """The modes with their covariance, and the statistic (n_modes,) of each."""
-        found = self.records, self.poles, self.fits, self.noise
-        refined = as_refined(*found, converged=self.converged, steps=self.steps)
+        fit = self.records, self.poles, self.fits, self.noise
+        refined = as_refined(*fit, converged=self.converged, steps=self.steps)
         refined = in_coloured_noise(refined, self.records, self.fits)
         statistic = statistic[np.argsort(np.abs(self.poles))]
-        found_modes = identified(refined, statistic, self.limit, self.rejected, self.records[0])
-        return replace(found_modes, remarks=self.budget.remarks)
+        result = identified(refined, statistic, self.limit, self.rejected, self.records[0])
+        return replace(result, remarks=self.budget.remarks)
 
     def _size(self, rate: float) -> tuple[int, int]:
-        """Samples that one of this rate lasts, and the length of a transform that resolves its frequency."""
+        """Samples that an exponential of this decay rate lasts, and the length of a transform that resolves it."""
         n = min(self.longest, int(np.ceil(LONG.life / (rate * self.dt))))
         return n, next_fast_len(n if rate * n * self.dt > 0.5 * LONG.life else 2 * n, real=True)
 
     def _strengths(self, rate: float) -> np.ndarray:
-        """χ² of one rate at every frequency of its transform, as if no mode were near."""
+        """χ² of one decay rate at every frequency of its transform, (n_frequencies,), without 1 / (1 - o)."""
         lives, size = self._size(rate)
-        found = np.zeros(size // 2 + 1, np.float32)
+        chi_square = np.zeros(size // 2 + 1, np.float32)
         for fit, weights in zip(self.fits, self.weights, strict=True):
             n = min(lives, len(fit.residual))
             energy = np.expm1(-2.0 * rate * self.dt * n) / np.expm1(-2.0 * rate * self.dt)
             scale = (np.sqrt(2.0 / energy) * weights).astype(np.float32)
             for first in range(0, weights.size, LONG.at_once):
                 some = slice(first, first + LONG.at_once)
-                # In single precision, and in place, as these fill the memory.
-                left = np.zeros((scale[some].size, size), np.float32)
+                # In single precision and in place, to save memory.
+                decayed = np.zeros((scale[some].size, size), np.float32)
                 decay = np.arange(n, dtype=np.float32)
                 decay *= -rate * self.dt
                 np.exp(decay, out=decay)
-                left[:, :n] = fit.residual[:n, some].T
-                left[:, :n] *= scale[some, None]
-                left[:, :n] *= decay
+                decayed[:, :n] = fit.residual[:n, some].T
+                decayed[:, :n] *= scale[some, None]
+                decayed[:, :n] *= decay
                 del decay
-                spectrum = rfft(left, axis=1, workers=cores())
-                del left
+                spectrum = rfft(decayed, axis=1, workers=cores())
+                del decayed
                 forget_transforms(n)
-                found += np.einsum("jk,jk->k", spectrum.real, spectrum.real)
-                found += np.einsum("jk,jk->k", spectrum.imag, spectrum.imag)
-        return found
+                chi_square += np.einsum("jk,jk->k", spectrum.real, spectrum.real)
+                chi_square += np.einsum("jk,jk->k", spectrum.imag, spectrum.imag)
+        return chi_square
 
     def _noise_ratio(self, pole: complex) -> float:
-        """Noise about a pole over white noise, where it is larger, as the last search saw it; 1 if white."""
+        """Noise about a pole over white noise, 1 or more, by quantiles of the last χ² of the lowest decay rate."""
         step = np.pi / (self.fine.size * self.dt)
-        at, half = round(pole.imag / step), max(int(abs(pole.real) / step), LONG.beside)
-        beside = self.fine[max(at - half, 0) : at + half + 1]
-        return max(1.0, float((np.quantile(beside, LONG.shares) / self.white).max()))
+        at, half = round(pole.imag / step), max(int(abs(pole.real) / step), LONG.half_window)
+        nearby = self.fine[max(at - half, 0) : at + half + 1]
+        return max(1.0, float((np.quantile(nearby, LONG.quantiles) / self.white).max()))
 
     def _peaks(self, rate: float, strengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Strengths and poles of one rate's local maxima that stand out of white noise."""
+        """χ² and poles of the local maxima of one decay rate that exceed white noise."""
         step = 2.0 * np.pi / (self._size(rate)[1] * self.dt)
         omega = step * np.arange(strengths.size)
         lowest = max(rate / SELECTION.most_damped, 1.5 * self.bin_width)
@@ -265,27 +280,29 @@ class _Search:
         for pole, _ in self.rejected:
             rejected += np.abs(poles.imag - pole.imag) < 2.0 * max(self.bin_width, 0.5 * abs(pole.real))
         at, poles = at[rejected < LONG.most_rejections], poles[rejected < LONG.most_rejections]
-        apart = self._independent(poles)
-        full = strengths[at] / np.maximum(apart, LONG.least_independent)
-        good = (apart > LONG.least_independent) & (full > self.enter)
-        return full[good], poles[good]
+        independent_share = self._independent(poles)
+        chi_square = strengths[at] / np.maximum(independent_share, LONG.least_independent)
+        good = (independent_share > LONG.least_independent) & (chi_square > self.enter)
+        return chi_square[good], poles[good]
 
     def _independent(self, poles: np.ndarray) -> np.ndarray:
-        """Shares of candidates, sorted by frequency, that lie outside the modes so far."""
-        apart = np.ones(poles.size)
+        """Share of each candidate, sorted by frequency, outside the span of the current modes, (n_candidates,)."""
+        share = np.ones(poles.size)
         reach = 3.0 * (2.0 * self.bin_width + np.abs(self.poles.real))
-        for first in range(0, poles.size, LONG.beside):
-            some = slice(first, first + LONG.beside)
-            w = poles[some]
-            wide = reach + 3.0 * np.abs(w[0].real)
-            near = self.poles[(self.poles.imag > w[0].imag - wide) & (self.poles.imag < w[-1].imag + wide)]
+        for first in range(0, poles.size, LONG.half_window):
+            block = slice(first, first + LONG.half_window)
+            candidates = poles[block]
+            wider = reach + 3.0 * np.abs(candidates[0].real)
+            near = self.poles[
+                (self.poles.imag > candidates[0].imag - wider) & (self.poles.imag < candidates[-1].imag + wider)
+            ]
             if near.size:
-                both = self._products(near, w)
+                products = self._products(near, candidates)
                 gram = self._products(near, near)
                 factor = cho_factor(gram + LONG.ridge * np.diag(np.diag(gram)))
-                shared = (both.conj() * cho_solve(factor, both)).sum(axis=0).real
-                apart[some] = 1.0 - shared / np.diag(self._products(w[:1], w[:1])).real
-        return apart
+                shared = (products.conj() * cho_solve(factor, products)).sum(axis=0).real
+                share[block] = 1.0 - shared / np.diag(self._products(candidates[:1], candidates[:1])).real
+        return share
 
     def _products(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Σ_t (e^{a t})* e^{b t} over the longest record, (a.size, b.size)."""
@@ -294,31 +311,31 @@ class _Search:
         return np.where(small, self.longest, np.expm1(rate * self.longest) / np.where(small, 1.0, np.expm1(rate)))
 
     def _overlap(self, poles: np.ndarray, pole: complex) -> np.ndarray:
-        """Shares of energy in common; none is narrower than the resolution of the record."""
+        """Share of energy that a pole has in common with each of `poles`, at the resolution of the record."""
         a, b = np.abs(poles.real) + 1.0 / self.span, abs(pole.real) + 1.0 / self.span
         return np.asarray(4.0 * a * b / ((a + b) ** 2 + (poles.imag - pole.imag) ** 2))
 
     def _gain(self, r: int, near: np.ndarray) -> float:
-        """χ² of mode r, the poles near it fitted anew without it.
+        """χ² of mode r, with the poles near it refitted without it.
 
-        Along the shapes of these modes alone: no other combination of the outputs depends on them.
+        Computed in the span of the shapes of these modes: other combinations of the outputs do not contain them.
         """
         shapes = np.hstack(np.split(self._shapes[:, near], len(self.fits)))
         directions = np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0]
-        seen, channels = [], self.records[0].output_channels[: directions.shape[1]]
+        projected, channels = [], self.records[0].output_channels[: directions.shape[1]]
         for record, fit, weights in zip(self.records, self.fits, self.weights, strict=True):
-            left = (fit.residual * weights) @ directions
+            residual = (fit.residual * weights) @ directions
             a = directions.T @ (fit.complex_amplitudes[:, near] * weights[:, None])
             own = (a @ np.exp(np.outer(self.poles[near], self.dt * np.arange(record.n_samples)))).real
-            seen.append(replace(record, outputs=left.T + own, output_channels=channels))
-        alone = np.ones((len(seen), directions.shape[1]))
-        _, with_it, *_ = search(seen, self.poles[near], alone, False, SELECTION.few_steps)
-        _, without, *_ = search(seen, self.poles[near[near != r]], alone, False, SELECTION.few_steps)
+            projected.append(replace(record, outputs=residual.T + own, output_channels=channels))
+        alone = np.ones((len(projected), directions.shape[1]))
+        _, with_it, *_ = search(projected, self.poles[near], alone, False, SELECTION.few_steps)
+        _, without, *_ = search(projected, self.poles[near[near != r]], alone, False, SELECTION.few_steps)
         return float(sum((a.residual**2).sum() - (b.residual**2).sum() for a, b in zip(without, with_it, strict=True)))
 
 
 def _nothing(record: Record) -> Projection:
-    """A record of which nothing but its constants is explained."""
+    """The projection of a record on constants alone."""
     level, none = record.outputs.mean(axis=1), np.zeros((0, 0))
     power = ((record.outputs - level[:, None]) ** 2).sum(axis=1)
     return Projection(record, np.zeros(0, complex), power, 0.0, level[None], none, none, none, none)

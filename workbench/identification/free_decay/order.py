@@ -1,12 +1,14 @@
-"""Which modes a free decay holds, by stepwise selection.
+"""Model order selection for free decays: the modes of a record, by stepwise selection.
 
-What the modes so far leave of the record, r_j for output j, is compared with damped exponentials e^{λt} on a grid of λ:
+The residual r_j of output j, left by the modes of the current model, is correlated with damped exponentials e^{λt} on a
+grid of λ:
 
     χ²(λ) = Σ_j |Q^T r_j|² / s_j²,     Q an orthonormal basis of (I - Φ Φ^+) [Re e^{λt}, Im e^{λt}],
 
-which is chi-square with two degrees of freedom an output where only white noise s_j is left. The strongest enters, and
-`signal/searches` decides whether it stays. What is tried and rejected is reported as noise. The search ends when
-the strongest candidate is no stronger than the strongest of so many in noise.
+which has a chi-square distribution of two degrees of freedom per output where the residual is white noise of standard
+deviation s_j. The strongest candidate enters the model, and a likelihood ratio test (`signal/searches`) decides whether
+it stays. Rejected candidates are reported as noise. The search ends when the strongest candidate of the grid is no
+stronger than the strongest of so many in noise.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -48,34 +50,35 @@ from workbench.threads import one_blas_thread
 
 @dataclass(frozen=True)
 class OrderSettings:
-    """Constants of the selection of modes of a free decay, beside those of every selection (`searches.SELECTION`)."""
+    """Constants of the selection of modes of a free decay, in addition to those of `searches.SELECTION`."""
 
-    long: int = 100_000  # values in all from which modes are taken in many at a time
-    max_modes: int = 40  # unless the call says more: fits of more at once take minutes
-    whitened: int = 2  # times that coloured noise is learnt from the residual, and the modes from it in turn
-    # of the energy that is left, up to which modes no more selected in whitened records leave it if they stay, and are
-    # modes: those that were fitted to coloured noise take a part of it
+    long: int = 100_000  # total number of values above which many modes enter at a time
+    max_modes: int = 40  # unless given: a joint fit of more takes minutes
+    whitenings: int = 2  # alternations between noise spectrum and modes
+    # Modes that whitening removed are true, and stay, if they reduce the residual to this share of its energy or less;
+    # modes fitted to coloured noise reduce it by a part only.
     whitened_away: float = 0.1
-    # candidates below the limit one after the other, and candidates that split a mode, after which the search ends
+    # consecutive candidates below the threshold, and candidates that split a mode, after which the search ends
     most_weak: int = 2
     most_splits: int = 6
-    # times the frequency step of the transform, by which rates of decay go on that need no step finer than a quarter
-    # of theirs: what they leave after the shorter transform is e^-25
+    # Least ratio of a decay rate to the frequency step of its transform: the exponential has decayed to e^-25 at the
+    # end of the transform.
     coarser: float = 4.0
-    decided: float = 0.1  # χ² that a step promises, below which a fit that only decides has decided
-    least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be distinguished from them
+    decided: float = 0.1  # predicted decrease of χ² below which a fit is precise enough to decide on a mode
+    least_independent: float = 1e-7  # least share of a candidate outside the span of the model, to be distinguishable
     resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
-    # bandwidths that a mode selected in whitened records may move when refined in the records as measured
+    # bandwidths by which a mode selected in whitened records may move when refined in the records as measured
     lost: float = 5.0
-    most_left: float = 0.5  # share of a record beside modes that explain it
-    same: float = 0.05  # bandwidths that poles may move before it is asked anew whether they are two
+    most_residual: float = 0.5  # largest share of a record's energy in the residual of modes that explain it
+    same: float = 0.05  # bandwidths that two poles may move before the test for one nonlinear mode is repeated
 
 
 ORDER = OrderSettings()
-# Poles of two modes and of those beside them, and whether the two are two; of records as measured.
+# Results of the test for one nonlinear mode: the poles of two modes and their neighbours, and whether the two are two.
 Verdicts = list[tuple[Complexes, bool]]
-DECIDES: Mapping[str, Any] = {"most_steps": SELECTION.few_steps, "enough": ORDER.decided}
-FULLY: Mapping[str, Any] = {}
+# Options of `search` for fits that only decide on a mode, and for fits to convergence.
+TO_DECIDE: Mapping[str, Any] = {"most_steps": SELECTION.few_steps, "enough": ORDER.decided}
+TO_CONVERGENCE: Mapping[str, Any] = {}
 
 
 @former_arguments(most_modes="max_modes")
@@ -90,12 +93,12 @@ def identify(
 ) -> Identified:
     """The modes of a free decay, their number selected, each with its standard error.
 
-    Records of more than 100,000 values in all are searched many modes at a time, as in `long_records`.
+    In records of more than 100,000 values in all many modes enter at a time (`long_records`).
 
     Args:
         records: free decay in noise, of the same sensors at one rate; each output may hold a constant.
-        max_modes: where to stop at the latest; 40 unless given, and 400 in long records.
-        false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
+        max_modes: largest number of modes; 40 unless given, and 400 in long records.
+        false_alarm: probability that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
             limit.
         progress: called with the search under way and the share of the time that is spent.
@@ -107,21 +110,21 @@ def identify(
     check_count("max_modes", max_modes)
     records = of_same_sensors(records)
     budget = Budget(seconds, progress)
-    found = identify_within(records, budget, max_modes=max_modes, false_alarm=false_alarm)
-    found = found.without_artefacts(np.pi / records[0].sample_time)
-    begun = tuple(remark for record in records for remark in _begins_later(record))
-    by_amplitude = amplitude_dependence(records, found.refined, budget=budget)
-    said = tuple(remark for remark in found.remarks if not remark.startswith(STOPPED))
-    return replace(found, remarks=(*begun, *said, *budget.remarks, *by_amplitude.remarks))
+    result = identify_within(records, budget, max_modes=max_modes, false_alarm=false_alarm)
+    result = result.without_artefacts(np.pi / records[0].sample_time)
+    start_remarks = tuple(remark for record in records for remark in _starts_later(record))
+    by_amplitude = amplitude_dependence(records, result.refined, budget=budget)
+    other_remarks = tuple(remark for remark in result.remarks if not remark.startswith(STOPPED))
+    return replace(result, remarks=(*start_remarks, *other_remarks, *budget.remarks, *by_amplitude.remarks))
 
 
-def _begins_later(record: Record) -> tuple[str, ...]:
-    """A remark where samples before the free decay were taken for part of it."""
+def _starts_later(record: Record) -> tuple[str, ...]:
+    """A remark where the record has samples before its free decay."""
     start = decay_start(record)
     if start == record.start_time:
         return ()
     return (
-        f"record {record.name!r} is free decay from {start:.6g} s on only: what comes before would be read as modes;"
+        f"record {record.name!r} is free decay from {start:.6g} s on only: samples before it would be read as modes;"
         f" cut it, `record.between({start:.6g})`, or give it to `ring_down`",
     )
 
@@ -129,42 +132,44 @@ def _begins_later(record: Record) -> tuple[str, ...]:
 def identify_within(
     records: Sequence[Record], budget: Budget, *, max_modes: int | None = None, false_alarm: float = FALSE_ALARM
 ) -> Identified:
-    """`identify`, on a budget that others share, artefacts included."""
+    """`identify` within the time left of `budget`, artefacts included."""
     for record in records:
         check_data_quality(record)
     shortest = min(records, key=lambda record: record.n_samples)
-    fit_in = (shortest.n_samples - 4) // 3
-    if fit_in < 1:
+    most_possible = (shortest.n_samples - 4) // 3
+    if most_possible < 1:
         raise ValueError(f"record {shortest.name!r} has {shortest.n_samples} samples; a mode needs 7: measure longer")
     if sum(r.outputs.size for r in records) > ORDER.long:
-        most = min(max_modes or 10 * ORDER.max_modes, fit_in)
-        found = identify_long(records, max_modes=most, false_alarm=false_alarm, budget=budget)
-        return found if found is not None else _refuse(records)
-    most = min(max_modes or ORDER.max_modes, fit_in)
+        most = min(max_modes or 10 * ORDER.max_modes, most_possible)
+        result = identify_long(records, max_modes=most, false_alarm=false_alarm, budget=budget)
+        return result if result is not None else _refuse_noise(records)
+    most = min(max_modes or ORDER.max_modes, most_possible)
     search_time = budget.share(SELECTION.search_share)
     verdicts: Verdicts = []
-    problem, model = _selected(records, most, false_alarm, search_time, records, verdicts)
+    problem, model = _select(records, most, false_alarm, search_time, records, verdicts)
     explained = problem.explains(model)
-    for _ in range(ORDER.whitened):
-        # While modes are left the residual is no noise.
+    for _ in range(ORDER.whitenings):
+        # After an unfinished search the residual still holds modes.
         if search_time.unfinished or search_time.spent("whitening of the noise"):
             break
         white = whitened(records, problem.oscillating(model))
         if white is None:
             break
-        again, fewer = _selected(white, most, false_alarm, search_time, records, verdicts)
-        # What a mode that depends on amplitude or time leaves is no noise either, and whitens modes away.
+        other, fewer = _select(white, most, false_alarm, search_time, records, verdicts)
+        # The residual of a mode that depends on amplitude or time is not noise: whitening by it removes modes.
         if not fewer.poles.size and explained:
             break
-        all_modes = np.append(fewer.poles, model.poles[again.lost(model.poles, fewer.poles)])
-        if explained and _left(records, all_modes) < ORDER.whitened_away * _left(records, fewer.poles):
-            fewer = again.fitted(all_modes, fewer.weights)
-        problem, model = again, fewer
+        all_modes = np.append(fewer.poles, model.poles[other.lost(model.poles, fewer.poles)])
+        if explained and _residual_share(records, all_modes) < ORDER.whitened_away * _residual_share(
+            records, fewer.poles
+        ):
+            fewer = other.fitted(all_modes, fewer.weights)
+        problem, model = other, fewer
     problem.budget = budget
-    return problem.report(model, records) if model.poles.size else _refuse(records)
+    return problem.report(model, records) if model.poles.size else _refuse_noise(records)
 
 
-def _selected(
+def _select(
     records: Sequence[Record],
     max_modes: int,
     false_alarm: float,
@@ -172,6 +177,7 @@ def _selected(
     measured: Sequence[Record],
     verdicts: "Verdicts",
 ) -> tuple["_FreeDecay", "_Model"]:
+    """The problem and the selected model for records, whitened or as measured; `measured` are those as measured."""
     problem = _FreeDecay(records, false_alarm, measured, budget, verdicts)
     selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, False, budget, alone=True)
     model = selection.select(problem.nothing)
@@ -179,7 +185,7 @@ def _selected(
     return problem, model
 
 
-def _refuse(records: Sequence[Record]) -> NoReturn:
+def _refuse_noise(records: Sequence[Record]) -> NoReturn:
     raise ValueError(
         f"record {records[0].name!r} holds no mode that rises above its noise: is it a free decay? Cut it to the"
         " decay, measure longer or excite harder"
@@ -188,12 +194,12 @@ def _refuse(records: Sequence[Record]) -> NoReturn:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Modes so far.
+    """The modes of the current model and their fit.
 
     Attributes:
         poles: (n_modes,) rad/s.
-        weights: (n_records, n_outputs) 1 / noise.
-        fits: projections of the records on these.
+        weights: (n_records, n_outputs) 1 / standard deviation of the noise.
+        fits: projection of each record on the poles.
     """
 
     poles: np.ndarray
@@ -202,19 +208,28 @@ class _Model:
 
     @property
     def residuals(self) -> list[Floats]:
-        """One (n_samples, n_outputs) a record."""
+        """Residual (n_samples, n_outputs) of each record."""
         return [fit.residual for fit in self.fits]
 
     @cached_property
-    def left(self) -> Floats:
-        """Mean power of what is left of the outputs of the first record, in units of their noise, at its lines."""
+    def residual_power(self) -> Floats:
+        """Power spectrum of the residual of the first record, mean over the outputs in units of their noise."""
         lines = rfft(self.residuals[0] * self.weights[0], axis=0)[1:]
         power: Floats = (lines.real**2 + lines.imag**2).mean(axis=1)
         return power
 
 
 class _FreeDecay:
-    """The `searches.Selection` of free decays."""
+    """The `searches.Selection` of free decays: a candidate is a pole of the grid.
+
+    Attributes:
+        records: free decays, whitened or as measured.
+        measured: the same as measured, for the test of one nonlinear mode.
+        enter: χ² from which on a candidate is tried.
+        limit: gain from which on it stays, in white noise.
+        split_off: candidates rejected for splitting a mode, with their gain.
+        nothing: the model without modes.
+    """
 
     def __init__(
         self,
@@ -227,18 +242,18 @@ class _FreeDecay:
         longest = max(record.n_samples for record in records)
         self.records, self.measured, self.budget = records, measured, budget
         self.grids = [_Grid(record, longest) for record in records]
-        # Residuals of round-off say nothing of one sensor beside another.
+        # Residuals at round-off level do not show how noise differs between sensors.
         self.round_off = FIT.round_off * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
         self.round_off = np.maximum(self.round_off, [m.n_samples * steps(m) ** 2 / 12.0 for m in measured])
         cells = self.grids[0].n_cells
         signals = 2 * sum(r.n_outputs for r in records)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))
-        # A mode is two amplitudes a signal and its pole, chosen among all cells of the grid.
+        # A mode has two amplitudes per signal and a pole, chosen among all cells of the grid.
         self.limit = float(chi2.isf(false_alarm / cells, signals + 2))
-        # Of several records, where two are asked about they are not chosen any more.
-        self.two = self.limit if len(records) == 1 else float(chi2.isf(false_alarm, signals + 2))
+        # With several records the test for two modes needs no correction for the choice among all cells.
+        self.two_modes_threshold = self.limit if len(records) == 1 else float(chi2.isf(false_alarm, signals + 2))
         self.verdicts = [] if verdicts is None else verdicts
-        self.halves: list[tuple[complex, float]] = []
+        self.split_off: list[tuple[complex, float]] = []
         self.rejected: list[tuple[complex, float]] = []
         self.nothing = self.fitted(np.zeros(0, complex), np.ones((len(records), records[0].n_outputs)))
 
@@ -246,27 +261,29 @@ class _FreeDecay:
         return model.poles.size
 
     def strongest(self, model: _Model, rejected: list[tuple[complex, float]]) -> complex | None:
-        # of round-off every candidate would make something else
+        # In round-off any candidate may seem strongest.
         if (_squares(model.residuals) <= self.round_off).all():
             return None
         each = zip(self.grids, model.residuals, model.weights, strict=True)
-        strengths = np.sum([grid.strengths(left, weights, model.poles) for grid, left, weights in each], axis=0)
+        strengths = np.sum([grid.strengths(residual, weights, model.poles) for grid, residual, weights in each], axis=0)
         grid = self.grids[0]
         for pole, _ in rejected:
             strengths[:, grid.near(pole, 2.0)] = 0.0
         elsewhere = np.where(self._tried(model, rejected), 0.0, strengths)
-        found = self._risen(model, elsewhere)
-        return self._risen(model, strengths) if found is None else found
+        candidate = self._significant(model, elsewhere)
+        return self._significant(model, strengths) if candidate is None else candidate
 
-    def _risen(self, model: _Model, strengths: np.ndarray) -> complex | None:
-        """The strongest, if it rises above the noise."""
+    def _significant(self, model: _Model, strengths: np.ndarray) -> complex | None:
+        """The pole of the largest of `strengths` (n_rates, n_frequencies); None where noise explains it."""
         grid, best = self.grids[0], np.unravel_index(int(np.argmax(strengths)), strengths.shape)
         pole = complex(-grid.rates[best[0]], grid.omega[best[1]])
         return None if strengths[best] < self.enter * self._noise_ratio(model, pole) else pole
 
     def _tried(self, model: _Model, rejected: list[tuple[complex, float]]) -> np.ndarray:
-        """Which candidates overlap with a mode that a rejected one overlaps with too, (n_rates, n_frequencies): what
-        splits a mode from one side does so from the other, and waits until no other mode is left."""
+        """Which candidates overlap with a mode that a rejected candidate overlaps with too, (n_rates, n_frequencies).
+
+        A candidate that splits a mode on one side would split it on the other side too; it is tried last.
+        """
         grid = self.grids[0]
         tried = np.zeros((grid.rates.size, grid.omega.size), bool)
         for mode in model.poles:
@@ -279,77 +296,81 @@ class _FreeDecay:
         return candidate
 
     def extended(self, model: _Model, candidate: complex) -> _Model:
-        return self.fitted(np.append(model.poles, candidate), model.weights, DECIDES)
+        return self.fitted(np.append(model.poles, candidate), model.weights, TO_DECIDE)
 
     def gain(self, smaller: _Model, larger: _Model) -> float:
-        """Noise unknown: Σ_ij N_i log(s²_smaller / s²_larger), records i, sensors j."""
+        """Twice the log-likelihood ratio, noise unknown: Σ_ij N_i log(s²_smaller / s²_larger), records i, sensors j."""
         n = np.array([residual.shape[0] for residual in larger.residuals])
-        first, second = (_squares(model.residuals) + self.round_off for model in (smaller, larger))
-        apart = differ(second, n)
-        return float((n @ np.log(variances(first, n, apart) / variances(second, n, apart))).sum())
+        before, after = (_squares(model.residuals) + self.round_off for model in (smaller, larger))
+        differing = differ(after, n)
+        return float((n @ np.log(variances(before, n, differing) / variances(after, n, differing))).sum())
 
     def threshold(self, model: _Model, pole: complex) -> float:
         return self.limit * self._noise_ratio(model, pole)
 
     def splits(self, model: _Model, trial: _Model) -> bool:
-        # One that splits another already, on its way or to be left out, is not the new one's fault; nor is one that
-        # stays where it is, away from the new one, and only now is found to split another.
+        # The new mode is not to blame for modes that were spurious before, nor for those that become spurious without
+        # moving and without overlapping with it.
         before, after = (self._spurious(each, model) for each in (model, trial))
         old, new, width = trial.poles[:-1], trial.poles[-1], self.grids[0].bin_width
         band = np.abs(old.real) + width
-        stays = np.abs(old - model.poles) < band
-        away = np.abs(old.imag - new.imag) > band + abs(new.real)
-        after[:-1] &= before | ~(stays & away)
+        unmoved = np.abs(old - model.poles) < band
+        separate = np.abs(old.imag - new.imag) > band + abs(new.real)
+        after[:-1] &= before | ~(unmoved & separate)
         splits = bool(after.sum() > before.sum())
         if splits:
-            self.halves.append((complex(new), self.gain(model, trial)))
+            self.split_off.append((complex(new), self.gain(model, trial)))
         return splits
 
     def settled(self, model: _Model) -> _Model:
         return self.fitted(self._reconsidered(model).poles, model.weights)
 
     def _reconsidered(self, model: _Model) -> _Model:
-        """With what seemed to split a mode while others were missing, each judged beside all the others of its kind."""
+        """The model with candidates rejected for splitting a mode, if they are not spurious now.
+
+        A candidate may seem to split a mode only because other modes are missing from the model. The strongest
+        candidate of each mode is tried again, all of them together.
+        """
         taken: list[int] = []
-        found: list[complex] = []
-        for pole, _ in sorted(self.halves, key=lambda half: -half[1]):
-            splits = int(np.argmin(np.abs(model.poles.imag - pole.imag)))
-            if splits not in taken:
-                taken, found = [*taken, splits], [*found, pole]
-        self.halves.clear()
+        candidates: list[complex] = []
+        for pole, _ in sorted(self.split_off, key=lambda candidate: -candidate[1]):
+            nearest = int(np.argmin(np.abs(model.poles.imag - pole.imag)))
+            if nearest not in taken:
+                taken, candidates = [*taken, nearest], [*candidates, pole]
+        self.split_off.clear()
         n, trial = model.poles.size, model
         with suppress(np.linalg.LinAlgError):
             spurious = np.zeros(0, bool)
-            trial = self.fitted(np.append(model.poles, found), model.weights, DECIDES)
+            trial = self.fitted(np.append(model.poles, candidates), model.weights, TO_DECIDE)
             while trial.poles.size > n and (spurious := self._spurious(trial, trial)).any():
-                trial = self.fitted(trial.poles[~spurious], trial.weights, DECIDES)
+                trial = self.fitted(trial.poles[~spurious], trial.weights, TO_DECIDE)
         return trial if trial.poles.size > n else model
 
     def suspects(self, model: _Model) -> Iterator[tuple[complex, _Model, bool]]:
-        """The weakest that is spurious, or else the modes whose amplitudes are weak or that stand close to another."""
+        """Modes to leave out on trial: the weakest spurious one, or else those that are weak or close to another."""
         statistic, spurious = self.statistic(model), self._spurious(model, model)
         if spurious.any():
             r = int(np.argmin(np.where(spurious, statistic, np.inf)))
             yield complex(model.poles[r]), self._without(model, r), True
             return
         for r, (pole, strength) in enumerate(zip(model.poles, statistic, strict=True)):
-            near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf)
-            if strength < SELECTION.weak * self.threshold(model, pole) or near < SELECTION.close * abs(pole.real):
+            distance = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf)
+            if strength < SELECTION.weak * self.threshold(model, pole) or distance < SELECTION.close * abs(pole.real):
                 yield complex(pole), self._without(model, r), False
 
     def explains(self, model: _Model) -> bool:
-        """Whether the modes are most of every record."""
+        """Whether the modes explain most of the energy of every record."""
         left = _squares(model.residuals).sum(axis=1)
-        return bool((left < ORDER.most_left * _squares([grid.nothing for grid in self.grids]).sum(axis=1)).all())
+        return bool((left < ORDER.most_residual * _squares([grid.centred for grid in self.grids]).sum(axis=1)).all())
 
     def oscillating(self, model: _Model) -> Complexes:
-        """The poles that oscillate within a record and hardly grow; others may be noise that is not white."""
+        """The poles that oscillate within a record and do not grow, rad/s; others may be coloured noise."""
         poles: Complexes = model.poles
         span = max(record.n_samples * record.sample_time for record in self.records)
         return poles[(poles.real * span < SELECTION.most_growth) & (np.abs(poles) * span > 2.0 * np.pi)]
 
     def statistic(self, model: _Model) -> np.ndarray:
-        """χ² of each mode's amplitudes, poles held, (n_modes,)."""
+        """χ² of the amplitudes of each mode at fixed poles, (n_modes,)."""
         n, strength = model.poles.size, np.zeros(model.poles.size)
         for fit, weights in zip(model.fits, model.weights, strict=True):
             for r in range(n):
@@ -359,9 +380,9 @@ class _FreeDecay:
         return strength
 
     def report(self, model: _Model, records: Sequence[Record]) -> Identified:
-        """The modes refined in the records as measured: filters cost the first samples, the strongest."""
+        """The modes refined in the records as measured: whitening filters lose the first samples, the strongest."""
         poles = model.poles
-        if self.budget.unfinished:  # perhaps before each mode was checked
+        if self.budget.unfinished:  # perhaps before all modes were tested
             spurious = self._spurious(model, model)
             poles = poles[~spurious] if not spurious.all() else poles
             self.rejected += [(complex(pole), 0.0) for pole in model.poles if pole not in poles]
@@ -370,22 +391,22 @@ class _FreeDecay:
             poles = poles[~lost]
             refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
         statistic = self.statistic(replace(model, poles=poles, fits=self._projected(poles)))[np.argsort(np.abs(poles))]
-        found = identified(in_coloured_noise(refined, records), statistic, self.limit, self.rejected, records[0])
-        return replace(found, remarks=self.budget.remarks)
+        result = identified(in_coloured_noise(refined, records), statistic, self.limit, self.rejected, records[0])
+        return replace(result, remarks=self.budget.remarks)
 
     def _lost(self, poles: np.ndarray, refined: np.ndarray) -> np.ndarray:
-        """Which modes are no more where they were selected: what else is in a record than modes has drawn them off,
-        or damps them too much to ring."""
-        away = np.abs(np.subtract.outer(poles, refined))
-        return np.asarray(overdamped(refined)[away.argmin(axis=1)] | self.lost(poles, refined))
+        """Which modes moved away or became overdamped in the refinement, fitted to a part of the record that is no
+        mode, (n_modes,)."""
+        distance = np.abs(np.subtract.outer(poles, refined))
+        return np.asarray(overdamped(refined)[distance.argmin(axis=1)] | self.lost(poles, refined))
 
-    def lost(self, poles: np.ndarray, found: np.ndarray) -> np.ndarray:
-        """Which poles have none of those found within a few of their bandwidths."""
-        away = np.abs(np.subtract.outer(poles, found)).min(axis=1, initial=np.inf)
-        return np.asarray(away > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width))
+    def lost(self, poles: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """Which poles have none of the others within a few of their bandwidths, (n_poles,)."""
+        distance = np.abs(np.subtract.outer(poles, others)).min(axis=1, initial=np.inf)
+        return np.asarray(distance > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width))
 
-    def fitted(self, poles: np.ndarray, weights: np.ndarray, how: Mapping[str, Any] = FULLY) -> _Model:
-        """Poles after a search, sensors then weighted by the noise found in each record."""
+    def fitted(self, poles: np.ndarray, weights: np.ndarray, how: Mapping[str, Any] = TO_CONVERGENCE) -> _Model:
+        """The model of refined poles, weighted by the noise of each sensor in each record; `how` as of `search`."""
         if poles.size == 0:
             fits = self._projected(poles)
         else:
@@ -397,14 +418,15 @@ class _FreeDecay:
         return [project(record, poles, True) for record in self.records]
 
     def _without(self, model: _Model, r: int) -> _Model:
-        return self.fitted(np.delete(model.poles, r), model.weights, DECIDES)
+        return self.fitted(np.delete(model.poles, r), model.weights, TO_DECIDE)
 
-    def _spurious(self, of: _Model, model: _Model) -> np.ndarray:
-        """Which modes of one model are spurious, in the noise that another leaves."""
-        poles = of.poles
-        shapes = np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(of.fits, model.weights, strict=True)])
+    def _spurious(self, tested: _Model, model: _Model) -> np.ndarray:
+        """Which modes of a tested model are spurious, (n_modes,), in the noise of another model."""
+        poles = tested.poles
+        each = zip(tested.fits, model.weights, strict=True)
+        shapes = np.vstack([f.complex_amplitudes * w[:, None] for f, w in each])
         strength = np.linalg.norm(shapes, axis=0)
-        if self.records[0].n_outputs == 1:  # the modes of one sensor have no shape, in however many records
+        if self.records[0].n_outputs == 1:  # one sensor shows no shape, however many records there are
             shapes = strength[None]
 
         def distinct(r: int, s: int) -> bool:
@@ -413,38 +435,41 @@ class _FreeDecay:
         return spurious_modes(poles, shapes, strength, self.grids[0].bin_width, distinct)
 
     def _distinct(self, model: _Model, poles: np.ndarray, r: int, s: int) -> bool:
-        """Whether one sensor that sees a beat of modes r and s is likelier to see both than a single nonlinear mode.
+        """Whether a single sensor shows two linear modes r and s, rather than one nonlinear mode.
 
-        In the records as measured: a filter that whitens the residual of one mode removes most of its statistic.
+        The records as measured decide: whitening by the residual of one mode removes most of the evidence.
         """
         width = self.grids[0].bin_width
         pair, others = poles[[r, s]], np.delete(poles, [r, s])
         middle, half = band_about(pair, width)
-        asked = np.r_[pair, np.sort_complex(others[np.abs(others.imag - middle) < half])]
+        group = np.r_[pair, np.sort_complex(others[np.abs(others.imag - middle) < half])]
         for known, verdict in self.verdicts:
-            if known.size == asked.size and (np.abs(known - asked) < ORDER.same * (np.abs(asked.real) + width)).all():
+            if known.size == group.size and (np.abs(known - group) < ORDER.same * (np.abs(group.real) + width)).all():
                 return verdict
         verdict = False
         with suppress(np.linalg.LinAlgError):
-            verdict = are_two(self.measured, poles, r, s, self.two)
-        self.verdicts.append((asked, verdict))
+            verdict = are_two(self.measured, poles, r, s, self.two_modes_threshold)
+        self.verdicts.append((group, verdict))
         return verdict
 
     def _noise_ratio(self, model: _Model, pole: complex) -> float:
-        """Noise about a frequency over its mean, where it is larger: median of the residual's spectrum, 1 if white."""
+        """Noise about a frequency over its mean, 1 or more: by the median of the residual's spectrum there."""
         grid = self.grids[0]
-        left = model.left
+        power = model.residual_power
         at = round((pole.imag - grid.lowest) / grid.bin_width)
-        beside = left[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
-        return max(1.0, float(np.median(beside)) / float(left.mean())) if beside.size else 1.0
+        nearby = power[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
+        return max(1.0, float(np.median(nearby)) / float(power.mean())) if nearby.size else 1.0
 
 
 class _Grid:
-    """Damped exponentials e^{λt} to compare a residual with, by rate of decay and frequency."""
+    """A grid of damped exponentials e^{λt} by decay rate and frequency, rad/s, with which residuals are correlated.
+
+    The transform of each decay rate is as short as the exponential allows, so that its frequencies are a subset.
+    """
 
     def __init__(self, record: Record, n: int) -> None:
         self.record, dt = record, record.sample_time
-        self.nothing = (record.outputs - record.outputs.mean(axis=1, keepdims=True)).T
+        self.centred = (record.outputs - record.outputs.mean(axis=1, keepdims=True)).T
         self.size = 1 << int(np.ceil(np.log2(2 * n)))
         omega = 2.0 * np.pi * np.fft.rfftfreq(self.size, dt)
         span = n * dt
@@ -458,65 +483,71 @@ class _Grid:
         self.n_cells = sum(int((rate < SELECTION.most_damped * self.omega).sum()) for rate in self.rates)
         step = 2.0 * np.pi / (self.size * dt)
         self.strides = [1 << int(np.log2(max(rate / (ORDER.coarser * step), 1.0))) for rate in self.rates]
-        # Of each rate: its frequencies among all, and where its transform has them.
+        # For each rate: the indices of its frequencies in `omega`, and in its own transform.
         self.cells = [np.flatnonzero(columns % stride == 0) for stride in self.strides]
         self.columns = [columns[at] // stride for at, stride in zip(self.cells, self.strides, strict=True)]
         self._sums: dict[int, list[tuple[Floats, float, Complexes, Complexes, Complexes]]] = {}
 
     def _of_length(self, n: int) -> list[tuple[Floats, float, Complexes, Complexes, Complexes]]:
-        """Of n samples and each rate: its decay, Σ|w|^2t, and w, Σ w*^2t and w^n at its frequencies."""
+        """For each rate, over n samples: its decay, Σ|w|^2t, and w = e^{λΔt}, Σ w*^2t and w^n at its frequencies."""
         if n not in self._sums:
-            dt, found = self.record.sample_time, []
-            once, end = np.exp(1j * dt * self.omega), np.exp(1j * n * dt * self.omega)
+            dt, tables = self.record.sample_time, []
+            step, last = np.exp(1j * dt * self.omega), np.exp(1j * n * dt * self.omega)
             for rate, cells, stride in zip(self.rates, self.cells, self.strides, strict=True):
                 decay = np.exp(-rate * dt * np.arange(min(n, self.size // stride)))
-                w, ends = np.exp(-rate * dt) * once[cells], np.exp(-rate * dt * n) * end[cells]
+                w, ends = np.exp(-rate * dt) * step[cells], np.exp(-rate * dt * n) * last[cells]
                 double = (1.0 - ends.conj() ** 2) / (1.0 - w.conj() ** 2)
-                found.append((decay, float(decay @ decay), w, double, ends))
-            self._sums[n] = found
+                tables.append((decay, float(decay @ decay), w, double, ends))
+            self._sums[n] = tables
         return self._sums[n]
 
     def near(self, pole: complex, bins: float) -> np.ndarray:
-        """Frequencies within so many bins, or half as many rates of decay, of a pole's."""
+        """Which frequencies lie within so many bins, or half as many decay rates, of a pole."""
         return np.asarray(np.abs(self.omega - pole.imag) < bins * max(self.bin_width, 0.5 * abs(pole.real)))
 
     def strengths(self, residual: np.ndarray, weights: np.ndarray, poles: np.ndarray) -> np.ndarray:
-        """χ² of each, (n_rates, n_frequencies); 0 where it cannot be distinguished from the modes so far."""
+        """χ² of each candidate, (n_rates, n_frequencies); 0 where the modes of the model are indistinguishable from it.
+
+        Args:
+            residual: (n_samples, n_outputs).
+            weights: (n_outputs,) 1 / noise.
+            poles: of the model, rad/s.
+        """
         dt, n = self.record.sample_time, residual.shape[0]
         weighted = residual * weights
-        found = np.zeros((self.rates.size, self.omega.size))
+        chi_square = np.zeros((self.rates.size, self.omega.size))
         modes = _Span(np.exp(poles * dt), n)
-        for k, (decay, whole, w, double, ends) in enumerate(self._of_length(n)):
+        for k, (decay, energy, w, double, ends) in enumerate(self._of_length(n)):
             rate, cells = self.rates[k], self.cells[k]
             allowed = rate < SELECTION.most_damped * self.omega[cells]
             decayed = weighted[: decay.size] * decay[:, None]
             spectrum = np.fft.rfft(decayed, self.size // self.strides[k], axis=0)[self.columns[k]]
-            own = (np.abs(spectrum) ** 2).sum(axis=1)
-            turned = (spectrum.conj() ** 2).sum(axis=1)
-            p, q = np.full(own.shape, whole), double.copy()
-            at = self._beside(poles, k) & allowed
+            power = (np.abs(spectrum) ** 2).sum(axis=1)
+            conjugate_power = (spectrum.conj() ** 2).sum(axis=1)
+            p, q = np.full(power.shape, energy), double.copy()
+            at = self._overlapping(poles, k) & allowed
             if at.any():
                 dp, dq = modes.shared(w[at], ends[at])
                 p[at] -= dp
                 q[at] -= dq
             det = p**2 - np.abs(q) ** 2
-            good = allowed & (det > ORDER.least_independent * whole**2) & (p > 0)
-            top = 2.0 * p * own - 2.0 * (q * turned).real
-            found[k, cells] = np.where(good, top / np.where(good, det, 1.0), 0.0)
-        return found
+            good = allowed & (det > ORDER.least_independent * energy**2) & (p > 0)
+            top = 2.0 * p * power - 2.0 * (q * conjugate_power).real
+            chi_square[k, cells] = np.where(good, top / np.where(good, det, 1.0), 0.0)
+        return chi_square
 
-    def _beside(self, poles: np.ndarray, k: int) -> np.ndarray:
-        """Which frequencies of a rate overlap with a mode so far."""
+    def _overlapping(self, poles: np.ndarray, k: int) -> np.ndarray:
+        """Which frequencies of rate k overlap with a mode of the model."""
         omega = self.omega[self.cells[k]]
-        near = np.zeros(omega.size, bool)
+        overlaps = np.zeros(omega.size, bool)
         for pole in poles:
             reach = 3.0 * (2.0 * self.bin_width + abs(pole.real) + self.rates[k])
-            near[slice(*np.searchsorted(omega, [pole.imag - reach, pole.imag + reach]))] = True
-        return near
+            overlaps[slice(*np.searchsorted(omega, [pole.imag - reach, pole.imag + reach]))] = True
+        return overlaps
 
 
 class _Span:
-    """The span of Re z^t and Im z^t over n samples, z of the modes so far."""
+    """The span of Re z^t and Im z^t over n samples, z = e^{λΔt} of the modes of the model."""
 
     def __init__(self, z: np.ndarray, n: int) -> None:
         self.n, self.both = n, np.r_[z, z.conj()]
@@ -548,12 +579,12 @@ def _geometric(a: np.ndarray, b: np.ndarray, n: int, end: np.ndarray) -> np.ndar
     return np.asarray(sums)
 
 
-def _left(records: Sequence[Record], poles: np.ndarray) -> float:
-    """Mean share of the energy of an output that modes leave."""
+def _residual_share(records: Sequence[Record], poles: np.ndarray) -> float:
+    """Share of an output's energy in the residual of modes, mean over outputs and records."""
     each = ((r.outputs.var(axis=1), project(r, poles, True).residual.var(axis=0)) for r in records)
     return float(np.mean([left / np.maximum(whole, 1e-300) for whole, left in each]))
 
 
 def _squares(residuals: Sequence[np.ndarray]) -> np.ndarray:
-    """Sums of those of each output in each record, (n_records, n_outputs)."""
+    """Sum of squares of the residual of each output in each record, (n_records, n_outputs)."""
     return np.array([(left**2).sum(axis=0) for left in residuals])

@@ -1,10 +1,11 @@
-"""What a record is before its modes are sought: cut to its free decay, slow drift removed.
+"""Preparation of a record for identification: start of the free decay, repair of spikes, removal of drift.
 
-Free decay, read backwards, follows from itself: y(t) = Σ_k c_k y(t + kΔt), the same c_k for every output, for any
-modes with constants and drifts besides. The c_k are learned from the end of the record on, by recursive least squares
-with a short memory, and each few samples are predicted from those after them. A force breaks the rule: the
-prediction error rises above its level in the samples after. The same is done at a quarter, a sixteenth, ... of the
-sample rate, behind a low-pass filter that leaves free decay one, for what is too slow to be seen from sample to sample.
+A free decay satisfies a backward linear prediction y(t) = Σ_k c_k y(t + kΔt), with the same c_k for every output, for
+any modes with constants and drifts. The c_k are estimated from the end of the record backwards, by recursive least
+squares with a short memory, and every few samples are predicted from those after them. Where a force acts the
+prediction error rises above its level in the samples after. The test is repeated at a quarter, a sixteenth, ... of the
+sample rate, behind a low-pass filter (a filtered free decay is a free decay), for changes that are slow against the
+sample time.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,37 +25,37 @@ from workbench.structure.modes import frozen
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Constants of the search for the start of a decay, and for what settles in it."""
+    """Constants of the detection of a decay's start, of spikes, and of exponential settling."""
 
-    order: int = 32  # samples that predict the one before
-    block: int = 4  # samples of an update
-    memory: int = 4  # orders: of the rule
-    level_memory: int = 2  # orders: of the level of its errors
-    most_signals: int = 8  # combinations of outputs that the rule is learnt from
-    most_samples: int = 40_000  # of them, at one rate: of longer records the rate is lower
-    most_sensors: int = 256  # whose combinations are sought, evenly among all: of more they take minutes
-    coarser: int = 4  # from one rate to the next
-    # squared prediction error over its level that is a break: alone, or where the energy of the motion also rises so
-    # many times, or within so many samples of another break, for a force that dies away
+    order: int = 32  # of the backward predictor
+    block: int = 4  # samples per update of the predictor
+    memory: int = 4  # of the predictor's coefficients, in orders
+    level_memory: int = 2  # of the level of its errors, in orders
+    most_signals: int = 8  # combinations of outputs that the predictor is estimated from
+    most_samples: int = 40_000  # per rate; longer records are tested at lower rates only
+    most_sensors: int = 256  # that are combined, evenly spaced among all: more take minutes
+    coarser: int = 4  # ratio of one rate to the next
+    # Squared prediction error over its level that is a break: alone; where the energy of the motion also rises by the
+    # factor `rise`; or, `lesser`, within `near` samples of another break, for a force that dies away.
     alone: float = 100.0
     rising: float = 25.0
     rise: float = 4.0
-    beside: float = 16.0
+    lesser: float = 16.0
     near: int = 8
-    rates: int = 8  # of exponential settling that are tried at once
-    rounds: int = 4  # of them, each about the best of the one before
-    fastest: float = 0.1  # of these, times a sample
-    least_left: float = 0.01  # of the record's energy, that must follow a break for the decay to begin there
-    most_spikes: int = 10  # lone samples that are replaced
-    neighbours: int = 8  # on either side, from which they are
-    about: int = 200  # samples on either side, from which is learnt how
-    leaps: float = 6.0  # times the error of that, of a lone sample that is wrong
+    rates: int = 8  # of exponential settling in one round of the search
+    rounds: int = 4  # of that search, each about the best rate of the one before
+    fastest: float = 0.1  # highest rate of settling, per sample
+    least_energy: float = 0.01  # share of the record's energy after a break from which on the decay begins there
+    most_spikes: int = 10  # single samples that are replaced
+    neighbours: int = 8  # on either side, from which a spike is interpolated
+    about: int = 200  # samples on either side, from which the interpolation is estimated
+    leaps: float = 6.0  # interpolation error of a spike, in standard deviations
 
 
 START = StartSettings()
-HIGHEST_DEGREE = 8  # of a drift: more oscillates as modes do
-PART = 65_536  # samples that it is fitted to at once
-# Fewer means are too few to learn the rule and to test it.
+HIGHEST_DEGREE = 8  # of a drift; polynomials of higher degree oscillate like modes
+PART = 65_536  # samples of a part of a record in the fit of drifts
+# Least number of samples to estimate the predictor and to test it.
 SHORTEST = (4 + START.level_memory) * START.order
 UPPER = np.triu(np.ones((START.order + 1, START.order + 1)))
 
@@ -62,20 +63,20 @@ UPPER = np.triu(np.ones((START.order + 1, START.order + 1)))
 def decay_start(record: Record) -> float:
     """The time from which a record is free decay, s, from its outputs alone.
 
-    The first sample after the last break of the rule above that a hundredth of the motion's energy follows: an impact,
-    a release, a second impact. At 40 dB it is found to half the shortest period; at 30 dB a soft release may go
-    undetected by sensors of displacement. A record that is free decay throughout, or shorter than two
-    hundred samples, begins with its first sample.
+    It is the first sample after the last break of the backward prediction (an impact, a release, a second impact) after
+    which at least a hundredth of the motion's energy follows. At a signal-to-noise ratio of 40 dB it is found to within
+    half the shortest period; at 30 dB a soft release may go undetected by displacement sensors. A record that is free
+    decay throughout, or shorter than two hundred samples, begins with its first sample.
 
     Args:
-        record: outputs that decay to rest at the end; what came before may be anything.
+        record: outputs that decay to rest at the end, after any motion.
     """
     signals, rounding = _scaled(record)
     n = record.n_samples
     if not signals.any():
         return float(record.start_time)
-    left = np.cumsum(np.einsum("jt,jt->t", signals, signals)[::-1])[::-1]
-    matters = left >= START.least_left * left[0]
+    energy_after = np.cumsum(np.einsum("jt,jt->t", signals, signals)[::-1])[::-1]
+    matters = energy_after >= START.least_energy * energy_after[0]
     starts = np.zeros(0, int)
     step = 1
     while n > START.most_samples * step:
@@ -83,7 +84,7 @@ def decay_start(record: Record) -> float:
     while n // step >= SHORTEST:
         window = blackman(6 * step, sym=False) if step > 1 else np.ones(1)
         window /= window.sum()
-        # Means end with the last sample; zeros before the first put them where every `step`th is.
+        # Weighted means end with the last sample; zero padding before the first aligns them to every `step`th sample.
         count = (n - window.size) // step + 1
         before = -(n - 1) % step
         means = upfirdn(window, np.pad(signals, ((0, 0), (before, 0))), down=step, axis=1)
@@ -92,7 +93,7 @@ def decay_start(record: Record) -> float:
         ratio, breaks = _breaks(means, rounding * (window**2).sum())
         broken = first + step * np.flatnonzero(_dying_away(ratio, breaks) if step == 1 else breaks)
         broken = broken[matters[broken]]
-        # A break known already from more samples is seen by every window that holds it.
+        # A break found at a higher rate shows in every window that contains it.
         known = ((starts >= broken[:, None]) & (starts <= broken[:, None] + 2 * window.size)).any(axis=1)
         starts = np.r_[starts, broken[~known] + window.size // 2 + 1]
         step *= START.coarser
@@ -100,32 +101,33 @@ def decay_start(record: Record) -> float:
 
 
 def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
-    """A record whose free decay goes on about lone samples that are wrong, when it begins in s, and remarks.
+    """A record without single wrong samples in its free decay, the start of the decay in s, and remarks.
 
-    A sample that ends the search for the start is replaced by what its neighbours on both sides say, y_t = Σ_k c_k
-    (y_{t-k} + y_{t+k}), where the decay then begins earlier: a blow, too, leaves another motion than was before.
+    The last break of the decay may be a spike. It is replaced by interpolation between its neighbours on both sides,
+    y_t = Σ_k c_k (y_{t-k} + y_{t+k}), if the decay then begins earlier. After an impact it does not, because an impact
+    changes the motion.
     """
     start, remarks = decay_start(record), []
     for _ in range(START.most_spikes):
         at = round((start - record.start_time) / record.sample_time) - 1
         repaired = record.outputs.copy()
-        wrong = [j for j, row in enumerate(repaired) if _repair(row, at)]
-        if not wrong:
+        spiked = [j for j, row in enumerate(repaired) if _repair(row, at)]
+        if not spiked:
             break
-        other = replace(record, outputs=repaired)
-        earlier = decay_start(other)
+        repaired_record = replace(record, outputs=repaired)
+        earlier = decay_start(repaired_record)
         if earlier > start - START.order * record.sample_time:
             break
-        names = ", ".join(repr(record.output_names[j]) for j in wrong)
+        names = ", ".join(repr(record.output_names[j]) for j in spiked)
         remarks.append(
-            f"output {names} leaps at {record.time[at]:.6g} s for one sample, replaced by what its neighbours say"
+            f"output {names} has a spike of one sample at {record.time[at]:.6g} s, replaced by interpolation"
         )
-        record, start = other, earlier
+        record, start = repaired_record, earlier
     return record, start, tuple(remarks)
 
 
 def _repair(row: np.ndarray, at: int) -> bool:
-    """Replace a sample that its neighbours do not expect, in place; whether it was."""
+    """Whether a sample is a spike; if so it is replaced in place by interpolation between its neighbours."""
     k, near = START.neighbours, START.about
     if at < START.order or at + START.order >= row.size:
         return False
@@ -142,11 +144,11 @@ def _repair(row: np.ndarray, at: int) -> bool:
 
 
 def _scaled(record: Record) -> tuple[np.ndarray, float]:
-    """Strongest combinations of the outputs about where they end, (n_signals, n_samples), and the variance that
-    rounding to the sensors' steps leaves in them."""
+    """Strongest combinations of the outputs relative to their final values, (n_signals, n_samples), and the variance
+    of their quantisation noise."""
     outputs = record.outputs[:: -(-record.n_outputs // START.most_sensors)]
     end = np.median(outputs[:, -max(record.n_samples // 10, 1) :], axis=1, keepdims=True)
-    # Differences weigh sensors by how they move, not by how they drift.
+    # Differences scale sensors by their motion rather than by their drift.
     size = np.array([np.linalg.norm(np.diff(row)) for row in outputs]) / np.sqrt(max(record.n_samples - 1, 1))
     moving = size > 0
     if not moving.any():
@@ -161,7 +163,12 @@ def _scaled(record: Record) -> tuple[np.ndarray, float]:
 
 
 def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
-    """Squared prediction error over its level (n_samples,), and which samples break the rule."""
+    """Squared backward prediction error over its level, (n_samples,), and which samples are breaks, (n_samples,).
+
+    Args:
+        y: (n_signals, n_samples).
+        rounding: variance of quantisation noise.
+    """
     m, n = y.shape
     order, block = START.order, START.block
     forget, forget_level = (np.exp(-block / (k * order)) for k in (START.memory, START.level_memory))
@@ -174,7 +181,7 @@ def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
         after = y[:, at[:, None] + np.arange(1, order + 1)].reshape(-1, order)
         here = y[:, at].reshape(-1)
         if n - t >= 3 * order:
-            # Rounding enters as a ridge, and as the least level.
+            # Quantisation noise enters as a ridge, and as the lower limit of the level.
             r = _triangular(np.vstack([factor, ridge]))
             c = dtrtrs(r[:order, :order], r[:order, order])[0]
             error = ((here - after @ c).reshape(m, -1) ** 2).mean(axis=0)
@@ -190,16 +197,15 @@ def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _triangular(rows: np.ndarray) -> np.ndarray:
-    """R of an orthogonal factorisation, (at most order + 1, order + 1); straight from LAPACK, for it is called so
-    often."""
+    """R of a QR factorisation, (at most order + 1, order + 1); directly by LAPACK, as it is called very often."""
     factored = dgeqrf(rows)[0][: START.order + 1]
     return np.asarray(factored * UPPER[: len(factored)])
 
 
 def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
-    """Breaks and the lesser ones that follow them closely."""
+    """Breaks (n_samples,), with lesser breaks that follow closely on another: a force that dies away."""
     broken, last = broken.copy(), -START.near - 1
-    for t in np.flatnonzero(ratio > START.beside).tolist():
+    for t in np.flatnonzero(ratio > START.lesser).tolist():
         if broken[t] or t - last <= START.near:
             broken[t], last = True, t
     return broken
@@ -207,12 +213,12 @@ def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """Drift slower than any mode, or the settling of sensors that pass no constant.
+    """A drift slower than any mode, or the exponential settling of sensors with a high-pass.
 
     Attributes:
-        record: without it; constants stay.
-        size: (n_outputs,) from its lowest to its highest, in the unit of each output; 0 where there is none.
-        time_constant: s, of what settles exponentially, as an accelerometer with a high-pass does; None of a drift.
+        record: without the drift; constants stay.
+        size: (n_outputs,) range of the drift, in the unit of each output; 0 where there is none.
+        time_constant: s, of exponential settling, as of an accelerometer with a high-pass; None of a polynomial drift.
     """
 
     record: Record = field(repr=False)
@@ -221,18 +227,20 @@ class Drift:
 
     @property
     def words(self) -> str:
-        """What it is."""
+        """Description for a remark."""
         if self.time_constant is None:
             return "a drift"
         return f"settling (time constant {self.time_constant:.3g} s)"
 
 
 def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGREE) -> Drift:
-    """A record less a polynomial in time, fitted beside its modes: y_j = Re Σ a_jr e^{λ_r t} + Σ_k p_jk P_k(t).
+    """A record without its drift, a polynomial in time fitted together with the modes.
 
-    The degree is the least, of those that oscillate no faster than the slowest mode, by Schwarz's criterion; and
-    nothing is taken where noise alone would show as much in one record of a thousand. One decay e^{-t/τ} of all outputs
-    takes the place of a polynomial where it is likelier.
+        y_j = Re Σ a_jr e^{λ_r t} + Σ_k p_jk P_k(t)
+
+    Schwarz's criterion selects the degree, among those that oscillate no faster than the slowest mode. Nothing is
+    removed where noise alone would show as much in one record of a thousand. An exponential e^{-t/τ} common to all
+    outputs replaces the polynomial where it is likelier.
 
     Args:
         record: free decay.
@@ -241,93 +249,93 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     """
     n, m, dt = record.n_samples, record.n_outputs, record.sample_time
     highest = int(min(most, np.abs(poles).min(initial=np.inf) * n * dt / (2.0 * np.pi), (n - 4) // 4))
-    nothing = Drift(record, frozen(np.zeros(m)))
+    no_drift = Drift(record, frozen(np.zeros(m)))
     if highest < 1:
-        return nothing
+        return no_drift
 
-    def beside(slow: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """R and Q^T y of a constant, the modes and what is slow."""
+    def factored_with(drift_columns: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """R and Q^T y of a constant, the modes and the columns of the drift."""
 
         def columns(at: np.ndarray) -> np.ndarray:
             decay = np.exp(np.outer(dt * at, poles))
-            return np.hstack([np.ones((at.size, 1)), decay.real, decay.imag, slow(at)])
+            return np.hstack([np.ones((at.size, 1)), decay.real, decay.imag, drift_columns(at)])
 
         return _factored(columns, record.outputs)
 
     fixed = 1 + 2 * poles.size
     power = (record.outputs**2).sum(axis=1)
-    a_number = np.log(n * m)
+    penalty = np.log(n * m)
 
     def gain(taken: np.ndarray, along: np.ndarray) -> np.ndarray:
-        """Twice the logarithm of the likelihood ratio by what further columns take of each output, (n_tried, m)."""
+        """Twice the log-likelihood ratio, (n_tried,), of columns that reduce the squares of each output by `taken`."""
         before = power - (along[:fixed] ** 2).sum(axis=0)
-        before, after = (np.maximum(left, 1e-26 * power + 1e-300) for left in (before, before - taken))
+        before, after = (np.maximum(squares, 1e-26 * power + 1e-300) for squares in (before, before - taken))
         return np.asarray(n * np.log(before / after).sum(axis=1))
 
-    # Columns beyond constant and modes add one degree after the other.
-    r, along = beside(lambda at: _polynomials(at, n, highest)[:, 1:])
+    # Each column after those of the constant and the modes adds one degree.
+    r, along = factored_with(lambda at: _polynomials(at, n, highest)[:, 1:])
     ratio = gain(np.vstack([np.zeros(m), along[fixed:] ** 2]).cumsum(axis=0), along)
-    degree = int(np.argmax(ratio - a_number * m * np.arange(highest + 1)))
+    degree = int(np.argmax(ratio - penalty * m * np.arange(highest + 1)))
     likely = degree > 0 and ratio[degree] >= chi2.isf(FALSE_ALARM / highest, m * degree)
 
     rates = np.geomspace(2.0, START.fastest * n, START.rates) / (n * dt)
     for _ in range(START.rounds):
-        decays, tried = beside(_decays(dt * rates))
-        own = decays[fixed:, fixed:]
-        each = (own.T @ tried[fixed:]) ** 2 / np.maximum((own**2).sum(axis=0), 1e-300)[:, None]
+        decays, tried = factored_with(_decays(dt * rates))
+        drift_part = decays[fixed:, fixed:]
+        each = (drift_part.T @ tried[fixed:]) ** 2 / np.maximum((drift_part**2).sum(axis=0), 1e-300)[:, None]
         settles = gain(each, tried)
         best = int(np.argmax(settles))
-        found = rates[best], settles[best]
+        best_rate = rates[best], settles[best]
         rates = np.geomspace(rates[max(best - 1, 0)], rates[min(best + 1, rates.size - 1)], START.rates)
-    rate, settling = found
-    paid = settling - a_number * (m + 1)
-    unless = ratio[degree] - a_number * m * degree if likely else 0.0
-    if paid > unless and settling > chi2.isf(FALSE_ALARM / START.rates, m + 1):
-        settled = _decays(dt * rate)
-        return _less(record, fixed, *beside(settled), settled, 1.0 / float(rate))
+    rate, settling = best_rate
+    criterion = settling - penalty * (m + 1)
+    of_polynomial = ratio[degree] - penalty * m * degree if likely else 0.0
+    if criterion > of_polynomial and settling > chi2.isf(FALSE_ALARM / START.rates, m + 1):
+        decay = _decays(dt * rate)
+        return _removed(record, fixed, *factored_with(decay), decay, 1.0 / float(rate))
     if not likely:
-        return nothing
+        return no_drift
     kept = fixed + degree
-    return _less(record, fixed, r[:kept, :kept], along[:kept], lambda at: _polynomials(at, n, degree)[:, 1:])
+    return _removed(record, fixed, r[:kept, :kept], along[:kept], lambda at: _polynomials(at, n, degree)[:, 1:])
 
 
 def _decays(rates: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Columns (n_at, n_rates) at some samples, of rates a sample."""
+    """The exponentials e^{-rate n} as a function of samples n (n_at,), (n_at, n_rates); rates per sample."""
     return lambda at: np.asarray(np.exp(-np.outer(at, rates)))
 
 
-def _less(
+def _removed(
     record: Record,
     fixed: int,
     r: np.ndarray,
     along: np.ndarray,
-    slow: Callable[[np.ndarray], np.ndarray],
+    drift_columns: Callable[[np.ndarray], np.ndarray],
     time_constant: float | None = None,
 ) -> Drift:
-    """A record less what is slow in it, of its factored columns."""
+    """A record without its drift, from the factored columns R and Q^T y of constant, modes and drift."""
     weights = np.linalg.solve(r, along)[fixed:]
     m = record.n_outputs
-    outputs, lowest, topmost = record.outputs.copy(), np.full(m, np.inf), np.full(m, -np.inf)
+    outputs, lowest, highest = record.outputs.copy(), np.full(m, np.inf), np.full(m, -np.inf)
     for part in _parts(record.n_samples):
-        drift = (slow(np.arange(part.start, part.stop)) @ weights).T
+        drift = (drift_columns(np.arange(part.start, part.stop)) @ weights).T
         outputs[:, part] -= drift
-        lowest, topmost = (np.minimum(lowest, drift.min(axis=1)), np.maximum(topmost, drift.max(axis=1)))
-    return Drift(replace(record, outputs=outputs), frozen(topmost - lowest), time_constant)
+        lowest, highest = (np.minimum(lowest, drift.min(axis=1)), np.maximum(highest, drift.max(axis=1)))
+    return Drift(replace(record, outputs=outputs), frozen(highest - lowest), time_constant)
 
 
 def without_polynomial(outputs: np.ndarray) -> np.ndarray:
-    """(n_outputs, n_samples) less the polynomial of `HIGHEST_DEGREE` in time that fits each best."""
+    """Outputs (n_outputs, n_samples) without the best polynomial of `HIGHEST_DEGREE` in time."""
     n = outputs.shape[1]
     degree = min(HIGHEST_DEGREE, n - 1)
     r, along = _factored(lambda at: _polynomials(at, n, degree), outputs)
-    weights, about = np.linalg.solve(r, along), outputs.copy()
+    weights, remainder = np.linalg.solve(r, along), outputs.copy()
     for part in _parts(n):
-        about[:, part] -= (_polynomials(np.arange(part.start, part.stop), n, degree) @ weights).T
-    return about
+        remainder[:, part] -= (_polynomials(np.arange(part.start, part.stop), n, degree) @ weights).T
+    return remainder
 
 
 def _polynomials(at: np.ndarray, n: int, degree: int) -> np.ndarray:
-    """Legendre polynomials over n samples, at some of them, (n_at, degree + 1)."""
+    """Legendre polynomials over n samples at the samples `at`, (n_at, degree + 1)."""
     return np.asarray(legvander(-1.0 + 2.0 * at / max(n - 1, 1), degree))
 
 
@@ -337,7 +345,7 @@ def _parts(n: int) -> Iterator[slice]:
 
 
 def _factored(columns: Callable[[np.ndarray], np.ndarray], outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R and Q^T y of columns over time, part by part, as the columns of a long record would fill the memory."""
+    """R and Q^T y of columns over time, part by part, as all columns of a long record would fill the memory."""
     r = np.zeros((0, 0))
     for part in _parts(outputs.shape[1]):
         rows = np.hstack([columns(np.arange(part.start, part.stop)), outputs[:, part].T])

@@ -1,13 +1,13 @@
-"""Maximum likelihood refinement: modes as accurate as the record allows, with standard errors that are true.
+"""Maximum likelihood refinement of the modes of free decays, with standard errors at the Cramér-Rao bound.
 
-In white noise the maximum likelihood modes minimise the squares of the residual y_j(t) - Re Σ_r a_jr e^{λ_r t}. For
-given poles the amplitudes are linear and drop out (variable projection, Golub & Pereyra 1973), so only the 2 n_modes
-numbers σ_r, ω_dr of λ = -σ + iω_d are searched, however many sensors there are. With columns
+In white noise the maximum likelihood modes minimise the sum of squares of the residual y_j(t) - Re Σ_r a_jr e^{λ_r t}.
+The amplitudes are linear parameters, eliminated by variable projection (Golub & Pereyra 1973). The search is over the
+2 n_modes parameters σ_r, ω_dr of λ = -σ + iω_d alone, however many sensors there are. With columns
 Φ = [e^{-σt} cos ω_d t, e^{-σt} sin ω_d t] all derivatives of Φ lie in the span of tΦ, so one matrix
 
     G = (tΦ)^T (I - Φ Φ^+) (tΦ)                                       (2 n_modes, 2 n_modes)
 
-gives the whole Gauss-Newton matrix H, and s² H^-1 is at the same time the Cramér-Rao bound of the poles.
+gives the whole Gauss-Newton matrix H, and s² H^-1 is the Cramér-Rao bound of the poles, s² the noise variance.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ from workbench.threads import one_blas_thread
 
 
 def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
-    """Modes of which only the poles are known, by rising frequency: a start for `refine`."""
+    """Modes of given poles with placeholder shapes of ones, sorted by frequency: a start for `refine`."""
     shapes = np.ones((record.n_outputs, poles.size), complex)
     return SampledModes.of_poles(poles[np.argsort(np.abs(poles))], shapes, record.positions)
 
@@ -48,7 +48,15 @@ def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
 def identified(
     refined: Refined, statistic: np.ndarray, limit: float, rejected: Sequence[tuple[complex, float]], record: Record
 ) -> Identified:
-    """Refined modes with their statistic (n_modes,), beside the poles rejected as noise, each with its own."""
+    """The result of an identification: refined modes with their test statistics, and the poles rejected as noise.
+
+    Args:
+        refined: the modes.
+        statistic: (n_modes,) test statistic of each.
+        limit: threshold of the statistic.
+        rejected: pole, rad/s, and statistic of each rejected candidate.
+        record: for the positions of its sensors.
+    """
     noise = sorted(rejected, key=lambda pair: abs(pair[0]))
     modes = unshaped(np.array([pole for pole, _ in noise], complex), record)
     return Identified(refined, frozen(statistic), limit, modes, frozen([strength for _, strength in noise]))
@@ -57,34 +65,35 @@ def identified(
 def in_coloured_noise(
     refined: Refined, records: Record | Sequence[Record], fits: Sequence[Projection] | None = None
 ) -> Refined:
-    """The same modes with standard errors that hold in noise of any smooth spectrum.
+    """The modes with standard errors that hold in noise of any smooth spectrum.
 
-    A mode is disturbed by noise within its own band only. Where output j has noise of spectrum S_j, a least squares fit
-    made for white noise s_j² has the covariance H^-1 (Σ_j J_j^T S_j J_j) H^-1 (White, Econometrica 48, 1980), and each
-    column of J lives where its mode does, so that
+    Noise disturbs a mode within the band of the mode only. Where output j has noise of spectrum S_j, a least squares
+    fit weighted for white noise s_j² has the covariance H^-1 (Σ_j J_j^T S_j J_j) H^-1 (White, Econometrica 48, 1980).
+    The spectrum of each column of the Jacobian J is concentrated about its mode, so that
 
         J_j^T S_j J_j  ≈  κ_jr^½ κ_js^½ (J_jr^T J_js),     κ_jr = S_j(ω_r) / s_j²,
 
-    for modes r and s. Where the noise may be white κ is one: the Cramér-Rao bound. Where outputs share a part of their
-    noise, of correlation C, it disturbs a mode of amplitudes a_r, over the noise, by a_r^H C a_r / a_r^H a_r as much.
+    for modes r and s. Where white noise is not rejected κ is one: the Cramér-Rao bound. Where the noise of the outputs
+    has the correlation matrix C, the variance of a mode of amplitudes a_r, over the noise, is multiplied by
+    a_r^H C a_r / a_r^H a_r.
 
     Args:
-        refined: of `refine` with a constant in each output, made for white noise.
+        refined: from `refine` with a constant in each output, weighted for white noise.
         records: that it was identified from.
-        fits: of its poles, in any order, one per record; found anew unless given.
+        fits: projections on its poles, in any order, one per record; computed unless given.
     """
     records = as_records(records)
     fits = fits or [project(record, refined.modes.poles, True) for record in records]
     poles = fits[0].poles
     each = zip(records, fits, refined.noise, strict=True)
     ratios = np.array([noise_near(poles, fit.residual, noise, record.sample_time) for record, fit, noise in each])
-    common = correlation([fit.residual.T for fit in fits])
+    output_correlation = correlation([fit.residual.T for fit in fits])
     amplitudes = [fit.complex_amplitudes / noise[:, None] for fit, noise in zip(fits, refined.noise, strict=True)]
-    shared = np.array([disturbed(common, each) for each in amplitudes])
+    shared = np.array([disturbed(output_correlation, each) for each in amplitudes])
     if (ratios == 1.0).all() and (shared == 1.0).all():
         return refined
-    found = records, poles, fits, refined.noise
-    return as_refined(*found, converged=refined.converged, steps=refined.steps, noise_ratio=ratios, shared=shared)
+    arguments = records, poles, fits, refined.noise
+    return as_refined(*arguments, converged=refined.converged, steps=refined.steps, noise_ratio=ratios, shared=shared)
 
 
 def as_refined(
@@ -98,24 +107,24 @@ def as_refined(
     noise_ratio: np.ndarray | None = None,
     shared: np.ndarray | float = 1.0,
 ) -> Refined:
-    """What a search ended with, with the covariance that follows from it.
+    """The modes of a fit with their covariance.
 
     Args:
         records: of the fit.
         poles: (n_modes,) rad/s.
-        fits: one per record.
+        fits: projections on the poles, one per record.
         noise: (n_records, n_outputs) standard deviations.
         converged, steps: of the search.
         noise_ratio: κ (n_records, n_outputs, n_modes), variance of the noise about each mode over its mean; 1 unless
             given.
-        shared: (n_records, n_modes) variance of what noise does to each pole over that of independent noise.
+        shared: (n_records, n_modes) variance of each pole over that in noise without correlation between outputs.
     """
     n = poles.size
     covariance = scaled_inverse(normal_equations(fits, 1.0 / noise)[0], rcond=1e-14)
     if noise_ratio is not None:
-        disturbance = np.sqrt(noise_ratio.swapaxes(1, 2) * np.atleast_2d(shared)[..., None])
-        between = normal_equations(fits, 1.0 / noise, disturbance)[0]
-        covariance = covariance @ between @ covariance
+        noise_factor = np.sqrt(noise_ratio.swapaxes(1, 2) * np.atleast_2d(shared)[..., None])
+        disturbed_normal = normal_equations(fits, 1.0 / noise, noise_factor)[0]
+        covariance = covariance @ disturbed_normal @ covariance
     jacobian = by_poles(poles) * np.r_[-np.ones(n), np.ones(n)]  # σ = -Re λ
     order = np.argsort(np.abs(poles))
     both = np.r_[order, order + n]
@@ -142,7 +151,7 @@ def normal_equations(
     Args:
         fits: one per record, of the same poles.
         weights: (n_records, n_outputs).
-        factor: (n_records, n_modes, n_outputs) of the share of each mode and output: κ^½ gives J^T S J.
+        factor: (n_records, n_modes, n_outputs) of the Jacobian of each mode and output: κ^½ gives J^T S J.
     """
     size = fits[0].gram.shape[0]
     n = size // 2
@@ -153,70 +162,76 @@ def normal_equations(
         matrix, right = pole_blocks(a, b, fit.gram, fit.slopes[:n] * weight, fit.slopes[n:] * weight)
         h += matrix
         g += right
-    decay = np.r_[-np.ones(n), np.ones(n)]  # σ = -Re λ
-    return h * np.outer(decay, decay), g * decay
+    sign = np.r_[-np.ones(n), np.ones(n)]  # σ = -Re λ
+    return h * np.outer(sign, sign), g * sign
 
 
 def _mean_shapes(
     fits: Sequence[Projection], derivative: np.ndarray, pole_covariance: np.ndarray, variance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shapes relative to their largest entry, (n_outputs, n_modes) complex, and of the covariance of their real parts a
-    factor of what outputs share, (n_modes, n_outputs, n_factors), and the variance of each output's own, (n_modes,
-    n_outputs).
+    """Shapes averaged over records, relative to the largest entry, and the covariance of their real parts.
 
-    Records share shapes but not amplitudes: of record i only ρ_j = s_j / s_k counts, k the largest entry. Each entry is
-    the mean over the records by their own noise, so that a record that misses a mode, or is noisy, counts little.
+    Records share shapes but not amplitudes, so that only the ratios ρ_j = s_j / s_k of a record count, k the largest
+    entry. The mean over records is weighted by the variance of each ratio: a record that is noisy, or hardly excites a
+    mode, counts little.
 
     Args:
         fits: one per record, of the same poles.
         derivative: (n_outputs,) order of the time derivative each output measures.
         pole_covariance: (2 n_modes, 2 n_modes) of (σ, ω_d).
         variance: (n_records, n_outputs, n_modes) of the noise about each mode.
+
+    Returns:
+        shapes (n_outputs, n_modes) complex; F (n_modes, n_outputs, n_factors) and v (n_modes, n_outputs) of the
+        covariance F F^T + diag v: F by the errors of the poles and of the reference, v by the noise of each output.
     """
     poles, n = fits[0].poles, fits[0].poles.size
     to_displacement = poles ** -derivative[:, None]
     shapes = np.array([fit.complex_amplitudes * to_displacement for fit in fits])
     spread = np.array([np.diag(fit.spread)[:n] + np.diag(fit.spread)[n : 2 * n] for fit in fits])
-    own = variance * np.abs(to_displacement) ** 2 * spread[:, None]
-    strongest = (np.abs(shapes) ** 2 / own).sum(axis=1).argmax(axis=0)
+    own_variance = variance * np.abs(to_displacement) ** 2 * spread[:, None]
+    strongest = (np.abs(shapes) ** 2 / own_variance).sum(axis=1).argmax(axis=0)
     root = symmetric_root(pole_covariance)
     mean, factors = np.empty(shapes.shape[1:], complex), np.zeros((n, len(derivative), 2 * n + 2 * len(fits)))
-    by_own = np.zeros((n, len(derivative)))
+    own_variances = np.zeros((n, len(derivative)))
     for r in range(n):
         best = shapes[strongest[r], :, r]
         k = int(np.argmax(np.abs(best)))
         size = np.maximum(np.abs(shapes[:, k, r, None]) ** 2, 1e-300)
-        weights = size / (own[:, :, r] + np.abs(best / best[k]) ** 2 * own[:, k, r, None])
+        weights = size / (own_variance[:, :, r] + np.abs(best / best[k]) ** 2 * own_variance[:, k, r, None])
         weights = weights / weights.sum(axis=0)
         ratios = shapes[:, :, r] / shapes[:, k, r, None]
         mean[:, r] = (weights * ratios).sum(axis=0)
         shared, own_noise, columns = np.zeros((len(derivative), 2 * n)), np.zeros(len(derivative)), []
         for fit, each, weight, ratio, noise in zip(fits, shapes, weights, ratios, variance[:, :, r], strict=True):
-            moved = _by_poles(fit, r) @ root * to_displacement[:, r, None]
+            moved = _amplitude_slopes(fit, r) @ root * to_displacement[:, r, None]
             shared += weight[:, None] * ((moved - ratio[:, None] * moved[k]) / each[k, r]).real
             unit = to_displacement[:, r] / each[k, r]
-            common, own_part = _by_noise(fit, r, k, unit, ratio, noise)
+            common, own_part = _ratio_covariance(fit, r, k, unit, ratio, noise)
             columns.append(weight[:, None] * common)
             own_noise += weight**2 * own_part
-        factors[r], by_own[r] = np.hstack([shared, *columns]), own_noise
-        factors[r, k], by_own[r, k] = 0.0, 0.0
-    return mean, factors, by_own
+        factors[r], own_variances[r] = np.hstack([shared, *columns]), own_noise
+        factors[r, k], own_variances[r, k] = 0.0, 0.0
+    return mean, factors, own_variances
 
 
-def _by_poles(fit: Projection, r: int) -> np.ndarray:
-    """∂ amplitudes of mode r / ∂ (σ, ω_d) of every mode, by -Φ^+ dΦ, (n_outputs, 2 n_modes) complex."""
+def _amplitude_slopes(fit: Projection, r: int) -> np.ndarray:
+    """Derivatives of the amplitudes of mode r by (σ, ω_d) of every mode, -Φ^+ dΦ, (n_outputs, 2 n_modes) complex."""
     n = fit.poles.size
-    # dΦ of mode p is -(α, β) tΦ_p by σ and (β, -α) tΦ_p by ω_d.
+    # The derivative of Φ of mode p is -(α, β) tΦ_p by σ and (β, -α) tΦ_p by ω_d.
     alpha, beta = fit.coefficients[:n], fit.coefficients[n : 2 * n]
     cosine, sine = (np.array([1.0, -1j]) @ fit.tilt[[r, n + r]]).reshape(2, n, 1)
     return np.vstack([cosine * alpha + sine * beta, sine * alpha - cosine * beta]).T
 
 
-def _by_noise(
+def _ratio_covariance(
     fit: Projection, r: int, k: int, unit: np.ndarray, ratio: np.ndarray, variance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the covariance of the real parts, poles held: a factor (n_outputs, 2) of what the reference's noise makes, and
-    the variance (n_outputs,) by each output's own, (Φ^T Φ)^-1."""
+    """Covariance of the real parts of the ratios of mode r to entry k by noise at fixed poles, from (Φ^T Φ)^-1.
+
+    Returns:
+        a factor (n_outputs, 2) by the noise of the reference k, and the variance (n_outputs,) by that of each output.
+    """
     pair = np.array([1.0, -1j]) @ symmetric_root(fit.spread[np.ix_([r, fit.poles.size + r], [r, fit.poles.size + r])])
     each = np.sqrt(variance)[:, None] * pair * unit[:, None]
     return (ratio[:, None] * each[k]).real, (each.real**2).sum(axis=1)
@@ -228,16 +243,16 @@ def refine(
 ) -> Refined:
     """The maximum likelihood modes near `start`, with the Cramér-Rao covariance of frequencies, damping and shapes.
 
-    Sensors are weighted by the noise that each turns out to have in each record. Records share poles, not amplitudes.
+    Sensors are weighted by their estimated noise in each record. Records share poles, not amplitudes.
 
     Args:
         records: free decay in white noise, of the same sensors at one rate.
         start: from `stacked_delays`; its shapes are not used.
         offset: whether each output may also hold a constant.
-        budget: of time; none unless given.
+        budget: time limit; none unless given.
 
     Returns:
-        `Refined`; look at `converged`: a start with modes that the record does not hold may not converge.
+        `Refined`; check `converged`: a start with modes that the record does not hold may not converge.
 
     Raises:
         ValueError: fewer samples than unknowns; no modes to start from.
@@ -254,7 +269,7 @@ def refine(
     poles, weights = start.poles, np.ones((len(records), records[0].n_outputs))
     steps = 0
     for _ in range(2):
-        # Noise differs from sensor to sensor and from record to record: it is measured at the first optimum.
+        # Noise differs between sensors and between records: it is estimated at the first optimum.
         poles, fit, converged, taken = search(records, poles, weights, offset, budget=budget)
         steps += taken
         noise = noise_level(records, fit, weights)
@@ -263,11 +278,11 @@ def refine(
 
 
 def cramer_rao_bound(modes: SampledModes, record: Record, *, noise_std: float | Sequence[float]) -> Refined:
-    """The Cramér-Rao bound of a free decay known without noise: what no unbiased estimate can beat.
+    """The Cramér-Rao bound of the modes of a free decay: the least covariance of any unbiased estimate.
 
     Args:
-        modes: true; shapes s_jr carry amplitude and phase at time 0, as `free_decay` takes them.
-        record: for its sample times and quantities; its values do not count.
+        modes: true; shapes s_jr carry amplitude and phase at time 0, as in `free_decay`.
+        record: for its sample times and quantities; its values do not matter.
         noise_std: of the white noise of all outputs, or of each (n_outputs,), in their units.
 
     Returns:
@@ -286,7 +301,7 @@ def modal_amplitudes(record: Record, modes: SampledModes) -> SampledModes:
 
     Args:
         record: free decay.
-        modes: poles are used.
+        modes: for their poles.
 
     Returns:
         `SampledModes` with y = d^k/dt^k Re Σ s_r e^{λ_r t}, k the derivative each sensor measures.
@@ -308,16 +323,28 @@ def search(
     enough: float = FIT.negligible,
     budget: Budget | None = None,
 ) -> tuple[np.ndarray, list[Projection], bool, int]:
-    """Least squares over (σ, ω_d): poles, projections, whether it converged, steps taken.
+    """Least squares over (σ, ω_d) of all modes.
 
-    Where a pole would leave what is admissible the step is made shorter; or, with `hold`, that pole stays for this step
-    and keeps no other from moving, unless it comes back as the mirror image that samples cannot distinguish from it.
-    A step that promises no more of χ² than `enough` is the last.
+    A step that would make a pole inadmissible is shortened. With `hold` that pole alone stays where it is for this
+    step, and a pole beyond the Nyquist frequency is folded back to its alias.
+
+    Args:
+        records: free decays.
+        poles: (n_modes,) start, rad/s.
+        weights: (n_records, n_outputs) 1 / noise.
+        offset: whether each output may also hold a constant.
+        most_steps: largest number of steps.
+        hold: see above.
+        enough: predicted decrease of χ², per value, at which the search ends.
+        budget: time limit; none unless given.
+
+    Returns:
+        poles, projections (one per record), whether the search converged, and the number of steps.
     """
     problem = _Poles(records, weights, offset, hold, enough)
     start = _Fitted(poles, [project(record, poles, offset) for record in records])
-    found = minimise(problem, start, most_steps=most_steps, round_off=problem.start_from(start), budget=budget)
-    return found.state.poles, found.state.fits, found.converged, found.steps
+    minimum = minimise(problem, start, most_steps=most_steps, round_off=problem.start_from(start), budget=budget)
+    return minimum.state.poles, minimum.state.fits, minimum.converged, minimum.steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,7 +360,7 @@ class _Poles:
         self.records, self.weights, self.offset, self.hold, self.enough = records, weights, offset, hold, enough
 
     def start_from(self, start: _Fitted) -> float:
-        """Round-off of the cost."""
+        """The round-off error of the cost; also sets the degrees of freedom and the weighted signal energy."""
         coefficients = sum(fit.coefficients.size for fit in start.fits)
         self.free = sum(r.outputs.size for r in self.records) - 2 * start.poles.size - coefficients
         self.signal = float((self.weights**2 * _squares(self.records)).sum())
@@ -366,28 +393,30 @@ class _Poles:
 
 
 def _folded(poles: np.ndarray, sample_time: float) -> np.ndarray:
-    """The same poles below the Nyquist frequency: real samples see no difference."""
+    """Poles folded below the Nyquist frequency: real samples do not distinguish aliases."""
     turn = np.abs(poles.imag) * sample_time
     return np.asarray(poles.real + 1j * np.minimum(turn, 2.0 * np.pi - turn) / sample_time)
 
 
 def _inadmissible(poles: np.ndarray, records: Sequence[Record]) -> np.ndarray:
-    """Which poles do not oscillate, pass the Nyquist frequency, grow too much over a record, or decay at once."""
+    """Which poles do not oscillate, exceed the Nyquist frequency, grow too fast over a record, or decay within about
+    a sample, (n_modes,)."""
     dt, longest = records[0].sample_time, max(r.n_samples * r.sample_time for r in records)
     turn = poles.imag * dt
-    growing, gone = poles.real * longest >= FIT.most_growth, -poles.real * dt > FIT.fastest_decay
-    return np.asarray((turn <= 0) | (turn >= np.pi) | growing | gone)
+    growing, too_fast = poles.real * longest >= FIT.most_growth, -poles.real * dt > FIT.fastest_decay
+    return np.asarray((turn <= 0) | (turn >= np.pi) | growing | too_fast)
 
 
 def _squares(records: Sequence[Record]) -> np.ndarray:
-    """Sums of those of every output, (n_records, n_outputs)."""
+    """Sum of squares of each output in each record, (n_records, n_outputs)."""
     return np.array([np.einsum("jt,jt->j", r.outputs, r.outputs) for r in records])
 
 
 def noise_level(records: Sequence[Record], fits: Sequence[Projection], weights: np.ndarray) -> np.ndarray:
     """Standard deviation of the residual of each output in each record, (n_records, n_outputs).
 
-    The degrees of freedom that the fit took are made good: the poles take theirs where they are learnt.
+    Sums of squares are divided by degrees of freedom. Those of the poles are shared among the records by the
+    information that each contributes.
     """
     n_poles = fits[0].gram.shape[0]
     lost = np.full(len(fits), n_poles / len(fits))

@@ -1,4 +1,4 @@
-"""Which frequencies a sampled mode may have: the branch k of the logarithm, which samples do not determine (3.23)."""
+"""Aliases of a mode: the frequencies that agree with its samples, one for each branch k of the logarithm (3.23)."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from workbench.structure.modes import SampledModes, frozen
 
 @dataclass(frozen=True, eq=False)
 class Aliases:
-    """What each mode found below half the sample rate may be in truth.
+    """Possible true frequencies and damping ratios of modes identified below half the sample rate.
 
     Every row gives the same samples: λ + 2πi j f_s, or its conjugate + 2πi j f_s, has the same e^{λΔt}.
 
@@ -26,9 +26,9 @@ class Aliases:
     sample_rate_hz: float
 
     def deciding_rate_hz(self, mode: int) -> float:
-        """The sample rate up to a tenth away from this one that sets the branches of a mode farthest apart, Hz.
+        """The sample rate within a tenth of this one that separates the aliases of a mode best, Hz.
 
-        A second record at that rate decides: of the candidates of each record only the true one is in both.
+        A second record at that rate decides: only the true frequency is an alias in both records.
         """
         f = self.frequencies_hz[:, mode]
         rates = self.sample_rate_hz * np.r_[np.linspace(0.9, 0.99, 46), np.linspace(1.01, 1.1, 46)]
@@ -38,13 +38,13 @@ class Aliases:
 
 
 def aliases(modes: SampledModes, *, sample_rate_hz: float, most: int = 4) -> Aliases:
-    """The frequencies beyond half the sample rate that look like the modes found: f_s - f, f_s + f, 2 f_s - f, ...
+    """The frequencies beyond half the sample rate with the same samples as the modes: f_s - f, f_s + f, 2 f_s - f, ...
 
-    Samples alone do not decide. What does: a filter before the sampling (then k = 0), a record at another rate
-    (`Aliases.deciding_rate_hz`), or a model that predicts the frequency; `stacked_delays(branch=k)` then takes it.
+    Samples do not determine the branch. It follows from an anti-alias filter (k = 0), a record at another rate
+    (`Aliases.deciding_rate_hz`), or a model that predicts the frequency; pass it to `stacked_delays(branch=k)`.
 
     Args:
-        modes: found below half the sample rate (branch 0).
+        modes: identified below half the sample rate (branch 0).
         sample_rate_hz: of the record.
         most: number of branches, from k = 0.
 

@@ -13,27 +13,27 @@ from workbench.rig.sensors import MEASURED
 class DataSettings:
     """Constants of the checks of a record."""
 
-    fewest_values: int = 4  # that a sensor which moves takes
-    # samples piled up at the end of a range: so many, and so many times those of the next value. An oscillation that
-    # turns back of itself has at most 1 / (√2 - 1) = 2.4 times as many in its last step as in the one before
+    fewest_values: int = 4  # distinct values of a working sensor, at least
+    # A clipped signal has at least so many samples at the end of its range, and so many times those at the next value.
+    # A rounded oscillation has at most 1 / (√2 - 1) = 2.4 times as many in its last step as in the one before.
     least_piled: int = 8
     piled: float = 6.0
-    # likewise of an input, of which a blow has few: sines and pulses that are rounded have more in 3 of a thousand
+    # Likewise for inputs, whose impacts are short: rounded sines and pulses have more in 3 of a thousand.
     least_piled_input: int = 4
     piled_input: float = 4.0
-    turning: float = 1e-6  # of a signal's range, by which samples beside a turning point of a sine differ by rounding
-    held: float = 0.5  # of an input's samples in the outer half of its range, that repeat: from there on it has levels
-    whole: float = 1e-3  # of a step, by which readings that are rounded to it lie off its multiples
-    fewest_changes: int = 16  # of an output, from which a rate at which it was held can be read
-    slowest: int = 64  # samples between changes: what changes less often rests
-    copied: float = 1e-2  # of the innovation, what its past does not predict: signals that differ by less are one
+    turning: float = 1e-6  # rounding difference between the neighbours of a sine's turning point, over the range
+    held: float = 0.5  # share of repeated samples in the outer half of an input's range from which on it has levels
+    whole: float = 1e-3  # deviation of rounded readings from multiples of the step, in steps
+    fewest_changes: int = 16  # of an output, to detect the rate at which it was held
+    slowest: int = 64  # longest hold, samples; an output that changes less often is at rest
+    copied: float = 1e-2  # largest difference between copies, relative to the standard deviation of the innovation
     predictor_order: int = 16  # samples that predict the next
-    longest: int = 20_000  # samples in which copies are looked for
-    noise_free: float = 1e-9  # innovation over the signal: below, sensors of one mode are alike without being copies
-    fewest_equal: int = 4  # samples in a row: of so many a lost message is told from a turning point
-    about: int = 32  # samples on either side of them, which show how the output moves
-    straight: float = 1e-9  # of the range of an output, by which samples on a straight line lie off it by rounding
-    moves: float = 100.0  # resolutions of the output that it moves there from sample to sample
+    longest: int = 20_000  # samples that are compared to detect copies
+    noise_free: float = 1e-9  # innovation over the signal below which sensors of a single mode may be alike
+    fewest_equal: int = 4  # consecutive samples of a dropout, at least; a turning point has fewer
+    about: int = 32  # samples on either side of a dropout, which show the motion there
+    straight: float = 1e-9  # rounding deviation of samples from a straight line, relative to the output's range
+    moves: float = 100.0  # least motion from sample to sample there, in resolutions of the output
     block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
 
 
@@ -42,14 +42,14 @@ DATA = DataSettings()
 
 @dataclass(frozen=True)
 class DataFault:
-    """Something in a record that would make identification wrong.
+    """A fault of a channel that would falsify an identification.
 
     Attributes:
         kind: "dead", "copied", "clipped", "upsampled" or "unstated".
-        outputs: names of those that have it; none where an input does.
+        outputs: names of the faulty outputs; empty where an input is faulty.
         message: what, where, why it matters and the way out.
-        until: the last time it touches, s; None where it is all through.
-        inputs: names of those that have it.
+        until: time of the last faulty sample, s; None where the whole record is faulty.
+        inputs: names of the faulty inputs.
     """
 
     kind: str
@@ -62,47 +62,47 @@ class DataFault:
 def data_faults(record: Record) -> tuple[DataFault, ...]:
     """The faults of a record, empty where there are none.
 
-    dead: an output takes fewer than four values, or is a straight line. copied: two outputs are the same but for scale
-    and a constant, so that their noise would count as two. clipped: samples pile up at an end of an output's range.
-    upsampled: an output changes at every k-th sample only, because it was sampled at another rate and held, or joined
-    by straight lines. unstated: an output has no quantity, and others measure motion. Inputs are looked at by
+    dead: an output takes fewer than four values, or is a straight line. copied: two outputs are the same up to scale
+    and a constant, so that their noise would count twice. clipped: samples pile up at an end of an output's range.
+    upsampled: an output was sampled at a lower rate and held, or interpolated linearly, so that it changes at every
+    k-th sample only. unstated: an output has no quantity, while others measure motion. Faults of inputs are those of
     `input_faults`.
     """
     dead = list(_dead(record))
     names = {fault.outputs[0] for fault in dead}
     alive = [j for j, name in enumerate(record.output_names) if name not in names]
-    found = _copied(record, alive), _clipped(record, alive), _upsampled(record, alive), _unstated(record, alive)
-    return (*dead, *(fault for faults in found for fault in faults), *input_faults(record))
+    others = _copied(record, alive), _clipped(record, alive), _upsampled(record, alive), _unstated(record, alive)
+    return (*dead, *(fault for faults in others for fault in faults), *input_faults(record))
 
 
 def input_faults(record: Record) -> tuple[DataFault, ...]:
     """The faults of inputs, empty where there are none.
 
-    clipped: samples pile up at an end of an input's range that is not zero, where it rests. One that was sent like that
-    is right as it is, so that it is said, and not refused.
+    clipped: samples pile up at an end of an input's range other than zero, its value at rest. A command may be limited
+    on purpose, so that this is a remark and no error.
     """
-    found = []
+    faults = []
     for channel, row in zip(record.input_channels, record.inputs, strict=True):
         stops = [
             at
             for at in _piled(row).values()
             if at.size
             and row[at[0]]
-            and _ends(row, at, DATA.least_piled_input, DATA.piled_input)
+            and _piles_up(row, at, DATA.least_piled_input, DATA.piled_input)
             and not _has_levels(row, at)
         ]
         if stops:
             ends, count = " and ".join(f"{row[at[0]]:g}" for at in stops), sum(at.size for at in stops)
-            found.append(
+            faults.append(
                 DataFault(
                     "clipped",
                     (),
-                    f"input {channel.name!r} is clipped at {ends}, {count} samples: unless it was sent like that, what"
-                    " acted beyond is lost, and modes, their masses above all, are wrong; measure with a larger range",
+                    f"input {channel.name!r} is clipped at {ends}, {count} samples: unless it was sent like that, the"
+                    " input beyond is lost, and modes, their masses above all, are wrong; measure with a larger range",
                     inputs=(channel.name,),
                 )
             )
-    return tuple(found)
+    return tuple(faults)
 
 
 def check_data_quality(record: Record) -> None:
@@ -150,15 +150,15 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
 
 
 def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
-    """Where an output stays at one value or runs straight amid motion, as lost messages of a wireless sensor leave it.
+    """Dropouts: where an output is constant or linear in time amid motion, as after lost messages of a wireless sensor.
 
-    At an end of its range an output is clipped, and that is another fault.
+    A constant output at an end of its range is clipped instead.
 
     Returns:
-        name of the output, time of the first such sample in s, number of samples, and what it does there; in order of
-        outputs and time.
+        for each, sorted by output and time: name of the output, time of the first sample in s, number of samples, and
+        "stays at one value" or "runs straight".
     """
-    found = []
+    result = []
     for name, row in zip(record.output_names, record.outputs, strict=True):
         rounding, ends = DATA.straight * np.ptp(row), (row.min(), row.max())
         resolution, taken, lost = 0.0, np.zeros(row.size, bool), []
@@ -177,23 +177,23 @@ def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
                 if moving > DATA.moves * resolution and row[first] not in ends and not taken[first : last + 1].any():
                     taken[first : last + 1] = True
                     lost.append((name, float(record.time[first]), last - first + 1, how))
-        found += sorted(lost)
-    return tuple(found)
+        result += sorted(lost)
+    return tuple(result)
 
 
 def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tuple[str, ...]:
-    """A remark where outputs stay at one value, or run straight, amid motion; empty where none does.
+    """A remark on the dropouts of a record; empty where there are none.
 
     Args:
-        record: looked at.
-        after: what follows from it, and the way out.
-        before: s, what begins later does not count.
+        record: the record.
+        after: second sentence of the remark: the consequence, and the way out.
+        before: s, dropouts that begin later are ignored.
     """
-    found = [lost for lost in dropouts(record) if lost[1] < before]
-    if not found:
+    early = [dropout for dropout in dropouts(record) if dropout[1] < before]
+    if not early:
         return ()
-    name, at, count, how = found[0]
-    more = f" (and {len(found) - 1} more like that)" if len(found) > 1 else ""
+    name, at, count, how = early[0]
+    more = f" (and {len(early) - 1} more like that)" if len(early) > 1 else ""
     return (
         f"in record {record.name!r} output {name!r} {how} for {count} samples from {at:.6g} s on{more}: lost data?"
         f" {after}",
@@ -201,23 +201,22 @@ def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tup
 
 
 def steps(record: Record) -> np.ndarray:
-    """The step that the readings of each output are whole multiples of, apart from a constant, (n_outputs,); 0 of those
-    that have none.
+    """Quantisation step of each output, (n_outputs,); 0 where its readings, less a constant, are no multiples of one.
 
-    Rounding to it is noise of a standard deviation of step/√12 at least, as long as the output moves by steps.
+    Rounding is noise of a standard deviation of step/√12 at least, as long as the output moves by steps.
     """
-    found = np.zeros(record.n_outputs)
+    result = np.zeros(record.n_outputs)
     for j, row in enumerate(record.outputs):
-        apart = np.diff(np.unique(row))
-        step = float(apart.min(initial=np.inf))
-        if np.isfinite(step) and np.abs(apart / step - np.round(apart / step)).max() < DATA.whole:
-            found[j] = step
-    return found
+        differences = np.diff(np.unique(row))
+        step = float(differences.min(initial=np.inf))
+        if np.isfinite(step) and np.abs(differences / step - np.round(differences / step)).max() < DATA.whole:
+            result[j] = step
+    return result
 
 
 def _dead(record: Record) -> Iterator[DataFault]:
     for name, row in zip(record.output_names, record.outputs, strict=True):
-        # most signals move within their first samples, which saves the rest
+        # Most signals move within their first samples; the rest is then not searched.
         few = np.unique(row[:64]).size < DATA.fewest_values and np.unique(row).size
         if few and few < DATA.fewest_values <= record.n_samples:
             what = f"stays at {row[0]:g}" if few == 1 else f"takes {few} values only, {row.min():g} to {row.max():g}"
@@ -236,7 +235,7 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
     part = record.outputs[alive, : DATA.longest]
     about = part - part.mean(axis=1, keepdims=True)
     size = np.sqrt((about**2).mean(axis=1))
-    # A part that is at rest has no copy.
+    # Outputs that are at rest here are not compared.
     moving = size > 1e-12 * size.max()
     scaled = about[moving] / size[moving, None]
     names = [record.output_channels[j].name for j, moves in zip(alive, moving, strict=True) if moves]
@@ -248,11 +247,11 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
             i, others = first + row, np.flatnonzero(near[row])
             others = others[~np.isin(first + others, list(copies))]
             noise = 0.0 if i in copies or not others.size else _innovation_std(scaled[i])
-            # Without noise, sensors of a single mode are the same but for scale.
+            # Without noise, sensors of a single mode are the same up to scale.
             if noise <= DATA.noise_free:
                 continue
-            apart = scaled[i] - np.sign(alike[row, others])[:, None] * scaled[first + others]
-            for j in (first + others[np.sqrt((apart**2).mean(axis=1)) < DATA.copied * noise]).tolist():
+            difference = scaled[i] - np.sign(alike[row, others])[:, None] * scaled[first + others]
+            for j in (first + others[np.sqrt((difference**2).mean(axis=1)) < DATA.copied * noise]).tolist():
                 copies.add(j)
                 yield DataFault(
                     "copied",
@@ -263,7 +262,7 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
 
 
 def _innovation_std(row: np.ndarray) -> float:
-    """Standard deviation of the innovation, what the samples before do not predict."""
+    """Standard deviation of the innovation of a signal: its linear prediction error from the samples before."""
     k = min(DATA.predictor_order, row.size // 4)
     if k == 0:
         return 0.0
@@ -275,9 +274,9 @@ def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
     for j in alive:
         row, name = record.outputs[j], record.output_channels[j].name
         piled = _piled(row)
-        clear = [side for side, at in piled.items() if _ends(row, at, DATA.least_piled, DATA.piled)]
+        clear = [side for side, at in piled.items() if _piles_up(row, at, DATA.least_piled, DATA.piled)]
         if clear:
-            # Where one end of the range is too near, so may be the other: two equal samples are enough there.
+            # Where one end of the range is too small, so may be the other: two equal samples are enough there.
             at, last = piled[clear[0]], float(record.time[max(a[-1] for a in piled.values() if a.size > 1)])
             yield DataFault(
                 "clipped",
@@ -289,27 +288,27 @@ def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
 
 
 def _piled(row: np.ndarray) -> dict[str, np.ndarray]:
-    """The samples at each end of a signal's range, less turning points of sines, which are alike on both sides."""
+    """Indices of samples at either end of a signal's range, without turning points of sines (equal on both sides)."""
     padded = np.pad(row, 1, constant_values=np.nan)
     before, after = padded[:-2], padded[2:]
     turns = (np.abs(before - after) <= DATA.turning * np.ptp(row)) & (before != row)
     return {name: np.flatnonzero((row == end) & ~turns) for name, end in (("above", row.max()), ("below", row.min()))}
 
 
-def _ends(row: np.ndarray, at: np.ndarray, least: int, ratio: float) -> bool:
-    """Whether the samples `at` an end of a signal's range are so many as where the range is too small for it."""
-    return least <= at.size < row.size and at.size > ratio * _beside(row, at)
+def _piles_up(row: np.ndarray, at: np.ndarray, least: int, ratio: float) -> bool:
+    """Whether the samples `at` an end of a signal's range are many enough for clipping."""
+    return least <= at.size < row.size and at.size > ratio * _count_next(row, at)
 
 
 def _has_levels(row: np.ndarray, at: np.ndarray) -> bool:
-    """Whether a signal is a sequence of levels, as it repeats near its end too: of these one is the highest."""
+    """Whether a signal is a sequence of constant levels, the highest of them at `at`: it repeats elsewhere too."""
     outer = row[1:] / row[at[0]] > 0.5
     outer &= row[1:] != row[at[0]]
     return not outer.any() or float(np.mean(np.diff(row)[outer] == 0)) > DATA.held
 
 
-def _beside(row: np.ndarray, at: np.ndarray) -> int:
-    """Samples that have the value next to that of the samples `at`."""
+def _count_next(row: np.ndarray, at: np.ndarray) -> int:
+    """Number of samples at the value next to that of the samples `at`."""
     others = row[row != row[at[0]]]
     return int(np.count_nonzero(others == others[np.argmin(np.abs(others - row[at[0]]))]))
 
@@ -321,7 +320,7 @@ def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
             moves = np.abs(np.diff(row, order))
             changes = np.flatnonzero(moves > 1e-9 * np.abs(row).max())
             every = int(np.gcd.reduce(np.diff(changes))) if changes.size >= DATA.fewest_changes else 1
-            # What rests for long and moves again would have its changes far apart.
+            # An output that rests for long has changes that are far apart too, but few.
             if 1 < every <= DATA.slowest and changes.size > 0.5 * (np.ptp(changes) // every):
                 yield DataFault(
                     "upsampled",

@@ -1,9 +1,9 @@
-"""Nonlinear distortion and noise seen in periodic excitation, before any model; its period.
+"""Nonlinear distortion and noise from periodic excitation, without a model; detection of the period.
 
-The response of a linear structure stands on the lines that are excited. The mean over periods on the other lines is
-distortion: of an even law on even multiples of 1/T, where only odd ones are excited, and of an odd law on odd ones.
-What differs from period to period is noise. Pintelon & Schoukens, System Identification: A Frequency Domain Approach,
-2nd ed., Wiley 2012, section 4.3.
+A linear structure responds at the excited lines only. The mean over periods at the other lines is distortion: where
+only odd multiples of 1/T are excited, an even nonlinearity shows at even multiples, an odd one at odd multiples. The
+scatter between periods is noise. Pintelon & Schoukens, System Identification: A Frequency Domain Approach, 2nd ed.,
+Wiley 2012, section 4.3.
 """
 
 from collections.abc import Mapping
@@ -17,13 +17,13 @@ from workbench.structure.modes import frozen
 
 @dataclass(frozen=True)
 class PeriodicSettings:
-    """Constants of the search for a period and its lines."""
+    """Constants of the detection of a period and its lines."""
 
-    excited: float = 0.05  # of the largest line of the inputs: the least that counts as excited
-    settling: int = 1  # periods at the start that a structure takes to settle
-    alike: float = 0.9  # correlation of the inputs with themselves a period later; that of other lags is far less
-    apart: float = 0.5  # correlation that comes in between: below it the inputs are no slow drift
-    least: int = 8  # samples of a period
+    excited: float = 0.05  # least amplitude of an excited line, relative to the largest line of the inputs
+    settling: int = 1  # periods at the start that are left out as transient
+    high: float = 0.9  # least autocorrelation of the inputs at a period; that of other lags is far lower
+    low: float = 0.5  # autocorrelation that lags before the period fall below; that of a slow drift does not
+    least: int = 8  # samples of a period, at least
 
 
 PERIODIC = PeriodicSettings()
@@ -31,7 +31,7 @@ PERIODIC = PeriodicSettings()
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
-    """Lines of the mean period of a record, and their noise.
+    """Fourier lines of the mean period of a record, and their noise.
 
     Attributes:
         name: of the record.
@@ -40,7 +40,7 @@ class Distortion:
         amplitudes: (n_outputs, n_lines) rms of each line, in the unit of the output.
         noise: (n_outputs, n_lines) standard error of each, from the scatter between periods.
         channels: of the outputs.
-        n_periods: that were averaged.
+        n_periods: number of periods averaged.
         input_rms: of all inputs together.
         input_amplitudes: (n_lines,) rms of each line of all inputs together.
     """
@@ -67,19 +67,19 @@ class Distortion:
 
     @property
     def parity_resolved(self) -> bool:
-        """Whether only odd lines are excited: even ones then reveal an even law."""
+        """Whether only odd lines are excited: even lines then show an even nonlinearity."""
         return not self.excited[1::2].any()
 
     @property
     def rms(self) -> Mapping[str, np.ndarray]:
         """Rms of each output (n_outputs,) on excited, odd and even lines, and of the noise of one period."""
         kinds = {"excited": self.excited, "odd": self.odd, "even": self.even}
-        found = {kind: np.sqrt((self.amplitudes[:, lines] ** 2).sum(axis=1)) for kind, lines in kinds.items()}
-        return found | {"noise": np.sqrt(self.n_periods * (self.noise**2).sum(axis=1))}
+        values = {kind: np.sqrt((self.amplitudes[:, lines] ** 2).sum(axis=1)) for kind, lines in kinds.items()}
+        return values | {"noise": np.sqrt(self.n_periods * (self.noise**2).sum(axis=1))}
 
 
 def distortion_of(record: Record) -> Distortion:
-    """Distortion and noise of a record whose inputs repeat three times or more, the first period left to settle.
+    """Distortion and noise of a record of three or more periods of its inputs, without the transient first period.
 
     Raises:
         ValueError: inputs that do not repeat, or too few periods.
@@ -95,7 +95,7 @@ def distortion_of(record: Record) -> Distortion:
     whole = slice(PERIODIC.settling * period, (PERIODIC.settling + n_periods) * period)
 
     def lines_of(signals: np.ndarray) -> np.ndarray:
-        """(n_signals, n_periods, n_lines), by rms."""
+        """Fourier lines (n_signals, n_periods, n_lines) complex, their moduli rms."""
         periods = signals[:, whole].reshape(signals.shape[0], n_periods, period)
         return np.asarray(np.sqrt(2.0) / period * np.fft.rfft(periods, axis=2)[:, :, 1 : (period + 1) // 2])
 
@@ -117,7 +117,7 @@ def distortion_of(record: Record) -> Distortion:
 
 
 def period_of(inputs: np.ndarray) -> int | None:
-    """Samples after which inputs repeat: the lag L of the first peak above 0.9 of their correlation with themselves.
+    """Period of the inputs in samples: the lag L of the first peak of their autocorrelation above 0.9.
 
         ρ(L) = Σ_k u(k)·u(k + L) / √(Σ_k |u(k)|² Σ_k |u(k + L)|²)      over k = 0 ... n - L - 1
 
@@ -137,15 +137,15 @@ def period_of(inputs: np.ndarray) -> int | None:
     sums = np.r_[0.0, np.cumsum((u**2).sum(axis=0))]
     lags = np.arange(most + 1)
     scale = np.sqrt(sums[n - lags] * (sums[n] - sums[lags]))
-    alike = product / np.where(scale > 0, scale, np.inf)
-    apart = np.flatnonzero(alike[:most] < PERIODIC.apart)
-    if apart.size == 0:
+    autocorrelation = product / np.where(scale > 0, scale, np.inf)
+    low = np.flatnonzero(autocorrelation[:most] < PERIODIC.low)
+    if low.size == 0:
         return None
-    start = max(int(apart[0]), PERIODIC.least)
-    beside = np.r_[alike, -np.inf]
+    start = max(int(low[0]), PERIODIC.least)
+    padded = np.r_[autocorrelation, -np.inf]
     peaks = start + np.flatnonzero(
-        (beside[start:-1] > PERIODIC.alike)
-        & (beside[start:-1] >= beside[start - 1 : -2])
-        & (beside[start:-1] >= beside[start + 1 :])
+        (padded[start:-1] > PERIODIC.high)
+        & (padded[start:-1] >= padded[start - 1 : -2])
+        & (padded[start:-1] >= padded[start + 1 :])
     )
     return int(peaks[0]) if peaks.size else None

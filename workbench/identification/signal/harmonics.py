@@ -1,7 +1,9 @@
-"""Harmonic excitation, which looks like a mode of next to no damping: mains hum, a machine that turns.
+"""Detection of harmonic excitation, such as mains hum or rotating machines, which looks like a mode of hardly any
+damping.
 
-The response of a mode to random forces is normal: of its envelope |z| the mean of |z|⁴ is twice the square of that of
-|z|². Of a sine it is once that square (Jacobsen, Andersen & Brincker, IOMAC 2007, by the kurtosis of the signal).
+The response of a mode to random forces is normally distributed: the mean of |z|⁴ of its envelope |z| is twice the
+square of the mean of |z|². For a sine both are equal (Jacobsen, Andersen & Brincker, IOMAC 2007, by the kurtosis of
+the signal).
 """
 
 from collections.abc import Sequence
@@ -18,12 +20,12 @@ from workbench.structure.printed import mode_text
 class HarmonicSettings:
     """Constants of the test for harmonic excitation."""
 
-    # of the mean of |z|⁴ over the square of that of |z|²; of random motion over six times the decay time of a mode it
-    # is below 1.42 in one of a thousand, of a sine with a tenth of its power in random motion about it 1.17
+    # Largest ratio of the mean of |z|⁴ to the square of the mean of |z|² for a sine. In random motion over six decay
+    # times of a mode one in a thousand is below 1.42; a sine with a tenth of its power in random motion has 1.17.
     steady: float = 1.3
-    lines: int = 8  # to either side, at least, that the envelope is made of
-    chance: float = 1e-4  # that a line of random motion is taken for a sine
-    peaked: float = 5.0  # power of a mode's peak over the median within four of its half bandwidths: 1 + 2²
+    lines: int = 8  # least number of lines on either side that form the envelope
+    false_alarm: float = 1e-4  # probability that a line of random motion is taken for a sine
+    peaked: float = 5.0  # power at the peak of a mode over its median within two bandwidths: 1 + 2²
 
 
 HARMONICS = HarmonicSettings()
@@ -32,13 +34,13 @@ HARMONICS = HarmonicSettings()
 def harmonic_remarks(
     records: Sequence[Record], poles: Complexes, among: Sequence[int], lasting: Sequence[int] = ()
 ) -> tuple[str, ...]:
-    """A remark on the modes about whose frequencies the motion of every record has an envelope that stays the same.
+    """A remark on the modes at whose frequencies the motion of every record has a constant envelope.
 
     Args:
-        records: motion that is driven all along.
+        records: motion under forces that act throughout.
         poles: (n_modes,) rad/s.
         among: the modes that may be harmonic excitation, from 0.
-        lasting: of these, those that are known to go on as they are.
+        lasting: those of them that are known to have a constant amplitude.
     """
     steady = list(among)
     for record in records if steady else ():
@@ -56,14 +58,15 @@ def harmonic_remarks(
 
 
 def _is_steady(lines: Complexes, power: Floats, pole: complex) -> bool:
-    """Whether the envelope stays the same in the output that holds most of what is about a pole, in lines.
+    """Whether the motion about a pole is harmonic.
 
-    Or, in any output, one line stands out of a broad peak: power of random motion is exponential, its median ln 2 of
-    its mean.
+    Either the envelope is constant in the output of the largest share of power there, or one line of any output stands
+    out of a broad peak: the power of random motion has an exponential distribution, whose median is ln 2 of its mean.
 
     Args:
-        lines: (n_outputs, n_lines) of the transform.
-        power: (n_outputs,) sum of squares.
+        lines: (n_outputs, n_lines) Fourier transform of the outputs.
+        power: (n_outputs,) sum of squares of the outputs.
+        pole: in units of the line spacing.
     """
     half = max(2.0 * abs(pole.real), HARMONICS.lines)
     first, last = (round(pole.imag + side * half) for side in (-1.0, 1.0))
@@ -71,9 +74,9 @@ def _is_steady(lines: Complexes, power: Floats, pole: complex) -> bool:
         return False
     inside = lines[:, first : last + 1]
     strongest = inside[np.argmax((np.abs(inside) ** 2).sum(axis=1) / power)]
-    each = np.abs(inside) ** 2
-    highest = HARMONICS.peaked * np.log(each.size / HARMONICS.chance) / np.log(2.0)
-    if abs(pole.real) >= HARMONICS.lines and (each.max(axis=1) > highest * np.median(each, axis=1)).any():
+    line_power = np.abs(inside) ** 2
+    ratio = HARMONICS.peaked * np.log(line_power.size / HARMONICS.false_alarm) / np.log(2.0)
+    if abs(pole.real) >= HARMONICS.lines and (line_power.max(axis=1) > ratio * np.median(line_power, axis=1)).any():
         return True
     envelope = np.abs(np.fft.ifft(strongest, 4 * strongest.size)) ** 2
     return bool((envelope**2).mean() < HARMONICS.steady * envelope.mean() ** 2)

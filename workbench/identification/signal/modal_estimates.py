@@ -1,4 +1,4 @@
-"""Estimates of frequencies, damping ratios and shapes: their standard errors, and how they are printed."""
+"""Types of modal estimates with standard errors, how they are printed, and remarks on pairs of modes."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -15,20 +15,21 @@ from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes, frozen
 from workbench.structure.printed import Printed, counted
 
-# of two neighbours that are one mode of two set-ups: relative distance of frequencies at most; cosine between the sizes
-# of their shapes, of which noise leaves 0.01, at most; and between those of their participation factors at least
+# Two neighbours are one mode of two set-ups if their frequencies differ by less than this, relative; if the cosine
+# between the moduli of their shapes is less than this (noise makes it 0.01); and if that of participation factors is
+# more than this.
 NEAR, APART, ALIKE = 0.05, 0.1, 0.9
-OF_CLOCKS = 0.01  # relative difference of two frequencies, at most, that may be one of sample rates
-SURE = 3.0  # standard errors below zero from which on a damping ratio is negative
+CLOCK_RATIO = 0.01  # largest relative difference of frequencies that is attributed to sample rates
+SURE = 3.0  # number of standard errors that makes a difference significant
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
 
 
 class ShapeEstimates(Protocol):
-    """Modes whose shapes have a covariance: of `refine`, `ring_down`, `identify`, `identify_driven`,
+    """Modes with a covariance of their shapes, from `refine`, `ring_down`, `identify`, `identify_driven` or
     `identify_transfer`.
 
-    `shape_covariance` is (n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of
-    each; `covariance` is (2 n_modes, 2 n_modes) of (ω, ζ).
+    `shape_covariance` is (n_modes, n_outputs, n_outputs) of the real parts of the shapes, relative to the largest entry
+    of each; `covariance` is (2 n_modes, 2 n_modes) of (ω, ζ).
     """
 
     @property
@@ -45,7 +46,7 @@ class ShapeEstimates(Protocol):
 
 
 class ModalEstimates(Printed):
-    """What modes with a covariance of (ω_1..ω_n, ζ_1..ζ_n), (2 n_modes, 2 n_modes), say of their errors."""
+    """Modes with a covariance of (ω_1..ω_n, ζ_1..ζ_n), (2 n_modes, 2 n_modes), and their standard errors."""
 
     modes: SampledModes
     covariance: np.ndarray
@@ -82,7 +83,7 @@ class ModalEstimates(Printed):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ParticipatingModes(ModalEstimates):
-    """Modes between inputs and outputs, each mode's shape and participation factors with one covariance."""
+    """Modes between inputs and outputs, with a joint covariance of the shape and participation factors of each mode."""
 
     modes: SampledModes
     covariance: np.ndarray
@@ -117,13 +118,13 @@ class Refined(ModalEstimates):
     Attributes:
         modes: refined; shapes of displacement, largest entry 1.
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
-        amplitudes: one (n_outputs, n_modes) complex a record: y = Re Σ a_r e^{λ_r (t - t_first)}, in its own units.
-        shape_factor, shape_variance: (n_modes, n_outputs, n_factors) F and (n_modes, n_outputs) v of the covariance
-            F F^T + diag v of the real parts of the shapes, relative to each one's largest entry (which is 1 and so
-            without error).
+        amplitudes: one (n_outputs, n_modes) complex per record: y = Re Σ a_r e^{λ_r (t - t_first)}, in its own units.
+        shape_factor, shape_variance: F (n_modes, n_outputs, n_factors) and v (n_modes, n_outputs) of the covariance
+            F F^T + diag v of the real parts of the shapes, relative to the largest entry of each (which is 1, without
+            error).
         noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
-        converged: whether the search ended because the step was small.
-        steps: taken.
+        converged: whether the search ended because the step was negligible.
+        steps: number of steps.
     """
 
     modes: SampledModes
@@ -136,7 +137,7 @@ class Refined(ModalEstimates):
     steps: int
 
     def select(self, which: np.ndarray) -> "Refined":
-        """Some of the modes, by index; the others were fitted beside them."""
+        """Some of the modes, by index, as they were fitted together with the others."""
         both = np.r_[which, which + self.modes.n_modes]
         return replace(
             self,
@@ -151,16 +152,16 @@ class Refined(ModalEstimates):
     def shape_covariance(self) -> np.ndarray:
         """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each.
 
-        Made only where it is asked for: that of thousands of outputs fills the memory.
+        Computed on demand: that of thousands of outputs fills the memory.
         """
-        found = np.matmul(self.shape_factor, self.shape_factor.transpose(0, 2, 1))
-        np.einsum("rjj->rj", found)[:] += self.shape_variance
-        found.setflags(write=False)
-        return np.asarray(found)
+        covariance = np.matmul(self.shape_factor, self.shape_factor.transpose(0, 2, 1))
+        np.einsum("rjj->rj", covariance)[:] += self.shape_variance
+        covariance.setflags(write=False)
+        return np.asarray(covariance)
 
     @property
     def noise_std(self) -> np.ndarray:
-        """Of each output (n_outputs,), root mean square over the records."""
+        """Noise of each output (n_outputs,), root mean square over the records."""
         return np.asarray(np.sqrt((self.noise**2).mean(axis=0)))
 
     @property
@@ -170,7 +171,7 @@ class Refined(ModalEstimates):
 
 
 class OfRefined(ModalEstimates):
-    """What was found about refined modes, whose figures and errors are its own."""
+    """A result that contains refined modes and presents their estimates and errors as its own."""
 
     refined: Refined
 
@@ -196,15 +197,15 @@ class OfRefined(ModalEstimates):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identified(OfRefined):
-    """The modes of a record, and what was taken for noise.
+    """The modes of a record, and the candidates rejected as noise.
 
     Attributes:
         refined: the modes, with covariance.
-        statistic: (n_modes,) χ² of each mode's amplitudes in the noise, 2 degrees of freedom a signal.
-        threshold: what the strongest mode fitted to white noise alone exceeds with the chance `false_alarm`.
-        noise_modes: candidates rejected, each with a statistic below the threshold, overdamped, or part of another.
-        noise_statistic: (n_noise,) theirs.
-        remarks: what was left undone, where the time was up.
+        statistic: (n_modes,) χ² of each mode's amplitudes in the noise, 2 degrees of freedom per signal.
+        threshold: value that the strongest mode fitted to white noise alone exceeds with probability `false_alarm`.
+        noise_modes: rejected candidates: insignificant, overdamped, or split off another mode.
+        noise_statistic: (n_noise,) test statistics of these.
+        remarks: on searches that the time limit ended early, among others.
     """
 
     refined: Refined
@@ -246,18 +247,18 @@ class Identified(OfRefined):
         )
 
 
-def rows_of(found: ModalEstimates) -> Iterator[tuple[str, ...]]:
-    """One row per mode under `HEADINGS`, figures to the second digit of their standard errors."""
-    modes = found.modes
+def rows_of(estimates: ModalEstimates) -> Iterator[tuple[str, ...]]:
+    """One row per mode under `HEADINGS`, values to the second digit of their standard errors."""
+    modes = estimates.modes
     collinearity = modes.phase_collinearity
     for r in range(modes.n_modes):
-        frequency = rounded(modes.frequencies_hz[r], found.omega_std[r] / (2.0 * np.pi))
-        damping = rounded(100 * modes.zeta[r], 100 * found.zeta_std[r])
+        frequency = rounded(modes.frequencies_hz[r], estimates.omega_std[r] / (2.0 * np.pi))
+        damping = rounded(100 * modes.zeta[r], 100 * estimates.zeta_std[r])
         yield str(r + 1), *frequency, *damping, f"{collinearity[r]:.4f}"
 
 
 def rounded(value: float, error: float) -> tuple[str, str]:
-    """A figure and its standard error, both to the second digit of the error."""
+    """A value and its standard error, both to the second digit of the error."""
     if not (math.isfinite(error) and error > 1e-9 * abs(value)):
         return f"{value:.10g}", f"{error:.1g}"
     digits = max(0, 1 - math.floor(math.log10(error)))
@@ -265,11 +266,11 @@ def rounded(value: float, error: float) -> tuple[str, str]:
 
 
 def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, nyquist: float) -> np.ndarray:
-    """Which estimates can be modes, (n_modes,): damping not negative beyond its error, a frequency known and below
+    """Which estimates can be modes, (n_modes,): no significantly negative damping, a significant frequency below
     Nyquist.
 
     Args:
-        modes: estimated.
+        modes: estimates.
         omega_std, zeta_std: (n_modes,) standard errors.
         nyquist: frequency, rad/s.
     """
@@ -277,53 +278,53 @@ def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, n
     return np.asarray(~growing & (omega_std < modes.omega) & (modes.omega < nyquist))
 
 
-def repeated_remarks(found: "ModalEstimates") -> tuple[str, ...]:
-    """A remark on neighbours whose frequency and damping are the same within their errors: a repeated root."""
-    modes, pairs = found.modes, []
+def repeated_remarks(estimates: "ModalEstimates") -> tuple[str, ...]:
+    """A remark on neighbours of equal frequency and damping within their errors: a repeated root."""
+    modes, pairs = estimates.modes, []
     for r in range(modes.n_modes - 1):
-        apart = np.abs(np.diff([modes.omega[r : r + 2], modes.zeta[r : r + 2]], axis=1)).ravel()
-        errors = np.hypot(*np.array([found.omega_std[r : r + 2], found.zeta_std[r : r + 2]]).T)
-        if (apart < SURE * errors).all() and apart[0] < modes.zeta[r] * modes.omega[r]:
+        differences = np.abs(np.diff([modes.omega[r : r + 2], modes.zeta[r : r + 2]], axis=1)).ravel()
+        errors = np.hypot(*np.array([estimates.omega_std[r : r + 2], estimates.zeta_std[r : r + 2]]).T)
+        if (differences < SURE * errors).all() and differences[0] < modes.zeta[r] * modes.omega[r]:
             pairs.append(f"{r + 1} and {r + 2} ({modes.frequencies_hz[r]:.4g} Hz)")
     if not pairs:
         return ()
     return (
-        f"modes {', '.join(pairs)} may be one repeated root: only the plane of their two shapes is determined, and each"
-        " shape is one of many in it, which need not be real",
+        f"modes {', '.join(pairs)} may be one repeated root: only the plane of their two shapes is determined; each"
+        " shape is one of many in that plane, and need not be real",
     )
 
 
-def clock_remarks(found: "ModalEstimates", only: Sequence[int]) -> tuple[str, ...]:
-    """A remark where all modes come in pairs of one damping and one ratio of frequencies: of two clocks.
+def clock_remarks(estimates: "ModalEstimates", only: Sequence[int]) -> tuple[str, ...]:
+    """A remark where all modes form pairs of equal damping and one ratio of frequencies: the sample rates differ.
 
     Args:
-        found: modes of several outputs or records, by rising frequency.
-        only: the modes to look at, from 0.
+        estimates: modes of several outputs or records, sorted by frequency.
+        only: the modes to examine, from 0.
     """
     if len(only) < 4 or len(only) % 2:
         return ()
-    omega, zeta = (values[list(only)].reshape(-1, 2).T for values in (found.modes.omega, found.modes.zeta))
-    omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in (found.omega_std, found.zeta_std))
-    faster, error = omega[1] / omega[0] - 1.0, np.hypot(*(omega_std / omega))
-    mean = np.average(faster, weights=error**-2)
-    apart = (SURE * error < faster) & (faster < OF_CLOCKS)
-    alike = (np.abs(faster - mean) < SURE * error) & (np.abs(np.diff(zeta, axis=0)[0]) < SURE * np.hypot(*zeta_std))
-    if not (apart & alike).all():
+    omega, zeta = (values[list(only)].reshape(-1, 2).T for values in (estimates.modes.omega, estimates.modes.zeta))
+    omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in (estimates.omega_std, estimates.zeta_std))
+    ratio, error = omega[1] / omega[0] - 1.0, np.hypot(*(omega_std / omega))
+    mean = np.average(ratio, weights=error**-2)
+    separate = (SURE * error < ratio) & (ratio < CLOCK_RATIO)
+    alike = (np.abs(ratio - mean) < SURE * error) & (np.abs(np.diff(zeta, axis=0)[0]) < SURE * np.hypot(*zeta_std))
+    if not (separate & alike).all():
         return ()
     return (
-        f"modes come in pairs whose frequencies all differ by {100.0 * mean:.2g} %: has an output or a record another"
-        " sample rate, by so much? Put it on the clock of the others; one mode of each pair is the other",
+        f"modes come in pairs whose frequencies all differ by {100.0 * mean:.2g} %: does the sample rate of an output"
+        " or a record differ by so much? Resample it to that of the others: each pair is then one mode",
     )
 
 
-def set_up_remarks(found: ParticipatingModes) -> tuple[str, ...]:
-    """A remark on neighbours that the same inputs move and that share no sensor: one mode of two set-ups.
+def set_up_remarks(estimates: ParticipatingModes) -> tuple[str, ...]:
+    """A remark on neighbours that the same inputs excite but that no sensor shows both: one mode in two set-ups.
 
-    Roving sensors load the structure elsewhere in each set-up, so that each has frequencies of its own. A mode that an
-    input moves is seen at the place of that input, in every set-up.
+    Roving sensors load the structure at other places in each set-up and so shift its frequencies. Two different modes
+    that an input excites would both be seen by a sensor near that input.
     """
-    modes, pairs = found.modes, []
-    shapes, inputs = np.abs(modes.shapes.T), np.abs(found.participation)
+    modes, pairs = estimates.modes, []
+    shapes, inputs = np.abs(modes.shapes.T), np.abs(estimates.participation)
     shapes, inputs = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (shapes, inputs))
     for r in range(modes.n_modes - 1):
         near = np.ptp(modes.omega[r : r + 2]) < NEAR * modes.omega[r]
@@ -338,7 +339,10 @@ def set_up_remarks(found: ParticipatingModes) -> tuple[str, ...]:
 
 
 def by_poles(poles: np.ndarray) -> np.ndarray:
-    """∂(ω, ζ)/∂(x, y) of poles λ = x + iy, (2 n_modes, 2 n_modes): dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³."""
+    """Jacobian ∂(ω, ζ)/∂(x, y) of poles λ = x + iy, (2 n_modes, 2 n_modes).
+
+    dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³.
+    """
     x, y, omega = poles.real, poles.imag, np.abs(poles)
     return np.block(
         [[np.diag(x / omega), np.diag(y / omega)], [np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)]]
@@ -367,16 +371,16 @@ def check_finite(shapes: np.ndarray) -> None:
 
 
 def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
-    """Each column turned as near the real axis as it goes, largest entry 1, first clear entry positive.
+    """Shapes rotated to be most nearly real, largest entry 1, the first entry of over 0.05 positive.
 
     Raises:
         ValueError: an entry that is not finite.
     """
     check_finite(shapes)
-    turned = shapes * np.exp(-0.5j * np.angle((shapes**2).sum(axis=0)))
-    turned = turned / np.abs(turned).max(axis=0)
-    clear = np.argmax(np.abs(turned.real) > 0.05, axis=0)
-    return np.asarray(turned * np.where(turned.real[clear, np.arange(turned.shape[1])] < 0, -1.0, 1.0))
+    rotated = shapes * np.exp(-0.5j * np.angle((shapes**2).sum(axis=0)))
+    rotated = rotated / np.abs(rotated).max(axis=0)
+    first = np.argmax(np.abs(rotated.real) > 0.05, axis=0)
+    return np.asarray(rotated * np.where(rotated.real[first, np.arange(rotated.shape[1])] < 0, -1.0, 1.0))
 
 
 def time_derivatives(channels: Sequence[Channel]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Poles that distortion of a stronger mode makes: at multiples of its frequency, and beside those of another mode."""
+"""Overtones: spurious poles due to distortion of a stronger mode, at multiples and combinations of frequencies."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,23 +13,24 @@ from workbench.structure.printed import mode_text
 class OvertoneSettings:
     """Constants of the search for overtones."""
 
-    highest: int = 9
-    at_most: float = 0.03  # amplitude of an overtone, relative to its base
-    within: float = 2e-3  # of a whole multiple of the base's frequency
-    scatters: float = 2.0  # rms scatters of the base's frequency, a multiple, by which that of an overtone may be off
-    sure: float = 3.0  # standard errors that either may be off by beyond that
-    damping: float = 0.2  # of the decay rate: by how much that of an overtone may be off
+    highest: int = 9  # order of an overtone
+    at_most: float = 0.03  # largest amplitude of an overtone, relative to its base
+    within: float = 2e-3  # relative tolerance of its frequency
+    scatters: float = 2.0  # further tolerance of its frequency, in rms scatters of the base's frequency times the order
+    sure: float = 3.0  # further tolerance of frequency and decay rate, in standard errors
+    damping: float = 0.2  # relative tolerance of its decay rate
 
 
 OVERTONES = OvertoneSettings()
 
 
 def multiple_of(frequencies: Floats, size: Floats, r: int) -> tuple[int | None, int]:
-    """The far stronger mode at a whole multiple of whose frequency mode r lies, and which multiple; None and 0 of none.
+    """The far stronger base mode of which mode r may be an overtone, and the order of the overtone; None and 0 if none.
 
     Args:
         frequencies: (n_modes,) in any unit.
         size: (n_modes,) amplitudes.
+        r: index of the mode.
     """
     for base in np.argsort(-size):
         times = round(frequencies[r] / frequencies[base])
@@ -40,37 +41,42 @@ def multiple_of(frequencies: Floats, size: Floats, r: int) -> tuple[int | None, 
 
 
 def overtone_remarks(poles: np.ndarray, size: Floats, scatter: Floats, deviation: np.ndarray) -> tuple[str, ...]:
-    """A remark on the modes whose poles a law of second or third degree makes of one that changes with amplitude.
+    """A remark on modes that may be quadratic or cubic distortion of a mode whose frequency depends on amplitude.
 
-    Products of free decays e^{λt} decay by the sum of their poles: 2λ, 3λ, and λ' ± λ, λ' ± 2λ beside another mode's.
-    Only frequency and damping together tell: a mode of the structure seldom has both.
+    A product of free decays e^{λt} has the sum of their poles: 2λ, 3λ, and with the pole λ' of another mode λ' ± λ and
+    λ' ± 2λ. A mode must agree in frequency and in damping: a mode of the structure seldom agrees in both.
 
     Args:
         poles: (n_modes,) of positive frequencies, rad/s.
         size: (n_modes,) amplitudes.
-        scatter: (n_modes,) rms by which the frequency of a mode changes, rad/s; 0 of one that does not.
+        scatter: (n_modes,) rms variation of the frequency of each mode, rad/s; 0 where it is constant.
         deviation: (n_modes,) standard errors of the poles' real and imaginary parts, as complex numbers.
     """
-    found, of = [], set()
+    overtones, base_modes = [], set()
     for r in range(poles.size):
-        makers = [base for base in np.flatnonzero(scatter) if size[r] < OVERTONES.at_most * size[base]]
-        for base in sorted(makers, key=lambda k: -size[k]):
+        bases = [base for base in np.flatnonzero(scatter) if size[r] < OVERTONES.at_most * size[base]]
+        for base in sorted(bases, key=lambda k: -size[k]):
             sums = _sums(poles, size, int(base), r)
-            how = next((w for w, made, n in sums if _meets(poles[r], made, n * scatter[base], deviation[r])), None)
-            if how is not None:
-                found.append(f"{mode_text(r, poles[r].imag / (2.0 * np.pi))} lies at {how}")
-                of.add(int(base) + 1)
+            words = next((w for w, pole, n in sums if _agrees(poles[r], pole, n * scatter[base], deviation[r])), None)
+            if words is not None:
+                overtones.append(f"{mode_text(r, poles[r].imag / (2.0 * np.pi))} lies at {words}")
+                base_modes.add(int(base) + 1)
                 break
-    if not found:
+    if not overtones:
         return ()
     return (
-        f"{'; '.join(found)}, in frequency and in damping: distortion of mode {' and '.join(map(str, sorted(of)))},"
-        " which changes, looks like this; it is a mode of the structure only if lower levels show it too",
+        f"{'; '.join(overtones)}, in frequency and in damping: distortion of mode"
+        f" {' and '.join(map(str, sorted(base_modes)))}, which changes, looks like this; it is a mode of the structure"
+        " only if lower levels show it too",
     )
 
 
 def _sums(poles: np.ndarray, size: Floats, base: int, r: int) -> Iterator[tuple[str, complex, int]]:
-    """The poles that a base makes, alone or beside modes far stronger than r: in words, and how often it is in each."""
+    """Poles of the distortion of a base mode, alone and with modes far stronger than r.
+
+    Yields:
+        description, pole, and the multiple of the base in it.
+    """
     own = complex(poles[base])
     for times in (2, 3):
         yield f"{times} × mode {base + 1}", times * own, times
@@ -83,8 +89,8 @@ def _sums(poles: np.ndarray, size: Floats, base: int, r: int) -> Iterator[tuple[
                 yield words, complex(rate, abs(poles[other].imag + sign * times * own.imag)), times
 
 
-def _meets(pole: complex, made: complex, scatter: float, deviation: complex) -> bool:
-    """Whether a pole is one that is made, in frequency and in decay."""
-    off = OVERTONES.within * made.imag + OVERTONES.scatters * scatter + OVERTONES.sure * deviation.imag
-    damped = OVERTONES.damping * abs(made.real) + OVERTONES.sure * deviation.real
-    return abs(pole.imag - made.imag) < off and abs(pole.real - made.real) < damped
+def _agrees(pole: complex, overtone: complex, scatter: float, deviation: complex) -> bool:
+    """Whether a pole agrees with that of an overtone in frequency and in decay rate."""
+    frequency = OVERTONES.within * overtone.imag + OVERTONES.scatters * scatter + OVERTONES.sure * deviation.imag
+    decay = OVERTONES.damping * abs(overtone.real) + OVERTONES.sure * deviation.real
+    return abs(pole.imag - overtone.imag) < frequency and abs(pole.real - overtone.real) < decay

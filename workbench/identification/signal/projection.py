@@ -1,20 +1,20 @@
-"""The projection of a record on given poles, amplitudes free, its residual, and the noise that this is.
+"""Least squares projection of a free decay on the exponentials of given poles, and the noise of its residual.
 
-y_j = Φ c_j + r_j, Φ = [e^{-σt} cos ω_d t, e^{-σt} sin ω_d t] and, where asked for, a column of ones. All derivatives of
-Φ by the poles lie in the span of tΦ. In a long record the matrices ΦᵀΦ, ΦᵀtΦ, (tΦ)ᵀtΦ are sums of powers
+y_j = Φ c_j + r_j, Φ = [e^{-σt} cos ω_d t, e^{-σt} sin ω_d t] and, optionally, a column of ones. All derivatives of Φ by
+the poles lie in the span of tΦ. In a long record the matrices ΦᵀΦ, ΦᵀtΦ, (tΦ)ᵀtΦ are sums of powers
 
     S_k(w) = Σ_{i<N} i^k w^i,     w = μ_r μ_s and μ_r μ_s*,   μ = e^{λΔt},
 
-which doubling gives in log N steps, and an exponential is left out where it has decayed below round-off.
+computed by doubling in log N steps. An exponential is left out where it has decayed below round-off.
 
-Whitening: the residual of an output is modelled as y_k = Σ_i a_i y_k-i + e_k (Yule & Walker), and the record filtered
-by 1 - Σ_i a_i z^-i. A free decay stays a free decay of the same poles.
+Whitening: the residual of an output is modelled as the autoregression y_k = Σ_i a_i y_k-i + e_k (Yule & Walker), and
+the record is filtered by 1 - Σ_i a_i z^-i. A free decay stays a free decay of the same poles.
 
-Where outputs share noise of correlation C, combinations C^-½ y / s whose noise is independent are filtered instead: the
-same holds of them.
+Where the noise of the outputs has the correlation matrix C, the combinations C^-½ y / s, whose noise is uncorrelated,
+are filtered instead. They are free decays of the same poles too.
 
-Variance: residuals of one day have one noise, and short records know it better together. Bartlett's statistic tests
-that (Proc. R. Soc. A 160, 1937): with ν_i degrees of freedom behind the variance v_i of record i, and v of all,
+Variance: if the noise of all records has one variance, short records estimate it better together. Bartlett's statistic
+tests this (Proc. R. Soc. A 160, 1937): with ν_i degrees of freedom of the variance v_i of record i, and v of all,
 
     B = (ν ln v - Σ ν_i ln v_i) / (1 + (Σ 1/ν_i - 1/ν) / (3 (n_records - 1))),     chi-square of n_records - 1.
 """
@@ -35,42 +35,42 @@ from workbench.records.record import Record
 
 @dataclass(frozen=True)
 class ProjectionSettings:
-    """Constants of projections and of what is said of their noise."""
+    """Constants of projections and of the statistics of their noise."""
 
-    largest_factored: int = 300_000  # samples by modes up to which Φ is factored, block by block
-    longest_factored: int = 20_000  # samples, likewise: beyond, normal equations take less time
-    many: int = 1_000_000  # samples of a transform whose tables are not kept
-    part: int = 8192  # samples of a part of a longer record, whole blocks
-    block: int = 256  # samples of a block of a part
-    died_away: float = 41.0  # nepers: e^-41 is below the last digit of 1
-    summed: float = 1e-14  # round-off of squares that are a difference of sums over the record, as a share of these
-    split: float = 0.05  # chance that records of one noise are each given their own, which costs little
-    false_alarm: float = 1e-3  # chance that white noise is taken for coloured
-    least_bins: int = 6  # over which a spectrum is averaged
-    own: float = 1e-3  # share of an output's noise, at least, that no other output has
-    band: int = 32  # lines in which the correlation of noise is taken
-    harmless: float = 1.2  # variance of the combination that shares most, over that of an output: less alters nothing
-    at_once: int = 2**21  # products of outputs, in all bands, that are held at once: 16 MB
-    of_median: float = 0.25  # samples that the median over bands is worth, of the mean without a window
+    largest_factored: int = 300_000  # n_samples × n_modes up to which Φ is factored, block by block
+    longest_factored: int = 20_000  # samples, likewise; above, normal equations take less time
+    many: int = 1_000_000  # samples of a transform above which its cached tables are dropped
+    part: int = 8192  # samples of a part of a long record, a multiple of the block
+    block: int = 256  # samples of a block
+    decayed: float = 41.0  # nepers after which an exponential is left out: e^-41 is below the last digit of 1
+    summed: float = 1e-14  # relative round-off of a sum of squares that is a difference of sums over the record
+    split: float = 0.05  # probability that records of equal noise are given separate variances, which costs little
+    false_alarm: float = 1e-3  # probability that white noise is taken for coloured
+    least_bins: int = 6  # least half width of the average of a spectrum
+    own: float = 1e-3  # least share of an output's noise that is uncorrelated with that of all others
+    band: int = 32  # lines of a band in which the correlation of noise is estimated
+    harmless: float = 1.2  # largest eigenvalue of the correlation matrix up to which correlation is neglected
+    at_once: int = 2**21  # products of outputs, in all bands, that are held in memory at once: 16 MB
+    median_efficiency: float = 0.25  # of the median over windowed bands, relative to the mean without a window
     order: int = 12  # of the autoregressive model of coloured noise
-    samples_each: int = 40  # for each of its coefficients; for each output, where noise that they share is asked for
-    rounding: float = 1e-9  # residual of records without noise, relative
+    samples_each: int = 40  # per coefficient of that model, and per output for a correlation matrix, at least
+    rounding: float = 1e-9  # relative residual of records without noise
     spectra_alike: float = 0.1  # rms of log ratios below which two spectra are the same
-    most_taken: float = 0.9  # leverage at most: a line that the fit took whole says nothing of its noise
+    most_taken: float = 0.9  # largest leverage of a line that is used for the noise spectrum
 
 
 PROJECTION = ProjectionSettings()
 
 
 def pole_blocks(a: np.ndarray, b: np.ndarray, gram: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[Floats, Floats]:
-    """Gauss-Newton matrix (2 n, 2 n) and right-hand side (2 n,) of complex unknowns, real parts first.
+    """Gauss-Newton matrix (2 n, 2 n) and right-hand side (2 n,) for the real, then imaginary parts of n poles.
 
-    Of readings Re Σ (a - ib) z whose tangents ∂z, real and imaginary parts, are known projected:
+    Outputs are Re Σ (a - ib) z; the tangents ∂z are projected orthogonally to the columns of the fit.
 
     Args:
         a, b: (n, n_outputs) cosine and sine amplitudes, in units of the noise.
-        gram: (2 n, 2 n) of the tangents among themselves.
-        x, y: (n, n_outputs) of their real and imaginary parts with the residual, in units of the noise.
+        gram: (2 n, 2 n) Gram matrix of the real, then imaginary parts of the projected tangents.
+        x, y: (n, n_outputs) products of these with the residual, in units of the noise.
     """
     n = len(a)
     aa, ab, bb = a @ a.T, a @ b.T, b @ b.T
@@ -86,8 +86,8 @@ class Projection:
 
     record: Record = field(repr=False)
     poles: np.ndarray
-    squares: np.ndarray  # sum of those of the residual, (n_outputs,)
-    round_off: float  # of these squares, as a share of those of the record
+    squares: np.ndarray  # sum of squares of the residual, (n_outputs,)
+    round_off: float  # of `squares`, relative to the sum of squares of the record
     coefficients: np.ndarray  # (n_columns, n_outputs)
     gram: np.ndarray  # G = (tΦ)^T (I - Φ Φ^+) tΦ
     slopes: np.ndarray  # (tΦ)^T residual, (2 n_modes, n_outputs)
@@ -96,24 +96,24 @@ class Projection:
 
     @cached_property
     def residual(self) -> np.ndarray:
-        """(n_samples, n_outputs); of a long record computed only on demand."""
-        left = self.record.outputs.T - _Exponentials(self.record, self.poles).motion(self.complex_amplitudes)
+        """Residual (n_samples, n_outputs); for a long record it is computed on demand."""
+        residual = self.record.outputs.T - _Exponentials(self.record, self.poles).motion(self.complex_amplitudes)
         if len(self.coefficients) > 2 * self.poles.size:
-            left -= self.coefficients[-1]
-        return left
+            residual -= self.coefficients[-1]
+        return residual
 
     @property
     def complex_amplitudes(self) -> np.ndarray:
-        """a_jr = α - iβ of α cos + β sin, (n_outputs, n_modes)."""
+        """Amplitudes a_jr = α - iβ of α cos + β sin, (n_outputs, n_modes)."""
         n = self.gram.shape[0] // 2
         return (self.coefficients[:n] - 1j * self.coefficients[n : 2 * n]).T
 
 
 def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
-    """Least squares of every output on the damped exponentials of `poles`, and on a constant with `offset`.
+    """Least squares fit of the damped exponentials of `poles`, and a constant with `offset`, to every output.
 
     Raises:
-        numpy.linalg.LinAlgError: two of them cannot be distinguished.
+        numpy.linalg.LinAlgError: exponentials that cannot be distinguished.
     """
     n = record.n_samples
     if n > PROJECTION.longest_factored or n * poles.size > PROJECTION.largest_factored:
@@ -134,10 +134,11 @@ def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
 
 
 class _Rows:
-    """Φ, tΦ, a constant and y in fewer rows, of the same products: of each block of the record, its part along Q.
+    """Φ, tΦ, a constant and y compressed to fewer rows with the same inner products.
 
-    The exponentials of a block from T on are e^{λT} e^{λτ}: in all blocks they lie in the span of one table,
-    [e^{λτ}, τ e^{λτ}, 1] = Q R. What of y is across Q has no product with any column.
+    The exponentials of a block that begins at T are e^{λT} e^{λτ}: in every block they lie in the span of one table,
+    [e^{λτ}, τ e^{λτ}, 1] = Q R. Each block is represented by its coordinates along Q; the part of y orthogonal to Q is
+    orthogonal to every column.
 
     Attributes:
         phi, t_phi: (n_rows, 2 n_modes).
@@ -147,7 +148,7 @@ class _Rows:
 
     def __init__(self, record: Record, poles: np.ndarray) -> None:
         n, k, dt, y = record.n_samples, poles.size, record.sample_time, record.outputs
-        # The table of a block and what is left of all blocks then take as long to factor.
+        # With so many blocks the table and the compressed rows take about the same time to factor.
         self.blocks = max(int(np.sqrt(2.0 * n / (4 * k + 1))), 1)
         size = n // self.blocks
         self.whole = size * self.blocks
@@ -155,7 +156,7 @@ class _Rows:
         near = _columns(_exponentials(size, dt, poles))
         table = np.hstack([near, tau[:, None] * near, np.ones((size, 1))])
         self.q, r = qr(table, mode="economic", check_finite=False)
-        # Samples after the last whole block are rows as they are.
+        # Samples after the last whole block are kept as rows.
         last = dt * np.arange(self.whole, n)
         far = np.exp(np.outer(begin, poles))[:, None]
         once = far * (r[:, :k] + 1j * r[:, k : 2 * k])
@@ -168,17 +169,17 @@ class _Rows:
         self.y = np.vstack([along.reshape(len(y), -1).T, y[:, self.whole :].T])
 
     def over_time(self, rows: Floats) -> Floats:
-        """The samples (n_samples, n_outputs) of combinations of the columns, given in these rows."""
+        """Samples (n_samples, n_outputs) of combinations of the columns, from compressed rows (n_rows, n_outputs)."""
         m, inside = rows.shape[1], self.blocks * self.q.shape[1]
         blocks = rows[:inside].T.reshape(m, self.blocks, -1) @ self.q.T
         return np.vstack([blocks.reshape(m, -1).T, rows[inside:]])
 
 
 def power_sums(w: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Σ_{i<n} i^k w^i for k = 0, 1, 2, each of the shape of w; |w| ≤ 1 or little more."""
+    """Sums Σ_{i<n} i^k w^i for k = 0, 1, 2, each of the shape of w; |w| ≤ 1 or little more."""
     sums = [np.zeros(w.shape, complex) for _ in range(3)]
     power, length = np.ones(w.shape, complex), 0
-    # The sums over 2L samples are those over L, and the same again L samples later.
+    # The sums over 2L samples are those over the first L and, from the same sums, over the next L.
     for bit in bin(n)[2:]:
         s0, s1, s2 = sums
         sums = [s0 + power * s0, s1 + power * (s1 + length * s0), s2 + power * (s2 + length * (2.0 * s1 + length * s0))]
@@ -190,7 +191,7 @@ def power_sums(w: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _exponentials(n: int, sample_time: float, poles: np.ndarray) -> np.ndarray:
-    """e^{λt} at n samples, (n, n_modes): each a product of two from tables of √n, as a product costs a twentieth."""
+    """e^{λt} at n samples, (n, n_modes), as products of two tables of √n: a product takes a twentieth of the time."""
     fine = int(np.ceil(np.sqrt(n)))
     near = np.exp(np.outer(sample_time * np.arange(fine), poles))
     far = np.exp(np.outer(sample_time * np.arange(0, n, fine), poles))
@@ -202,7 +203,7 @@ def _columns(exponentials: np.ndarray) -> np.ndarray:
 
 
 def _grams(poles: np.ndarray, record: Record, offset: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """ΦᵀΦ with the constant, Φᵀ tΦ likewise, and (tΦ)ᵀ tΦ."""
+    """The matrices ΦᵀΦ and ΦᵀtΦ, with `offset` including the constant in Φ, and (tΦ)ᵀtΦ."""
     mu, n, dt = np.exp(poles * record.sample_time), record.n_samples, record.sample_time
     same, turned = power_sums(np.outer(mu, mu), n), power_sums(np.outer(mu, mu.conj()), n)
     grams = []
@@ -218,14 +219,14 @@ def _grams(poles: np.ndarray, record: Record, offset: bool) -> tuple[np.ndarray,
 
 
 def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projection:
-    """The same from normal equations, where Φ would fill the memory, part after part of the record.
+    """The projection from normal equations, part by part of the record, where Φ would fill the memory.
 
-    They square the condition number, which long records of many modes can afford: their length separates the modes.
+    Normal equations square the condition number. Long records can afford that: their length separates the modes.
     """
     whole, tilted, doubly = _grams(poles, record, offset)
-    seen, t_seen = _Exponentials(record, poles).sums()
+    phi_y, t_phi_y = _Exponentials(record, poles).sums()
     if offset:
-        seen = np.vstack([seen, record.outputs.sum(axis=1)])
+        phi_y = np.vstack([phi_y, record.outputs.sum(axis=1)])
     power = np.einsum("jt,jt->j", record.outputs, record.outputs)
     scale = 1.0 / np.sqrt(np.diag(whole))
     factor = cho_factor(whole * np.outer(scale, scale))
@@ -233,44 +234,46 @@ def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projec
     def solve(right: np.ndarray) -> np.ndarray:
         return np.asarray(scale[:, None] * cho_solve(factor, scale[:, None] * right))
 
-    coefficients, tilt = solve(seen), solve(tilted)
-    squares = np.maximum(power - (coefficients * seen).sum(axis=0), 0.0)
-    slopes = t_seen - tilted.T @ coefficients
+    coefficients, tilt = solve(phi_y), solve(tilted)
+    squares = np.maximum(power - (coefficients * phi_y).sum(axis=0), 0.0)
+    slopes = t_phi_y - tilted.T @ coefficients
     gram, spread = doubly - tilted.T @ tilt, solve(np.eye(len(whole)))
-    if (np.diag(gram) < 0.0).any():  # sums of squares: no digit of them is left
+    if (np.diag(gram) < 0.0).any():  # sums of squares that are round-off only
         raise np.linalg.LinAlgError("exponentials that are alike to round-off")
     return Projection(record, poles, squares, PROJECTION.summed, coefficients, gram, slopes, spread, tilt)
 
 
 class _Exponentials:
-    """e^{λt} of a record without those that have decayed: of the sample τ of a block from T on, e^{λT} e^{λτ}.
+    """e^{λt} of a record, factored as e^{λT} e^{λτ} for the sample τ of a block that begins at T.
 
-    Sums over the samples are thus products of the outputs, a row a block, with one table of e^{λτ}.
+    Sums over samples are products of the outputs, one row per block, with one table of e^{λτ}. Exponentials that have
+    decayed below round-off are left out.
     """
 
     def __init__(self, record: Record, poles: np.ndarray) -> None:
         self.record, self.dt = record, record.sample_time
-        # The slowest to die away first: those alive in a part are then the first few.
+        # Sorted by decay rate, the exponentials that remain in a part are the first few.
         self.order = np.argsort(-poles.real)
-        self.slow = poles[self.order]
-        self.lives = PROJECTION.died_away / np.maximum(-self.slow.real, 1e-300)
+        self.sorted_poles = poles[self.order]
+        self.lifetimes = PROJECTION.decayed / np.maximum(-self.sorted_poles.real, 1e-300)
         self.tau = self.dt * np.arange(PROJECTION.block)
-        self.near = np.exp(np.outer(self.tau, self.slow))
+        self.near = np.exp(np.outer(self.tau, self.sorted_poles))
 
     def _parts(self) -> Iterator[tuple[slice, Floats, Complexes]]:
-        """Samples, where their blocks begin, s, and e^{λT} there of the exponentials left, (n_blocks, n_left)."""
+        """Parts of the record: samples, start times T of their blocks, s, and e^{λT} of the exponentials that have not
+        decayed, (n_blocks, n_left)."""
         n = self.record.n_samples
         for first in range(0, n, PROJECTION.part):
             part = slice(first, min(first + PROJECTION.part, n))
-            alive = int(np.searchsorted(-self.lives, -first * self.dt, side="right"))
-            if not alive:
+            n_left = int(np.searchsorted(-self.lifetimes, -first * self.dt, side="right"))
+            if not n_left:
                 return
             begin: Floats = self.dt * np.arange(first, part.stop, PROJECTION.block, dtype=float)
-            yield part, begin, np.exp(np.outer(begin, self.slow[:alive]))
+            yield part, begin, np.exp(np.outer(begin, self.sorted_poles[:n_left]))
 
     def sums(self) -> tuple[Floats, Floats]:
-        """Φᵀy and (tΦ)ᵀy, (2 n_modes, n_outputs) each."""
-        found = np.zeros((2, self.order.size, self.record.n_outputs), complex)
+        """The products Φᵀy and (tΦ)ᵀy, (2 n_modes, n_outputs) each."""
+        totals = np.zeros((2, self.order.size, self.record.n_outputs), complex)
         for part, begin, far in self._parts():
             y = self.record.outputs[:, part]
             y = np.pad(y, ((0, 0), (0, begin.size * self.tau.size - y.shape[1]))).reshape(-1, self.tau.size)
@@ -278,46 +281,46 @@ class _Exponentials:
             both = np.hstack([near, self.tau[:, None] * near])
             inner = (y @ both.view(float)).view(complex).reshape(-1, begin.size, 2, far.shape[1])
             level, rising = inner[:, :, 0], inner[:, :, 1] + begin[:, None] * inner[:, :, 0]
-            for total, each in zip(found, (level, rising), strict=True):
+            for total, each in zip(totals, (level, rising), strict=True):
                 total[self.order[: far.shape[1]]] += np.einsum("jbr,br->rj", each, far)
-        return np.concatenate([found[0].real, found[0].imag]), np.concatenate([found[1].real, found[1].imag])
+        return np.concatenate([totals[0].real, totals[0].imag]), np.concatenate([totals[1].real, totals[1].imag])
 
     def motion(self, amplitudes: Complexes) -> Floats:
-        """Re Σ_r a_jr e^{λ_r t} of amplitudes (n_outputs, n_modes), (n_samples, n_outputs)."""
-        found = np.zeros((self.record.n_samples, len(amplitudes)))
+        """The motion Re Σ_r a_jr e^{λ_r t} of amplitudes (n_outputs, n_modes), (n_samples, n_outputs)."""
+        samples = np.zeros((self.record.n_samples, len(amplitudes)))
         for part, _, far in self._parts():
-            alive = far.shape[1]
-            turned = (amplitudes[:, None, self.order[:alive]] * far).reshape(-1, alive)
-            near = self.near[:, :alive]
-            moved = turned.real @ near.real.T - turned.imag @ near.imag.T
-            found[part] = moved.reshape(len(amplitudes), -1)[:, : part.stop - part.start].T
-        return found
+            n_left = far.shape[1]
+            rotated = (amplitudes[:, None, self.order[:n_left]] * far).reshape(-1, n_left)
+            near = self.near[:, :n_left]
+            moved = rotated.real @ near.real.T - rotated.imag @ near.imag.T
+            samples[part] = moved.reshape(len(amplitudes), -1)[:, : part.stop - part.start].T
+        return samples
 
 
 def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | None:
-    """The records behind filters that whiten the residual of `poles`; None where it may be white.
+    """The records filtered so that the residual of `poles` becomes white; None where it may be white.
 
-    Where outputs share a part of their noise, as what shakes the whole bench, combinations of them that do not come
-    first: noise of two outputs counts twice else, and its peaks for modes. Each then has a filter of its own.
+    Correlated noise, such as vibration of the whole bench, would count once per output, and its peaks would be taken
+    for modes. Outputs are therefore first replaced by combinations of uncorrelated noise, each with its own filter.
 
     Args:
-        records: free decays, of the same outputs.
+        records: free decays of the same outputs.
         poles: (n_modes,) of their modes, rad/s.
     """
-    left = [project(record, poles, True).residual.T for record in records]
-    order = min(PROJECTION.order, sum(each.shape[1] for each in left) // PROJECTION.samples_each)
-    squares = sum((each**2).sum(axis=1) for each in left)
-    whole = sum((record.outputs**2).sum(axis=1) for record in records)
-    if order == 0 or (squares < PROJECTION.rounding**2 * whole).any():
+    residuals = [project(record, poles, True).residual.T for record in records]
+    order = min(PROJECTION.order, sum(each.shape[1] for each in residuals) // PROJECTION.samples_each)
+    squares = sum((each**2).sum(axis=1) for each in residuals)
+    energy = sum((record.outputs**2).sum(axis=1) for record in records)
+    if order == 0 or (squares < PROJECTION.rounding**2 * energy).any():
         return None
-    apart = independent(records, left)
-    if apart is not None:
-        records, left = apart
-    powers = [np.abs(np.fft.rfft(each, axis=1)[:, 1:].T) ** 2 for each in left]
+    uncorrelated = independent(records, residuals)
+    if uncorrelated is not None:
+        records, residuals = uncorrelated
+    powers = [np.abs(np.fft.rfft(each, axis=1)[:, 1:].T) ** 2 for each in residuals]
     if all(white(power, poles.size).all() for power in powers):
-        return None if apart is None else list(records)
+        return None if uncorrelated is None else list(records)
     filters = []
-    for rows in zip(*left, strict=True):
+    for rows in zip(*residuals, strict=True):
         # Records of one spectrum may differ in variance.
         row = [each * np.sqrt(each.size) / max(float(np.linalg.norm(each)), 1e-300) for each in rows]
         lags = [sum(float(each[k:] @ each[: each.size - k]) for each in row) for k in range(order + 1)]
@@ -333,21 +336,21 @@ def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | Non
     ]
 
 
-def correlation(left: Sequence[np.ndarray]) -> Floats | None:
-    """Of the noise of outputs, over all records, (n_outputs, n_outputs); None where they may share none.
+def correlation(residuals: Sequence[np.ndarray]) -> Floats | None:
+    """Correlation matrix of the noise of outputs over all records, (n_outputs, n_outputs); None if not significant.
 
     Args:
-        left: (n_outputs, n_samples) a record.
+        residuals: (n_outputs, n_samples) of each record.
     """
-    if len(left[0]) == 1:
+    if len(residuals[0]) == 1:
         return None
-    return correlation_of_lines([_lines_of(each) for each in left])
+    return correlation_of_lines([_lines_of(each) for each in residuals])
 
 
 def _lines_of(signals: np.ndarray) -> Complexes:
-    """Lines of signals, but for the first, by Hann's window: modes not found yet leak far into other bands without it.
+    """Fourier lines of signals, without the mean; Hann's window keeps modes not found yet from leaking far.
 
-    One signal after the other: the windows of all of them would be as much again.
+    Signals are transformed one by one to save memory.
     """
     n_signals, n_samples = signals.shape
     lines, window = np.empty((n_signals, n_samples // 2), complex), np.hanning(n_samples)
@@ -356,35 +359,39 @@ def _lines_of(signals: np.ndarray) -> Complexes:
     return lines
 
 
-def correlation_of_lines(left: Sequence[np.ndarray]) -> Floats | None:
-    """The same of lines of frequency, (n_outputs, n_lines) complex a record.
+def correlation_of_lines(lines: Sequence[np.ndarray]) -> Floats | None:
+    """Correlation matrix of the noise of outputs, (n_outputs, n_outputs), from Fourier lines; None if not significant.
 
-    The median over bands, so that modes not found yet do not count for noise. Bartlett's test of sphericity
-    (Proc. Camb. Phil. Soc. 47, 1951): -(N - (2 m + 5)/6) ln det C is chi-square of m (m - 1)/2, of N values of m.
+    It is the median over bands, so that modes not found yet do not count as noise. Bartlett's test of sphericity
+    (Proc. Camb. Phil. Soc. 47, 1951): for N values of m outputs -(N - (2 m + 5)/6) ln det C is chi-square with
+    m (m - 1)/2 degrees of freedom.
+
+    Args:
+        lines: (n_outputs, n_lines) complex, of the residual of each record.
     """
-    m, size = len(left[0]), 2 * sum(each.shape[1] for each in left)
-    if m == 1 or min(each.shape[1] for each in left) < PROJECTION.band or size < PROJECTION.samples_each * m:
+    m, size = len(lines[0]), 2 * sum(each.shape[1] for each in lines)
+    if m == 1 or min(each.shape[1] for each in lines) < PROJECTION.band or size < PROJECTION.samples_each * m:
         return None
-    values, vectors = np.linalg.eigh(_median_correlation(left))
-    shared: Floats = (vectors * np.maximum(values, PROJECTION.own)) @ vectors.T
-    shared /= np.sqrt(np.outer(np.diag(shared), np.diag(shared)))
-    lost = -(PROJECTION.of_median * size - (2 * m + 5) / 6.0) * np.linalg.slogdet(shared)[1]
-    none = lost < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2) or values[-1] < PROJECTION.harmless
-    return None if none else shared
+    values, vectors = np.linalg.eigh(_median_correlation(lines))
+    matrix: Floats = (vectors * np.maximum(values, PROJECTION.own)) @ vectors.T
+    matrix /= np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
+    statistic = -(PROJECTION.median_efficiency * size - (2 * m + 5) / 6.0) * np.linalg.slogdet(matrix)[1]
+    none = statistic < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2) or values[-1] < PROJECTION.harmless
+    return None if none else matrix
 
 
-def _median_correlation(left: Sequence[np.ndarray]) -> Floats:
-    """The median over bands of the correlation of lines (n_outputs, n_lines) a record; the lower triangle of it."""
-    m, band = len(left[0]), 2 * PROJECTION.band
-    # real and imaginary parts beside each other: the real part of a product with a conjugate is their scalar product
-    bands = [np.ascontiguousarray(each).view(float) for each in left]
+def _median_correlation(lines: Sequence[np.ndarray]) -> Floats:
+    """Median over bands of the correlation of lines (n_outputs, n_lines) of each record; its lower triangle only."""
+    m, band = len(lines[0]), 2 * PROJECTION.band
+    # Real and imaginary parts alternate: the real part of a product with a conjugate is their scalar product.
+    bands = [np.ascontiguousarray(each).view(float) for each in lines]
     bands = [each[:, : each.shape[1] // band * band].reshape(m, -1, band).transpose(1, 0, 2) for each in bands]
-    own = [np.sqrt(np.einsum("bjk,bjk->bj", each, each)) + 1e-150 for each in bands]
+    norms = [np.sqrt(np.einsum("bjk,bjk->bj", each, each)) + 1e-150 for each in bands]
     median, n_bands = np.zeros((m, m)), sum(map(len, bands))
-    some = max(PROJECTION.at_once // (n_bands * m), 1)  # a few outputs beside all, in all bands
+    some = max(PROJECTION.at_once // (n_bands * m), 1)  # so many rows of the matrix at a time
     for start in range(0, m, some):
         rows, columns = slice(start, min(start + some, m)), slice(0, min(start + some, m))
-        each = zip(bands, own, strict=True)
+        each = zip(bands, norms, strict=True)
         products = [
             np.matmul(b[:, rows], b[:, columns].transpose(0, 2, 1)) / (o[:, rows, None] * o[:, None, columns])
             for b, o in each
@@ -394,11 +401,10 @@ def _median_correlation(left: Sequence[np.ndarray]) -> Floats:
 
 
 def disturbed(shared: Floats | None, amplitudes: np.ndarray) -> Floats:
-    """Variance of what noise of that correlation does to each mode over that of noise which outputs do not share:
-    a^H C a / a^H a, (n_modes,).
+    """Variance of each mode in correlated noise over that in uncorrelated noise, a^H C a / a^H a, (n_modes,).
 
     Args:
-        shared: C (n_outputs, n_outputs); None where they share none.
+        shared: correlation matrix C of the noise (n_outputs, n_outputs); None where it is uncorrelated.
         amplitudes: a (n_outputs, n_modes), over the noise of each output.
     """
     if shared is None:
@@ -408,43 +414,48 @@ def disturbed(shared: Floats | None, amplitudes: np.ndarray) -> Floats:
 
 
 def mixing_of(shared: Floats | None) -> Floats | None:
-    """Combinations (n_outputs, n_outputs) of outputs, over their noise, that make it independent; None where it is."""
+    """Combinations (n_outputs, n_outputs) of outputs, over their noise, in which it is uncorrelated; None where it is
+    uncorrelated already.
+
+    Args:
+        shared: correlation matrix of the noise, or None.
+    """
     return None if shared is None else np.linalg.inv(np.linalg.cholesky(shared))
 
 
-def independent(records: Sequence[Record], left: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:
-    """Records of combinations of the outputs whose noise is independent and of unit variance, and what is left of them.
+def independent(records: Sequence[Record], residuals: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:
+    """Records of combinations of the outputs whose noise is uncorrelated and of unit variance, and their residuals.
 
     A free decay stays a free decay of the same poles.
 
     Args:
         records: of the same outputs.
-        left: (n_outputs, n_samples) noise of each.
+        residuals: (n_outputs, n_samples) of each.
 
     Returns:
-        None where the outputs may share no noise as they are.
+        None where correlation of the noise is not significant.
     """
-    apart = mixing_of(correlation(left))
-    if apart is None:
+    whitening = mixing_of(correlation(residuals))
+    if whitening is None:
         return None
-    mixing = [apart / np.sqrt((each**2).mean(axis=1)) for each in left]
+    mixing = [whitening / np.sqrt((each**2).mean(axis=1)) for each in residuals]
     mixed = [replace(record, outputs=m @ record.outputs) for record, m in zip(records, mixing, strict=True)]
-    return mixed, [m @ each for m, each in zip(mixing, left, strict=True)]
+    return mixed, [m @ each for m, each in zip(mixing, residuals, strict=True)]
 
 
 def noise_near(poles: np.ndarray, residual: np.ndarray, noise: np.ndarray, sample_time: float) -> np.ndarray:
-    """κ, the noise about each mode over its mean, (n_outputs, n_modes); 1 for an output whose noise may be white.
+    """Ratio κ of the noise power about each mode to its mean, (n_outputs, n_modes); 1 where the noise may be white.
 
     Args:
-        poles: (n_modes,) of the modes taken out, rad/s.
+        poles: (n_modes,) of the fitted modes, rad/s.
         residual: (n_samples, n_outputs).
-        noise: (n_outputs,) its standard deviation.
+        noise: (n_outputs,) standard deviation of the residual.
         sample_time: s.
     """
     n, m = residual.shape
     bin_width = 2.0 * np.pi / (n * sample_time)
     widths = np.maximum(np.abs(poles.real), PROJECTION.least_bins * bin_width)
-    # Each mode took the noise of one bin.
+    # The fit of a mode removes the noise of one bin.
     taken = _bandwidth_weight(np.subtract.outer(poles.imag, poles.imag) / widths).sum(axis=0)
     factors = np.ones((m, poles.size))
     for j in range(m):
@@ -459,7 +470,7 @@ def noise_near(poles: np.ndarray, residual: np.ndarray, noise: np.ndarray, sampl
 
 
 def power_of(row: np.ndarray, size: int | None = None) -> np.ndarray:
-    """|·|² of the transform of a row, padded to a length; in the row's precision."""
+    """Power spectrum |·|² of a signal, zero-padded to `size`, in the precision of the signal."""
     spectrum = rfft(row, size)
     forget_transforms(row.size)
     power: np.ndarray = spectrum.real**2
@@ -468,8 +479,10 @@ def power_of(row: np.ndarray, size: int | None = None) -> np.ndarray:
 
 
 def forget_transforms(n: int) -> None:
-    """After one of n samples, where they are many: the tables of the last sixteen, each as large as the signal, are
-    kept otherwise."""
+    """Empty SciPy's cache of transform tables after long transforms, of n samples.
+
+    It keeps the tables of the last sixteen lengths, each as large as its signal; short transforms replace them.
+    """
     if n > PROJECTION.many:
         for size in range(1, 17):
             for kind in (np.float32, np.float64):
@@ -477,67 +490,73 @@ def forget_transforms(n: int) -> None:
 
 
 def noise_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.ndarray:
-    """κ, noise over its mean along each signal, (n_signals, n_outputs); 1 where it may be white.
+    """Ratio κ of the noise power in the spectrum of each signal to its mean, (n_signals, n_outputs); 1 where the noise
+    may be white.
 
     Args:
         signals: (n_samples, n_signals).
         residual: (n_samples, n_outputs) of a fit, over its standard deviation.
-        n_modes: taken out of it.
+        n_modes: of the fit.
     """
     columns = residual / np.sqrt(len(residual)), signals
     power, weight = (np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in columns)
-    whole = weight.sum(axis=0)
-    along = (weight / np.where(whole > 0, whole, 1.0)).T @ power
+    total = weight.sum(axis=0)
+    ratio = (weight / np.where(total > 0, total, 1.0)).T @ power
     # A constant is disturbed by noise about zero frequency.
-    along[whole <= 1e-20 * len(signals)] = power[: 2 * PROJECTION.least_bins].mean(axis=0)
-    return np.where(white(power, n_modes), 1.0, along)
+    ratio[total <= 1e-20 * len(signals)] = power[: 2 * PROJECTION.least_bins].mean(axis=0)
+    return np.where(white(power, n_modes), 1.0, ratio)
 
 
-def _bandwidth_weight(away: np.ndarray) -> np.ndarray:
-    """Power of t e^{λt}, over that at its own frequency."""
-    return (1.0 + away**2) ** -2.0
+def _bandwidth_weight(distance: np.ndarray) -> np.ndarray:
+    """Power spectrum of t e^{λt} relative to its peak, at distances in half bandwidths."""
+    return (1.0 + distance**2) ** -2.0
 
 
 def white(power: np.ndarray, n_modes: int, *, among: int | None = None) -> np.ndarray:
-    """Outputs (n_outputs,) whose spectrum may be flat: its sum runs along a straight line (Bartlett; Kolmogorov).
+    """Which outputs may have white noise, (n_outputs,): test of the cumulative periodogram (Bartlett; Kolmogorov).
 
     Args:
-        power: (n_bins, n_outputs).
-        n_modes: taken out of it.
-        among: how many outputs are asked about in all; these unless given.
+        power: (n_bins, n_outputs) periodogram of the residual.
+        n_modes: number of modes of the fit.
+        among: number of outputs tested in all; those of `power` unless given.
     """
     bins, m = power.shape
-    whole = power.sum(axis=0)
-    summed = np.cumsum(power, axis=0) / np.where(whole > 0, whole, 1.0)
-    apart = np.abs(summed - np.arange(1, bins + 1)[:, None] / bins).max(axis=0)
-    # The bins that the modes took are not coloured noise.
-    least = np.sqrt(0.5 * np.log(2.0 * (among or m) / PROJECTION.false_alarm) / bins) + (n_modes + 1) / bins
-    return np.asarray(apart < least)
+    total = power.sum(axis=0)
+    cumulative = np.cumsum(power, axis=0) / np.where(total > 0, total, 1.0)
+    deviation = np.abs(cumulative - np.arange(1, bins + 1)[:, None] / bins).max(axis=0)
+    # The fit removes about one bin per mode, which does not make the noise coloured.
+    threshold = np.sqrt(0.5 * np.log(2.0 * (among or m) / PROJECTION.false_alarm) / bins) + (n_modes + 1) / bins
+    return np.asarray(deviation < threshold)
 
 
 def variances(squares: np.ndarray, free: np.ndarray, apart: np.ndarray | None = None) -> np.ndarray:
-    """Variance of the noise, (n_records, n_outputs).
+    """Variance of the noise, (n_records, n_outputs), pooled over the records where they do not differ.
 
     Args:
         squares: (n_records, n_outputs) sums of squares of the residual, positive.
         free: (n_records,) or (n_records, n_outputs) degrees of freedom, at least 1.
-        apart: (n_outputs,) whose records differ; by `differ` unless given.
+        apart: (n_outputs,) whether records differ in variance; by `differ` unless given.
     """
-    free = _each(free, squares)
+    free = _per_output(free, squares)
     apart = differ(squares, free) if apart is None else apart
     return np.asarray(np.where(apart, squares / free, squares.sum(axis=0) / free.sum(axis=0)))
 
 
 def differ(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Outputs (n_outputs,) whose noise is not the same in all records."""
-    n, free = len(squares), _each(free, squares)
+    """Which outputs differ in noise variance between records, (n_outputs,), by Bartlett's test.
+
+    Args:
+        squares, free: as of `variances`.
+    """
+    n, free = len(squares), _per_output(free, squares)
     if n == 1:
         return np.zeros(squares.shape[1], bool)
-    whole = free.sum(axis=0)
-    apart = whole * np.log(squares.sum(axis=0) / whole) - (free * np.log(squares / free)).sum(axis=0)
-    corrected = apart / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / whole) / (3.0 * (n - 1)))
+    total = free.sum(axis=0)
+    statistic = total * np.log(squares.sum(axis=0) / total) - (free * np.log(squares / free)).sum(axis=0)
+    corrected = statistic / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / total) / (3.0 * (n - 1)))
     return np.asarray(corrected > chi2.isf(PROJECTION.split, n - 1))
 
 
-def _each(free: np.ndarray, squares: np.ndarray) -> np.ndarray:
+def _per_output(free: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    """Degrees of freedom of each output in each record, (n_records, n_outputs)."""
     return np.broadcast_to(free[:, None] if free.ndim == 1 else free, squares.shape)

@@ -1,16 +1,15 @@
-"""The searches of an identification, whatever was measured: over parameters, over modes, and the time they take.
+"""Levenberg-Marquardt least squares, stepwise selection of modes, and the time limit of both.
 
-Nonlinear least squares, by Levenberg and Marquardt: problems differ in what they linearise, squares with the linear
-unknowns projected out (variable projection, Golub & Pereyra 1973) or a likelihood (Fisher scoring). All give, at a
-state, a matrix N and a right-hand side g, and share the damped step (Marquardt 1963), which does not depend on the
-units of the unknowns:
+Nonlinear least squares (Levenberg-Marquardt): a problem is a sum of squares with the linear parameters eliminated
+(variable projection, Golub & Pereyra 1973), or a likelihood (Fisher scoring). Each gives a matrix N and a right-hand
+side g at the current parameters. The damped step s (Marquardt 1963) does not depend on the units of the parameters:
 
     (D N D + μ I) D⁻¹ s = D g,     D = diag(N)^-½
 
-Model order, by stepwise selection. Forward: the strongest candidate enters, all modes are fitted anew, and it stays if
-twice the logarithm of the likelihood ratio is more than noise would give in one record of a thousand. Backward: each
-mode that is weak, close to another or spurious is left out in turn, and goes for good if the likelihood does not miss
-it. Both in turn until the modes stay the same.
+Model order (stepwise selection). Forward: the strongest candidate enters, all modes are fitted again, and it stays if
+twice the log-likelihood ratio exceeds what noise would give in one record of a thousand. Backward: each mode that is
+weak, close to another or spurious is left out in turn, and removed if the likelihood ratio without it is not
+significant. Both alternate until the modes no longer change.
 """
 
 from collections.abc import Callable, Iterable
@@ -26,11 +25,11 @@ from workbench.deadline import Deadline
 from workbench.structure.modes import mac
 
 State = TypeVar("State")
-SECONDS = 30.0  # of processor time
-WHOLE = 0.995  # of the time: as good as all
+SECONDS = 30.0  # processor time limit
+WHOLE = 0.995  # share of the time from which on a search counts as ended by the limit as a whole
 FURTHER = "search for further modes"
-STOPPED = "stopped after"  # as the remark of a search begins that the time was up for
-# Chance that a record of nothing but noise yields a mode.
+STOPPED = "stopped after"  # first words of the remark on an exceeded time limit
+# Probability that a record of noise alone yields a mode.
 FALSE_ALARM = 1e-3
 
 
@@ -39,12 +38,12 @@ class FitSettings:
     """Constants of every fit of modes."""
 
     most_steps: int = 60
-    # of χ², each value: a step is negligible once it moves the estimate by less than a thousandth of its standard error
+    # predicted decrease of χ² per value; the step then moves the estimate by under a thousandth of its standard error
     negligible: float = 1e-6
     round_off: float = 1e-26  # of a sum of squares, relative to that of the measurement
-    most_growth: float = 20.0  # nepers over a record: no pole is searched that grows faster
-    fastest_decay: float = 1.0  # nepers within a sample: no pole is searched beyond
-    # participation factor over that held at one: factors that run apart without end are no mode's, and overflow
+    most_growth: float = 20.0  # nepers over a record; poles that grow faster are inadmissible
+    fastest_decay: float = 1.0  # nepers per sample; poles that decay faster are inadmissible
+    # largest ratio of a participation factor to the one normalised to 1; diverging factors are no mode's, and overflow
     most_unlike: float = 1e20
 
 
@@ -52,22 +51,23 @@ class FitSettings:
 class SelectionSettings:
     """Constants of every selection of modes."""
 
-    search_share: float = 0.5  # of the time, in which modes are searched; the rest is for refinement and errors
-    growing: float = 0.6  # of the time left, that a round searches for further modes; unchecked ones may be artefacts
+    search_share: float = 0.5  # of the time, for the selection of modes; the rest is for refinement and errors
+    forward_share: float = 0.6  # of the time left, for one forward search; the rest is to test the new modes
     most_damped: float = 0.3  # damping ratio above which a pole is no mode
-    most_growth: float = 0.5  # nepers over a record above which a pole grows: it may be noise that is not white
+    most_growth: float = 0.5  # nepers over a record above which a pole grows: it may be coloured noise
     same_shape: float = 0.95  # MAC from which on two overlapping poles are one mode, split
-    most_rounds: int = 4  # where noise is not white, or modes depend on amplitude, they may enter and leave for ever
+    most_rounds: int = 4  # in coloured noise, or with amplitude dependence, modes might enter and leave for ever
     few_steps: int = 12  # of a fit that only decides whether a mode enters or leaves
-    weak: float = 4.0  # times the limit, below which a mode may be noise and is tried again
+    weak: float = 4.0  # times the threshold, below which a mode may be noise and is tested again
     close: float = 2.0  # bandwidths to the next mode, likewise
-    noise_bins: int = 50  # on either side, from which the noise about a pole is taken
-    peaks_a_rate: int = 12  # candidates of each rate of decay, of records with known inputs
+    noise_bins: int = 50  # on either side of a pole, from which the noise about it is estimated
+    peaks_a_rate: int = 12  # candidates per decay rate, in records with known inputs
 
 
 FIT = FitSettings()
 SELECTION = SelectionSettings()
-# Chance that shapes of three signals agree so far, (1 - MAC)^(n_signals - 1); fewer must agree better to say as much.
+# Probability (1 - MAC)^(n_signals - 1) that random shapes of three signals agree so far; shapes of fewer signals must
+# have a higher MAC to be as improbable.
 BY_CHANCE = (1.0 - SELECTION.same_shape) ** 2
 
 # (the search under way, the share of the time that is spent)
@@ -75,11 +75,11 @@ Progress = Callable[[str, float], None]
 
 
 class Budget(Deadline):
-    """Processor time left for an identification, and which searches found it spent.
+    """A limit of processor time for an identification, and the searches that it ended early.
 
     Attributes:
-        progress: called as the searches go on.
-        unfinished: the searches that were ended early, each with the share of the whole time that had passed then.
+        progress: called with the search under way and the share of the time that is spent.
+        unfinished: name of each search that was ended early, and the share of the whole time that had passed then.
     """
 
     def __init__(self, seconds: float | None = None, progress: Progress | None = None) -> None:
@@ -88,7 +88,7 @@ class Budget(Deadline):
         self.unfinished: dict[str, float] = {}
 
     def spent(self, search: str) -> bool:
-        """Whether the time is up; the search that asks is then noted as unfinished."""
+        """Whether the time is up; then `search` is recorded as unfinished."""
         if self.progress is not None:
             self.progress(search, min((self._now - self._begun) / (self._whole - self._begun), 1.0))
         if not self.is_past:
@@ -97,29 +97,29 @@ class Budget(Deadline):
         return True
 
     def share(self, share: float) -> "Budget":
-        """A share of the time left, in (0, 1]; what it leaves unfinished counts here."""
+        """A budget of a share of the time left, in (0, 1]; both record unfinished searches together."""
         part = Budget(None if self.seconds is None else share * max(self._end - self._now, 1e-3), self.progress)
         part.unfinished, part._begun, part._whole = self.unfinished, self._begun, self._whole
         return part
 
     def aside(self, share: float) -> "Budget":
-        """A share of the time left for a look on the side; what it leaves unfinished does not count here."""
+        """A budget of a share of the time left for a preliminary search; its unfinished searches are not recorded."""
         return Budget(self.share(share).seconds)
 
     def apart(self, share: float) -> "Budget":
-        """A share of the time left for one of several tasks; what it leaves unfinished counts once it is `counted`."""
+        """A budget of a share of the time left for one of several tasks; `counted` records its unfinished searches."""
         part = self.share(share)
         part.unfinished = {}
         return part
 
     def counted(self, part: "Budget") -> None:
-        """What a task left unfinished now counts here."""
+        """Record the unfinished searches of a budget from `apart`."""
         for search, share in part.unfinished.items():
             self.unfinished.setdefault(search, share)
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What was left undone, in one sentence; empty where all was finished."""
+        """A remark that lists the unfinished searches; empty where all were finished."""
         if not self.unfinished:
             return ()
         each = (
@@ -134,18 +134,18 @@ class Budget(Deadline):
 
 @dataclass(frozen=True)
 class DampingSettings:
-    """How the damping μ, a share of the diagonal of N, follows what the steps achieve.
+    """How the damping μ, relative to the diagonal of N, is adapted from step to step.
 
-    The result does not depend on these numbers, only the number of steps does; they are Marquardt's habit.
+    The minimum does not depend on these numbers, only the number of steps does; they follow Marquardt.
 
     Attributes:
-        first: at the start.
+        first: initial value.
         raised: factor after a step that raised the cost.
         lowered: factor after a step that lowered it.
-        least: below which N is not regularised any further.
-        most: from which on no step is tried: s has shrunk to a gradient step of 1e-8 standard errors.
-        stuck: from which on the search ends after a step.
-        indefinite: least, where N is not positive definite as it stands.
+        least: lower limit.
+        most: value above which no step is tried: s has shrunk to a gradient step of 1e-8 standard errors.
+        stuck: value above which the search ends after a step.
+        indefinite: lower limit where N is not positive definite.
     """
 
     first: float = 1e-3
@@ -171,10 +171,10 @@ def check_count(name: str, number: int | None) -> None:
 
 
 class LeastSquares(Protocol[State]):
-    """What the engine asks of a problem."""
+    """A problem for `minimise`; its state holds the parameters and what was computed from them."""
 
     def cost(self, state: State) -> float:
-        """What is minimised; infinite where the state is not admissible."""
+        """The function that is minimised; infinite where the state is not admissible."""
         ...
 
     def normal_equations(self, state: State) -> tuple[np.ndarray, np.ndarray]:
@@ -182,23 +182,23 @@ class LeastSquares(Protocol[State]):
         ...
 
     def moved(self, state: State, step: np.ndarray) -> tuple[State | None, np.ndarray]:
-        """The state after a step, None where it is not admissible, and what of the step was taken."""
+        """The state after a step, None where it is not admissible, and the part of the step that was taken."""
         ...
 
     def negligible(self, decrease: float, cost: float) -> bool:
-        """Whether a step that promises such a decrease of the cost need not be followed by another."""
+        """Whether a step of this predicted decrease of the cost may be the last."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """What a search ended with.
+    """The result of `minimise`.
 
     Attributes:
-        state: the best found.
-        cost: there.
-        converged: whether it ended because the step was negligible.
-        steps: taken.
+        state: of least cost.
+        cost: of this state.
+        converged: whether the search ended because the step was negligible.
+        steps: number of steps.
     """
 
     state: State
@@ -215,30 +215,30 @@ def minimise(
     Args:
         problem: see `LeastSquares`.
         start: admissible.
-        most_steps: at which to end at the latest.
-        round_off: of the cost: a step that raises it by no more is as good as one that does not.
-        budget: of time; none unless given.
+        most_steps: largest number of steps.
+        round_off: of the cost; a step that raises it by no more is accepted.
+        budget: time limit; none unless given.
     """
     state, cost, damping, small = start, problem.cost(start), DAMPING.first, False
     for taken in range(1, most_steps + 1):
         normal, right = problem.normal_equations(state)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        scaled, one = normal * np.outer(scale, scale), np.eye(right.size)
+        scaled, identity = normal * np.outer(scale, scale), np.eye(right.size)
         while True:
             try:
-                step = scale * cho_solve(cho_factor(scaled + damping * one), scale * right)
+                step = scale * cho_solve(cho_factor(scaled + damping * identity), scale * right)
             except np.linalg.LinAlgError:
                 damping = max(DAMPING.raised * damping, DAMPING.indefinite)
                 continue
             trial, step = problem.moved(state, step)
             small = problem.negligible(float(step @ right), cost)
-            cost_there = np.inf if trial is None else problem.cost(trial)
-            accepted = trial is not None and cost_there <= cost + round_off
+            new_cost = np.inf if trial is None else problem.cost(trial)
+            accepted = trial is not None and new_cost <= cost + round_off
             if accepted or small or damping > DAMPING.most:
                 break
             damping *= DAMPING.raised
         if accepted and trial is not None:
-            state, cost = trial, cost_there
+            state, cost = trial, new_cost
         damping = max(DAMPING.lowered * damping, DAMPING.least)
         if small or damping > DAMPING.stuck:
             return Minimum(state, cost, small, taken)
@@ -252,50 +252,50 @@ Candidate = TypeVar("Candidate")
 
 
 class Once:
-    """What is left (n,) and its slopes (n, n_unknowns), kept for the slopes asked for where what is left was.
+    """A function for the residual (n,) and its Jacobian (n, n_unknowns) that keeps its last value.
 
-    For fits of a few unknowns, of which SciPy finds the least.
+    SciPy's least squares asks for both at the same unknowns in turn; here they are computed together.
     """
 
     def __init__(self, fitted: Callable[[Floats], tuple[Floats, Floats]]) -> None:
-        self.fitted, self.at, self.found = fitted, np.zeros(0), (np.zeros(0), np.zeros(0))
+        self.fitted, self.at, self.value = fitted, np.zeros(0), (np.zeros(0), np.zeros(0))
 
     def __call__(self, unknowns: Floats) -> tuple[Floats, Floats]:
         if not np.array_equal(self.at, unknowns):
-            self.at, self.found = unknowns.copy(), self.fitted(unknowns)
-        return self.found
+            self.at, self.value = unknowns.copy(), self.fitted(unknowns)
+        return self.value
 
-    def least(self, start: Floats, most_tries: int, **how: float) -> Floats:
-        """The unknowns of least squares, by at most so many evaluations; `how` as of `scipy.optimize.least_squares`."""
-        left, slopes = (lambda x: self(x)[0]), (lambda x: self(x)[1])
-        return np.asarray(least_squares(left, start, slopes, x_scale="jac", max_nfev=most_tries, **how).x)
+    def least(self, start: Floats, most_tries: int, **options: float) -> Floats:
+        """The least squares unknowns, by at most so many evaluations; options of `scipy.optimize.least_squares`."""
+        residual, jacobian = (lambda x: self(x)[0]), (lambda x: self(x)[1])
+        return np.asarray(least_squares(residual, start, jacobian, x_scale="jac", max_nfev=most_tries, **options).x)
 
 
 class Selection(Protocol[Model, Candidate]):
-    """What the selection asks of a measurement; a model is a fitted set of modes."""
+    """A measurement for `Stepwise`; a model is a fitted set of modes, a candidate a mode that may enter it."""
 
     def n_modes(self, model: Model) -> int: ...
 
     def strongest(self, model: Model, rejected: list[tuple[complex, float]]) -> Candidate | None:
-        """The candidate most likely to be a mode beside those of a model; None where only noise is left."""
+        """The candidate most likely to be a further mode; None where the residual of the model is noise."""
         ...
 
     def pole_of(self, candidate: Candidate) -> complex: ...
 
     def extended(self, model: Model, candidate: Candidate) -> Model:
-        """The model with one more mode, all fitted anew; LinAlgError where they cannot be distinguished."""
+        """The model with one more mode, all fitted again; LinAlgError where they cannot be distinguished."""
         ...
 
     def gain(self, smaller: Model, larger: Model) -> float:
-        """Twice the logarithm of the likelihood ratio of two models."""
+        """Twice the log-likelihood ratio of two models."""
         ...
 
     def threshold(self, model: Model, pole: complex) -> float:
-        """What noise about a pole gains by one more mode with the chance of a false alarm."""
+        """The gain by a mode at this pole that noise exceeds with the probability of a false alarm."""
         ...
 
     def splits(self, model: Model, trial: Model) -> bool:
-        """Whether the mode that a trial adds splits one of the model, or is none."""
+        """Whether the mode that a trial adds splits a mode of the model in two, or is spurious."""
         ...
 
     def settled(self, model: Model) -> Model:
@@ -303,25 +303,25 @@ class Selection(Protocol[Model, Candidate]):
         ...
 
     def suspects(self, model: Model) -> Iterable[tuple[complex, Model, bool]]:
-        """Modes that may be none: their pole, the model without each, and whether it is none for certain."""
+        """Modes to test: the pole of each, the model without it, and whether it is certainly spurious."""
         ...
 
 
 @dataclass
 class Stepwise(Generic[Model, Candidate]):
-    """The selection.
+    """Stepwise selection of modes, forward and backward.
 
     Attributes:
         problem: see `Selection`.
-        max_modes: where to stop at the latest.
-        most_weak: candidates below the threshold, one after the other, from which on only noise is left.
-        most_splits: candidates that split a mode before the search ends; None where they count as weak ones.
+        max_modes: largest number of modes.
+        most_weak: number of consecutive candidates below the threshold at which the forward search ends.
+        most_splits: number of candidates that split a mode at which it ends; None to count these as weak.
         forgets: whether a rejected candidate may be tried again once another mode has entered.
-        budget: of time.
-        alone: whether all of that is for this search; other things follow unless given.
+        budget: time limit.
+        alone: whether the whole budget is for this selection.
         rejected: poles tried and rejected, with their gain.
-        full: whether the search stopped at the most modes.
-        cut_short: whether the last search forward ended because its time was up.
+        full: whether the selection stopped at `max_modes`.
+        cut_short: whether the time limit ended the last forward search.
     """
 
     problem: Selection[Model, Candidate]
@@ -336,7 +336,7 @@ class Stepwise(Generic[Model, Candidate]):
     cut_short: bool = False
 
     def select(self, model: Model) -> Model:
-        """The modes of a measurement, from those of a model on."""
+        """The model after forward and backward selection, starting from `model`."""
         for _ in range(SELECTION.most_rounds):
             before = self.problem.n_modes(model)
             grown = self.forward(model)
@@ -346,18 +346,18 @@ class Stepwise(Generic[Model, Candidate]):
                 break
             model = self.backward(self.problem.settled(grown))
             left = self.problem.n_modes(model)
-            # What the check of each mode has left of the time is for the search that had a share of it.
+            # The forward search had a share of the time only; it goes on with what the backward search left.
             if self.cut_short and self.alone and not self.budget.is_past:
                 continue
-            # With nothing remembered the next round would only repeat this one.
+            # Without a memory of rejected candidates the next round would repeat this one.
             if left == most or (self.forgets and left <= before):
                 break
         return model
 
     def forward(self, model: Model) -> Model:
-        """With every candidate that the likelihood asks for."""
+        """The model with every candidate of significant gain."""
         weak = splits = 0
-        growing = self.budget.share(SELECTION.growing)
+        own_budget = self.budget.share(SELECTION.forward_share)
         if self.cut_short:
             self.budget.unfinished.pop(FURTHER, None)
             self.cut_short = False
@@ -367,8 +367,8 @@ class Stepwise(Generic[Model, Candidate]):
             self.problem.n_modes(model) < self.max_modes
             and weak < self.most_weak
             and (self.most_splits is None or splits < self.most_splits)
-            # The first mode is worth the wait.
-            and not (self.problem.n_modes(model) and self._ends(growing))
+            # The first mode is searched whatever the time.
+            and not (self.problem.n_modes(model) and self._ends(own_budget))
         ):
             candidate = self.problem.strongest(model, self.rejected)
             if candidate is None:
@@ -392,13 +392,13 @@ class Stepwise(Generic[Model, Candidate]):
             self.rejected.append((complex(pole), gain))
         return model
 
-    def _ends(self, growing: Budget) -> bool:
-        """Whether the time of the search for further modes is up; noted, as there may be more once it is not."""
-        self.cut_short = growing.spent(FURTHER)
+    def _ends(self, own_budget: Budget) -> bool:
+        """Whether the time of the forward search is up; sets `cut_short`."""
+        self.cut_short = own_budget.spent(FURTHER)
         return self.cut_short
 
     def backward(self, model: Model) -> Model:
-        """Without the modes that the likelihood does not miss."""
+        """The model without modes of insignificant gain; the weakest goes first."""
         while self.problem.n_modes(model) and not self.budget.spent("check of each mode"):
             weakest: tuple[float, complex, Model] | None = None
             for pole, without, certainly in self.problem.suspects(model):
@@ -416,7 +416,7 @@ class Stepwise(Generic[Model, Candidate]):
 
 
 def overdamped(poles: np.ndarray) -> np.ndarray:
-    """Which poles are damped too much to ring."""
+    """Which poles are damped too much to oscillate."""
     return np.asarray(-poles.real > SELECTION.most_damped * np.abs(poles))
 
 
@@ -427,23 +427,23 @@ def spurious_modes(
     bin_width: float,
     distinct: Callable[[int, int], bool] | None = None,
 ) -> np.ndarray:
-    """Which poles are damped too much to ring, or split a stronger mode that has their shape and their band.
+    """Which poles are overdamped, or split off a stronger mode of the same shape in the same band, (n_modes,).
 
     Args:
         poles: (n_modes,) rad/s.
         shapes: (n_signals, n_modes) amplitudes over the noise, complex.
-        strength: (n_modes,) of two alike the weaker splits the other.
-        bin_width: rad/s, the resolution of the record.
-        distinct: whether modes r and s, which one signal cannot distinguish by shape, are two all the same.
+        strength: (n_modes,); of two poles of one mode the weaker is spurious.
+        bin_width: rad/s, the frequency resolution of the record.
+        distinct: test whether modes r and s are two modes, for a single signal, which shows no shape.
     """
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     damped = overdamped(poles)
-    # An overdamped one has every band; it is split itself.
-    # One signal has no shape, and a mode that depends on amplitude looks like two there.
+    # No mode splits off an overdamped pole, whose band is wide enough for any.
+    # A single signal shows no shape, and a mode that depends on amplitude looks like two there.
     others = len(shapes) - 1
-    alike = max(SELECTION.same_shape, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SELECTION.same_shape
-    split = near & (mac(shapes, shapes) > alike) & (strength[:, None] < strength) & ~damped
+    least_mac = max(SELECTION.same_shape, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SELECTION.same_shape
+    split = near & (mac(shapes, shapes) > least_mac) & (strength[:, None] < strength) & ~damped
     if distinct is not None and others == 0:
         for r, s in np.argwhere(split):
             split[r, s] = not distinct(r, s)

@@ -1,4 +1,4 @@
-"""Free decay written out from its modes: what a model says a ring-down should look like."""
+"""Synthesis of free decays from modes."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from workbench.structure.modes import Modes, SampledModes
 
 
 def impulse_response_modes(modes: Modes, *, at: Place, positions: Sequence[Place]) -> SampledModes:
-    """The free decay after a unit impulse, as sampled modes whose shapes carry amplitude and phase.
+    """The free decay after a unit impulse, as sampled modes whose shapes include amplitude and phase.
 
     An impulse of 1 N s at x0 gives q_r'(0) = φ_r(x0), so w(x, t) = Re Σ_r s_r(x) e^{λ_r t} with
     s_r(x) = -i φ_r(x) φ_r(x0) / ω_dr.
@@ -55,7 +55,7 @@ def free_decay(
         start_time: time of the first sample, s.
         noise_std: standard deviation of white noise added, in the unit of the quantity.
         seed: of that noise.
-        aliases: let modes beyond half the sample rate fold over, as they do in a record without a filter.
+        aliases: whether modes beyond half the sample rate are allowed, and alias, as without an anti-alias filter.
 
     Raises:
         ValueError: a quantity that is not a motion of a point, or a mode beyond half the sample rate.
