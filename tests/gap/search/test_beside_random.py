@@ -16,7 +16,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.beside_random import looks_random, random_beside, random_beside_errors
 from workbench.gap.search.fit import Fit
-from workbench.gap.search.jointly import measured
+from workbench.gap.search.jointly import evaluated
 from workbench.gap.search.search import Search
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import AirDrag, CoulombFriction, OneSidedStop
@@ -93,7 +93,7 @@ def test_it_is_found_beside_small_errors_of_the_model(rig, records):
     data = FitData(tuple(made), np.array([s.noise_std for s in rig.sensors]))
     nominal = data.by_channel(data.residual(told))
     search = Search(told, data, data, data, CATALOGUE, lambda text, share: None, ALONE, nominal)
-    step = measured(search, Fit((nominal_errors(told, search.prior),), 0.0, nominal, 0))
+    step = evaluated(search, Fit((nominal_errors(told, search.prior),), 0.0, nominal, 0))
     assert not looks_random(evidence(told, made))
     assert random_beside_errors(search, step) is None
     found = random_beside_errors(search, step, surely=False)

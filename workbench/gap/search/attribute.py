@@ -25,7 +25,7 @@ from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import with_all_errors
 from workbench.gap.search.nominal_figures import beside_modes, beside_records
 from workbench.gap.search.pairs import Pairs
-from workbench.gap.search.plain import are_common, common_as_errors, may_be_error
+from workbench.gap.search.plain import are_uniform_errors, is_plausible_error, uniform_as_nominal_errors
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, best_of_each_kind, most_informative, nearest, promise
 from workbench.gap.search.settings import ATTRIBUTION, LAW, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
@@ -205,7 +205,7 @@ def attribute(
     outcome, best, random, rivals, noise, beside_inputs = decision
     is_cut = search.is_over
     within = beside_inputs or search
-    best = common_as_errors(search, best, alone=random is not None)
+    best = uniform_as_nominal_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
         best = widened(within, best)
     if seen:
@@ -442,12 +442,12 @@ def _with_a_second(
     decision = pairs.decision(start)
     if law is not None:
         return compared_with(law, search, decision)
-    if explained and not (are_common(decision.best.effects) and beside.is_nothing):
+    if explained and not (are_uniform_errors(decision.best.effects) and beside.is_nothing):
         return decision
     beside.run()
     if not beside.is_settled and beside.decision().outcome != "explained" and pairs.by_exchange():
         decision = pairs.decision(start)
-        if not (are_common(decision.best.effects) and beside.is_nothing):
+        if not (are_uniform_errors(decision.best.effects) and beside.is_nothing):
             return decision
     decision = nearest(search, start, beside.decision(), pairs.found)
     if decision.outcome in ("explained", "none") or search.is_over:
@@ -468,7 +468,7 @@ def _clean_pair(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> Decision | 
         return None
     decision = pairs.decision(start)
     effects = decision.best.effects
-    if are_common(effects) or any(may_be_error(effect, search) for effect in effects):
+    if are_uniform_errors(effects) or any(is_plausible_error(effect, search) for effect in effects):
         return None
     sure = with_intervals(search.rig, decision.best, search.data, search.workers).effects
     return decision if all(effect.stands_out(search.rig) for effect in sure) else None

@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import differing, figures_of
 from workbench.gap.search.fit import finite_residual
 from workbench.gap.search.jointly import Step, too_large
-from workbench.gap.search.plain import OF_PORTS
+from workbench.gap.search.plain import PORT_GROUPS
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import RECORDS, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
@@ -128,7 +128,7 @@ def beside_records(before: Stepwise) -> Stepwise | None:
     if not (beside.is_believed or search.prior.shape):  # a profile bends to shapes that are off by themselves
         by_mode = Stepwise(replace(varied, by_mode=True), before.tolerance, before.ahead)
         # no effect of the structure hides among errors of ports and of records
-        if by_mode.is_quiet and set(too_large(by_mode.last.errors)) <= {"damping", "record", *OF_PORTS}:
+        if by_mode.is_quiet and set(too_large(by_mode.last.errors)) <= {"damping", "record", *PORT_GROUPS}:
             by_mode.run(most=0)
             return by_mode
     noise = nearest.noise_power

@@ -278,7 +278,7 @@ class StepwiseSettings:
     # share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power
     no_gap: float = 0.15
     # likewise, that errors of the model alone leave in trials that hide nothing: under 0.02 in 40 of them
-    spotless: float = 0.05
+    noise_floor: float = 0.05
     # likewise, that substeps twice as fine may move the readings by; where it is more, the search goes on by finer ones
     stepping: float = 0.05
     excluded: float = 1e-3  # probability below which another set that explains the records is no rival
