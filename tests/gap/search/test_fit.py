@@ -206,8 +206,8 @@ def test_numbers_of_different_sensors_are_moved_at_once_where_each_alters_its_ow
     effects = (*([exchange] if swapped else []), nominal_errors(rig, prior))
     together = _Problem(rig, effects, data)
     alone = _Problem(rig, effects, data)
-    alone._of_sensors_alone = lambda numbers: []
-    assert bool(together._of_sensors_alone(range(20))) != swapped
+    alone._groups_of_sensors = lambda indices: []
+    assert bool(together._groups_of_sensors(range(20))) != swapped
     start = together.residual(together.start)
     one, other = (each.jacobian(each.start, start, False, _of(each)) for each in (together, alone))
     np.testing.assert_allclose(one, other, atol=1e-12 / min(together.steps) * np.abs(start).max())
@@ -222,7 +222,7 @@ def test_slopes_along_believed_numbers_are_kept_and_others_taken_anew(rig, measu
     np.testing.assert_allclose(chord.normal(first), first.T @ first)
     moved = chord.start + 0.01 * (np.arange(chord.start.size) < 2)
     second = chord.jacobian(moved, chord.residual(moved), False, _of(chord))
-    np.testing.assert_array_equal(second[:, chord.believed], first[:, chord.believed])
+    np.testing.assert_array_equal(second[:, chord.with_prior], first[:, chord.with_prior])
     assert np.abs(second[:, :2] - first[:, :2]).max() > 1e-6 * np.abs(first[:, :2]).max()
     np.testing.assert_allclose(chord.normal(second), second.T @ second, rtol=1e-9, atol=1e-6)
 
@@ -239,7 +239,7 @@ def test_a_fit_keeps_the_slopes_along_believed_numbers_of_the_one_before(rig, me
     residual, moves = problem.residual(problem.start), []
     share = _of(problem)
     kept = problem.jacobian(problem.start, residual, False, lambda each: moves.extend(each) or share(each)).copy()
-    assert sorted(j for move in moves for j in move.numbers) == [0, 1]
+    assert sorted(j for move in moves for j in move.indices) == [0, 1]
     fresh = _Problem(rig, effects, data)
     taken = fresh.jacobian(fresh.start, residual, False, _of(fresh))
     np.testing.assert_allclose(kept, taken, atol=1e-4 * np.abs(taken).max())

@@ -66,7 +66,7 @@ def test_residual_gives_way_to_errors_as_a_fit_of_them_would(rig, records):
     errors = nominal_errors(rig, NominalPrior(stiffness=0.02, mass=0.02, damping=0.2))
     freed = fit(rig, (errors,), data).effects
     jacobian, residual = sensitivity(rig, freed, data), data.residual(apply_all(rig, freed))
-    projected = data.giving_way(jacobian)
+    projected = data.with_nuisance(jacobian)
     k = jacobian.shape[1]
     stacked = np.linalg.lstsq(np.r_[jacobian, np.eye(k)], np.r_[residual, np.zeros(k)], rcond=None)[0]
     left = residual - jacobian @ stacked

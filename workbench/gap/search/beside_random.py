@@ -211,7 +211,7 @@ def _by_laws_on_measured_motion(search: Search, evidence: Evidence, observer: Ob
     if not is_stepped(evidence.rig):
         return evidence
     observer = observer or _observer(search, evidence.rig)
-    return replace(evidence, residuals=tuple(search.data.left_beside(evidence.rig, observer)))
+    return replace(evidence, residuals=tuple(search.data.residual_on_measured_motion(evidence.rig, observer)))
 
 
 def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, RandomForceFit]:

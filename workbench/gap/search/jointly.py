@@ -389,7 +389,7 @@ def with_reading_sides(search: Search, errors: Effect, effects: Sequence[Effect]
     return nominal_errors(search.rig, replace(errors.target, late=late, early=early), starts)
 
 
-def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Search | None:
+def with_input_noise(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Search | None:
     """The search with input noise of the likeliest level given a fit, or None if that does not whiten the residual.
 
     None also if most records would need more noise than any logger has: a missing law grows with the level too.
@@ -406,9 +406,9 @@ def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Sear
     (share, _, is_beyond), louder = min(zip(shares, (search, found), strict=True), key=lambda each: each[0].loss)
     if share < LEAST_LOGGED or is_beyond:
         return None
-    beside = louder.beside_inputs(rig, share)
+    beside = louder.with_input_noise(rig, share)
     white = evaluated(beside, fitted).fit
-    if INPUTS.white < white.cost < INPUTS.bent * fitted.cost:
+    if INPUTS.white < white.cost < INPUTS.over_fitted * fitted.cost:
         fitted = white = fit_jointly(beside, fitted.effects[:-1], fitted.effects[-1]).fit
         rig = apply_all(search.rig, fitted.effects)
         left = search.data.differences(rig)
@@ -416,7 +416,7 @@ def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Sear
         return None
     for _ in range(INPUTS.rounds):  # sensor noise from the power of the innovations
         louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
-        beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
+        beside = louder.with_input_noise(rig, likeliest_share(rig, louder.data, left).share)
         white = evaluated(beside, fitted).fit
     return beside
 

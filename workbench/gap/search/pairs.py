@@ -10,7 +10,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.screening import Screening, fitted_ahead, on_whole_records, one_more
-from workbench.gap.search.search import Decision, Search, in_one_valley, unexplained
+from workbench.gap.search.search import Decision, Search, in_one_minimum, unexplained
 from workbench.gap.search.settings import PAIRS, RANDOM, SELECTION
 from workbench.structure.domain import Between
 
@@ -131,7 +131,7 @@ class Pairs:
         domain = self.search.rig.modes.domain
         enough = max(SELECTION.promising, SELECTION.promising_share * self.search.nominal_ahead)
         promising = [f for f in ahead if f.cost < enough]
-        fresh = [f for f in promising if not any(in_one_valley(f, other, domain) for other in self.followed)]
+        fresh = [f for f in promising if not any(in_one_minimum(f, other, domain) for other in self.followed)]
         most = PAIRS.more if self.found else PAIRS.finalists
         self.followed += fresh[:most]
         self._add(on_whole_records(self.search, fresh, most))

@@ -161,7 +161,7 @@ def _at_ports(errors: Effect) -> Iterator[tuple[Effect, ...]]:
     prior = errors.target
     sides = {"late": prior.late, "early": prior.early, "interpolated": prior.interpolated}
     timing = NominalPrior(sample_time=prior.sample_time, waves=prior.waves, **sides)
-    if prior.delay > PLAIN.punctual or prior.late:
+    if prior.delay > PLAIN.smallest_delay or prior.late:
         timing = replace(timing, delay=prior.delay)
     for kept in dict.fromkeys((timing, replace(timing, gain=prior.gain, place=prior.place))):
         values = {name: value for name, value in errors.values.items() if group_of(name) in kept.groups}
@@ -262,7 +262,7 @@ def delay_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
     """
     delays = {name.removeprefix("delay_"): float(v) for name, v in errors.values.items() if group_of(name) == "delay"}
     doubt = {name: PLAIN.sure * errors.deviations.get(f"delay_{name}", 0.0) for name in delays}
-    off = [name for name, delay in delays.items() if abs(delay) > max(PLAIN.punctual, doubt[name])]
+    off = [name for name, delay in delays.items() if abs(delay) > max(PLAIN.smallest_delay, doubt[name])]
     sample_time = errors.target.sample_time
     if len(delays) >= PLAIN.several and len(off) == 1 and delays[off[0]] > 0:
         return (Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * sample_time}),)

@@ -12,7 +12,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all, contained
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit, slopes
-from workbench.gap.search.search import Search, apart, best_of_each_kind, in_one_valley, promise
+from workbench.gap.search.search import Search, apart, best_of_each_kind, in_one_minimum, promise
 from workbench.gap.search.settings import SCREENING, SEARCH, SELECTION
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
@@ -52,8 +52,8 @@ class Screening:
         Args:
             evidence: of the rig with the given effects.
         """
-        data, standing = search.first_ahead, search.first_ahead.standing
-        before = finite_residual(search.rig, (*given, *search.held), standing)
+        data, unprojected = search.first_ahead, search.first_ahead.unprojected
+        before = finite_residual(search.rig, (*given, *search.held), unprojected)
         if before is None:
             return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.domain)
         thin = slice(None, None, max(1, before.size // SCREENING.most_values))
@@ -62,7 +62,7 @@ class Screening:
         starts = [start for task in tasks for start in task]
         bounds = [_bounds(task) for task in tasks for _ in task]
         left = before.copy()
-        data.give_way(left)
+        data.project_out(left)
         left = left[thin]
         moves = search.workers.array(len(starts), left.size)  # the one large array
 
@@ -70,9 +70,9 @@ class Screening:
             # errors of the model give way to many starts at once: their directions are large
             moved = np.zeros((len(some), before.size))
             for row, i in zip(moved, some, strict=True):
-                there = finite_residual(search.rig, (*given, starts[i], *search.held), standing)
+                there = finite_residual(search.rig, (*given, starts[i], *search.held), unprojected)
                 row[:] = 0.0 if there is None else there - before
-            data.give_way(moved)
+            data.project_out(moved)
             moves[some] = moved[:, thin]
             return [bool(0 < moves[i] @ moves[i] < RUNAWAY * left.size) for i in some]
 
@@ -222,7 +222,7 @@ def one_more(
         return found
     # beside errors that give way, a start that stands a little off its place comes to nothing
     there = fitted_ahead(search, [(*given, effect) for effect in _exchanged(found, screened)])
-    return distinct_valleys(search, sorted((*found, *there), key=lambda f: f.cost))
+    return distinct_minima(search, sorted((*found, *there), key=lambda f: f.cost))
 
 
 def _exchanged(found: Sequence[Fit], screened: Screening) -> list[Effect]:
@@ -258,19 +258,19 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
     with search.workers.standing(ahead) as share:
         tried = share([(effects, True, 2) for effects in sets[: SELECTION.tried]])
         likely = sorted(tried, key=promise)[: SELECTION.likely]
-        fits = distinct_valleys(search, sorted(share([(f.effects, False, 3) for f in likely]), key=promise))
+        fits = distinct_minima(search, sorted(share([(f.effects, False, 3) for f in likely]), key=promise))
         falling = [
             f for f in fits[: SELECTION.likeliest] if f.falling and promise(f) < SELECTION.far_behind * promise(fits[0])
         ]
         longer = share([(f.effects, False, 8) for f in falling])
-    return distinct_valleys(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
+    return distinct_minima(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
 
 
-def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
+def distinct_minima(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     """The fits without those that came to where a better one of the same set came."""
     distinct: list[Fit] = []
     for candidate in fits:
-        if not any(in_one_valley(candidate, other, search.rig.modes.domain) for other in distinct):
+        if not any(in_one_minimum(candidate, other, search.rig.modes.domain) for other in distinct):
             distinct.append(candidate)
     return distinct
 

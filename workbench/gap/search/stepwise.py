@@ -30,12 +30,12 @@ from workbench.gap.search.fit import Chord, Fit, cost_of, fit, parameters_of, sl
 from workbench.gap.search.jointly import (
     Step,
     are_plausible,
-    beside_inputs,
     evaluated,
     fit_jointly,
     likeliest_loss,
     size_of,
     with_all_groups,
+    with_input_noise,
     with_reading_sides,
 )
 from workbench.gap.search.plain import (
@@ -321,12 +321,12 @@ class Stepwise:
         loud = plain.excess(plain.sensor_noise) > STEPWISE.loud * float(plain.sensor_noise.mean())
         if plain.logged < LEAST_LOGGED or not loud:
             return self._continue_in(search, step, plain) if self.search.logged else None
-        beside = beside_inputs(search, step.fit, plain.sensor_noise)
+        beside = with_input_noise(search, step.fit, plain.sensor_noise)
         if beside is None:
             return None
         fitted = fit_jointly(beside, step.effects, step.errors)
         if fitted.fit.cost < STEPWISE.too_white:  # nominal errors had fitted the noise, so it was estimated too loud
-            beside = beside_inputs(search, fitted.fit, plain.sensor_noise)
+            beside = with_input_noise(search, fitted.fit, plain.sensor_noise)
             if beside is None:
                 return None
             fitted = fit_jointly(beside, step.effects, fitted.errors)
@@ -481,7 +481,7 @@ class Stepwise:
         self.search = search = replace(self.search, quick=quick, first=first)
         search.report("another effect beside small errors of the model", 0.5 + 0.1 * len(step.effects))
         # the residual beyond nominal errors fitted to whole records is evidence of a missing effect
-        beside = search.beside(step.errors)
+        beside = search.with_nominal_errors(step.errors)
         rig = apply_all(search.rig, step.fit.effects)
         residual = beside.ahead.residual(rig)
         left = float(residual @ residual) / residual.size
@@ -798,7 +798,7 @@ class Stepwise:
             return None
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
         if step.logged > LEAST_LOGGED and not self.search.logged:
-            search = beside_inputs(self.at_first, step.fit, step.sensor_noise) or search
+            search = with_input_noise(self.at_first, step.fit, step.sensor_noise) or search
         key, rig = key_of(step.effects), self.search.rig
         rivals = [s.effects for s in self._others()[1:] if key not in contained(s.effects, rig)]
         found = in_place_of_nominal_errors(search, step, rivals)
