@@ -14,7 +14,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.beside_random import looks_random, random_beside, random_beside_errors
+from workbench.gap.search.beside_random import looks_random, random_with_effects, random_with_nominal_errors
 from workbench.gap.search.fit import Fit
 from workbench.gap.search.jointly import evaluated
 from workbench.gap.search.search import Search
@@ -95,8 +95,8 @@ def test_it_is_found_beside_small_errors_of_the_model(rig, records):
     search = Search(told, data, data, data, CATALOGUE, lambda text, share: None, ALONE, nominal)
     step = evaluated(search, Fit((nominal_errors(told, search.prior),), 0.0, nominal, 0))
     assert not looks_random(evidence(told, made))
-    assert random_beside_errors(search, step) is None
-    found = random_beside_errors(search, step, surely=False)
+    assert random_with_nominal_errors(search, step) is None
+    found = random_with_nominal_errors(search, step, surely=False)
     wind = found.best.effects[-1]
     assert wind.label == "random_disturbance"
     assert wind.values["at"] == pytest.approx(1.3, abs=3.0 * wind.deviations["at"])
@@ -141,4 +141,4 @@ def test_an_effect_of_a_coarse_sensor_keeps_it(rig, records):
     left = data.by_channel(data.residual(rig))
     search = Search(rig, data, data, data, CATALOGUE, lambda text, share: None, ALONE, left)
     assert coarse not in search.without_clipped().rig.sensors
-    assert random_beside(search, [Fit((swapped,), 1.0, left, 0)]) is None
+    assert random_with_effects(search, [Fit((swapped,), 1.0, left, 0)]) is None

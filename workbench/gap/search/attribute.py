@@ -18,12 +18,12 @@ from workbench.gap.prediction.noise import is_noise_alone, logging_noise, noise_
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search.beside_random import decide_on_random, random_beside, random_beside_errors
+from workbench.gap.search.beside_random import decide_on_random, random_with_effects, random_with_nominal_errors
 from workbench.gap.search.finish import best_of_each, finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import with_all_errors
-from workbench.gap.search.nominal_figures import beside_modes, beside_records
+from workbench.gap.search.nominal_figures import with_mode_errors, with_record_deviations
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import are_uniform_errors, is_plausible_error, uniform_as_nominal_errors
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
@@ -409,7 +409,7 @@ def _decide_beyond_singles(
 ) -> Decision:
     """The decision among nominal errors, several effects, random forces and a law beyond the catalogue."""
     at_once = Pairs.at_once(search, screened)
-    pair = _pair_at_noise_floor(at_once.further(), start, singles[:1])
+    pair = _pair_at_noise_floor(at_once.copy(), start, singles[:1])
     if pair is not None:
         return pair
     beside = Stepwise(search, tolerance, ahead)
@@ -421,19 +421,19 @@ def _decide_beyond_singles(
     enough = beside.is_enough or beside.without_errors() or beside.by_singles() or beside.by_few()
     enough = enough or (beside.is_quiet and beside.is_believed)
     if not (enough or near or search.is_over):
-        random = random_beside(search, singles) or random_beside_errors(search, beside.steps[0])
+        random = random_with_effects(search, singles) or random_with_nominal_errors(search, beside.steps[0])
         if random is not None:
             return random
     if enough:
         beside.run()
-    by_mode = None if search.is_over or (enough and beside.is_believed) else beside_modes(beside)
+    by_mode = None if search.is_over or (enough and beside.is_believed) else with_mode_errors(beside)
     if by_mode is not None or enough:
         return (by_mode or beside).decision()
-    varied = None if search.is_over else beside_records(beside)
+    varied = None if search.is_over else with_record_deviations(beside)
     if varied is not None:
         return varied.decision()
     law = None if search.is_over else force_of_other_law(search, evidence)
-    pairs = at_once.further()
+    pairs = at_once.copy()
     # implausible nominal errors show a missing effect, so sets of few effects without nominal errors come first
     nearer = beside.last.is_plausible and beside.last.fit.cost < min(f.cost for f in (start, *singles))
     if law is None and nearer:
@@ -454,8 +454,8 @@ def _decide_beyond_singles(
     decision = nearest(search, start, beside.decision(), pairs.found)
     if decision.outcome in ("explained", "none") or search.is_over:
         return decision
-    random = random_beside(search, pairs.found[:1])
-    return random or random_beside_errors(search, beside.steps[0], surely=False) or decision
+    random = random_with_effects(search, pairs.found[:1])
+    return random or random_with_nominal_errors(search, beside.steps[0], surely=False) or decision
 
 
 def _pair_at_noise_floor(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> Decision | None:
@@ -466,7 +466,7 @@ def _pair_at_noise_floor(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> De
     """
     search = pairs.search
     near = [effect for f in singles if search.near(f, PAIRS.most) for effect in f.effects]
-    if not (pairs.explain or pairs.beside_any(near)):
+    if not (pairs.explain or pairs.with_any(near)):
         return None
     decision = pairs.decision(start)
     effects = decision.best.effects
@@ -502,7 +502,7 @@ def _single_in_louder_noise(search: Search, start: Fit, singles: Sequence[Fit], 
 def _decide_with_nominal_errors(search: Search, tolerance: float) -> Decision:
     """The decision with nominal errors from the first."""
     beside = Stepwise(search, tolerance)
-    varied = None if beside.is_enough else beside_records(beside)
+    varied = None if beside.is_enough else with_record_deviations(beside)
     if varied is not None:
         return varied.decision()
     beside.run()

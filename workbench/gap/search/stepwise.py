@@ -449,7 +449,7 @@ class Stepwise:
         if len(step.effects) != 1 or not is_linear_structural(step.effects[0].kind) or step.effects[0].at is None:
             return None
         (effect,), domain = step.effects, self.search.rig.modes.domain
-        self.search.report("the same effect elsewhere", 0.6)
+        self.search.report("the same effect at other places", 0.6)
         places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
         here, *others = self._fitted_to_quick([(effect,), *places], step, self._slopes(step))
         near = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
@@ -479,7 +479,7 @@ class Stepwise:
         """The likeliest sets with one more effect, fitted to the two most informative records."""
         quick, first = most_informative(self.search.data, step.fit.cost_by_channel)
         self.search = search = replace(self.search, quick=quick, first=first)
-        search.report("another effect beside small errors of the model", 0.5 + 0.1 * len(step.effects))
+        search.report("another effect, with small errors of the model", 0.5 + 0.1 * len(step.effects))
         # the residual beyond nominal errors fitted to whole records is evidence of a missing effect
         beside = search.with_nominal_errors(step.errors)
         rig = apply_all(search.rig, step.fit.effects)
