@@ -9,7 +9,7 @@ import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
-from workbench.gap.prediction.innovations import LOOSE, Observer, _grows
+from workbench.gap.prediction.innovations import LOOSE, Observer, _is_growing
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.gap.search.fit import cost_of
@@ -76,7 +76,7 @@ def test_a_motion_grows_where_an_eigenvalue_is_beyond_one(radius):
     for _ in range(20):
         step = rng.standard_normal((12, 12))
         step *= radius / np.abs(np.linalg.eigvals(step)).max()
-        assert _grows(step) is (radius > 1.0)
+        assert _is_growing(step) is (radius > 1.0)
 
 
 @pytest.mark.parametrize("law", [(), (("cubic_spring", {"at": 0.7, "stiffness": 30.0}),)], ids=["linear", "stepped"])

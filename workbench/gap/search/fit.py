@@ -361,7 +361,7 @@ def slopes(
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")
-    with workers.standing(problem.run) as share:
+    with workers.pool(problem.run) as share:
         slope_base = problem.slope_base(problem.start, residual)
         jacobian = problem.jacobian(problem.start, *slope_base, share)
         if wide:
@@ -408,7 +408,7 @@ def fit(
     if residual is None:
         shape = (len(data.records), data.noise.size)
         return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), problem.start.size)
-    with workers.standing(problem.run) as share:
+    with workers.pool(problem.run) as share:
         found = _minimised(problem, share, residual, iterations, tolerance, damping)
     problem.store_chord()
     problem.close()

@@ -260,7 +260,7 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
         data = first if alone else both
         return fit(search.rig, effects, data, held=search.held, iterations=iterations, tolerance=1e-4)
 
-    with search.workers.standing(ahead) as share:
+    with search.workers.pool(ahead) as share:
         tried = share([(effects, True, 2) for effects in sets[: SELECTION.tried]])
         likely = sorted(tried, key=promise)[: SELECTION.likely]
         fits = distinct_minima(search, sorted(share([(f.effects, False, 3) for f in likely]), key=promise))
