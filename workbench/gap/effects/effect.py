@@ -156,7 +156,7 @@ def place_values(where: Where) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Moved:
+class ForceAndMotion:
     """The unmodelled force at a point and the motion there, one row per record joined end to end.
 
     Attributes:
@@ -171,12 +171,12 @@ class Moved:
     displacement: Floats
     velocity: Floats
     acceleration: Floats
-    bent: bool = False
+    absorbed: bool = False
 
     def strength_along(self, basis: Floats) -> float:
         """The k for which -k basis (n_total,) is nearest to the force, beside any linear force where that is bent."""
         force = self.force
-        if self.bent:
+        if self.absorbed:
             force, basis = (each - self._linear @ (self._linear.T @ each) for each in (force, basis))
         return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
 
@@ -213,7 +213,7 @@ class Evidence(Protocol):
     @property
     def domain(self) -> Domain: ...
     @property
-    def at_peaks(self) -> Sequence[Moved]: ...
+    def at_peaks(self) -> Sequence[ForceAndMotion]: ...
     @property
     def places_to_try(self) -> Sequence[Any]: ...
 

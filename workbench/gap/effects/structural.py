@@ -10,8 +10,8 @@ import numpy as np
 from workbench.gap.effects.effect import (
     Effect,
     Evidence,
+    ForceAndMotion,
     Kind,
-    Moved,
     Parameter,
     Scales,
     place_of,
@@ -203,7 +203,7 @@ MODULUS_ERROR = Kind(
 # --- what hangs on the structure at a point
 
 
-def _regressed(place: Moved, series: str) -> float:
+def _regressed(place: ForceAndMotion, series: str) -> float:
     """The coefficient k of force = -k series, by least squares."""
     x = getattr(place, series)
     return float(-np.dot(place.force, x) / max(np.dot(x, x), 1e-300))

@@ -485,7 +485,7 @@ class Stepwise:
         rig = apply_all(search.rig, step.fit.effects)
         residual = beside.ahead.residual(rig)
         left = float(residual @ residual) / residual.size
-        evidence = Evidence.of(rig, search.data, workers=search.workers, bent=True)
+        evidence = Evidence.of(rig, search.data, workers=search.workers, absorbed=True)
         ahead = one_more(beside, step.effects, evidence)
         if not ahead or ahead[0].cost > (1.0 - STEPWISE.ahead) * left:
             return []
