@@ -8,7 +8,7 @@ import pytest
 
 from workbench.gap.diagnose import _fails_unseen, _hiding, _leaves_much
 from workbench.gap.effects.catalogue import kind_named
-from workbench.gap.effects.effect import Effect, apply_all, fewer, merged_sets, simpler_forms
+from workbench.gap.effects.effect import Effect, apply_all, merged_sets, simpler_forms, with_two_as_one
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.prediction.innovations import LOOSE
 from workbench.gap.prediction.random_force import tonal
@@ -113,10 +113,10 @@ def test_a_spring_beside_a_hinge_is_a_hinge_that_resists_turning(rig):
 def test_two_effects_of_one_kind_may_be_one():
     first, second = (Effect(CUBIC, None, {"at": at, "stiffness": 1.0}) for at in (0.5, 0.9))
     other = Effect(SPRING, None, {"at": 1.2, "stiffness": 2.0})
-    sets = list(fewer((first, other, second)))
+    sets = list(with_two_as_one((first, other, second)))
     assert [s[0] for s in sets] == [other] * 3
     assert sorted(s[1].values["at"] for s in sets) == pytest.approx([0.5, 0.7, 0.9])
-    assert not list(fewer((first, other)))
+    assert not list(with_two_as_one((first, other)))
 
 
 def test_friction_and_a_constant_force_are_friction_that_differs_between_the_directions(rig):
