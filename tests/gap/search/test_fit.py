@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from workbench.gap.diagnose import _fails_unseen, _hiding, _leaves_much
+from workbench.gap.diagnose import _leaves_far_more_than_noise, _note_of_large_errors, _over_fits
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all, merged_sets, simpler_forms, with_two_as_one
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
@@ -152,15 +152,15 @@ class Found:
 
 
 def test_a_set_must_hold_on_records_it_has_not_seen():
-    def unseen(after, overall):
+    def held_out(after, overall):
         return Shrinkage({"v": 0.5}, {"v": after}, {"v": 0.01}, {"v": overall}, overall, (overall, overall))
 
-    assert _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77))
-    assert not _fails_unseen(Found("cubic_spring"), unseen(0.02, 0.97))
-    assert not _fails_unseen(Found("cubic_spring"), unseen(0.0102, 0.8)), "what is left is noise"
-    assert not _fails_unseen(Found("random_disturbance"), unseen(0.3, 0.1)), "no prediction can hold it"
-    assert not _fails_unseen(Found("cubic_spring"), None)
-    assert not _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77), beyond=0.12**2), "noise of the inputs is"
+    assert _over_fits(Found("cubic_spring"), held_out(0.12, 0.77))
+    assert not _over_fits(Found("cubic_spring"), held_out(0.02, 0.97))
+    assert not _over_fits(Found("cubic_spring"), held_out(0.0102, 0.8)), "what is left is noise"
+    assert not _over_fits(Found("random_disturbance"), held_out(0.3, 0.1)), "no prediction can hold it"
+    assert not _over_fits(Found("cubic_spring"), None)
+    assert not _over_fits(Found("cubic_spring"), held_out(0.12, 0.77), beyond=0.12**2), "noise of the inputs is"
 
 
 @pytest.mark.parametrize(
@@ -180,15 +180,15 @@ def test_errors_that_no_model_has_explain_nothing_where_they_leave_far_more_than
     load = Effect(kind_named("axial_load"), None, {"tension": -1.0})
     found = SimpleNamespace(outcome="explained", best=SimpleNamespace(effects=(load, errors)))
     shrinkage = Shrinkage({"v": 1.7}, {"v": after}, {"v": 0.01}, {"v": 0.82}, 0.82, (0.8, 0.9))
-    assert _leaves_much(found, shrinkage, np.array([beyond])) == much
+    assert _leaves_far_more_than_noise(found, shrinkage, np.array([beyond])) == much
 
 
 def test_a_note_says_which_errors_are_larger_than_those_of_a_careful_test(rig):
     prior = NominalPrior(damping=0.25, gain=0.02)
     small = nominal_errors(rig, prior, {"damping_1": 0.2, "gain_at_d1": 0.01})
     large = replace(small, values={name: 0.43 if "damping" in name else 0.01 for name in small.values})
-    assert _hiding(small) == _hiding(None) == ()
-    (note,) = _hiding(large)
+    assert _note_of_large_errors(small) == _note_of_large_errors(None) == ()
+    (note,) = _note_of_large_errors(large)
     assert "in damping are larger than those of a careful test" in note and "a damper" in note
 
 
