@@ -61,7 +61,7 @@ def test_a_load_that_only_a_stiffer_beam_bears_ends_no_search(rig, search):
     assert _starts(replace(search, held=(errors,)), (load,), Evidence.of(rig, search.data))
     assert left_with(rig, (load,), search.data.records[0], 0.0) == RUNAWAY
     linear = replace(search, data=search.first.stepped(1), quick=search.first.stepped(1), by_mode=True)
-    assert np.isfinite(Stepwise(linear, 0.0).afresh((load,)).fit.cost)
+    assert np.isfinite(Stepwise(linear, 0.0).fit_from_zero((load,)).fit.cost)
 
 
 def screened(n_starts: int, seed: int) -> Screening:

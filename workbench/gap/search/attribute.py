@@ -203,30 +203,34 @@ def attribute(
         decision = nearest(search, start, decision, singles)
     outcome, best, random, rivals, noise, own_search = decision
     is_cut = search.is_over
-    within = own_search or search
+    final_search = own_search or search
     best = uniform_as_nominal_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
-        best = widened(within, best)
+        best = widened(final_search, best)
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
     best = replace(best, effects=exchanged_last(best.effects))
-    beside = identified if random is None and not any(effect.kind.applied_first for effect in best.effects) else None
-    if beside is not None:
-        best = with_identified_errors(within, best, beside, seen)
-    logged = within.logged
+    identified_prior = (
+        identified if random is None and not any(effect.kind.applied_first for effect in best.effects) else None
+    )
+    if identified_prior is not None:
+        best = with_identified_errors(final_search, best, identified_prior, seen)
+    logged = final_search.logged
     if random is None:
         logged = logged or _input_noise_of(search, best, noise_of(search, best) if noise is None else noise)
         if outcome == "explained":
-            best = replace(best, effects=with_all_errors(within, best.effects))
-        best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None, logged=logged)
+            best = replace(best, effects=with_all_errors(final_search, best.effects))
+        best = with_intervals(
+            search.rig, best, final_search.data, workers, wide=identified_prior is not None, logged=logged
+        )
         best = _without_negligible_parameters(search, best)
         if outcome == "explained":
-            best = _significant(within, best, seen, logged)
+            best = _significant(final_search, best, seen, logged)
             named = [e for e in best.effects if not e.kind.applied_first]
             # an effect without any significant parameter only shows that there is a gap
-            vague = any(not e.stands_out(search.rig) for e in named if e not in seen)
-            outcome = "none" if not named else "unknown" if vague else outcome
+            is_insignificant = any(not e.stands_out(search.rig) for e in named if e not in seen)
+            outcome = "none" if not named else "unknown" if is_insignificant else outcome
     if noise is None:
         noise = noise_of(search, best) if random is None else search.data.noise
     report("done", 1.0)
@@ -240,7 +244,7 @@ def attribute(
         ahead=tuple(ahead),
         evidence=nominal,
         search=search,
-        weighed=within.data,
+        weighed=final_search.data,
         noise=noise,
         logged=logged,
         seen=seen,
@@ -303,13 +307,13 @@ def with_identified_errors(search: Search, best: Fit, identified: IdentifiedPrio
     if not others:
         return best
 
-    def beside(effects: Sequence[Effect], errors: Effect) -> Fit:
+    def fitted_with(effects: Sequence[Effect], errors: Effect) -> Fit:
         return fit(search.rig, (*effects, errors), search.data, iterations=ATTRIBUTION.together, workers=search.workers)
 
-    found = beside(others, nominal_errors(search.rig, identified))
+    found = fitted_with(others, nominal_errors(search.rig, identified))
     while len(found.effects) > 2:
         *effects, errors = found.effects
-        fewer = min((beside(some, errors) for some in each_left_out(effects)), key=lambda f: f.cost)
+        fewer = min((fitted_with(some, errors) for some in each_left_out(effects)), key=lambda f: f.cost)
         if search.tells_apart(found.cost, fewer.cost, found.n_parameters - fewer.n_parameters):
             break
         found = fewer
@@ -320,18 +324,18 @@ def _is_small(nominal: Evidence, tolerance: float) -> bool:
     """Whether the gap above the noise is within a tolerance, or a tenth of the noise, in every record."""
     for record, residual in zip(nominal.data.counted, nominal.residuals, strict=True):
         scale = record.outputs.std(axis=1, keepdims=True)
-        floor = float(((nominal.data.noise[:, None] / scale) ** 2).mean())
-        if float(((residual / scale) ** 2).mean()) - floor > max(tolerance**2, ATTRIBUTION.a_tenth * floor):
+        noise_floor = float(((nominal.data.noise[:, None] / scale) ** 2).mean())
+        if float(((residual / scale) ** 2).mean()) - noise_floor > max(tolerance**2, ATTRIBUTION.a_tenth * noise_floor):
             return False
     return tolerance > 0
 
 
 def _input_noise_of(search: Search, best: Fit, noise: np.ndarray) -> float:
     """Input noise, as a share of the inputs' rms, from the residual of a set above the sensor noise (n_outputs,)."""
-    left = search.data.by_channel(search.data.residual(apply_all(search.rig, best.effects)))
-    if (left.mean(axis=1) < (1.0 + ATTRIBUTION.a_tenth) * ((noise / search.data.noise) ** 2).mean()).all():
+    residual_power = search.data.by_channel(search.data.residual(apply_all(search.rig, best.effects)))
+    if (residual_power.mean(axis=1) < (1.0 + ATTRIBUTION.a_tenth) * ((noise / search.data.noise) ** 2).mean()).all():
         return 0.0
-    return logging_noise(left, (noise / search.data.noise) ** 2, search.logging_noise)
+    return logging_noise(residual_power, (noise / search.data.noise) ** 2, search.logging_noise)
 
 
 def noise_of(search: Search, best: Fit) -> np.ndarray:
@@ -340,9 +344,9 @@ def noise_of(search: Search, best: Fit) -> np.ndarray:
     A residual within the stated noise is all noise: coloured noise has peaks, which an estimate from the quiet bands
     misses, and differs between records.
     """
-    left = search.data.differences(apply_all(search.rig, best.effects))
-    rms = np.sqrt(np.mean([(residual**2).mean(axis=1) for residual in left], axis=0))
-    noise: np.ndarray = np.maximum(noise_found(left), np.minimum(rms, search.data.noise))
+    residuals = search.data.differences(apply_all(search.rig, best.effects))
+    rms = np.sqrt(np.mean([(residual**2).mean(axis=1) for residual in residuals], axis=0))
+    noise: np.ndarray = np.maximum(noise_found(residuals), np.minimum(rms, search.data.noise))
     return noise
 
 
@@ -352,8 +356,8 @@ def _single_effects(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
     if not search.explains(start):
         return on_whole_records(search, promising, ATTRIBUTION.finalists)
     # only a significant gain matters, and there may be no effect at all
-    enough = start.cost - SEARCH.significant
-    return on_whole_records(search, promising, ATTRIBUTION.finalists, to_cost=enough, at_first=ATTRIBUTION.briefly)
+    to_cost = start.cost - SEARCH.significant
+    return on_whole_records(search, promising, ATTRIBUTION.finalists, to_cost=to_cost, at_first=ATTRIBUTION.briefly)
 
 
 def _of_one_sensor(start: Fit) -> bool:
@@ -408,54 +412,54 @@ def _decide_beyond_singles(
     tolerance: float,
 ) -> Decision:
     """The decision among nominal errors, several effects, random forces and a law beyond the catalogue."""
-    at_once = Pairs.at_once(search, screened)
-    pair = _pair_at_noise_floor(at_once.copy(), start, singles[:1])
+    all_pairs = Pairs.at_once(search, screened)
+    pair = _pair_at_noise_floor(all_pairs.copy(), start, singles[:1])
     if pair is not None:
         return pair
-    beside = Stepwise(search, tolerance, ahead)
-    alone = _single_in_louder_noise(search, start, singles, beside)
+    stepwise = Stepwise(search, tolerance, ahead)
+    alone = _single_in_louder_noise(search, start, singles, stepwise)
     if alone is not None:
         return alone
-    near = min(f.cost for f in (start, *singles)) < 1.0 + STEPWISE.no_gap
+    is_near_noise = min(f.cost for f in (start, *singles)) < 1.0 + STEPWISE.no_gap
     # damping is hardly known: if only its errors are large, only an effect that makes them smaller is searched for
-    enough = beside.is_enough or beside.without_errors() or beside.by_singles() or beside.by_few()
-    enough = enough or (beside.is_quiet and beside.is_believed)
-    if not (enough or near or search.is_over):
-        random = random_with_effects(search, singles) or random_with_nominal_errors(search, beside.steps[0])
+    is_explained = stepwise.is_sufficient or stepwise.without_errors() or stepwise.by_singles() or stepwise.by_few()
+    is_explained = is_explained or (stepwise.is_noise_only and stepwise.has_plausible_errors)
+    if not (is_explained or is_near_noise or search.is_over):
+        random = random_with_effects(search, singles) or random_with_nominal_errors(search, stepwise.steps[0])
         if random is not None:
             return random
-    if enough:
-        beside.run()
-    by_mode = None if search.is_over or (enough and beside.is_believed) else with_mode_errors(beside)
-    if by_mode is not None or enough:
-        return (by_mode or beside).decision()
-    varied = None if search.is_over else with_record_deviations(beside)
+    if is_explained:
+        stepwise.run()
+    by_mode = None if search.is_over or (is_explained and stepwise.has_plausible_errors) else with_mode_errors(stepwise)
+    if by_mode is not None or is_explained:
+        return (by_mode or stepwise).decision()
+    varied = None if search.is_over else with_record_deviations(stepwise)
     if varied is not None:
         return varied.decision()
-    law = None if search.is_over else force_of_other_law(search, evidence)
-    pairs = at_once.copy()
+    other_law = None if search.is_over else force_of_other_law(search, evidence)
+    pairs = all_pairs.copy()
     # implausible nominal errors show a missing effect, so sets of few effects without nominal errors come first
-    nearer = beside.last.is_plausible and beside.last.fit.cost < min(f.cost for f in (start, *singles))
-    if law is None and nearer:
-        beside.run()
-        if beside.is_settled:
-            return beside.decision()
-    explained = pairs.explain or (law is None and pairs.with_a_third())
+    is_better = stepwise.last.is_plausible and stepwise.last.fit.cost < min(f.cost for f in (start, *singles))
+    if other_law is None and is_better:
+        stepwise.run()
+        if stepwise.is_conclusive:
+            return stepwise.decision()
+    explained = pairs.explain or (other_law is None and pairs.with_a_third())
     decision = pairs.decision(start)
-    if law is not None:
-        return law_or_decision(law, search, decision)
-    if explained and not (are_uniform_errors(decision.best.effects) and beside.is_nothing):
+    if other_law is not None:
+        return law_or_decision(other_law, search, decision)
+    if explained and not (are_uniform_errors(decision.best.effects) and stepwise.needs_no_effect):
         return decision
-    beside.run()
-    if not beside.is_settled and beside.decision().outcome != "explained" and pairs.by_exchange():
+    stepwise.run()
+    if not stepwise.is_conclusive and stepwise.decision().outcome != "explained" and pairs.by_exchange():
         decision = pairs.decision(start)
-        if not (are_uniform_errors(decision.best.effects) and beside.is_nothing):
+        if not (are_uniform_errors(decision.best.effects) and stepwise.needs_no_effect):
             return decision
-    decision = nearest(search, start, beside.decision(), pairs.found)
+    decision = nearest(search, start, stepwise.decision(), pairs.found)
     if decision.outcome in ("explained", "none") or search.is_over:
         return decision
     random = random_with_effects(search, pairs.found[:1])
-    return random or random_with_nominal_errors(search, beside.steps[0], surely=False) or decision
+    return random or random_with_nominal_errors(search, stepwise.steps[0], surely=False) or decision
 
 
 def _pair_at_noise_floor(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> Decision | None:
@@ -476,13 +480,13 @@ def _pair_at_noise_floor(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> De
     return decision if all(effect.stands_out(search.rig) for effect in sure) else None
 
 
-def _single_in_louder_noise(search: Search, start: Fit, singles: Sequence[Fit], beside: Stepwise) -> Decision | None:
+def _single_in_louder_noise(search: Search, start: Fit, singles: Sequence[Fit], stepwise: Stepwise) -> Decision | None:
     """The decision for a single effect that explains the records if the noise is louder than stated, or None.
 
     One effect has fewer parameters than nominal errors that fit equally well.
     """
     stated, best = search.data.noise, singles[0] if singles else start
-    under_errors = np.sqrt(beside.last.sensor_noise) * stated
+    under_errors = np.sqrt(stepwise.last.sensor_noise) * stated
     noise = np.clip(noise_of(search, best), stated, (1.0 + ATTRIBUTION.a_tenth) ** 0.5 * under_errors)
     if np.median(noise / stated) ** 2 < 1.0 + ATTRIBUTION.a_tenth:
         return None
@@ -501,12 +505,12 @@ def _single_in_louder_noise(search: Search, start: Fit, singles: Sequence[Fit], 
 
 def _decide_with_nominal_errors(search: Search, tolerance: float) -> Decision:
     """The decision with nominal errors from the first."""
-    beside = Stepwise(search, tolerance)
-    varied = None if beside.is_enough else with_record_deviations(beside)
+    stepwise = Stepwise(search, tolerance)
+    varied = None if stepwise.is_sufficient else with_record_deviations(stepwise)
     if varied is not None:
         return varied.decision()
-    beside.run()
-    return beside.decision()
+    stepwise.run()
+    return stepwise.decision()
 
 
 def force_of_other_law(search: Search, evidence: Evidence) -> Fit | None:

@@ -60,9 +60,11 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     alone = fitted_with_random(search, _fit_without_effects(search), evidence)
     if not search.near(alone[0], RANDOM.near) or alone[1].tonal > TONAL:
         return None, []
-    beside = search.through(model_filter(evidence.model, search.rig, alone[1]), _observer(search, search.rig, alone[1]))
+    whitened = search.through(
+        model_filter(evidence.model, search.rig, alone[1]), _observer(search, search.rig, alone[1])
+    )
     search.report("effects with a random disturbance", 0.2)
-    gaining = beside.side_by_side(simplest, _improving_singles(search, beside, evidence)[: RANDOM.tried])
+    gaining = whitened.side_by_side(simplest, _improving_singles(search, whitened, evidence)[: RANDOM.tried])
     if any(search.explains(finished(search, single)) for single in gaining):
         return None, []
     tried = [alone, *(fitted_with_random(search, single) for single in gaining)]
@@ -102,18 +104,18 @@ def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = Tru
     found, random = _random_given(search, step.fit, evidence)
     for _ in range(RANDOM.turns):
         before = random.cost
-        beside = search.through(
+        whitened = search.through(
             model_filter(evidence.model, evidence.rig, random), _observer(search, search.rig, random)
         )
-        step = fit_jointly(beside, step.effects, step.errors)
+        step = fit_jointly(whitened, step.effects, step.errors)
         evidence = _evidence_with(search, step.fit)
         found, random = _random_given(search, step.fit, evidence)
         if random.cost > (1.0 - RANDOM.settled) * before:
             break
-    whole = cost_of(search.rig, step.fit.effects, search.data)
-    closed = random.left - 1.0 < STEPWISE.explained * whole
-    counts = whole - 1.0 > STEPWISE.least * float(search.nominal.mean())
-    holds = closed and counts and random.is_steady and looks_random(evidence)
+    cost = cost_of(search.rig, step.fit.effects, search.data)
+    is_closed = random.left - 1.0 < STEPWISE.explained * cost
+    is_noticeable = cost - 1.0 > STEPWISE.least * float(search.nominal.mean())
+    holds = is_closed and is_noticeable and random.is_steady and looks_random(evidence)
     return Decision("explained", found, random) if holds else None
 
 
@@ -122,28 +124,28 @@ def _evidence_with(search: Search, given: Fit) -> Evidence:
     return _with_laws_on_measured_motion(search, search.evidence_of(apply_all(search.rig, given.effects)))
 
 
-def _improving_singles(search: Search, beside: Search, evidence: Evidence) -> list[Fit]:
+def _improving_singles(search: Search, whitened: Search, evidence: Evidence) -> list[Fit]:
     """Fits of single effects that improve on a random force alone, best first.
 
     The unmodelled force is located where the random one acts, so all laws are tried again at the best effect's place.
 
     Args:
         search: without the whitening filter of the force.
-        beside: with it.
+        whitened: the search with it.
         evidence: of the rig without effects.
     """
-    cost = cost_of(beside.rig, (), beside.data)
+    cost = cost_of(whitened.rig, (), whitened.data)
 
     def fitted(evidence: Evidence) -> list[Fit]:
-        fits = on_whole_records(beside, one_more(beside, (), evidence), RANDOM.finalists)
-        return [f for f in fits if beside.surely_better(f, cost, f.n_parameters)]
+        fits = on_whole_records(whitened, one_more(whitened, (), evidence), RANDOM.finalists)
+        return [f for f in fits if whitened.surely_better(f, cost, f.n_parameters)]
 
     found = fitted(evidence)
     places = [f.effects[0].at for f in found if f.effects[0].at is not None]
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
-    likely = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.rival]
-    return [f for f in likely if _removes_enough(search, f)]
+    rivals = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.rival]
+    return [f for f in rivals if _removes_enough(search, f)]
 
 
 def _removes_enough(search: Search, single: Fit) -> bool:
@@ -239,8 +241,8 @@ def _random_given(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, 
     spread = dict(zip(domain.coordinates, at_std, strict=True))
     # the force is inferred from its response, so it is as uncertain as mass and stiffness
     priors = (e.target for e in given.effects if isinstance(e.target, NominalPrior))
-    off = max((float(np.hypot(prior.mass, prior.stiffness)) for prior in priors), default=INTERVALS.alike)
-    deviations = {**spread, "rms": float(np.hypot(level * rms_std, off * rms))}
+    model_uncertainty = max((float(np.hypot(prior.mass, prior.stiffness)) for prior in priors), default=INTERVALS.alike)
+    deviations = {**spread, "rms": float(np.hypot(level * rms_std, model_uncertainty * rms))}
     effect = Effect(RANDOM_DISTURBANCE, None, {**place_values(found.at), "rms": rms}, deviations)
     fitted = given.n_parameters + 1 + len(spread)
     combined = Fit((*given.effects, effect), found.cost, given.cost_by_channel, fitted)

@@ -129,25 +129,25 @@ def fit_jointly(
         errors = replace(errors, target=replace(errors.target, waves=JOINT.last_waves))
     if known is None:
         errors = with_all_groups(search, errors)
-    i, counted, chord = 0, 0, Chord(known)
-    while counted < rounds and i < JOINT.most_rounds:
+    i, n_counted, chord = 0, 0, Chord(known)
+    while n_counted < rounds and i < JOINT.most_rounds:
         # the two most informative records come first
-        quickly = known is not None or (i == 0 and not until_convergence)
-        data = search.quick.stepped(whole.substeps) if quickly else whole
-        level = _residual_level(search.rig, (*effects, errors), data)
-        if level > (1.0 - (JOINT.last_settled if until_convergence else JOINT.settled)) * before:
+        on_quick = known is not None or (i == 0 and not until_convergence)
+        data = search.quick.stepped(whole.substeps) if on_quick else whole
+        power = _residual_level(search.rig, (*effects, errors), data)
+        if power > (1.0 - (JOINT.last_settled if until_convergence else JOINT.settled)) * before:
             break
-        falls = level < JOINT.falling * before
-        counted += not falls or not np.isfinite(before)
+        fell = power < JOINT.falling * before
+        n_counted += not fell or not np.isfinite(before)
         # new sensitivities: far from the last ones, in the final fit, or if there are few
-        if known is None and (falls or until_convergence or len(errors.values) < JOINT.few):
+        if known is None and (fell or until_convergence or len(errors.values) < JOINT.few):
             chord = Chord()
-        before = level if known is not None or not quickly else np.inf
+        before = power if known is not None or not on_quick else np.inf
         i += 1
         found = fit(
             search.rig,
             (*effects, errors),
-            data.tempered(level),
+            data.tempered(power),
             iterations=JOINT.last_iterations if until_convergence else JOINT.iterations,
             tolerance=JOINT.last_tolerance if until_convergence else JOINT.tolerance,
             workers=search.workers,
@@ -159,8 +159,8 @@ def fit_jointly(
         return evaluated(search, replace(found, effects=(*effects, errors)), whole.substeps)
     last = evaluated(search, replace(found, effects=(*effects, _without_negligible_groups(errors))), whole.substeps)
     # far above the noise floor, the prior variances mean little
-    near = last.excess(last.noise_power) < JOINT.near * float(last.noise_power.mean())
-    at_limit = _at_fixed_point(search, found, whole, chord) if known is None and near else found
+    is_near_noise = last.excess(last.noise_power) < JOINT.near * float(last.noise_power.mean())
+    at_limit = _at_fixed_point(search, found, whole, chord) if known is None and is_near_noise else found
     if at_limit is found:
         return last
     *effects, errors = at_limit.effects
@@ -220,20 +220,18 @@ def evaluated(search: Search, found: Fit, substeps: int | None = None) -> Step:
         found: the fit.
         substeps: of a sample; None for those of the search.
     """
-    whole, rig = search.data.stepped(substeps or search.data.substeps), apply_all(search.rig, found.effects)
-    if whole.whiteners:
-        by_channel = whole.by_channel(whole.residual(rig))
+    data, rig = search.data.stepped(substeps or search.data.substeps), apply_all(search.rig, found.effects)
+    if data.whiteners:
+        by_channel = data.by_channel(data.residual(rig))
         of_noise = np.ones_like(by_channel)
         step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
         return Step(step, of_noise[0], search.logged, of_noise)
-    residuals = whole.differences(rig)
+    residuals = data.differences(rig)
     with np.errstate(over="ignore", invalid="ignore"):  # the simulation may diverge
-        by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
+        by_channel = np.array([((r / data.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
         coloured = are_coloured(residuals)
-        credible = (
-            np.inf if is_noise_alone(residuals, whole.counted, coloured) else _largest_noise_ratio(whole, coloured)
-        )
-        sensor_noise = np.minimum(noise_found(residuals, coloured) / whole.noise, credible) ** 2
+        credible = np.inf if is_noise_alone(residuals, data.counted, coloured) else _largest_noise_ratio(data, coloured)
+        sensor_noise = np.minimum(noise_found(residuals, coloured) / data.noise, credible) ** 2
     step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
     per_unit = search.logging_noise
     logged = logging_noise(by_channel, sensor_noise, per_unit)
@@ -363,29 +361,33 @@ def with_reading_sides(search: Search, errors: Effect, effects: Sequence[Effect]
     after. Sensors known to be late stay so. One-step-ahead predictions decide, since over whole records a wrong
     frequency looks like a delay.
     """
-    known = errors.target.late
-    jumping = tuple(s.name for s in search.rig.sensors if s.quantity == "acceleration" and s.name not in known)
-    if not jumping or not errors.target.delay or errors.target.interpolated:
+    known_late = errors.target.late
+    accelerometers = tuple(
+        s.name for s in search.rig.sensors if s.quantity == "acceleration" and s.name not in known_late
+    )
+    if not accelerometers or not errors.target.delay or errors.target.interpolated:
         return errors
-    none = {**errors.values, **{f"delay_{name}": 0.0 for name in jumping}}
+    zero_delays = {**errors.values, **{f"delay_{name}": 0.0 for name in accelerometers}}
 
-    def left(delay: float) -> np.ndarray:
-        tried = nominal_errors(search.rig, replace(errors.target, late=known, early=()), none)
-        tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in jumping}})
+    def residual_with(delay: float) -> np.ndarray:
+        tried = nominal_errors(search.rig, replace(errors.target, late=known_late, early=()), zero_delays)
+        tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in accelerometers}})
         return search.ahead.residual(apply_all(search.rig, (*effects, tried)))
 
     # if the motion changes much between samples, a reading well before a jump differs from one just before
     delays = np.array([*(-delay for delay in JOINT.delays), 0.0, JUST_LATE, *JOINT.delays])
-    residuals = {float(delay): left(float(delay)) for delay in delays}
-    before, at, after = left(-JUST_LATE), residuals[0.0], residuals[JUST_LATE]
+    residuals = {float(delay): residual_with(float(delay)) for delay in delays}
+    before, at, after = residual_with(-JUST_LATE), residuals[0.0], residuals[JUST_LATE]
     with np.errstate(invalid="ignore"):  # of a diverging simulation nothing is late
         step, smooth = (search.ahead.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
     powers = np.array([search.ahead.by_channel(residual).sum(axis=0) for residual in residuals.values()])
-    rows = [j for j, s in enumerate(search.rig.sensors) if s.name in jumping and step[j] > JOINT.jump * smooth[j]]
-    sided = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}
-    late = (*known, *(name for name, delay in sided.items() if delay > 0))
-    early = tuple(name for name, delay in sided.items() if delay <= 0)
-    starts = {**errors.values, **{f"delay_{name}": delay for name, delay in sided.items()}}
+    rows = [
+        j for j, s in enumerate(search.rig.sensors) if s.name in accelerometers and step[j] > JOINT.jump * smooth[j]
+    ]
+    best_delays = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}
+    late = (*known_late, *(name for name, delay in best_delays.items() if delay > 0))
+    early = tuple(name for name, delay in best_delays.items() if delay <= 0)
+    starts = {**errors.values, **{f"delay_{name}": delay for name, delay in best_delays.items()}}
     return nominal_errors(search.rig, replace(errors.target, late=late, early=early), starts)
 
 
@@ -400,25 +402,25 @@ def with_input_noise(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> S
         sensor_noise: (n_outputs,) noise power of each sensor estimated without input noise, over the stated one.
     """
     rig = apply_all(search.rig, fitted.effects)
-    left, found = search.data.differences(rig), search.with_noise(np.sqrt(sensor_noise) * search.data.noise)
+    residuals, found = search.data.differences(rig), search.with_noise(np.sqrt(sensor_noise) * search.data.noise)
     # input noise inflates the estimate of sensor noise, so the stated sensor noise is tried as well
-    shares = [likeliest_share(rig, s.data, left) for s in (search, found)]
-    (share, _, is_beyond), louder = min(zip(shares, (search, found), strict=True), key=lambda each: each[0].loss)
+    shares = [likeliest_share(rig, s.data, residuals) for s in (search, found)]
+    (share, _, is_beyond), best = min(zip(shares, (search, found), strict=True), key=lambda each: each[0].loss)
     if share < LEAST_LOGGED or is_beyond:
         return None
-    beside = louder.with_input_noise(rig, share)
-    white = evaluated(beside, fitted).fit
+    noisy = best.with_input_noise(rig, share)
+    white = evaluated(noisy, fitted).fit
     if INPUTS.white < white.cost < INPUTS.over_fitted * fitted.cost:
-        fitted = white = fit_jointly(beside, fitted.effects[:-1], fitted.effects[-1]).fit
+        fitted = white = fit_jointly(noisy, fitted.effects[:-1], fitted.effects[-1]).fit
         rig = apply_all(search.rig, fitted.effects)
-        left = search.data.differences(rig)
+        residuals = search.data.differences(rig)
     if white.cost > INPUTS.white:
         return None
     for _ in range(INPUTS.rounds):  # sensor noise from the power of the innovations
-        louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
-        beside = louder.with_input_noise(rig, likeliest_share(rig, louder.data, left).share)
-        white = evaluated(beside, fitted).fit
-    return beside
+        best = best.with_noise(best.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
+        noisy = best.with_input_noise(rig, likeliest_share(rig, best.data, residuals).share)
+        white = evaluated(noisy, fitted).fit
+    return noisy
 
 
 def likeliest_loss(search: Search, rig: Rig) -> float:

@@ -97,10 +97,10 @@ def varying_parameter(search: Search, step: Step) -> Deviations | None:
     if len(search.data.records) < 2:
         return None
     noise = float(step.noise_power.mean())
-    found = [deviations(search, step.fit.effects, figure) for figure in figures_of(search.rig)]
-    sure = [d for d in found if d is not None and d.is_sure]
+    candidates = [deviations(search, step.fit.effects, figure) for figure in figures_of(search.rig)]
+    sure = [d for d in candidates if d is not None and d.is_sure]
     promising = [d for d in sure if d.in_common - d.left > RECORDS.enough * (d.in_common - noise)]
-    return min(promising, key=lambda d: d.left * (RECORDS.clearly if d is found[0] else 1.0), default=None)
+    return min(promising, key=lambda d: d.left * (RECORDS.clearly if d is candidates[0] else 1.0), default=None)
 
 
 def with_record_deviations(before: Stepwise) -> Stepwise | None:
@@ -120,18 +120,24 @@ def with_record_deviations(before: Stepwise) -> Stepwise | None:
     if before.decision().outcome == "explained":
         return before
     search.report(f"{varying.figure} that varies from record to record", 0.5)
-    varied = replace(search, differs=varying.figure)
-    beside = Stepwise(varied, before.tolerance, before.ahead)
-    if not (beside.is_believed or search.prior.shape):  # errors of profiles over-fit errors of single shapes
-        by_mode = Stepwise(replace(varied, by_mode=True), before.tolerance, before.ahead)
+    varying_search = replace(search, differs=varying.figure)
+    with_deviations = Stepwise(varying_search, before.tolerance, before.ahead)
+    if not (
+        with_deviations.has_plausible_errors or search.prior.shape
+    ):  # errors of profiles over-fit errors of single shapes
+        by_mode = Stepwise(replace(varying_search, by_mode=True), before.tolerance, before.ahead)
         # errors of ports and records cannot absorb an effect in the structure
-        if by_mode.is_quiet and set(too_large(by_mode.last.errors)) <= {"damping", "record", *PORT_GROUPS}:
+        if by_mode.is_noise_only and set(too_large(by_mode.last.errors)) <= {"damping", "record", *PORT_GROUPS}:
             by_mode.run(most=0)
             return by_mode
     noise = nearest.noise_power
-    if beside.is_enough or beside.by_singles() or beside.nearest.excess(noise) < RECORDS.half * nearest.excess(noise):
-        beside.run()
-        return beside
+    if (
+        with_deviations.is_sufficient
+        or with_deviations.by_singles()
+        or with_deviations.nearest.excess(noise) < RECORDS.half * nearest.excess(noise)
+    ):
+        with_deviations.run()
+        return with_deviations
     return None
 
 
@@ -150,30 +156,30 @@ def with_mode_errors(before: Stepwise) -> Stepwise | None:
     if nearest.excess(nearest.noise_power) > STEPWISE.of_modes * float(before.search.nominal.mean()):
         return None
     before.search.report("errors of each mode", 0.5)
-    beside = Stepwise(replace(before.at_first, by_mode=True), before.tolerance, before.ahead)
-    if beside.is_quiet:
-        found = len(beside.last.effects)
-        if not beside.is_believed:
-            beside.calibrate()
-        if beside.is_believed and beside.is_quiet:
-            if _explained_with_one_more(before, found):
+    with_modes = Stepwise(replace(before.at_first, by_mode=True), before.tolerance, before.ahead)
+    if with_modes.is_noise_only:
+        n_effects = len(with_modes.last.effects)
+        if not with_modes.has_plausible_errors:
+            with_modes.calibrate()
+        if with_modes.has_plausible_errors and with_modes.is_noise_only:
+            if _explained_with_one_more(before, n_effects):
                 return before
-            beside.run(most=0)
-            return beside
-        beside.singles = [step.effects for step in before.alone]
+            with_modes.run(most=0)
+            return with_modes
+        with_modes.singles = [step.effects for step in before.fitted_singles]
     else:
-        again = beside.afresh(nearest.effects)
-        left = nearest.excess(nearest.noise_power)
-        if before.is_believed and again.excess(again.noise_power) > STEPWISE.halved * left:
+        refitted = with_modes.fit_from_zero(nearest.effects)
+        excess = nearest.excess(nearest.noise_power)
+        if before.has_plausible_errors and refitted.excess(refitted.noise_power) > STEPWISE.halved * excess:
             return None
-        beside.known = [again] if len(again.effects) == 1 else []
-    if not beside.by_singles():
+        with_modes.known = [refitted] if len(refitted.effects) == 1 else []
+    if not with_modes.by_singles():
         # gain errors too large for any calibration count even with large other errors
-        return beside if beside.last.effects and beside.is_quiet and not before.is_closed else None
-    beside.run()
-    if not (beside.is_closed and beside.is_believed):
+        return with_modes if with_modes.last.effects and with_modes.is_noise_only and not before.closes_gap else None
+    with_modes.run()
+    if not (with_modes.closes_gap and with_modes.has_plausible_errors):
         return None
-    return before if _explained_with_one_more(before, len(beside.last.effects)) else beside
+    return before if _explained_with_one_more(before, len(with_modes.last.effects)) else with_modes
 
 
 def _explained_with_one_more(before: Stepwise, found: int) -> bool:
@@ -184,4 +190,4 @@ def _explained_with_one_more(before: Stepwise, found: int) -> bool:
         found: number of effects with errors of each mode, wrong gains not counted.
     """
     before.run(most=found + 1)
-    return bool(before.is_believed and (before.plain or (before.last.effects and before.is_quiet)))
+    return bool(before.has_plausible_errors and (before.plain or (before.last.effects and before.is_noise_only)))

@@ -59,11 +59,11 @@ def is_plausible_gain_or_place(effect: Effect, rig: Rig) -> bool:
     """Whether an effect is a gain error or a shift of place within the accuracy of calibration and tape measure."""
     if "gain" in effect.values:
         return bool(abs(np.log(abs(effect.values["gain"]))) < PLAIN.most_gain)
-    standing = [a.at for a in rig.actuators if a.name == effect.target]
-    standing += [s.at for s in rig.sensors if s.name == effect.target]
-    if effect.at is None or not standing:
+    places = [a.at for a in rig.actuators if a.name == effect.target]
+    places += [s.at for s in rig.sensors if s.name == effect.target]
+    if effect.at is None or not places:
         return False
-    return rig.modes.domain.separation(effect.at, middle(standing[0])) < PLAIN.most_moved
+    return rig.modes.domain.separation(effect.at, middle(places[0])) < PLAIN.most_moved
 
 
 def uniform_as_nominal_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
@@ -76,28 +76,28 @@ def uniform_as_nominal_errors(search: Search, found: Fit, *, alone: bool = False
         found: the fit.
         alone: convert one alone too, as a random force may mask the other.
     """
-    common = {e.kind.name: float(np.log(e.values["factor"])) for e in found.effects if e.kind in UNIFORM}
+    uniform = {e.kind.name: float(np.log(e.values["factor"])) for e in found.effects if e.kind in UNIFORM}
     others = [e for e in found.effects if e.kind not in UNIFORM]
-    late = next((e for e in others if e.kind is NOMINAL_ERRORS), None)
-    named = [e for e in others if e is not late]
-    most = dict(PLAIN.most_alone if len(common) == 1 else PLAIN.most_common)
+    port_errors = next((e for e in others if e.kind is NOMINAL_ERRORS), None)
+    named = [e for e in others if e is not port_errors]
+    largest = dict(PLAIN.most_alone if len(uniform) == 1 else PLAIN.most_common)
     if (
-        len(common) < (1 if alone else len(UNIFORM))
+        len(uniform) < (1 if alone else len(UNIFORM))
         or not named
-        or any(abs(size) >= most[name] for name, size in common.items())
+        or any(abs(size) >= largest[name] for name, size in uniform.items())
     ):
         return found
-    if late is not None and not set(late.target.groups) <= set(PORT_GROUPS):
+    if port_errors is not None and not set(port_errors.target.groups) <= set(PORT_GROUPS):
         return found
-    stiffness, damping = (common.get(kind.name, 0.0) for kind in UNIFORM)
+    stiffness, damping = (uniform.get(kind.name, 0.0) for kind in UNIFORM)
     if isinstance(search.rig.structure, Structure):
         sizes = {"stiffness": stiffness, "damping": damping}
     else:  # without known profiles, all frequencies have the same error
         sizes = {"frequency": 0.5 * stiffness, "damping": damping}
-    prior = NominalPrior(sample_time=search.data.records[0].sample_time) if late is None else late.target
+    prior = NominalPrior(sample_time=search.data.records[0].sample_time) if port_errors is None else port_errors.target
     errors = nominal_errors(search.rig, replace(prior, **{name: abs(size) for name, size in sizes.items()}, waves=1))
     values = {name: sizes.get(group_of(name), 0.0) for name in errors.values}
-    values.update({} if late is None else late.values)
+    values.update({} if port_errors is None else port_errors.values)
     return replace(found, effects=(*named, replace(errors, values=values)), covariance=None)
 
 
@@ -115,8 +115,8 @@ def in_place_of_nominal_errors(search: Search, step: Step, rivals: Sequence[tupl
     """
     if step.errors.target.record:  # no effect varies from record to record
         return None
-    each = (_with_port_errors(search, step, rivals, kept) for kept in _at_ports(step.errors))
-    return next((found for found in each if found is not None), None)
+    candidates = (_with_port_errors(search, step, rivals, kept) for kept in _at_ports(step.errors))
+    return next((found for found in candidates if found is not None), None)
 
 
 def _with_port_errors(
@@ -183,22 +183,22 @@ def _simplest_explaining(search: Search, sets: Sequence[tuple[Effect, ...]], ste
 
     def briefly(effects: Sequence[Effect]) -> Fit:
         found = fit(search.rig, effects, search.quick, iterations=PLAIN.briefly)
-        more = PLAIN.plainly - PLAIN.briefly
-        if not found.falling or promise(found, more) > PLAIN.near:
+        extra = PLAIN.plainly - PLAIN.briefly
+        if not found.falling or promise(found, extra) > PLAIN.near:
             return found
-        return fit(search.rig, found.effects, search.quick, iterations=more)
+        return fit(search.rig, found.effects, search.quick, iterations=extra)
 
-    quickly = search.workers.map(briefly, list(sets))
-    near = [f for f in quickly if f.cost < PLAIN.near and not _is_surely_worse(search, f, step, search.quick)]
-    whole, best = search.data.finely(SELECTION.fine), None
-    for candidate in sorted(near, key=lambda f: f.n_parameters):
+    on_quick = search.workers.map(briefly, list(sets))
+    promising = [f for f in on_quick if f.cost < PLAIN.near and not _is_surely_worse(search, f, step, search.quick)]
+    fine_data, best = search.data.finely(SELECTION.fine), None
+    for candidate in sorted(promising, key=lambda f: f.n_parameters):
         if best is not None and _labels(best) <= _labels(candidate):
             continue
         effects = _with_reading_sides(search, candidate.effects)
-        found = fit(search.rig, effects, whole, iterations=PLAIN.plainly)
-        more = 0 if best is None else found.n_parameters - best.n_parameters
-        explains = search.explains(found) and not _is_surely_worse(search, found, step, whole)
-        if explains and (best is None or search.surely_better(found, best.cost, more)):
+        found = fit(search.rig, effects, fine_data, iterations=PLAIN.plainly)
+        extra = 0 if best is None else found.n_parameters - best.n_parameters
+        explains = search.explains(found) and not _is_surely_worse(search, found, step, fine_data)
+        if explains and (best is None or search.surely_better(found, best.cost, extra)):
             best = found
     return None if best is None else _with_delay_as_effect(search, finished(search, best))
 
@@ -226,12 +226,12 @@ def _with_reading_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Ef
 
 def _with_delay_as_effect(search: Search, found: Fit) -> Fit:
     """The fit with the delay of one sensor, or an equal delay of all, as an effect instead of nominal errors."""
-    late = next((e for e in found.effects if e.kind is NOMINAL_ERRORS), None)
-    if late is None or late.target.groups != ("delay",):
+    delays = next((e for e in found.effects if e.kind is NOMINAL_ERRORS), None)
+    if delays is None or delays.target.groups != ("delay",):
         return found
-    others, whole = [e for e in found.effects if e is not late], search.data.finely(SELECTION.fine)
-    each = search.workers.map(lambda e: fit(search.rig, (*others, e), whole), delay_effects(search.rig, late))
-    return min((f for f in each if search.explains(f)), key=lambda f: f.cost, default=found)
+    others, fine_data = [e for e in found.effects if e is not delays], search.data.finely(SELECTION.fine)
+    fits = search.workers.map(lambda e: fit(search.rig, (*others, e), fine_data), delay_effects(search.rig, delays))
+    return min((f for f in fits if search.explains(f)), key=lambda f: f.cost, default=found)
 
 
 def other_delay_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], ...]:
@@ -241,10 +241,10 @@ def other_delay_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], .
     )
     if late is None:
         return ()
-    others, whole = [e for e in found.effects if e is not late], search.data.finely(SELECTION.fine)
+    others, fine_data = [e for e in found.effects if e is not late], search.data.finely(SELECTION.fine)
     causes = [e for e in _common_delays(search.rig, delay_of(late)) if e.kind is not late.kind]
-    each = search.workers.map(lambda e: fit(search.rig, (*others, e), whole), causes)
-    best, rivals = ranked(search, [found, *(f for f in each if search.explains(f))])
+    fits = search.workers.map(lambda e: fit(search.rig, (*others, e), fine_data), causes)
+    best, rivals = ranked(search, [found, *(f for f in fits if search.explains(f))])
     return rivals if best is found else ()
 
 
@@ -261,18 +261,20 @@ def delay_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
     a lag of the sensors or of the actuators, or a delay of the actuators.
     """
     delays = {name.removeprefix("delay_"): float(v) for name, v in errors.values.items() if group_of(name) == "delay"}
-    doubt = {name: PLAIN.sure * errors.deviations.get(f"delay_{name}", 0.0) for name in delays}
-    off = [name for name, delay in delays.items() if abs(delay) > max(PLAIN.smallest_delay, doubt[name])]
+    uncertainty = {name: PLAIN.sure * errors.deviations.get(f"delay_{name}", 0.0) for name in delays}
+    late = [name for name, delay in delays.items() if abs(delay) > max(PLAIN.smallest_delay, uncertainty[name])]
     sample_time = errors.target.sample_time
-    if len(delays) >= PLAIN.several and len(off) == 1 and delays[off[0]] > 0:
-        return (Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * sample_time}),)
-    if len(delays) < 2 or len(off) < len(delays) or min(delays.values()) < 0:
+    if len(delays) >= PLAIN.several and len(late) == 1 and delays[late[0]] > 0:
+        return (Effect(SENSOR_DELAY, late[0], {"delay": delays[late[0]] * sample_time}),)
+    if len(delays) < 2 or len(late) < len(delays) or min(delays.values()) < 0:
         return ()
-    common = float(np.mean([*delays.values()]))
-    apart = max(max(abs(delay - common), doubt[name]) for name, delay in delays.items())
-    if (2.0 * apart / common) ** (len(delays) - 1) > PLAIN.by_chance:  # probability that independent delays agree
+    mean = float(np.mean([*delays.values()]))
+    largest_difference = max(max(abs(delay - mean), uncertainty[name]) for name, delay in delays.items())
+    if (2.0 * largest_difference / mean) ** (
+        len(delays) - 1
+    ) > PLAIN.by_chance:  # probability that independent delays agree
         return ()
-    return _common_delays(rig, common * sample_time)
+    return _common_delays(rig, mean * sample_time)
 
 
 def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None:
@@ -292,11 +294,11 @@ def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None
             return None
         ahead = one_more(search, best.effects, search.evidence_of(apply_all(search.rig, best.effects)))
         fits = on_whole_records(search, ahead, PAIRS.more)
-        nearer = bool(fits) and fits[0].cost - 1.0 < PAIRS.nearer * (best.cost - 1.0)
-        if not (nearer or (fits and ahead[0].cost < PAIRS.nearer * cost_of(search.rig, best.effects, search.ahead))):
+        is_better = bool(fits) and fits[0].cost - 1.0 < PAIRS.nearer * (best.cost - 1.0)
+        if not (is_better or (fits and ahead[0].cost < PAIRS.nearer * cost_of(search.rig, best.effects, search.ahead))):
             return None
-        comes_to, enough = contained(fits[0].effects, search.rig), (1.0 + SEARCH.significant) * fits[0].cost
-        best = next((f for f in fits if f.key in comes_to and f.cost < enough), fits[0])
+        limiting_cases, cost_limit = contained(fits[0].effects, search.rig), (1.0 + SEARCH.significant) * fits[0].cost
+        best = next((f for f in fits if f.key in limiting_cases and f.cost < cost_limit), fits[0])
         named = [effect for effect in best.effects if effect.kind not in UNIFORM]
         if any(is_plausible_error(effect, search) for effect in named):
             return None
@@ -317,23 +319,25 @@ def _with_one_linear_effect(
     search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...], step: Step
 ) -> Fit | None:
     """The effects and one linear structural effect in place of the nominal errors of every mode or wave, or None."""
-    alike = tuple(kind for kind in search.catalogue if is_linear_structural(kind))
-    if not alike:
+    linear_kinds = tuple(kind for kind in search.catalogue if is_linear_structural(kind))
+    if not linear_kinds:
         return None
-    alone = fit(search.rig, effects, search.quick, iterations=PLAIN.plainly)
+    start = fit(search.rig, effects, search.quick, iterations=PLAIN.plainly)
     # the residual is too small for another effect; with input noise it is weighted down, so its size does not decide
-    if not search.logged and alone.cost < 1.0 + STEPWISE.no_gap:
+    if not search.logged and start.cost < 1.0 + STEPWISE.no_gap:
         return None
-    given = alone.effects
+    given = start.effects
     evidence = search.evidence_of(apply_all(search.rig, given))
-    screened = Screening.of(replace(search, catalogue=alike), given, evidence).likeliest()
+    screened = Screening.of(replace(search, catalogue=linear_kinds), given, evidence).likeliest()
     likeliest = {effect.kind: effect for effect in reversed(screened)}  # the best of each kind
-    more = [(*given, effect) for effect in screened if effect is likeliest[effect.kind]][: PLAIN.likeliest]
-    found = _simplest_explaining(search, [set_ for one in more for set_ in dict.fromkeys((one, (*one, *common)))], step)
+    candidates = [(*given, effect) for effect in screened if effect is likeliest[effect.kind]][: PLAIN.likeliest]
+    found = _simplest_explaining(
+        search, [set_ for one in candidates for set_ in dict.fromkeys((one, (*one, *common)))], step
+    )
     if found is None:
         return None
-    rest = [e for e in found.effects if e.kind in UNIFORM or any(e.label == other.label for other in given)]
-    without = fit(search.rig, rest, search.data.finely(SELECTION.fine), iterations=PLAIN.plainly)
+    others = [e for e in found.effects if e.kind in UNIFORM or any(e.label == other.label for other in given)]
+    without = fit(search.rig, others, search.data.finely(SELECTION.fine), iterations=PLAIN.plainly)
     extra = found.n_parameters - without.n_parameters
-    worth = without.cost - found.cost > SEARCH.significant and search.surely_better(found, without.cost, extra)
-    return found if worth else None
+    is_justified = without.cost - found.cost > SEARCH.significant and search.surely_better(found, without.cost, extra)
+    return found if is_justified else None

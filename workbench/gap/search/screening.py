@@ -225,8 +225,8 @@ def one_more(
     if not (search.held and found):
         return found
     # nuisance parameters absorb a start slightly off its place, so exact places are tried too
-    there = fitted_ahead(search, [(*given, effect) for effect in _at_likely_places(found, screened)])
-    return distinct_minima(search, sorted((*found, *there), key=lambda f: f.cost))
+    at_likely_places = fitted_ahead(search, [(*given, effect) for effect in _at_likely_places(found, screened)])
+    return distinct_minima(search, sorted((*found, *at_likely_places), key=lambda f: f.cost))
 
 
 def _at_likely_places(found: Sequence[Fit], screened: Screening) -> list[Effect]:
@@ -297,10 +297,10 @@ def on_whole_records(
     simpler = contained(close[0].effects, search.rig) if close else set()
     first = [f for f in close if f is close[0] or f.key in simpler]
     fits = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), first)
-    rest = [f for f in close if f not in first]
+    remaining = [f for f in close if f not in first]
     if any(search.explains(f) for f in fits):
-        rest = [f for f in rest if f.cost < ahead[0].cost + SEARCH.rival]
-    others = _without_generalisations(search, fits, rest)
+        remaining = [f for f in remaining if f.cost < ahead[0].cost + SEARCH.rival]
+    others = _without_generalisations(search, fits, remaining)
     more = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), others)
     fits = sorted((*fits, *more), key=promise)
     fits = _without_generalisations(search, fits, fits)

@@ -69,11 +69,14 @@ class Search:
         """
         if self.clustered(candidate.effects):
             return False
-        left = candidate.cost_by_channel.mean(axis=1)
+        residual_power = candidate.cost_by_channel.mean(axis=1)
         per_record = self.data.counted[0].outputs.size
         slack = SEARCH.slack + 5.0 * np.sqrt(2.0 / per_record) + SEARCH.integration_share * self.nominal.mean(axis=1)
         slack = slack + candidate.stepping
-        return bool((left < 1.0 + slack).all() and left.mean() < self.cost_limit + np.mean(candidate.stepping))
+        return bool(
+            (residual_power < 1.0 + slack).all()
+            and residual_power.mean() < self.cost_limit + np.mean(candidate.stepping)
+        )
 
     @property
     def cost_limit(self) -> float:
@@ -293,8 +296,8 @@ def unexplained(start: Fit, best: Fit, rivals: tuple[tuple[Fit, float], ...]) ->
         best: the set with the smallest residual.
         rivals: other sets with their probabilities.
     """
-    closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
-    return Decision("part" if closed > 0.5 else "unknown", best, rivals=rivals)
+    share_closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
+    return Decision("part" if share_closed > 0.5 else "unknown", best, rivals=rivals)
 
 
 def nearest(search: Search, start: Fit, decision: Decision, fits: Sequence[Fit]) -> Decision:

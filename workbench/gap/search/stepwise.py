@@ -69,7 +69,7 @@ class Stepwise:
         at_first: the search without input noise.
         steps: the sets of effects selected so far; each has one effect more or one less than the one before.
         plain: the last set without nominal errors, if it explains the records as well.
-        is_beyond: whether nonlinear effects cluster at one place, which shows a law that the catalogue lacks.
+        shows_unknown_law: whether nonlinear effects cluster at one place: the catalogue lacks the law.
         tried_beside_input_noise: whether an effect has been tried with the current model of input noise, which can
             mask an effect.
         has_finer_substeps: whether the time step was refined during the selection.
@@ -89,10 +89,10 @@ class Stepwise:
         self.has_finer_substeps = False
         self.is_run = False
         self.plain: Fit | None = None
-        self.is_beyond = False
+        self.shows_unknown_law = False
         search.report("small errors of the nominal model", 0.4)
         self.steps: list[Step] = []
-        self.steps.append(self.afresh(()))
+        self.steps.append(self.fit_from_zero(()))
         self._with_input_noise(self.last)
 
     @property
@@ -102,17 +102,19 @@ class Stepwise:
     @property
     def nearest(self) -> Step:
         """The last set or the best single effect with nominal errors, whichever has the smaller residual."""
-        return min((self.last, *self.alone), key=lambda s: s.fit.cost)
+        return min((self.last, *self.fitted_singles), key=lambda s: s.fit.cost)
 
     @cached_property
-    def alone(self) -> list[Step]:
+    def fitted_singles(self) -> list[Step]:
         """Single effects, each fitted jointly with nominal errors that start from zero, best first."""
         sets = [f.effects for f in self._likeliest_singles()] if self.singles is None else self.singles
         keys = {key_of(step.effects) for step in self.known}
-        fresh = self.search.workers.map(self.afresh, [effects for effects in sets if key_of(effects) not in keys])
+        fresh = self.search.workers.map(
+            self.fit_from_zero, [effects for effects in sets if key_of(effects) not in keys]
+        )
         found = [s for s in (*self.known, *fresh) if not self._may_be_port_errors(s)]
         best = sorted(found, key=lambda s: s.fit.cost)
-        if not (best and self.explains(best[0]) and (self.search.by_mode or not self.is_believed)):
+        if not (best and self.explains(best[0]) and (self.search.by_mode or not self.has_plausible_errors)):
             return best
         # nominal errors of each mode, or implausibly large ones, absorb the residual of any linear effect: the effect
         # that needs the smallest nominal errors is preferred
@@ -126,21 +128,21 @@ class Stepwise:
         """
         search = self.search
         sets = [f.effects for f in self.ahead if f.effects[0].kind not in UNIFORM]
-        beside = replace(search, held=(self.last.errors,))
-        without = cost_of(search.rig, beside.held, beside.ahead)
-        found = [f for f in fitted_ahead(beside, sets) if beside.surely_better(f, without, f.n_parameters)]
-        alike = self._linear_singles
-        if not (found or self.is_believed):  # implausibly large nominal errors have absorbed the effect
-            return alike[: STEPWISE.singles]
+        with_errors = replace(search, held=(self.last.errors,))
+        without = cost_of(search.rig, with_errors.held, with_errors.ahead)
+        found = [f for f in fitted_ahead(with_errors, sets) if with_errors.surely_better(f, without, f.n_parameters)]
+        linear = self._linear_singles
+        if not (found or self.has_plausible_errors):  # implausibly large nominal errors have absorbed the effect
+            return linear[: STEPWISE.singles]
         chosen: list[Fit] = []
         for single in best_of_each_kind(found):
-            comes_to = contained(single.effects, search.rig)
-            as_likely = {f.key for f in found if f.cost < (1.0 + SEARCH.significant) * single.cost}
-            if not comes_to & as_likely:
+            limiting_cases = contained(single.effects, search.rig)
+            fits_as_well = {f.key for f in found if f.cost < (1.0 + SEARCH.significant) * single.cost}
+            if not limiting_cases & fits_as_well:
                 chosen.append(single)
         chosen = [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.near * chosen[0].cost]
         # nominal errors may have absorbed an effect, so the best one without nominal errors is tried too
-        return chosen + [f for f in alike[:1] if f.key not in {other.key for other in chosen}]
+        return chosen + [f for f in linear[:1] if f.key not in {other.key for other in chosen}]
 
     @property
     def _linear_singles(self) -> list[Fit]:
@@ -161,8 +163,8 @@ class Stepwise:
         errors = nominal_errors(search.rig, search.prior)
         if "stiffness_0" not in errors.values:
             return
-        common = fit(search.rig, NO_UNIFORM_ERROR, search.data)
-        stiffness, damping = (float(np.log(effect.values["factor"])) for effect in common.effects)
+        uniform = fit(search.rig, NO_UNIFORM_ERROR, search.data)
+        stiffness, damping = (float(np.log(effect.values["factor"])) for effect in uniform.effects)
         sizes = {name: damping for name in errors.values if group_of(name) == "damping"} | {"stiffness_0": stiffness}
         found = fit_jointly(search, (), nominal_errors(search.rig, search.prior, errors.values | sizes))
         if self.explains(found) and are_plausible(found.errors, damping=False):
@@ -170,25 +172,25 @@ class Stepwise:
 
     def by_singles(self) -> bool:
         """Whether a single effect with nominal errors explains the records; it is then the first step."""
-        if not self.alone or self.search.is_over:  # the order of unfinished fits means nothing
+        if not self.fitted_singles or self.search.is_over:  # the order of unfinished fits means nothing
             return False
-        best = self.alone[0]
-        beside = None if self.explains(best) else self._with_input_noise(best)
-        if beside is not None:  # the residual of the nominal errors alone may be that input noise
-            best = beside
+        best = self.fitted_singles[0]
+        with_noise = None if self.explains(best) else self._with_input_noise(best)
+        if with_noise is not None:  # the residual of the nominal errors alone may be that input noise
+            best = with_noise
             self.steps[-1] = fit_jointly(self.search, self.last.effects, self.last.errors)
-        left = best.excess(best.noise_power)
-        if not self.explains(best) and left > STEPWISE.further * float(self.search.nominal.mean()):
+        excess = best.excess(best.noise_power)
+        if not self.explains(best) and excess > STEPWISE.further * float(self.search.nominal.mean()):
             return False
-        best = replace(self._simplest(best, self.alone[1:]), others=tuple(self.alone))
+        best = replace(self._simplest(best, self.fitted_singles[1:]), others=tuple(self.fitted_singles))
         if not (best.is_plausible and self._is_accepted(best, self.last)):
             return False
-        fewer = self._backward_eliminated(best)
-        without = None if fewer.effects else fit_jointly(self.search, (), fewer.errors)
+        reduced = self._backward_eliminated(best)
+        errors_only = None if reduced.effects else fit_jointly(self.search, (), reduced.errors)
         # the effect only led the nominal errors out of a local minimum
-        if without is not None and are_plausible(without.errors, damping=False):
-            self.steps.append(without)
-            return self.is_enough
+        if errors_only is not None and are_plausible(errors_only.errors, damping=False):
+            self.steps.append(errors_only)
+            return self.is_sufficient
         self.steps.append(best)
         self._with_input_noise(best)
         self.steps.append(self._with_finer_substeps(self.last))
@@ -199,16 +201,18 @@ class Stepwise:
 
         The likelihood must prefer it too: the noise is seldom exactly as modelled.
         """
-        alone, noise = self.last, self.last.noise_power
-        longest = alone.description(noise) - STEPWISE.fewer_words
-        if longest < 0.0:
+        errors_only, noise = self.last, self.last.noise_power
+        length_limit = errors_only.description(noise) - STEPWISE.fewer_words
+        if length_limit < 0.0:
             return
         sets = [f.effects for f in self._linear_singles[: STEPWISE.finalists]]
         tried = [
-            s for s in self.search.workers.map(self.afresh, sets) if s.is_plausible and not self._may_be_port_errors(s)
+            s
+            for s in self.search.workers.map(self.fit_from_zero, sets)
+            if s.is_plausible and not self._may_be_port_errors(s)
         ]
-        shorter = [s for s in tried if s.description(noise) < longest]
-        found = [s for s in shorter if self._is_likelier(s, alone, least=SEARCH.trifle)]
+        shorter = [s for s in tried if s.description(noise) < length_limit]
+        found = [s for s in shorter if self._is_likelier(s, errors_only, least=SEARCH.trifle)]
         if found:
             best = min(found, key=lambda s: s.description(noise))
             if self._are_noticeable(best.effects, best.fit.effects):
@@ -219,7 +223,7 @@ class Stepwise:
 
         Tried only if the nominal errors alone are implausible.
         """
-        if self.is_believed or self.last.effects or self.search.logged:
+        if self.has_plausible_errors or self.last.effects or self.search.logged:
             return False
         found = few_with_uniform_errors(self.search, self.last, STEPWISE.most)
         if found is None or not self._are_noticeable(found.effects, found.effects):
@@ -233,7 +237,7 @@ class Stepwise:
         if self.is_run:
             return
         self.is_run = True
-        if self.is_quiet and self.last.is_plausible and not (self.last.effects or self.search.by_mode):
+        if self.is_noise_only and self.last.is_plausible and not (self.last.effects or self.search.by_mode):
             self._by_shorter_description()
         first = self.last
         if first.effects:  # of two effects, the nominal errors may have absorbed one
@@ -258,7 +262,7 @@ class Stepwise:
 
     def _add(self, most: int) -> None:
         """Add effects one after the other, `most` in all."""
-        while len(self.last.effects) < most and not (self.is_enough and self._is_at_noise_floor):
+        while len(self.last.effects) < most and not (self.is_sufficient and self._is_at_noise_floor):
             if self.search.is_over:
                 break
             before = self.last
@@ -275,7 +279,7 @@ class Stepwise:
                 break
 
     @property
-    def is_enough(self) -> bool:
+    def is_sufficient(self) -> bool:
         """Whether the residual of the last set is too small to search for another effect."""
         left = self.explains(self.last) or (self.last.effects and self.unexplained < STEPWISE.further)
         return bool(left and self.last.is_plausible and (self.tried_beside_input_noise or not self.search.logged))
@@ -291,15 +295,15 @@ class Stepwise:
         The selection continues with these substeps: the error of coarser ones would pass for another effect.
         """
         rig, noise = apply_all(self.search.rig, step.fit.effects), step.noise_power
-        near = step.excess(noise) < STEPWISE.further * self._gap
-        if not (step.effects and near and is_stepped(rig)) or self.explains(step):
+        is_near_noise = step.excess(noise) < STEPWISE.further * self._gap
+        if not (step.effects and is_near_noise and is_stepped(rig)) or self.explains(step):
             return step
         data, substeps = self.search.data, self.search.data.substeps
-        left = data.residual(rig)
+        residual = data.residual(rig)
         while substeps < FINISH.finest:
             finer = data.stepped(2 * substeps).residual(rig)
-            moved, left = finer - left, finer
-            if float(moved @ moved) < STEPWISE.stepping * moved.size:
+            change, residual = finer - residual, finer
+            if float(change @ change) < STEPWISE.stepping * change.size:
                 break
             substeps *= 2
         if substeps == data.substeps:
@@ -317,27 +321,31 @@ class Stepwise:
         of this step shows; without input noise if this step explains the records.
         """
         search = self.at_first
-        plain = fit_jointly(search, step.effects, step.errors) if self.search.logged else evaluated(search, step.fit)
-        loud = plain.excess(plain.sensor_noise) > STEPWISE.loud * float(plain.sensor_noise.mean())
-        if plain.logged < LEAST_LOGGED or not loud:
-            return self._continue_in(search, step, plain) if self.search.logged else None
-        beside = with_input_noise(search, step.fit, plain.sensor_noise)
-        if beside is None:
+        without_noise = (
+            fit_jointly(search, step.effects, step.errors) if self.search.logged else evaluated(search, step.fit)
+        )
+        is_loud = without_noise.excess(without_noise.sensor_noise) > STEPWISE.loud * float(
+            without_noise.sensor_noise.mean()
+        )
+        if without_noise.logged < LEAST_LOGGED or not is_loud:
+            return self._continue_in(search, step, without_noise) if self.search.logged else None
+        noisy = with_input_noise(search, step.fit, without_noise.sensor_noise)
+        if noisy is None:
             return None
-        fitted = fit_jointly(beside, step.effects, step.errors)
+        fitted = fit_jointly(noisy, step.effects, step.errors)
         if fitted.fit.cost < STEPWISE.too_white:  # nominal errors had fitted the noise, so it was estimated too loud
-            beside = with_input_noise(search, fitted.fit, plain.sensor_noise)
-            if beside is None:
+            noisy = with_input_noise(search, fitted.fit, without_noise.sensor_noise)
+            if noisy is None:
                 return None
-            fitted = fit_jointly(beside, step.effects, fitted.errors)
+            fitted = fit_jointly(noisy, step.effects, fitted.errors)
         if fitted.fit.cost < STEPWISE.too_white:
             return None
         # noise this loud masks most effects; if a single effect explains the residual, there is no input noise
-        found = None if step.effects or self.search.logged else self._in_place_of_inputs(plain)
+        found = None if step.effects or self.search.logged else self._in_place_of_inputs(without_noise)
         if found is not None:
             self.steps.append(found)
             return None
-        return self._continue_in(beside, step, fitted)
+        return self._continue_in(noisy, step, fitted)
 
     def _continue_in(self, search: Search, step: Step, fitted: Step) -> Step:
         """`fitted`, the step refitted in another search; the selection continues in that search."""
@@ -360,32 +368,32 @@ class Stepwise:
         return max(float(np.maximum(self.search.nominal - self.last.noise_power, 0.0).mean()), 1e-12)
 
     @property
-    def is_nothing(self) -> bool:
+    def needs_no_effect(self) -> bool:
         """Whether nominal errors alone explain the gap."""
-        return not self.last.effects and self.is_closed
+        return not self.last.effects and self.closes_gap
 
     @property
-    def is_closed(self) -> bool:
+    def closes_gap(self) -> bool:
         """Whether the residual of the last set is at the noise floor, or a negligible share of the gap."""
-        return self.is_quiet or self.unexplained < STEPWISE.explained
+        return self.is_noise_only or self.unexplained < STEPWISE.explained
 
     @property
-    def is_quiet(self) -> bool:
+    def is_noise_only(self) -> bool:
         """Whether the residual of the last set is at the noise floor of sensors and inputs."""
         return self.last.excess(self.last.noise_power) < STEPWISE.no_gap * float(self.last.noise_power.mean())
 
     @property
-    def is_believed(self) -> bool:
+    def has_plausible_errors(self) -> bool:
         """Whether the nominal errors of the last set are plausible; those of damping do not count."""
         return self.plain is not None or are_plausible(self.last.errors, damping=False)
 
     @property
-    def is_settled(self) -> bool:
+    def is_conclusive(self) -> bool:
         """Whether the search may end: the residual is at the noise floor and the nominal errors are plausible."""
         if self.plain is not None:
             return True
         outcome = self.decision().outcome
-        return self.is_quiet and (outcome == "none" or (outcome == "explained" and self.last.is_plausible))
+        return self.is_noise_only and (outcome == "none" or (outcome == "explained" and self.last.is_plausible))
 
     def decision(self) -> Decision:
         """The verdict on the last set of effects."""
@@ -395,10 +403,10 @@ class Stepwise:
             return Decision("explained", self.plain, rivals=rivals, noise=self.search.data.noise, beside=beside)
         effects, left = self.last.effects, self.unexplained
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
-        closed = self.is_closed or (len(effects) > 1 and left < STEPWISE.in_part)
-        if effects and closed and not self.is_beyond:
+        closed = self.closes_gap or (len(effects) > 1 and left < STEPWISE.in_part)
+        if effects and closed and not self.shows_unknown_law:
             return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise, beside=beside)
-        if self.is_nothing:
+        if self.needs_no_effect:
             return Decision("none", self.last.fit, noise=noise, beside=beside)
         return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise, beside=beside)
 
@@ -427,9 +435,10 @@ class Stepwise:
             return ()
         key, rig = key_of(sets[0].effects), self.search.rig
         sets = [s for s in sets if key not in contained(s.effects, rig)]
-        noise, alike = sets[0].sensor_noise, not self.explains(sets[0])
+        noise, none_explains = sets[0].sensor_noise, not self.explains(sets[0])
         length = [
-            s.description(noise, of_errors_alone=alike) + self._nats_per_parameter * s.fit.n_parameters for s in sets
+            s.description(noise, of_errors_alone=none_explains) + self._nats_per_parameter * s.fit.n_parameters
+            for s in sets
         ]
         odds = np.exp(min(length) - np.array(length))
         likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
@@ -465,15 +474,15 @@ class Stepwise:
         tried = self._candidates_with_one_more(step)
         if not tried:
             return None
-        sided = self._with_late_accelerometer(step, tried)
-        if sided is not None:
-            self.steps[-1] = sided
-            return self._with_one_more(sided)
+        with_late = self._with_late_accelerometer(step, tried)
+        if with_late is not None:
+            self.steps[-1] = with_late
+            return self._with_one_more(with_late)
         best = self._best_of(tried, step)
         if not self._is_accepted(best, step):
             return None
-        self.is_beyond = self.search.clustered(best.effects)
-        return None if self.is_beyond else best
+        self.shows_unknown_law = self.search.clustered(best.effects)
+        return None if self.shows_unknown_law else best
 
     def _candidates_with_one_more(self, step: Step) -> list[Step]:
         """The likeliest sets with one more effect, fitted to the two most informative records."""
@@ -481,19 +490,19 @@ class Stepwise:
         self.search = search = replace(self.search, quick=quick, first=first)
         search.report("another effect, with small errors of the model", 0.5 + 0.1 * len(step.effects))
         # the residual beyond nominal errors fitted to whole records is evidence of a missing effect
-        beside = search.with_nominal_errors(step.errors)
+        with_errors = search.with_nominal_errors(step.errors)
         rig = apply_all(search.rig, step.fit.effects)
-        residual = beside.ahead.residual(rig)
-        left = float(residual @ residual) / residual.size
+        residual = with_errors.ahead.residual(rig)
+        cost = float(residual @ residual) / residual.size
         evidence = Evidence.of(rig, search.data, workers=search.workers, absorbed=True)
-        ahead = one_more(beside, step.effects, evidence)
-        if not ahead or ahead[0].cost > (1.0 - STEPWISE.ahead) * left:
+        ahead = one_more(with_errors, step.effects, evidence)
+        if not ahead or ahead[0].cost > (1.0 - STEPWISE.ahead) * cost:
             return []
-        promising, as_good = (left - share * (left - ahead[0].cost) for share in (STEPWISE.promising, STEPWISE.as_good))
+        promising, as_good = (cost - share * (cost - ahead[0].cost) for share in (STEPWISE.promising, STEPWISE.as_good))
         chosen: list[tuple[Effect, ...]] = []
         for candidate in ahead:
-            alike = sum(candidate.effects[-1].kind is others[-1].kind for others in chosen)
-            if candidate.cost <= promising and alike < (2 if candidate.cost <= as_good else 1):
+            same_kind = sum(candidate.effects[-1].kind is others[-1].kind for others in chosen)
+            if candidate.cost <= promising and same_kind < (2 if candidate.cost <= as_good else 1):
                 chosen.append(candidate.effects)
         chosen = [*chosen[: STEPWISE.candidates], *more_general_sets(step.effects)]
         return self._fitted_to_quick(chosen, step, self._slopes(step))
@@ -519,25 +528,25 @@ class Stepwise:
         prior, late = step.errors.target, best.effects[-1]
         if late.kind not in TIMING or prior.interpolated or not self._is_timing(best, TIMING):
             return None
-        jumping = {sensor.name for sensor in self.search.rig.sensors if sensor.quantity == "acceleration"}
-        if late.target not in jumping.difference(prior.late):
+        accelerometers = {sensor.name for sensor in self.search.rig.sensors if sensor.quantity == "acceleration"}
+        if late.target not in accelerometers.difference(prior.late):
             return None
         errors = with_all_groups(self.search, step.errors)
         early = tuple(name for name in prior.early if name != late.target)
         target = replace(errors.target, late=(*prior.late, late.target), early=early)
         delay = delay_of(late) / prior.sample_time
         values = {**errors.values, f"delay_{late.target}": delay}
-        sided = fit_jointly(self.search, step.effects, nominal_errors(self.search.rig, target, values))
-        return sided if sided.fit.cost < step.fit.cost else None
+        refitted = fit_jointly(self.search, step.effects, nominal_errors(self.search.rig, target, values))
+        return refitted if refitted.fit.cost < step.fit.cost else None
 
     def _best_of(self, tried: Sequence[Step], step: Step) -> Step:
         """The best set on all records, of candidates fitted to the most informative ones."""
         # the single effects fitted before nominal errors could absorb them compete too
-        alone = [] if step.effects else self.alone
+        singles = [] if step.effects else self.fitted_singles
         tried = sorted((s for s in tried if not self._may_be_port_errors(s)), key=self._loss)
-        near = [s for s in tried if s.fit.cost < STEPWISE.near * tried[0].fit.cost][: STEPWISE.finalists]
-        whole = self.search.workers.map(lambda s: self._without_inactive(self._fitted_to_all(s)), near)
-        whole = sorted((*whole, *alone), key=self._loss)
+        close = [s for s in tried if s.fit.cost < STEPWISE.near * tried[0].fit.cost][: STEPWISE.finalists]
+        whole = self.search.workers.map(lambda s: self._without_inactive(self._fitted_to_all(s)), close)
+        whole = sorted((*whole, *singles), key=self._loss)
         return self._simplest_of_sets(whole) if whole else step
 
     def _simplest_of_sets(self, sets: Sequence[Step]) -> Step:
@@ -561,22 +570,24 @@ class Stepwise:
         if not self._are_noticeable(best.effects, best.fit.effects):
             return False
         # if nominal errors, sensor delays among them, explain the records, another small delay is no effect
-        asked = self.explains(step) and not self._is_timing(best, TIMING)
-        if (self.search.logged or asked) and self._is_likelier(best, step):
+        by_likelihood = self.explains(step) and not self._is_timing(best, TIMING)
+        if (self.search.logged or by_likelihood) and self._is_likelier(best, step):
             return True
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
-        trifle = bool(step.effects) and before - after < STEPWISE.least * self._gap
-        worth = STEPWISE.further_excess if step.effects and not trifle else STEPWISE.excess
-        if not self.explains(step) and before - after > worth * before:
+        is_negligible = bool(step.effects) and before - after < STEPWISE.least * self._gap
+        share = STEPWISE.further_excess if step.effects and not is_negligible else STEPWISE.excess
+        if not self.explains(step) and before - after > share * before:
             return True
-        saved = step.description(noise, of_errors_alone=trifle) - best.description(noise, of_errors_alone=trifle)
+        saved = step.description(noise, of_errors_alone=is_negligible) - best.description(
+            noise, of_errors_alone=is_negligible
+        )
         return not step.is_plausible and saved > STEPWISE.shorter
 
     def _is_likelier(self, best: Step, step: Step, least: float = SEARCH.significant) -> bool:
         """Whether the likelihood surely prefers a set to a smaller one, beyond the imperfection of any model."""
-        more, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), self._gain(best, step)
-        return gain > least and self.search.pays(gain, more)
+        extra, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), self._gain(best, step)
+        return gain > least and self.search.pays(gain, extra)
 
     def _gain(self, best: Step, step: Step) -> float:
         """Twice the log-likelihood ratio of one step over another, per measured value."""
@@ -641,41 +652,43 @@ class Stepwise:
             [effects for effects in sets if can_be(self.search.rig, (*effects, step.errors))],
         )
 
-    def afresh(self, effects: tuple[Effect, ...]) -> Step:
+    def fit_from_zero(self, effects: tuple[Effect, ...]) -> Step:
         """The effects and nominal errors that start from zero, fitted jointly to all records.
 
         With wrong frequencies, a simulation drifts out of phase over a record, so one-step-ahead predictions are
         fitted first.
         """
         search = self.search
-        none = nominal_errors(search.rig, search.prior)
-        effects = nearest_possible(search.rig, effects, (none,))  # with nominal errors they could be larger
-        none = with_reading_sides(search, none, effects)
-        ahead = self._fitted_ahead(effects, none)
+        zero_errors = nominal_errors(search.rig, search.prior)
+        effects = nearest_possible(search.rig, effects, (zero_errors,))  # with nominal errors they could be larger
+        zero_errors = with_reading_sides(search, zero_errors, effects)
+        ahead = self._fitted_ahead(effects, zero_errors)
         *others, errors = ahead.effects
         # with corrected frequencies, the sides of the accelerometers are clearer
-        again = with_reading_sides(search, replace(errors, target=replace(errors.target, late=(), early=())), others)
-        if again.target.late != none.target.late:
-            ahead = min(ahead, self._fitted_ahead(others, again), key=lambda each: each.cost)
-        straight = self._interpolated(ahead)
-        if straight is not ahead:
-            ahead, none = straight, nominal_errors(search.rig, replace(search.prior, interpolated=True))
+        reassigned = with_reading_sides(
+            search, replace(errors, target=replace(errors.target, late=(), early=())), others
+        )
+        if reassigned.target.late != zero_errors.target.late:
+            ahead = min(ahead, self._fitted_ahead(others, reassigned), key=lambda each: each.cost)
+        interpolated = self._interpolated(ahead)
+        if interpolated is not ahead:
+            ahead, zero_errors = interpolated, nominal_errors(search.rig, replace(search.prior, interpolated=True))
         found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
         if search.by_mode or found.excess(found.noise_power) < STEPWISE.astray * float(search.nominal.mean()):
             return found
-        return min(found, fit_jointly(search, effects, none), key=lambda s: s.fit.cost)
+        return min(found, fit_jointly(search, effects, zero_errors), key=lambda s: s.fit.cost)
 
     def _interpolated(self, ahead: Fit) -> Fit:
         """The one-step-ahead fit, or one with delays by linear interpolation of the readings if its cost is lower."""
         *effects, errors = ahead.effects
         delays = {name: value for name, value in errors.values.items() if group_of(name) == "delay"}
         is_late = any(effect.kind in TIMING for effect in effects)
-        seen = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.surely_late
-        if not seen and (effects or ahead.cost < JOINT.straight):
+        may_be_late = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.surely_late
+        if not may_be_late and (effects or ahead.cost < JOINT.straight):
             return ahead
         prior = replace(self.search.prior, interpolated=True)
-        straight = self._fitted_ahead(effects, nominal_errors(self.search.rig, prior, delays))
-        return min(ahead, straight, key=lambda each: each.cost)
+        interpolated = self._fitted_ahead(effects, nominal_errors(self.search.rig, prior, delays))
+        return min(ahead, interpolated, key=lambda each: each.cost)
 
     def _fitted_ahead(self, effects: Sequence[Effect], errors: Effect) -> Fit:
         """Effects and nominal errors fitted to one-step-ahead predictions.
@@ -702,44 +715,44 @@ class Stepwise:
         Nominal errors fitted without an effect have absorbed part of it and may be in another local minimum, so they
         start from zero; they also start from their values if that does not explain the records.
         """
-        fresh = self.afresh(step.effects)
+        fresh = self.fit_from_zero(step.effects)
         if self.explains(fresh):
             return fresh
         return min(fresh, fit_jointly(self.search, step.effects, step.errors, rounds=2), key=lambda s: s.fit.cost)
 
     def _simplest(self, best: Step, tried: Sequence[Step]) -> Step:
         """The best step, or a simpler set (a limiting case, or fewer effects) that fits almost as well."""
-        equals = [s for s in (best, *tried) if len(s.effects) > 1 and not self._surely_prefers(best, s)]
-        fresh = [
+        as_good = [s for s in (best, *tried) if len(s.effects) > 1 and not self._surely_prefers(best, s)]
+        simpler = [
             *simpler_sets(best.effects, self.search.rig),
             *merged_sets(best.effects),
-            *(fewer for s in equals for fewer in each_left_out(s.effects)),
+            *(fewer for s in as_good for fewer in each_left_out(s.effects)),
         ]
-        quickly = self._fitted_to_quick(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))
-        sets = [*tried, *self._refitted_to_all(quickly, best), *self._simpler_singles(best)]
+        on_quick = self._fitted_to_quick(simpler, best, self._slopes(best) if simpler else np.zeros((0, 0)))
+        sets = [*tried, *self._refitted_to_all(on_quick, best), *self._simpler_singles(best)]
         # implausible nominal errors may have absorbed the effect that is left out
         sets = [s for s in sets if s.is_plausible or not best.is_plausible]
         # a set of as many parameters may fit better: friction, for a hysteretic spring that always slides
         best = min((best, *(s for s in sets if self._size(s) == self._size(best))), key=lambda s: s.fit.cost)
-        enough = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
-        limits = contained(best.effects, self.search.rig)
+        excess_limit = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
+        limiting_cases = contained(best.effects, self.search.rig)
         fewer = [
             step
             for step in sets
-            if (self._size(step) < self._size(best) or key_of(step.effects) in limits)
-            and step.excess(best.sensor_noise) < enough
+            if (self._size(step) < self._size(best) or key_of(step.effects) in limiting_cases)
+            and step.excess(best.sensor_noise) < excess_limit
             and not self._surely_prefers(best, step)
         ]
         return min(fewer, key=lambda s: (self._size(s), s.fit.cost)) if fewer else best
 
-    def _refitted_to_all(self, quickly: Sequence[Step], best: Step) -> list[Step]:
+    def _refitted_to_all(self, on_quick: Sequence[Step], best: Step) -> list[Step]:
         """The steps; those that may be as good as `best`, which was fitted to all records, are refitted to all."""
         if not self.explains(best):
-            return list(quickly)
-        near = max(STEPWISE.near * best.fit.cost, STEPWISE.least * self._gap)
+            return list(on_quick)
+        cost_limit = max(STEPWISE.near * best.fit.cost, STEPWISE.least * self._gap)
         return self.search.workers.map(
-            lambda s: fit_jointly(self.search, s.effects, s.errors, rounds=2) if s.fit.cost < near else s,
-            list(quickly),
+            lambda s: fit_jointly(self.search, s.effects, s.errors, rounds=2) if s.fit.cost < cost_limit else s,
+            list(on_quick),
         )
 
     def _limiting_case(self, step: Step) -> Step:
@@ -751,8 +764,8 @@ class Stepwise:
             return step
         sets = list(with_one_simpler(step.effects, self.search.rig))
         limits = self._fitted_to_quick(sets, step, self._slopes(step)) if sets else []
-        alike = [s for s in self.search.workers.map(self._fitted_to_all, limits) if self._is_as_good(s, step)]
-        return self._limiting_case(min(alike, key=lambda s: s.fit.cost)) if alike else step
+        as_good = [s for s in self.search.workers.map(self._fitted_to_all, limits) if self._is_as_good(s, step)]
+        return self._limiting_case(min(as_good, key=lambda s: s.fit.cost)) if as_good else step
 
     def _is_as_good(self, step: Step, best: Step) -> bool:
         """Whether a step with plausible nominal errors fits almost as well as the best, which does not explain the gap.
@@ -770,8 +783,8 @@ class Stepwise:
         nominal = self.search.nominal_ahead
         good = nominal - STEPWISE.as_good * (nominal - self.ahead[0].cost)
         likely = [f.effects for f in best_of_each_kind(self.ahead) if f.cost <= good and f.n_parameters < size]
-        quickly = self._fitted_to_quick(likely, best, self._slopes(best)) if likely else []
-        return [self._fitted_to_all(step) for step in quickly if step.fit.cost < STEPWISE.near * best.fit.cost]
+        on_quick = self._fitted_to_quick(likely, best, self._slopes(best)) if likely else []
+        return [self._fitted_to_all(step) for step in on_quick if step.fit.cost < STEPWISE.near * best.fit.cost]
 
     def _size(self, step: Step) -> tuple[int, int]:
         """Number of parameters and of effects: of as many parameters, one effect is simpler than two."""
@@ -779,8 +792,8 @@ class Stepwise:
 
     def _surely_prefers(self, best: Step, simpler: Step) -> bool:
         """Whether the best step explains the records and its likelihood is surely higher than that of a simpler one."""
-        more, gain = best.fit.n_parameters - simpler.fit.n_parameters, self._gain(best, simpler)
-        return self.explains(best) and self.search.pays(gain, more)
+        extra, gain = best.fit.n_parameters - simpler.fit.n_parameters, self._gain(best, simpler)
+        return self.explains(best) and self.search.pays(gain, extra)
 
     def _backward_eliminated(self, step: Step) -> Step:
         """The step after backward elimination: without effects that later ones have made unnecessary."""
@@ -788,13 +801,13 @@ class Stepwise:
             return step
         fewer = self._fitted_to_quick(list(each_left_out(step.effects)), step, self._slopes(step))
         best = min(fewer, key=lambda s: s.fit.cost)
-        enough = (1.0 + STEPWISE.needless) * max(step.excess(step.sensor_noise), STEPWISE.simpler)
-        needless = best.excess(step.sensor_noise) < enough and (best.is_plausible or not step.is_plausible)
-        return self._backward_eliminated(best) if needless else step
+        excess_limit = (1.0 + STEPWISE.needless) * max(step.excess(step.sensor_noise), STEPWISE.simpler)
+        is_needless = best.excess(step.sensor_noise) < excess_limit and (best.is_plausible or not step.is_plausible)
+        return self._backward_eliminated(best) if is_needless else step
 
     def _without_errors(self, step: Step) -> Fit | None:
         """Few effects that explain the records without nominal errors as well as a step with them, or None."""
-        if not self.is_closed:
+        if not self.closes_gap:
             return None
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
         if step.logged > LEAST_LOGGED and not self.search.logged:
@@ -829,9 +842,9 @@ class Stepwise:
         _, side, port = name.split("_", 2)
         kind = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}[side]
         effect = Effect(kind, port, {"gain": float(np.exp(gains[name]))})
-        found = self.afresh((*step.effects, effect))  # other nominal errors have absorbed part of it
-        off = abs(float(np.log(found.effects[-1].values["gain"])))
-        is_wrong = off >= max(PLAIN.most_gain, PLAIN.outlying * size_of(found.errors, "gain"))
+        found = self.fit_from_zero((*step.effects, effect))  # other nominal errors have absorbed part of it
+        error = abs(float(np.log(found.effects[-1].values["gain"])))
+        is_wrong = error >= max(PLAIN.most_gain, PLAIN.outlying * size_of(found.errors, "gain"))
         if not (is_wrong and self._are_noticeable(found.effects, found.fit.effects)):
             return step
         return self._with_wrong_gains(found, most - 1)
@@ -842,11 +855,11 @@ class Stepwise:
         damping = float(np.mean([v for n, v in values.items() if group_of(n) == "damping"] or [0.0]))
         stiffness = values.get("stiffness_0", 0.0) - values.get("mass_0", 0.0)
         named = {effect.kind for effect in step.effects}
-        added, reset, most = [], dict(values), dict(PLAIN.most_common)
-        if abs(damping) > most["modal_damping"] and MODAL_DAMPING not in named:
+        added, reset, largest = [], dict(values), dict(PLAIN.most_common)
+        if abs(damping) > largest["modal_damping"] and MODAL_DAMPING not in named:
             added.append(Effect(MODAL_DAMPING, None, {"factor": float(np.exp(damping))}))
             reset.update({n: v - damping for n, v in values.items() if group_of(n) == "damping"})
-        if abs(stiffness) > most["modulus_error"] and MODULUS_ERROR not in named:
+        if abs(stiffness) > largest["modulus_error"] and MODULUS_ERROR not in named:
             added.append(Effect(MODULUS_ERROR, None, {"factor": float(np.exp(stiffness))}))
             reset.update({"stiffness_0": 0.0, "mass_0": 0.0})
         if not added:
@@ -863,8 +876,8 @@ class Stepwise:
         late = [effect for effect in late if self._are_noticeable([effect], [*step.effects, effect])]
         if not late:
             return step
-        punctual = {n: 0.0 if group_of(n) == "delay" else v for n, v in step.errors.values.items()}
-        errors = nominal_errors(search.rig, replace(target, late=(), early=(), interpolated=False), punctual)
+        without_delays = {n: 0.0 if group_of(n) == "delay" else v for n, v in step.errors.values.items()}
+        errors = nominal_errors(search.rig, replace(target, late=(), early=(), interpolated=False), without_delays)
         each = search.workers.map(lambda e: fit_jointly(search, (*step.effects, e), errors, rounds=2), late)
         best, *others = sorted(each, key=lambda s: s.fit.cost)
         effect = best.effects[-1]
