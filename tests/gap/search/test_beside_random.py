@@ -78,7 +78,7 @@ def test_what_a_right_law_leaves_beside_a_random_force_is_its_linear_answer(rig,
     quiet = simulate(replace(rig, actuators=rig.actuators[:1]), plain.inputs, sample_time=0.01).outputs
     truth = plain.outputs - quiet  # the same wind on the structure without the law
     observer = Observer.of(told, noise, 0.1, 0.01, at=1.3, rms=0.05)
-    left = observer.left(told, weak, 8)
+    left = observer.residual_on_measured_motion(told, weak, 8)
     whole = weak.outputs - simulate(told, weak.inputs, sample_time=0.01).outputs
     error = [np.sqrt(np.mean((r - truth) ** 2) / np.mean(truth**2)) for r in (left, whole)]
     assert error[0] < 0.02 < 0.1 < error[1]

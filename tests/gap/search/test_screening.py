@@ -113,7 +113,7 @@ def test_errors_ahead_of_a_linear_rig_are_those_of_steps_through_time(rig, recor
     softer = kind_named("modulus_error").apply(rig, None, {"factor": 0.9})
     for other in (softer, GAIN.apply(softer, "d2", {"gain": 1.3})):
         data = FitData((record,), np.full(4, NOISE))
-        ahead = observer.errors_of_linear(other, data.residual(other).reshape(4, -1) * NOISE, DT, 1)
+        ahead = observer.innovations_of_linear(other, data.residual(other).reshape(4, -1) * NOISE, DT, 1)
         stepped = prediction_errors(other, record.inputs, record.outputs, observer.gain, sample_time=DT, substeps=1)
         np.testing.assert_allclose(ahead, observer.whitening @ stepped, atol=1e-6 * np.abs(ahead).max())
 

@@ -70,7 +70,9 @@ class Observer:
         whitening = np.linalg.inv(np.linalg.cholesky(found.innovation))
         return cls(gain.reshape(2, n, -1).copy(), whitening, rig.sensors)
 
-    def errors(self, rig: Rig, record: Record, substeps: int, motion: Callable[[], Motion] | None = None) -> np.ndarray:
+    def innovations(
+        self, rig: Rig, record: Record, substeps: int, motion: Callable[[], Motion] | None = None
+    ) -> np.ndarray:
         """Innovations of unit covariance (n_outputs, n_samples) of a rig that is integrated in time.
 
         The effect of delay, lag and clipping of sensors is taken from a simulation of the whole record.
@@ -85,7 +87,7 @@ class Observer:
             errors: Floats = self.whitening @ self._innovations(rig, record, substeps, motion)
         return errors
 
-    def left(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+    def residual_on_measured_motion(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
         """Residual (n_outputs, n_samples) of a whole record with nonlinear laws acting on the measured motion.
 
         The laws then do not distort the response to an unmodelled force: the residual is the structure's linear
@@ -115,7 +117,7 @@ class Observer:
             instantaneous, record.inputs, measured, gain, sample_time=dt, substeps=substeps, input_hold=hold
         )
 
-    def errors_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
+    def innovations_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
         """Innovations of unit covariance (n_outputs, n_samples) of a linear rig, from its simulation residual.
 
         Args:

@@ -196,11 +196,11 @@ class FitData:
             substeps, first = self.substeps if is_stepped(rig) else 1, self._from_the_first_sample
             rigs = [(rig.in_record(record.name), record) for record in self.records]
             # a sensor's fault does not change the motion, which may be cached
-            ahead = [observer.errors(r, record, substeps, partial(first._motion, r, record)) for r, record in rigs]
+            ahead = [observer.innovations(r, record, substeps, partial(first._motion, r, record)) for r, record in rigs]
         else:
             whole = zip(self.records, self._from_the_first_sample.differences(rig), strict=True)
             ahead = [
-                observer.errors_of_linear(rig.in_record(record.name), left, record.sample_time, self.substeps)
+                observer.innovations_of_linear(rig.in_record(record.name), left, record.sample_time, self.substeps)
                 for record, left in whole
             ]
         each_ahead = zip(self.records, ahead, strict=True)
@@ -232,7 +232,9 @@ class FitData:
         if observer is None or not is_stepped(rig) or rig.stiffness_rate:
             return self.differences(rig)
         return [
-            observer.left(rig.in_record(record.name), record, self.substeps)[:, lead_of(record, self.settle) :]
+            observer.residual_on_measured_motion(rig.in_record(record.name), record, self.substeps)[
+                :, lead_of(record, self.settle) :
+            ]
             for record in self.records
         ]
 

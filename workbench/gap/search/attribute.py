@@ -518,7 +518,7 @@ def force_of_other_law(search: Search, evidence: Evidence) -> Fit | None:
 
     Two effects at one place can fit many laws, so this comes before pairs are accepted. None if there is none.
     """
-    search.report("one force of another law", 0.35)
+    search.report("one force of a law beyond the catalogue", 0.35)
     beyond = replace(search, catalogue=BEYOND)
     promising = [f for f in one_more(beyond, (), evidence) if f.cost < SELECTION.promising]
     fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.cost_limit)
@@ -545,7 +545,7 @@ def unless_other_law(search: Search, decision: Decision, evidence: Evidence) -> 
     (effect,) = best.effects
     if not effect.kind.nonlinear or effect.at is None:
         return decision
-    search.report("one force of another law", 0.9)
+    search.report("one force of a law beyond the catalogue", 0.9)
     beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.at)
     as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
     promising = [f for f in one_more(beyond, (), there) if f.cost < as_near]

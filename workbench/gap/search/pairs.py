@@ -68,7 +68,7 @@ class Pairs:
         search = self.search
         if not self.found or not search.near(self.found[0], PAIRS.most) or search.near(self.found[0], PAIRS.least):
             return False
-        search.report("the best pair and another", 0.45)
+        search.report("the best pair and a third effect", 0.45)
         pair = self.found[0].effects
         if self._explained_with_one_more(pair):
             return True
@@ -104,7 +104,7 @@ class Pairs:
         """Whether a pair with this effect explains the records."""
         if self.search.is_over:
             return False
-        self.search.report(f"{effect.kind.words} and another", 0.55 + 0.05 * min(len(self.given), 8))
+        self.search.report(f"{effect.kind.words} and a second effect", 0.55 + 0.05 * min(len(self.given), 8))
         self.given.append(effect)
         return self._add_and_check(one_more(self.search, (effect,), _evidence_with(self.search, effect)))
 

@@ -97,6 +97,7 @@ class Stepwise:
 
     @property
     def last(self) -> Step:
+        """The last set."""
         return self.steps[-1]
 
     @property
@@ -262,7 +263,7 @@ class Stepwise:
 
     def _add(self, most: int) -> None:
         """Add effects one after the other, `most` in all."""
-        while len(self.last.effects) < most and not (self.is_sufficient and self._is_at_noise_floor):
+        while len(self.last.effects) < most and not (self.is_sufficient and self._is_exhausted):
             if self.search.is_over:
                 break
             before = self.last
@@ -285,7 +286,7 @@ class Stepwise:
         return bool(left and self.last.is_plausible and (self.tried_beside_input_noise or not self.search.logged))
 
     @property
-    def _is_at_noise_floor(self) -> bool:
+    def _is_exhausted(self) -> bool:
         """Whether the residual of the last set is below what any missing effect would leave."""
         return self.last.excess(self.last.noise_power) < STEPWISE.noise_floor * float(self.last.noise_power.mean())
 
@@ -520,7 +521,7 @@ class Stepwise:
         return self._simplest_of_sets(sorted(found, key=lambda s: s.fit.cost)) if found else None
 
     def _with_late_accelerometer(self, step: Step, tried: Sequence[Step]) -> Step | None:
-        """The step with an accelerometer read before the input steps, if the best candidate delays that sensor.
+        """The step with an accelerometer that reads before the input steps, if the best candidate delays it.
 
         The acceleration jumps with a held input, so the cost jumps at zero delay and no gradient leads across.
         """
