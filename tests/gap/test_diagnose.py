@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.gap.diagnose import _is_much, _of_rest, diagnose
+from workbench.gap.diagnose import _leaves_unexplained, _note_of_residual, diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, Kind, Parameter, place_parameters
 from workbench.gap.effects.nonlinear import with_element
@@ -257,10 +257,10 @@ def test_no_gap_is_told_only_where_records_held_out_have_none_either(hinged_rig,
     low = record_of(rig, 0.3 * commands, rng, name="low")
     touched = replace(rig, elements=(OneSidedStop(0.7, 2000.0, 1.2 * float(np.abs(low.outputs).max())),))
     commands = np.repeat(rng.normal(size=40), 10)[None]
-    sound, loud = (record_of(touched, level * commands, rng, name=f"at {level}") for level in (0.2, 2.0))
-    crossed = replace(sound, outputs=sound.outputs[[2, 1, 0, 3]], name="crossed")
+    is_settled, loud = (record_of(touched, level * commands, rng, name=f"at {level}") for level in (0.2, 2.0))
+    crossed = replace(is_settled, outputs=is_settled.outputs[[2, 1, 0, 3]], name="crossed")
     gain = (kind_named("actuator_gain"),)
-    for held, disagreeing in (((sound,), ()), ((sound, loud), ("at 2.0",)), ((crossed,), ("crossed",))):
+    for held, disagreeing in (((is_settled,), ()), ((is_settled, loud), ("at 2.0",)), ((crossed,), ("crossed",))):
         verdict = diagnose(rig, [low], validation=held, catalogue=gain, workers=1)
         assert verdict.disagreeing == disagreeing and verdict.outcome == ("unknown" if disagreeing else "none")
         assert verdict.effects == () and not verdict.shows_gap
@@ -297,17 +297,17 @@ def test_a_time_to_settle_that_no_record_has_is_refused(nothing_hidden, settle):
 def test_a_set_that_leaves_more_than_a_few_per_cent_explains_the_gap_in_part(unexplained, noise, power, much):
     """By chance a tenth of the noise may be left beside it, and what is below the tolerance is not searched for."""
     shares = {"effects": {}, "nominal": 1.0 - unexplained - noise, "unexplained": unexplained, "noise": noise}
-    assert _is_much(Budget(**shares, by_record={"r": np.array([])}), power, 0.01) is much
+    assert _leaves_unexplained(Budget(**shares, by_record={"r": np.array([])}), power, 0.01) is much
 
 
 def test_a_rest_of_the_model_is_noted_with_its_size_and_not_called_noise():
     """100 times the power of the noise is 10 times its rms; of a gap as large as the signal, 1e-5 are 0.32 % of it."""
     noise = {"noise_stated": (1.0,), "noise_found": (1.8,)}
     rest = Budget({}, 1.0 - 1.01e-5, 1e-5, 1e-7, {}, **noise)
-    assert [*_of_rest(rest, 1.0, 0.01)] == [
-        "Beyond the noise, 0.32 % of the signal is left, 10 times the noise: below the tolerance of 1 %, no cause of it"
-        " was sought."
+    assert [*_note_of_residual(rest, 1.0, 0.01)] == [
+        "The residual above the noise is 0.32 % of the signal, 10 times the noise: below the tolerance of 1 %, so its"
+        " cause was not searched for."
     ]
-    assert [note.endswith("something is missed.") for note in _of_rest(rest, 1.0, 0.001)] == [True]
+    assert [note.endswith("an effect is missing.") for note in _note_of_residual(rest, 1.0, 0.001)] == [True]
     assert rest.noise_remark.startswith("What looks like noise is 1.8 times the stated noise_std; part of it may be")
-    assert not [*_of_rest(Budget({}, 0.9, 0.04, 0.06, {}, **noise), 1.0, 0.01)]
+    assert not [*_note_of_residual(Budget({}, 0.9, 0.04, 0.06, {}, **noise), 1.0, 0.01)]

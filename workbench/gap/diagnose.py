@@ -1,4 +1,4 @@
-"""The diagnosis from end to end: rig and records in, verdict out."""
+"""The diagnosis: from rig and records to a verdict."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -52,21 +52,22 @@ from workbench.rig.simulate import predict
 from workbench.structure.printed import joined_in_words
 from workbench.threads import one_blas_thread
 
-LIKELY = 0.01  # probability from which an alternative is worth an experiment
-TOLERANCE = 0.01  # of the signal: a gap that is worth no cause
-PAID = 0.02  # of what is left of records held out: what an effect that acts there must take away, to be named
-TRIFLE = 0.0005  # of the gap there: likewise
-CLEAR = 10.0  # times that: what is left there without an effect that counts beyond doubt
-HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
+LIKELY = 0.01  # probability from which an alternative deserves an experiment
+TOLERANCE = 0.01  # of the signal: a smaller gap is not explained
+WORTH = 0.02  # of the residual power of held-out records: an effect that acts there must remove more to be named
+TRIFLE = 0.0005  # of the gap's power there: likewise
+DECISIVE = 10.0  # times the residual with it: an effect without which more is left there is not refitted without
+LEAST_CLOSED = 0.9  # share of the gap to be closed on held-out records
+LARGEST_LEFT = 0.1  # of the noise power there: a larger residual above the noise is significant
+LEAST_CLOSED_WITH_ERRORS = 0.8  # like LEAST_CLOSED, with nominal errors: 4 % of the gap's power may be left
 UNEXPLAINED = 0.05  # of the gap: a set that leaves more explains it in part
-CHANCE = 5.0  # standard deviations of the mean square of white noise: more than that is left of a record by no chance
+CHANCE = 5.0  # standard deviations of the mean square of white noise: a larger excess is significant
 SECONDS = 120.0  # of processor time of this process and one beside it: twice what cases of a laboratory take at most
 SEARCH_SHARE = 0.8  # of that time; the rest is for intervals, budget and the next experiment
-ABOVE = 0.2  # of the gap, above the last mode of the model, from which on that is remarked
-BESIDE_ERRORS = 0.8  # likewise where the model itself is a little off: 4 % of the gap's power may be left
+ABOVE = 0.2  # of the gap: a larger share above the last mode of the model is remarked
 
 
-OVER_FITTING = "The nearest set explains the records it was fitted to, but not the validation records: over-fitting."
+OVER_FITTING = "The best set explains the records that it was fitted to, but not the validation records: over-fitting."
 
 
 @former_arguments(free_nominal="uncertain_nominal", report="progress")
@@ -87,28 +88,26 @@ def diagnose(
     identified: IdentifiedPrior | None = None,
     units: Units = SI,
 ) -> Verdict:
-    """Where a rig and records of the real structure disagree, which effect is missing, how far the gap then shrinks.
+    """Locate the gap between a rig and records of the real structure, and identify the missing effects.
 
-    The search sees `records` alone; `validation` is opened once, after the last fit, to measure the shrinkage.
+    The search sees `records` alone; `validation` is used once, after the last fit, to measure the shrinkage.
 
     Args:
-        rig: nominal; for a sensor without noise_std, what the quietest bands of its spectrum hold is taken.
+        rig: nominal; the noise of a sensor without noise_std is estimated from the quietest bands of its spectrum.
         records: one or several, with the rig's inputs and outputs, in its order.
         validation: kept out of every fit.
         catalogue: kinds of effects to try.
         name: of the case.
         progress: called with (what, share done) as the search proceeds.
         workers: processes that share the work, this one included; None for one per core.
-        seconds: of processor time of this process, twice as many where it works alone, after which the search ends with
-            the best that it has, and the verdict says so; None for no limit. What compiling takes is not counted.
-        settle: seconds at the start of each record that are simulated but not counted, where a record does not start
-            at rest.
-        uncertain_nominal: fit errors of the nominal model beside every effect from the first.
-        tolerance: of the signal's rms: a gap beyond the noise that is smaller in every record is reported, and not
-            explained; nor is one below a tenth of the noise. What an explained gap leaves below it is not searched
-            either, and noted where it is more than the noise.
-        identified: errors that the nominal rig has because it was itself identified: they are fitted beside the effects
-            in the end, so that intervals allow for them. Those of a rig's modes where their covariance is known.
+        seconds: of processor time of this process, doubled if it works alone, after which the search ends with the best
+            set so far, and the verdict says so; None for no limit. Compilation is not counted.
+        settle: seconds at the start of each record that are simulated but not counted, if records do not start at rest.
+        uncertain_nominal: fit nominal errors jointly with every effect from the first.
+        tolerance: of the signal's rms: a gap above the noise that is smaller in every record, or below a tenth of the
+            noise, is reported but not explained. A residual of an explained gap below it is noted, if above the noise.
+        identified: errors of a nominal rig that was itself identified; they are fitted with the effects at the end, so
+            that intervals allow for them. None for those of the rig's modes, if their covariance is known.
         units: names of the units of the rig and the records, in which the verdict states its numbers.
 
     Raises:
@@ -129,7 +128,7 @@ def diagnose(
         seconds *= 2.0
     deadline = Deadline(None if seconds is None else SEARCH_SHARE * seconds)
     for record in (*records, *validation):
-        _check(rig, record)
+        _check_channels(rig, record)
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     shortest = min(record.n_samples * record.sample_time for record in (*records, *validation))
@@ -140,13 +139,15 @@ def diagnose(
     check_modes(rig)
     check_records(rig, records, validation, settle=settle)
     check_disjoint(records, validation)
-    silent = frozenset(sensor.name for sensor in rig.sensors if not sensor.noise_std)
-    if silent:
+    without_noise = frozenset(sensor.name for sensor in rig.sensors if not sensor.noise_std)
+    if without_noise:
         each = zip(rig.sensors, noise_guessed(rig, records), strict=True)
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
     faults = setup_faults(rig, records, validation, settle=settle)
-    progress("looking for the unmodelled force", 0.02)
-    seen, nominal, evidence = baseline(rig, records, settle=settle, guessed=silent, workers=sharing, deadline=deadline)
+    progress("locating the unmodelled force", 0.02)
+    seen, nominal, evidence = baseline(
+        rig, records, settle=settle, guessed=without_noise, workers=sharing, deadline=deadline
+    )
     with (
         sharing.in_background(lambda: locate_force(nominal.without(_faulty(seen)))) as place,
         sharing.in_background(lambda: detectability(nominal, catalogue=catalogue)) as ready,
@@ -162,16 +163,16 @@ def diagnose(
             identified=identified or IdentifiedPrior.of_modes(rig),
         )
         if attribution.outcome == "explained" and attribution.random is None:
-            # rivals are fitted to the records as the best set was, which is else at a disadvantage
+            # rivals are fitted to the same whitened records as the best set
             alike, search = ready().indistinguishable, replace(attribution.search, data=attribution.weighed)
             rivals = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
             attribution = replace(attribution, alternatives=rivals)
-        attribution = _paid_for(rig, attribution, validation, settle)
+        attribution = _validated(rig, attribution, validation, settle)
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)
         accounted = with_held_out(rig, attribution.best.effects, validation, settle=settle)
-        beyond = _beyond_models(rig, attribution, validation, settle, accounted)
-        if _leaves_much(attribution, shrinkage, beyond):
+        beyond = _power_beyond_effects(rig, attribution, validation, settle, accounted)
+        if _leaves_far_more_than_noise(attribution, shrinkage, beyond):
             attribution = replace(attribution, outcome="part")
         disagreeing = _disagreeing(attribution, shrinkage, validation, settle, tolerance, beyond)
         outcome = _outcome(attribution, shrinkage, beyond, disagreeing)
@@ -180,7 +181,7 @@ def diagnose(
         effects = named if outcome in ("none", "explained") else ()
         faulty = _faulty(attribution.best.effects)
         as_seen = faulty == _faulty(seen)
-        taken_apart = partial(
+        budget_for = partial(
             budget_of,
             rig,
             errors=errors,
@@ -189,14 +190,14 @@ def diagnose(
             logged=attribution.logged,
             settle=settle,
         )
-        budget = taken_apart(effects)
-        power = _left_of(rig, (), validation or records, settle) / len(validation or records)
-        if outcome == "explained" and _is_much(budget, power, tolerance):
+        budget = budget_for(effects)
+        power = _residual_power(rig, (), validation or records, settle) / len(validation or records)
+        if outcome == "explained" and _leaves_unexplained(budget, power, tolerance):
             outcome, effects, attribution = "part", (), replace(attribution, outcome="part")
-            budget = taken_apart(effects)
-        sound = outcome in ("none", "explained")
-        in_records = () if sound else data_faults(rig, records, settle=settle)
-        in_unseen = () if sound else data_faults(rig, validation, settle=settle)
+            budget = budget_for(effects)
+        is_settled = outcome in ("none", "explained")
+        in_records = () if is_settled else data_faults(rig, records, settle=settle)
+        in_validation = () if is_settled else data_faults(rig, validation, settle=settle)
         where = locate(nominal, effects, place() if as_seen else locate_force(nominal.without(faulty)))
         of_setup = any(record.name in fault.records for fault in faults for record in validation)
         return Verdict(
@@ -212,26 +213,34 @@ def diagnose(
             attribution=attribution,
             detectability=ready(),
             budget=budget,
-            experiment=_next(rig, attribution, sharing, units),
+            experiment=_next_experiment(rig, attribution, sharing, units),
             tolerance=tolerance,
             units=units,
             notes=(
                 *(fault.sentence for fault in faults),
                 *in_records,
-                *in_unseen,
-                *([OVER_FITTING] if outcome == "part" != attribution.outcome and not (in_unseen or of_setup) else []),
-                *([] if sound or disagreeing else _of_gap(outcome, where, budget, rig, units)),
-                *([] if sound else filter(None, [steady_remainder(corrected, (*records, *validation), settle=settle)])),
-                *(_of_rest(budget, power, tolerance) if sound and attribution.best.effects else ()),
-                *_notes(attribution, budget, seconds, silent, sound),
-                *_fitted_to_unseen(errors, attribution, validation),
-                *(_hiding(errors) if outcome == "explained" else ()),
+                *in_validation,
+                *(
+                    [OVER_FITTING]
+                    if outcome == "part" != attribution.outcome and not (in_validation or of_setup)
+                    else []
+                ),
+                *([] if is_settled or disagreeing else _notes_of_gap(outcome, where, budget, rig, units)),
+                *(
+                    []
+                    if is_settled
+                    else filter(None, [steady_remainder(corrected, (*records, *validation), settle=settle)])
+                ),
+                *(_note_of_residual(budget, power, tolerance) if is_settled and attribution.best.effects else ()),
+                *_notes(attribution, budget, seconds, without_noise, is_settled),
+                *_note_of_record_deviations(errors, attribution, validation),
+                *(_note_of_large_errors(errors) if outcome == "explained" else ()),
             ),
         )
 
 
 def diagnose_case(case: Case, **options: Any) -> Verdict:
-    """`diagnose` of what a case holds, stated in its units.
+    """`diagnose` of a case, stated in its units.
 
     Args:
         case: rig and records.
@@ -241,84 +250,87 @@ def diagnose_case(case: Case, **options: Any) -> Verdict:
 
 
 def _faulty(effects: Sequence[Effect]) -> set[str]:
-    """Sensors at fault, which one force at a point would have to explain too."""
+    """Names of faulty sensors, which are left out of the localisation of a force."""
     return {name for effect in effects if effect.kind.path == "sensor" for name in names_in(effect.target)}
 
 
-def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: float) -> Attribution:
-    """What was found, without effects that act on records held out and take nothing away there.
+def _validated(rig: Rig, found: Attribution, held_out: Sequence[Record], settle: float) -> Attribution:
+    """The attribution without effects that act on held-out records but do not reduce their residual.
 
-    A trifle that is left of a measured gap bends to any law, on the records that were fitted; and what makes
-    the gap of others larger, in a nearest set, corrects nothing. What only errors that no careful model has would
-    do without stays.
+    Any law fits some of the residual of the fitted records. An effect stays if only implausibly large nominal errors
+    would make it unnecessary. Of a set that explains the gap in part, effects that enlarge the residual are dropped.
     """
     effects = found.best.effects
     if found.outcome in ("part", "unknown") and not _unpredictable(found):
-        with_none, kept = _left_of(rig, found.seen, unseen, settle), effects
-        while len(kept) > len(found.seen) and _left_of(rig, kept, unseen, settle) > with_none:
+        with_none, kept = _residual_power(rig, found.seen, held_out, settle), effects
+        while len(kept) > len(found.seen) and _residual_power(rig, kept, held_out, settle) > with_none:
             fewer = [tuple(e for e in kept if e is not one) for one in kept if one not in found.seen]
-            kept = min(fewer, key=lambda rest: _left_of(rig, rest, unseen, settle))
+            kept = min(fewer, key=lambda rest: _residual_power(rig, rest, held_out, settle))
         dropped = [e for e in effects if e not in kept]
-        return _paid_for(rig, found.without(*dropped), unseen, settle) if dropped else found
+        return _validated(rig, found.without(*dropped), held_out, settle) if dropped else found
     named = [e for e in effects if not e.kind.applied_first and e not in found.seen]
     if found.outcome != "explained" or len(named) < 2 or _unpredictable(found):
         return found
-    after = _left_of(rig, effects, unseen, settle)
-    trifle = max(PAID * after, TRIFLE * _left_of(rig, (), unseen, settle))
+    after = _residual_power(rig, effects, held_out, settle)
+    trifle = max(WORTH * after, TRIFLE * _residual_power(rig, (), held_out, settle))
     for effect in named:
         rest = [e for e in effects if e is not effect]
-        if _acts(rig, effects, rest, unseen, settle) < PAID * after:
+        if _power_of_difference(rig, effects, rest, held_out, settle) < WORTH * after:
             continue
-        # beside others that are fitted anew; first as they are, which shows of most effects that they count
-        if _left_of(rig, rest, unseen, settle) < CLEAR * (after + trifle):
+        # most effects count decisively even with the others unchanged; else the others are refitted
+        if _residual_power(rig, rest, held_out, settle) < DECISIVE * (after + trifle):
             without = found.without(effect)
-            if _errors_believed(effects) and not _errors_believed(without.best.effects):
+            if _errors_are_plausible(effects) and not _errors_are_plausible(without.best.effects):
                 continue
-            if _left_of(rig, without.best.effects, unseen, settle) < after + trifle:
-                return _paid_for(rig, without, unseen, settle)
+            if _residual_power(rig, without.best.effects, held_out, settle) < after + trifle:
+                return _validated(rig, without, held_out, settle)
     return found
 
 
-def _errors_believed(effects: Sequence[Effect]) -> bool:
-    """Whether the errors beside effects are those of a careful model: larger ones stand in for what is left out."""
+def _errors_are_plausible(effects: Sequence[Effect]) -> bool:
+    """Whether the nominal errors among effects are plausible: larger ones may have absorbed an effect left out."""
     return not any(too_large(effect) for effect in effects if isinstance(effect.target, NominalPrior))
 
 
-def _left_of(rig: Rig, effects: Sequence[Effect], unseen: Sequence[Record], settle: float) -> float:
-    """Mean square that a rig with effects leaves of records, each sensor by the standard deviation of its readings."""
-    return sum(left_with(rig, effects, record, settle) for record in unseen)
+def _residual_power(rig: Rig, effects: Sequence[Effect], held_out: Sequence[Record], settle: float) -> float:
+    """Mean square residual of a rig with effects, summed over records, each sensor scaled by its standard deviation."""
+    return sum(left_with(rig, effects, record, settle) for record in held_out)
 
 
-def _acts(
-    rig: Rig, effects: Sequence[Effect], others: Sequence[Effect], unseen: Sequence[Record], settle: float
+def _power_of_difference(
+    rig: Rig, effects: Sequence[Effect], others: Sequence[Effect], held_out: Sequence[Record], settle: float
 ) -> float:
-    """Mean square by which the readings of records differ between two sets of effects, in the same measure."""
+    """Mean square difference of the readings between two sets of effects, in the units of `_residual_power`."""
     if not can_be(rig, others):
         return np.inf
     one, other = apply_all(rig, effects), apply_all(rig, others)
-    return sum(power_in(record, predict(one, record) - predict(other, record), settle) for record in unseen)
+    return sum(power_in(record, predict(one, record) - predict(other, record), settle) for record in held_out)
 
 
 def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray, disagreeing: Sequence[str]) -> str:
+    """The outcome, after the test on held-out records."""
     if disagreeing:
         return "unknown"
-    fails = found.outcome == "explained" and _fails_unseen(found, shrinkage, beyond)
+    fails = found.outcome == "explained" and _over_fits(found, shrinkage, beyond)
     return "part" if fails else found.outcome
 
 
-def _is_much(budget: Budget, power: float, tolerance: float) -> bool:
-    """Whether a set leaves too much of a gap unexplained to be called its explanation; power: mean square of the gap.
+def _leaves_unexplained(budget: Budget, power: float, tolerance: float) -> bool:
+    """Whether a set leaves more of the gap unexplained than an explanation may, and more than the tolerance.
 
-    What is below the tolerance is not searched for.
+    Args:
+        budget: of the set.
+        power: mean square of the gap.
+        tolerance: of the signal's rms.
     """
-    least = max(UNEXPLAINED, LEFT * budget.noise)
+    least = max(UNEXPLAINED, LARGEST_LEFT * budget.noise)
     return budget.unexplained > least and budget.unexplained * power > tolerance**2
 
 
-def _leaves_much(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray) -> bool:
-    """Whether errors that no model has, and effects beside them, leave far more than noise of records held out.
+def _leaves_far_more_than_noise(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray) -> bool:
+    """Whether effects with implausibly large nominal errors leave a residual far above the noise of held-out records.
 
-    Such errors bend to whatever is missing, and what they leave is no louder noise.
+    Such errors over-fit whatever is missing, so the residual is not just louder noise.
     """
     errors = next((e for e in found.best.effects if e.kind is NOMINAL_ERRORS), None)
     if found.outcome != "explained" or shrinkage is None or are_small(sizes_of(errors)) or _unpredictable(found):
@@ -327,59 +339,60 @@ def _leaves_much(found: Attribution, shrinkage: Shrinkage | None, beyond: np.nda
     return bool((after > JOINT.credible**2 * floor + beyond).any())
 
 
-def _beyond_models(
-    rig: Rig, found: Attribution, unseen: Sequence[Record], settle: float, accounted: Sequence[Effect]
+def _power_beyond_effects(
+    rig: Rig, found: Attribution, held_out: Sequence[Record], settle: float, accounted: Sequence[Effect]
 ) -> np.ndarray:
-    """Mean square (n_records,) that noise of the logged inputs, and a figure's own value in a record, leave there.
+    """Mean square residual (n_records,) due to input noise and to parameters that vary from record to record.
 
-    No set closes it.
+    No set of effects removes it from held-out records.
     """
-    beyond = np.zeros(len(unseen))
-    if found.logged and unseen:
-        beyond = found.logged**2 * power_of_inputs(rig, unseen, settle)
+    beyond = np.zeros(len(held_out))
+    if found.logged and held_out:
+        beyond = found.logged**2 * power_of_inputs(rig, held_out, settle)
     if any(effect not in found.best.effects for effect in accounted):
         rigs = [apply_all(rig, effects) for effects in (found.best.effects, accounted)]
-        common, own = (np.array([mean_square(r, record, settle) for record in unseen]) for r in rigs)
+        common, own = (np.array([mean_square(r, record, settle) for record in held_out]) for r in rigs)
         beyond = beyond + common - own
     return beyond
 
 
 def _powers(shrinkage: Shrinkage) -> Iterator[np.ndarray]:
-    """Mean squares (n_records,) of the gap before and after, and of the noise that was stated."""
+    """Mean squares (n_records,) of the gap before and after, and of the stated noise."""
     return (np.array([*by_name.values()]) ** 2 for by_name in (shrinkage.before, shrinkage.after, shrinkage.floor))
 
 
 def _disagreeing(
     found: Attribution,
     shrinkage: Shrinkage | None,
-    unseen: Sequence[Record],
+    held_out: Sequence[Record],
     settle: float,
     tolerance: float,
     beyond: np.ndarray,
 ) -> tuple[str, ...]:
-    """Names of the records held out that have a gap, where those that were fitted have none.
+    """Names of the held-out records that have a gap although the fitted records have none.
 
-    It is larger than the tolerance, than chance, and than what errors of the model may leave where these were fitted.
+    The gap must exceed the tolerance, chance, and the residual that fitted nominal errors may leave.
     """
     if found.outcome != "none" or shrinkage is None:
         return ()
     before, after, _ = _powers(shrinkage)
-    noise = beyond + [noise_power(record, found.noise, settle) for record in unseen]
-    chance = [CHANCE * np.sqrt(2.0 / (r.n_outputs * (r.n_samples - lead_of(r, settle)))) for r in unseen]
-    may_leave = (1.0 - BESIDE_ERRORS) ** 2 if found.best.effects else 0.0
+    noise = beyond + [noise_power(record, found.noise, settle) for record in held_out]
+    chance = [CHANCE * np.sqrt(2.0 / (r.n_outputs * (r.n_samples - lead_of(r, settle)))) for r in held_out]
+    tolerated = (1.0 - LEAST_CLOSED_WITH_ERRORS) ** 2 if found.best.effects else 0.0
     least = np.max(
-        [np.full(len(unseen), tolerance**2), (LEFT + np.array(chance)) * noise, may_leave * (before - noise)], axis=0
+        [np.full(len(held_out), tolerance**2), (LARGEST_LEFT + np.array(chance)) * noise, tolerated * (before - noise)],
+        axis=0,
     )
-    return tuple(record.name for record, is_gap in zip(unseen, after - noise > least, strict=True) if is_gap)
+    return tuple(record.name for record, is_gap in zip(held_out, after - noise > least, strict=True) if is_gap)
 
 
-def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float | Floats = 0.0) -> bool:
-    """Whether the set leaves much of a gap that it should close on records that it was not fitted to.
-
-    Enough effects of the wrong kind over-fit the records: they do not predict others.
+def _over_fits(found: Attribution, shrinkage: Shrinkage | None, beyond: float | Floats = 0.0) -> bool:
+    """Whether a set that explains the fitted records leaves much of the gap of held-out records: over-fitting.
 
     Args:
-        beyond: (n_records,) of `_beyond_models`.
+        found: the attribution.
+        shrinkage: of the gap on held-out records.
+        beyond: (n_records,) of `_power_beyond_effects`.
     """
     if shrinkage is None or _unpredictable(found):
         return False
@@ -388,15 +401,18 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float
     left, closable = (np.maximum(power - floor, 0.0).sum() for power in (after, before))
     closed = max(shrinkage.overall, 1.0 - float(np.sqrt(left / max(closable, 1e-300))))
     beside = any(effect.kind is NOMINAL_ERRORS for effect in found.best.effects)
-    return bool((after > (1.0 + LEFT) * floor).any()) and closed < (BESIDE_ERRORS if beside else HELD_OUT)
+    return bool((after > (1.0 + LARGEST_LEFT) * floor).any()) and closed < (
+        LEAST_CLOSED_WITH_ERRORS if beside else LEAST_CLOSED
+    )
 
 
 def _unpredictable(found: Attribution) -> list[str]:
-    """What the effects leave that no model can predict."""
+    """Sentences on the parts of the response that no model can predict."""
     return list(dict.fromkeys(effect.kind.unpredictable for effect in found.best.effects if effect.kind.unpredictable))
 
 
-def _check(rig: Rig, record: Record) -> None:
+def _check_channels(rig: Rig, record: Record) -> None:
+    """Refuse a record whose inputs or outputs are not those of the rig, in its order."""
     for kind, parts, names in (
         ("input", rig.actuators, record.input_names),
         ("output", rig.sensors, record.output_names),
@@ -409,7 +425,7 @@ def _check(rig: Rig, record: Record) -> None:
             )
 
 
-def _next(rig: Rig, found: Attribution, workers: Workers, units: Units) -> Experiment | None:
+def _next_experiment(rig: Rig, found: Attribution, workers: Workers, units: Units) -> Experiment | None:
     """The experiment that would separate the best set from its likeliest alternative."""
     explained = found.outcome == "explained" or any_beyond(found.best.effects)
     for other, probability in found.alternatives:
@@ -418,8 +434,8 @@ def _next(rig: Rig, found: Attribution, workers: Workers, units: Units) -> Exper
     return None
 
 
-def _hiding(errors: Effect | None) -> tuple[str, ...]:
-    """A note where errors of the model are so large that an effect may be among them."""
+def _note_of_large_errors(errors: Effect | None) -> tuple[str, ...]:
+    """A note that nominal errors are so large that they may include an effect."""
     if errors is None or not isinstance(errors.target, NominalPrior):
         return ()
     large = [PLURAL[group] for group in too_large(errors) if group in PLURAL]
@@ -431,8 +447,8 @@ def _hiding(errors: Effect | None) -> tuple[str, ...]:
     )
 
 
-def _of_gap(outcome: str, where: Where, budget: Budget, rig: Rig, units: Units) -> Iterator[str]:
-    """What is said of a gap that is not explained."""
+def _notes_of_gap(outcome: str, where: Where, budget: Budget, rig: Rig, units: Units) -> Iterator[str]:
+    """Notes on a gap that is not explained."""
     if where.share_above > ABOVE:
         last = f"{rig.modes.frequencies_hz[-1]:.4g} {'Hz' if units.time == 's' else f'1/{units.time}'}"
         yield (
@@ -442,48 +458,48 @@ def _of_gap(outcome: str, where: Where, budget: Budget, rig: Rig, units: Units) 
     if where.is_distorted:
         i, j = np.unravel_index(where.distortions.argmax(), where.distortions.shape)
         yield (
-            f"Record {where.record_names[i]!r}: on {('odd', 'even')[j]} lines that the inputs do not have, the gap is"
-            f" {10.0 * np.log10(where.distortions[i, j]):.0f} dB above the noise: something there is nonlinear."
+            f"Record {where.record_names[i]!r}: on {('odd', 'even')[j]} lines that the inputs do not excite, the gap is"
+            f" {10.0 * np.log10(where.distortions[i, j]):.0f} dB above the noise: a nonlinearity is present."
         )
     if outcome == "unknown" and budget.is_open and budget.errors:
-        yield "Most of the gap is unexplained: sizes of errors of the model, fitted beside it, are no findings."
+        yield "Most of the gap is unexplained, so the fitted sizes of the model's errors are not meaningful."
 
 
-def _fitted_to_unseen(errors: Effect | None, found: Attribution, unseen: Sequence[Record]) -> Iterator[str]:
-    """A note that a figure which differs from record to record was fitted to records held out."""
+def _note_of_record_deviations(errors: Effect | None, found: Attribution, held_out: Sequence[Record]) -> Iterator[str]:
+    """A note that the deviation of a parameter that varies from record to record was fitted to held-out records."""
     fitted = set(deviations_of(errors.values)) if errors is not None else set()
-    own = [record.name for record in unseen if record.name in fitted - {r.name for r in found.search.data.records}]
+    own = [record.name for record in held_out if record.name in fitted - {r.name for r in found.search.data.records}]
     if errors is not None and own and deviations_of(errors.values)[own[0]]:
         yield (
             f"The {errors.target.figure} of record{'s' if len(own) > 1 else ''} {joined_in_words(own)} was fitted to"
-            " the record itself for the budget; the share of the gap that closes is without it, as a prediction is."
+            " the record itself for the budget; the share of the gap that closes is computed without it."
         )
 
 
-def _of_rest(budget: Budget, power: float, tolerance: float) -> Iterator[str]:
-    """What is said of more than noise that an explained gap leaves; power: mean square of the gap."""
+def _note_of_residual(budget: Budget, power: float, tolerance: float) -> Iterator[str]:
+    """A note on the residual of an explained gap above the noise; power: mean square of the gap."""
     if budget.leaves_more_than_noise:
         rest, times = np.sqrt(budget.unexplained * power), np.sqrt(budget.unexplained / budget.noise)
         below = rest < tolerance
         why = (
-            f"below the tolerance of {100 * tolerance:g} %, no cause of it was sought"
+            f"below the tolerance of {100 * tolerance:g} %, so its cause was not searched for"
             if below
-            else "something is missed"
+            else "an effect is missing"
         )
-        yield f"Beyond the noise, {100 * rest:.2g} % of the signal is left, {times:.2g} times the noise: {why}."
+        yield f"The residual above the noise is {100 * rest:.2g} % of the signal, {times:.2g} times the noise: {why}."
 
 
 def _notes(
-    found: Attribution, budget: Budget, seconds: float | None, silent: Collection[str], sound: bool
+    found: Attribution, budget: Budget, seconds: float | None, without_noise: Collection[str], is_settled: bool
 ) -> tuple[str, ...]:
-    """What is said beside the sentence; `silent` are the sensors whose noise was not stated."""
-    names = [sensor.name for sensor in found.search.rig.sensors if sensor.name in silent]
-    taken = f"noise_std of {', '.join(names)} is not stated; it was taken from the records."
-    cut = f"The search reached its limit of {seconds} s of processor time with this best set; allow more by `seconds`."
+    """General notes; `without_noise` are the sensors whose noise was not stated."""
+    names = [sensor.name for sensor in found.search.rig.sensors if sensor.name in without_noise]
+    taken = f"noise_std of {', '.join(names)} is not stated; it was estimated from the records."
+    cut = f"The search reached its limit of {seconds} s of processor time; a larger `seconds` lets it continue."
     notes = (
-        *([taken] if silent else []),
+        *([taken] if without_noise else []),
         *([cut] if found.is_cut else []),
-        budget.noise_remark if sound and not silent else "",  # else more than noise is left
+        budget.noise_remark if is_settled and not without_noise else "",  # otherwise the residual is not only noise
         *_unpredictable(found),
     )
     return tuple(note for note in notes if note)

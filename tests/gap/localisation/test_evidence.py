@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.gap.effects.effect import Moved
+from workbench.gap.effects.effect import ForceAndMotion
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.actuators import Actuator
@@ -42,6 +42,6 @@ def test_the_strength_of_a_law_is_told_although_errors_have_taken_its_linear_par
     motion = [swing * np.sin(7.0 * time), 7.0 * swing * np.cos(7.0 * time), -49.0 * swing * np.sin(7.0 * time)]
     law = np.tanh(motion[1] / 0.3)
     force = -2.0 * law + 1.4 * (2.0 * (law @ motion[1]) / (motion[1] @ motion[1])) * motion[1] + 0.3 * motion[0]
-    alone, bent = (Moved(0.4, force, *motion, bent=bent) for bent in (False, True))
+    alone, absorbed = (ForceAndMotion(0.4, force, *motion, absorbed=absorbed) for absorbed in (False, True))
     assert alone.strength_along(law) < 0.0
-    assert bent.strength_along(law) == pytest.approx(2.0, rel=1e-9)
+    assert absorbed.strength_along(law) == pytest.approx(2.0, rel=1e-9)

@@ -9,7 +9,7 @@ import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
-from workbench.gap.prediction.innovations import LOOSE, Observer, _grows
+from workbench.gap.prediction.innovations import LOOSE, Observer, _is_growing
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.gap.search.fit import cost_of
@@ -47,7 +47,7 @@ def test_errors_beside_the_forces_that_are_believed_are_white(hinged_rig, quanti
     outputs += noise[:, None] * rng.normal(size=outputs.shape)
     channels = tuple(Channel(s.name, s.quantity) for s in rig.sensors)
     record = Record(dt, outputs, channels, np.zeros((1, 20_000)), (Channel("F", "force"),))
-    errors = Observer.of(rig, noise, 1.0, dt).errors(rig, record, 1)[:, 1000:]
+    errors = Observer.of(rig, noise, 1.0, dt).innovations(rig, record, 1)[:, 1000:]
     np.testing.assert_allclose(np.cov(errors), np.eye(4), atol=0.05)
     for lag in (1, 2, 5):
         assert np.abs(errors[:, lag:] @ errors[:, :-lag].T / errors.shape[1]).max() < 0.04
@@ -76,7 +76,7 @@ def test_a_motion_grows_where_an_eigenvalue_is_beyond_one(radius):
     for _ in range(20):
         step = rng.standard_normal((12, 12))
         step *= radius / np.abs(np.linalg.eigvals(step)).max()
-        assert _grows(step) is (radius > 1.0)
+        assert _is_growing(step) is (radius > 1.0)
 
 
 @pytest.mark.parametrize("law", [(), (("cubic_spring", {"at": 0.7, "stiffness": 30.0}),)], ids=["linear", "stepped"])

@@ -51,5 +51,5 @@ def test_fewer_values_than_uncertain_numbers_give_way(at_two_rates):
     sensitivity, residual = rng.normal(size=(5, 9)), rng.normal(size=5)
     stacked, target = np.vstack([sensitivity, np.eye(9)]), np.r_[-residual, np.zeros(9)]
     left = stacked @ np.linalg.lstsq(stacked, target)[0] - target
-    data.giving_way(sensitivity).give_way(residual)
+    data.with_nuisance(sensitivity).project_out(residual)
     assert residual @ residual == pytest.approx(left @ left)

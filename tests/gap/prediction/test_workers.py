@@ -161,7 +161,7 @@ def test_a_process_that_is_killed_is_missed(helpers):
             os.kill(os.getpid(), signal.SIGKILL)
         return i
 
-    with pytest.raises(ChildProcessError, match="one worker alone"):
+    with pytest.raises(ChildProcessError, match="try workers=1"):
         TWO.map(killed, range(4))
 
 
@@ -238,7 +238,7 @@ def test_processes_that_stand_by_are_forked_once_and_as_many_as_there_is_work_fo
         time.sleep(0.02)
         return os.getpid(), i + offset
 
-    with Workers(3).standing(late) as share:
+    with Workers(3).pool(late) as share:
         assert share([]) == [] and share([1]) == [(os.getpid(), 1)] and not helpers
         assert [i for _, i in share(range(2))] == [0, 1] and len(helpers) == 1
         offset = 10  # which only this process knows of
@@ -258,7 +258,7 @@ def test_a_failure_of_processes_that_stand_by_is_raised_whoever_fails(number, mo
 
     for forks in (FORKS, False):
         monkeypatch.setattr(module, "FORKS", forks)
-        with Workers(number).standing(fails) as share:
+        with Workers(number).pool(fails) as share:
             assert share(range(5)) == list(range(5))
             with pytest.raises(ValueError, match="no rig 7"):
                 share(range(9))

@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import IdentifiedPrior
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.attribute import _as_it_stands, _settled, beside_identified
+from workbench.gap.search.attribute import _significant, _without_negligible_parameters, with_identified_errors
 from workbench.gap.search.fit import fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.search import Decision, Search, nearest
@@ -54,7 +54,7 @@ def test_a_mass_that_stood_for_an_error_of_the_identified_frequency_is_left_out(
     search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
     alone = fit(nominal, (GAIN, replace(mass, values={"at": "y", "mass": added + 0.01})), data)
     assert alone.effects[1].values["mass"] > 0.008, "without the doubt it stands for the error"
-    found = beside_identified(search, alone, IdentifiedPrior.of_modes(nominal), ())
+    found = with_identified_errors(search, alone, IdentifiedPrior.of_modes(nominal), ())
     assert sorted(e.kind.name for e in found.effects if not e.kind.applied_first) == kinds
 
 
@@ -71,7 +71,7 @@ def test_friction_far_below_its_smoothing_speed_is_a_damper():
     friction = Effect(kind_named("coulomb_friction"), None, {"at": "y", "force": 30.0, "smoothing_speed": 100.0})
     found = with_intervals(nominal, fit(nominal, (friction,), data), data)
     assert found.effects[0].kind is friction.kind and not found.effects[0].stands_out(nominal)
-    (told,) = _as_it_stands(search, found, (), 0.0).effects
+    (told,) = _significant(search, found, (), 0.0).effects
     assert told.kind is damper.kind
     assert told.values["coefficient"] == pytest.approx(0.3, abs=4.0 * told.deviations["coefficient"])
 
@@ -93,7 +93,7 @@ def test_a_joint_of_hardly_any_yield_displacement_is_a_loss_of_stiffness():
     joint = Effect(kind_named("joint_slip"), None, {"at": where, "stiffness": 15.0, "yield_displacement": 1e-7})
     found = with_intervals(nominal, fit(nominal, (joint,), data.stepped(8)), data.stepped(8))
     assert found.effects[0].stands_out(nominal) and not found.effects[0].is_sure(nominal)
-    (told,) = _as_it_stands(search, found, (), 0.0).effects
+    (told,) = _significant(search, found, (), 0.0).effects
     assert told.kind is loss.kind
     assert told.values["stiffness"] == pytest.approx(-15.0, abs=4.0 * told.deviations["stiffness"])
 
@@ -114,7 +114,7 @@ def test_a_speed_that_the_records_do_not_tell_from_none_is_not_stated(speed, sta
     data = FitData((record,), np.array([NOISE]))
     before = data.by_channel(data.residual(nominal))
     search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
-    (told,) = _settled(search, fit(nominal, (friction,), data)).effects
+    (told,) = _without_negligible_parameters(search, fit(nominal, (friction,), data)).effects
     assert ("smoothing_speed" in told.stated(nominal)) == stated
 
 

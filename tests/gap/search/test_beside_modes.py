@@ -77,7 +77,7 @@ def beside_modes_of(rig, records) -> Stepwise:
 def test_a_gain_far_from_the_others_is_an_effect(rig, measured):
     *fitted, _ = measured(gain=0.8)
     beside = beside_modes_of(rig, fitted)
-    assert beside.is_quiet and not beside.is_believed
+    assert beside.is_noise_only and not beside.has_plausible_errors
     assert beside.calibrate()
     (effect,) = beside.last.effects
     assert (effect.kind.name, effect.target) == ("sensor_gain", rig.sensors[1].name)
@@ -99,9 +99,9 @@ def test_of_effects_that_errors_of_modes_close_the_one_with_the_smallest_errors_
     loss = Effect(LOCAL_STIFFNESS_LOSS, None, {"at": AT, "width": 0.2, "loss": 0.3})
     *fitted, _ = measured(nominal=apply_all(rig, [mass]))
     beside = beside_modes_of(rig, fitted)
-    assert beside.is_quiet and not beside.is_believed
+    assert beside.is_noise_only and not beside.has_plausible_errors
     beside.singles = [(loss,), (mass,)]
-    likeliest, _ = beside.alone
+    likeliest, _ = beside.fitted_singles
     assert likeliest.effects[0].kind is POINT_MASS and likeliest.is_plausible
 
 

@@ -14,9 +14,9 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.beside_random import looks_random, random_beside, random_beside_errors
+from workbench.gap.search.beside_random import looks_random, random_with_effects, random_with_nominal_errors
 from workbench.gap.search.fit import Fit
-from workbench.gap.search.jointly import measured
+from workbench.gap.search.jointly import evaluated
 from workbench.gap.search.search import Search
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import AirDrag, CoulombFriction, OneSidedStop
@@ -78,7 +78,7 @@ def test_what_a_right_law_leaves_beside_a_random_force_is_its_linear_answer(rig,
     quiet = simulate(replace(rig, actuators=rig.actuators[:1]), plain.inputs, sample_time=0.01).outputs
     truth = plain.outputs - quiet  # the same wind on the structure without the law
     observer = Observer.of(told, noise, 0.1, 0.01, at=1.3, rms=0.05)
-    left = observer.left(told, weak, 8)
+    left = observer.residual_on_measured_motion(told, weak, 8)
     whole = weak.outputs - simulate(told, weak.inputs, sample_time=0.01).outputs
     error = [np.sqrt(np.mean((r - truth) ** 2) / np.mean(truth**2)) for r in (left, whole)]
     assert error[0] < 0.02 < 0.1 < error[1]
@@ -93,10 +93,10 @@ def test_it_is_found_beside_small_errors_of_the_model(rig, records):
     data = FitData(tuple(made), np.array([s.noise_std for s in rig.sensors]))
     nominal = data.by_channel(data.residual(told))
     search = Search(told, data, data, data, CATALOGUE, lambda text, share: None, ALONE, nominal)
-    step = measured(search, Fit((nominal_errors(told, search.prior),), 0.0, nominal, 0))
+    step = evaluated(search, Fit((nominal_errors(told, search.prior),), 0.0, nominal, 0))
     assert not looks_random(evidence(told, made))
-    assert random_beside_errors(search, step) is None
-    found = random_beside_errors(search, step, surely=False)
+    assert random_with_nominal_errors(search, step) is None
+    found = random_with_nominal_errors(search, step, surely=False)
     wind = found.best.effects[-1]
     assert wind.label == "random_disturbance"
     assert wind.values["at"] == pytest.approx(1.3, abs=3.0 * wind.deviations["at"])
@@ -141,4 +141,4 @@ def test_an_effect_of_a_coarse_sensor_keeps_it(rig, records):
     left = data.by_channel(data.residual(rig))
     search = Search(rig, data, data, data, CATALOGUE, lambda text, share: None, ALONE, left)
     assert coarse not in search.without_clipped().rig.sensors
-    assert random_beside(search, [Fit((swapped,), 1.0, left, 0)]) is None
+    assert random_with_effects(search, [Fit((swapped,), 1.0, left, 0)]) is None

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from workbench.gap.diagnose import _fails_unseen, _hiding, _leaves_much
+from workbench.gap.diagnose import _leaves_far_more_than_noise, _note_of_large_errors, _over_fits
 from workbench.gap.effects.catalogue import kind_named
-from workbench.gap.effects.effect import Effect, apply_all, fewer, merged_sets, simpler_forms
+from workbench.gap.effects.effect import Effect, apply_all, merged_sets, simpler_forms, with_two_as_one
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.prediction.innovations import LOOSE
 from workbench.gap.prediction.random_force import tonal
@@ -113,10 +113,10 @@ def test_a_spring_beside_a_hinge_is_a_hinge_that_resists_turning(rig):
 def test_two_effects_of_one_kind_may_be_one():
     first, second = (Effect(CUBIC, None, {"at": at, "stiffness": 1.0}) for at in (0.5, 0.9))
     other = Effect(SPRING, None, {"at": 1.2, "stiffness": 2.0})
-    sets = list(fewer((first, other, second)))
+    sets = list(with_two_as_one((first, other, second)))
     assert [s[0] for s in sets] == [other] * 3
     assert sorted(s[1].values["at"] for s in sets) == pytest.approx([0.5, 0.7, 0.9])
-    assert not list(fewer((first, other)))
+    assert not list(with_two_as_one((first, other)))
 
 
 def test_friction_and_a_constant_force_are_friction_that_differs_between_the_directions(rig):
@@ -152,15 +152,15 @@ class Found:
 
 
 def test_a_set_must_hold_on_records_it_has_not_seen():
-    def unseen(after, overall):
+    def held_out(after, overall):
         return Shrinkage({"v": 0.5}, {"v": after}, {"v": 0.01}, {"v": overall}, overall, (overall, overall))
 
-    assert _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77))
-    assert not _fails_unseen(Found("cubic_spring"), unseen(0.02, 0.97))
-    assert not _fails_unseen(Found("cubic_spring"), unseen(0.0102, 0.8)), "what is left is noise"
-    assert not _fails_unseen(Found("random_disturbance"), unseen(0.3, 0.1)), "no prediction can hold it"
-    assert not _fails_unseen(Found("cubic_spring"), None)
-    assert not _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77), beyond=0.12**2), "noise of the inputs is"
+    assert _over_fits(Found("cubic_spring"), held_out(0.12, 0.77))
+    assert not _over_fits(Found("cubic_spring"), held_out(0.02, 0.97))
+    assert not _over_fits(Found("cubic_spring"), held_out(0.0102, 0.8)), "what is left is noise"
+    assert not _over_fits(Found("random_disturbance"), held_out(0.3, 0.1)), "no prediction can hold it"
+    assert not _over_fits(Found("cubic_spring"), None)
+    assert not _over_fits(Found("cubic_spring"), held_out(0.12, 0.77), beyond=0.12**2), "noise of the inputs is"
 
 
 @pytest.mark.parametrize(
@@ -180,15 +180,15 @@ def test_errors_that_no_model_has_explain_nothing_where_they_leave_far_more_than
     load = Effect(kind_named("axial_load"), None, {"tension": -1.0})
     found = SimpleNamespace(outcome="explained", best=SimpleNamespace(effects=(load, errors)))
     shrinkage = Shrinkage({"v": 1.7}, {"v": after}, {"v": 0.01}, {"v": 0.82}, 0.82, (0.8, 0.9))
-    assert _leaves_much(found, shrinkage, np.array([beyond])) == much
+    assert _leaves_far_more_than_noise(found, shrinkage, np.array([beyond])) == much
 
 
 def test_a_note_says_which_errors_are_larger_than_those_of_a_careful_test(rig):
     prior = NominalPrior(damping=0.25, gain=0.02)
     small = nominal_errors(rig, prior, {"damping_1": 0.2, "gain_at_d1": 0.01})
     large = replace(small, values={name: 0.43 if "damping" in name else 0.01 for name in small.values})
-    assert _hiding(small) == _hiding(None) == ()
-    (note,) = _hiding(large)
+    assert _note_of_large_errors(small) == _note_of_large_errors(None) == ()
+    (note,) = _note_of_large_errors(large)
     assert "in damping are larger than those of a careful test" in note and "a damper" in note
 
 
@@ -206,8 +206,8 @@ def test_numbers_of_different_sensors_are_moved_at_once_where_each_alters_its_ow
     effects = (*([exchange] if swapped else []), nominal_errors(rig, prior))
     together = _Problem(rig, effects, data)
     alone = _Problem(rig, effects, data)
-    alone._of_sensors_alone = lambda numbers: []
-    assert bool(together._of_sensors_alone(range(20))) != swapped
+    alone._groups_of_sensors = lambda indices: []
+    assert bool(together._groups_of_sensors(range(20))) != swapped
     start = together.residual(together.start)
     one, other = (each.jacobian(each.start, start, False, _of(each)) for each in (together, alone))
     np.testing.assert_allclose(one, other, atol=1e-12 / min(together.steps) * np.abs(start).max())
@@ -222,7 +222,7 @@ def test_slopes_along_believed_numbers_are_kept_and_others_taken_anew(rig, measu
     np.testing.assert_allclose(chord.normal(first), first.T @ first)
     moved = chord.start + 0.01 * (np.arange(chord.start.size) < 2)
     second = chord.jacobian(moved, chord.residual(moved), False, _of(chord))
-    np.testing.assert_array_equal(second[:, chord.believed], first[:, chord.believed])
+    np.testing.assert_array_equal(second[:, chord.with_prior], first[:, chord.with_prior])
     assert np.abs(second[:, :2] - first[:, :2]).max() > 1e-6 * np.abs(first[:, :2]).max()
     np.testing.assert_allclose(chord.normal(second), second.T @ second, rtol=1e-9, atol=1e-6)
 
@@ -239,7 +239,7 @@ def test_a_fit_keeps_the_slopes_along_believed_numbers_of_the_one_before(rig, me
     residual, moves = problem.residual(problem.start), []
     share = _of(problem)
     kept = problem.jacobian(problem.start, residual, False, lambda each: moves.extend(each) or share(each)).copy()
-    assert sorted(j for move in moves for j in move.numbers) == [0, 1]
+    assert sorted(j for move in moves for j in move.indices) == [0, 1]
     fresh = _Problem(rig, effects, data)
     taken = fresh.jacobian(fresh.start, residual, False, _of(fresh))
     np.testing.assert_allclose(kept, taken, atol=1e-4 * np.abs(taken).max())

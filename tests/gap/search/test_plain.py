@@ -16,12 +16,12 @@ from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import fit_jointly, size_of, surely_late, with_all_errors
 from workbench.gap.search.plain import (
     _at_ports,
-    common_as_errors,
-    few_one_by_one,
-    in_place_of_errors,
-    late_effects,
-    may_be_error,
-    other_causes,
+    delay_effects,
+    few_with_uniform_errors,
+    in_place_of_nominal_errors,
+    is_plausible_error,
+    other_delay_causes,
+    uniform_as_nominal_errors,
 )
 from workbench.gap.search.search import Search
 from workbench.rig.actuators import Actuator
@@ -63,8 +63,8 @@ def beside_errors(search, effects=()):
 def test_a_damper_stands_in_place_of_the_damping_of_every_mode(search):
     """Beside stiffness and damping that are a little off, which are told as errors of the model."""
     one = search((DAMPER, MODULUS, DAMPING))
-    found = in_place_of_errors(one, beside_errors(one))
-    damper, errors = common_as_errors(one, found).effects
+    found = in_place_of_nominal_errors(one, beside_errors(one))
+    damper, errors = uniform_as_nominal_errors(one, found).effects
     assert damper.kind is DAMPER.kind and errors.kind is NOMINAL_ERRORS
     assert damper.values["at"] == pytest.approx(1.2, abs=0.02)
     assert damper.values["coefficient"] == pytest.approx(0.06, rel=0.05)
@@ -79,7 +79,7 @@ def test_a_gain_beside_common_errors_is_known_no_better_than_calibrations(search
     """
     gain = Effect(kind_named("actuator_gain"), "F", {"gain": 0.8})
     one = search((gain, MODULUS, DAMPING))
-    found = common_as_errors(one, fit(one.rig, (gain, MODULUS, DAMPING), one.data))
+    found = uniform_as_nominal_errors(one, fit(one.rig, (gain, MODULUS, DAMPING), one.data))
     wide = replace(found, effects=with_all_errors(one, found.effects))
     np.testing.assert_allclose(*(one.data.residual(apply_all(one.rig, f.effects)) for f in (found, wide)), atol=1e-6)
     told = with_intervals(one.rig, wide, one.data).effects[0]
@@ -105,7 +105,7 @@ def test_what_is_common_to_all_modes_of_a_plate_is_an_error_of_each(search):
     rng = np.random.default_rng(0)
     record = simulate(apply_all(rig, effects), np.repeat(rng.normal(size=60), 5)[None], sample_time=1e-3)
     one = replace(search(()), rig=rig, data=FitData((record,), np.full(2, 1e-6)))
-    again = common_as_errors(one, found)
+    again = uniform_as_nominal_errors(one, found)
     assert [effect.kind for effect in again.effects] == [DAMPER.kind, NOMINAL_ERRORS]
     assert size_of(again.effects[-1], "frequency") == pytest.approx(0.5 * np.log(1.008), rel=0.01)
     left = one.data.residual(apply_all(rig, again.effects))
@@ -117,7 +117,7 @@ def test_a_damper_is_found_beside_sensors_that_stand_and_read_a_little_otherwise
     off = {"place_at_d1_at": 0.002, "place_at_d2_at": -0.003, "place_of_F_at": 0.001, "gain_at_d3": 0.01}
     moved = nominal_errors(search(()).rig, NominalPrior(gain=0.01, place=0.002), off)
     one = search((moved, DAMPER))
-    damper, errors = in_place_of_errors(one, beside_errors(one)).effects[-2:]
+    damper, errors = in_place_of_nominal_errors(one, beside_errors(one)).effects[-2:]
     damper, errors = (damper, errors) if damper.kind is DAMPER.kind else (errors, damper)
     assert errors.target.groups == ("gain", "place")
     assert damper.values["at"] == pytest.approx(1.2, abs=0.02)
@@ -141,12 +141,12 @@ def test_a_damper_is_found_beside_sensors_that_stand_and_read_a_little_otherwise
     ],
 )
 def test_what_a_careful_model_may_be_off_by_at_a_port(search, effect, may):
-    assert may_be_error(effect, search(())) == may
+    assert is_plausible_error(effect, search(())) == may
 
 
 def test_stiffness_and_damping_that_are_a_little_off_are_no_effect(search):
     one = search((MODULUS, DAMPING))
-    assert in_place_of_errors(one, beside_errors(one)) is None
+    assert in_place_of_nominal_errors(one, beside_errors(one)) is None
 
 
 def test_strong_effects_are_found_one_by_one_beside_common_errors(search):
@@ -156,7 +156,7 @@ def test_strong_effects_are_found_one_by_one_beside_common_errors(search):
     one = search((strong, halved, MODULUS, DAMPING))
     errors = beside_errors(one)
     assert not errors.is_plausible
-    found = {effect.kind.name: effect for effect in few_one_by_one(one, errors, 4).effects}
+    found = {effect.kind.name: effect for effect in few_with_uniform_errors(one, errors, 4).effects}
     assert found.keys() == {"point_damper", "sensor_gain", "modulus_error", "modal_damping"}
     assert found["point_damper"].at == pytest.approx(1.2, abs=0.01)
     assert found["point_damper"].values["coefficient"] == pytest.approx(0.6, rel=0.01)
@@ -167,7 +167,7 @@ def test_strong_effects_are_found_one_by_one_beside_common_errors(search):
 def test_what_a_careful_model_may_have_at_a_port_is_not_taken_for_one_of_few(search):
     slight = Effect(kind_named("sensor_gain"), "d3", {"gain": 1.03})
     one = replace(search((slight,)), catalogue=(slight.kind,))
-    assert few_one_by_one(one, beside_errors(one), 4) is None
+    assert few_with_uniform_errors(one, beside_errors(one), 4) is None
 
 
 @pytest.mark.slow
@@ -178,13 +178,13 @@ def test_errors_that_are_surely_likelier_stay(search):
     one = replace(search((DAMPER, varied), steps=4000, level=0.01), catalogue=())
     plainly = fit(one.rig, (DAMPER, MODULUS), one.data)
     assert one.explains(plainly) and plainly.cost > 1.012
-    assert in_place_of_errors(one, beside_errors(one, (DAMPER,))) is None
+    assert in_place_of_nominal_errors(one, beside_errors(one, (DAMPER,))) is None
 
 
 @pytest.mark.parametrize("common", [MODULUS, DAMPING])
 def test_one_of_them_alone_is_an_effect(search, common):
     one = search((common,))
-    found = in_place_of_errors(one, beside_errors(one))
+    found = in_place_of_nominal_errors(one, beside_errors(one))
     assert [effect.kind for effect in found.effects] == [common.kind]
     assert found.effects[0].values["factor"] == pytest.approx(common.values["factor"], rel=1e-3)
 
@@ -214,7 +214,7 @@ def test_hidden_effects_that_errors_could_stand_in_for_are_named(seed, kinds, im
 def test_one_sensor_late_alone_is_an_effect(hinged_rig, late, alone):
     prior = NominalPrior(delay=0.3, sample_time=0.01)
     errors = nominal_errors(hinged_rig(n_modes=4), prior, {f"delay_{name}": delay for name, delay in late.items()})
-    found = late_effects(hinged_rig(n_modes=4), errors)
+    found = delay_effects(hinged_rig(n_modes=4), errors)
     assert [effect.target for effect in found] == ([alone] if alone else [])
     assert all(effect.values["delay"] == pytest.approx(0.005) for effect in found)
 
@@ -230,7 +230,7 @@ def test_a_sensor_on_the_late_side_of_jumps_stays_there_by_a_trifle(hinged_rig):
 def test_a_sensor_is_late_where_it_is_surely_so(hinged_rig, deviation, is_late):
     errors = nominal_errors(hinged_rig(n_modes=4), NominalPrior(delay=0.3, sample_time=0.01), {"delay_d2": 0.5})
     errors = replace(errors, deviations={"delay_d2": deviation})
-    assert bool(late_effects(hinged_rig(n_modes=4), errors)) is is_late
+    assert bool(delay_effects(hinged_rig(n_modes=4), errors)) is is_late
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_sensors_that_are_all_late_alike_are_so_for_one_cause(hinged_rig, delays
     prior = NominalPrior(delay=0.3, sample_time=0.01)
     errors = nominal_errors(hinged_rig(n_modes=4), prior, dict(zip(names, delays, strict=True)))
     errors = replace(errors, deviations=dict.fromkeys(names, deviation))
-    found = late_effects(hinged_rig(n_modes=4), errors)
+    found = delay_effects(hinged_rig(n_modes=4), errors)
     causes = [("sensor_lag", "all"), ("actuator_lag", "F"), ("actuator_delay", "F")] if has_one_cause else []
     assert [(effect.kind.name, effect.target) for effect in found] == causes
     assert all(list(effect.values.values()) == pytest.approx([0.002], rel=0.02) for effect in found)
@@ -261,7 +261,7 @@ def test_a_delay_of_all_sensors_is_the_effect_that_it_is(search, kind):
     one = search((late, MODULUS, DAMPING))
     prior = replace(one.prior, interpolated=kind == "sensor_lag")
     step = fit_jointly(one, (), nominal_errors(one.rig, prior))
-    found = in_place_of_errors(one, step)
+    found = in_place_of_nominal_errors(one, step)
     named = [effect for effect in found.effects if effect.kind.name == kind]
     assert len(named) == 1 and named[0].values[SENSORS_LATE[kind]] == pytest.approx(0.003, rel=0.02)
-    assert all(p < 0.01 for _, p in other_causes(one, found))
+    assert all(p < 0.01 for _, p in other_delay_causes(one, found))

@@ -16,7 +16,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.report.budget import RUNAWAY, left_with
 from workbench.gap.search.fit import Fit, fit, slopes
-from workbench.gap.search.pairs import Pairs, _evidence
+from workbench.gap.search.pairs import Pairs, _evidence_with
 from workbench.gap.search.screening import Screening, _starts, fitted_ahead, one_more
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import SELECTION
@@ -61,7 +61,7 @@ def test_a_load_that_only_a_stiffer_beam_bears_ends_no_search(rig, search):
     assert _starts(replace(search, held=(errors,)), (load,), Evidence.of(rig, search.data))
     assert left_with(rig, (load,), search.data.records[0], 0.0) == RUNAWAY
     linear = replace(search, data=search.first.stepped(1), quick=search.first.stepped(1), by_mode=True)
-    assert np.isfinite(Stepwise(linear, 0.0).afresh((load,)).fit.cost)
+    assert np.isfinite(Stepwise(linear, 0.0).fit_from_zero((load,)).fit.cost)
 
 
 def screened(n_starts: int, seed: int) -> Screening:
@@ -74,7 +74,7 @@ def screened(n_starts: int, seed: int) -> Screening:
 
 def test_what_two_effects_come_to_is_least_squares_within_bounds():
     one = screened(12, 3)
-    costs = one._of_pairs()
+    costs = one._pair_costs()
     for i in range(12):
         for j in range(i):
             ends = one.least[[i, j]], one.most[[i, j]]
@@ -113,7 +113,7 @@ def test_errors_ahead_of_a_linear_rig_are_those_of_steps_through_time(rig, recor
     softer = kind_named("modulus_error").apply(rig, None, {"factor": 0.9})
     for other in (softer, GAIN.apply(softer, "d2", {"gain": 1.3})):
         data = FitData((record,), np.full(4, NOISE))
-        ahead = observer.errors_of_linear(other, data.residual(other).reshape(4, -1) * NOISE, DT, 1)
+        ahead = observer.innovations_of_linear(other, data.residual(other).reshape(4, -1) * NOISE, DT, 1)
         stepped = prediction_errors(other, record.inputs, record.outputs, observer.gain, sample_time=DT, substeps=1)
         np.testing.assert_allclose(ahead, observer.whitening @ stepped, atol=1e-6 * np.abs(ahead).max())
 
@@ -141,9 +141,9 @@ def test_a_sensor_that_rounds_coarsely_is_not_heard_beside_a_random_force(search
 def test_a_force_is_sought_beside_no_motion_that_runs_away(rig, search):
     """A spring that pushes away is told by predictions one sample ahead; whole records of it alone are none."""
     softening = Effect(kind_named("cubic_spring"), None, {"at": 0.62, "stiffness": -3e5})
-    assert _evidence(search, softening).rig is rig
+    assert _evidence_with(search, softening).rig is rig
     hardening = replace(softening, values={"at": 0.62, "stiffness": 2000.0})
-    assert _evidence(search, hardening).rig.elements
+    assert _evidence_with(search, hardening).rig.elements
 
 
 @pytest.mark.slow

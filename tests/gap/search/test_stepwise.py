@@ -66,7 +66,7 @@ def test_residual_gives_way_to_errors_as_a_fit_of_them_would(rig, records):
     errors = nominal_errors(rig, NominalPrior(stiffness=0.02, mass=0.02, damping=0.2))
     freed = fit(rig, (errors,), data).effects
     jacobian, residual = sensitivity(rig, freed, data), data.residual(apply_all(rig, freed))
-    projected = data.giving_way(jacobian)
+    projected = data.with_nuisance(jacobian)
     k = jacobian.shape[1]
     stacked = np.linalg.lstsq(np.r_[jacobian, np.eye(k)], np.r_[residual, np.zeros(k)], rcond=None)[0]
     left = residual - jacobian @ stacked
@@ -257,7 +257,7 @@ def test_sensors_are_late_as_the_records_show(rig, measured, interpolated):
     data = FitData((measured(real, "low", 0.3, 0), measured(real, "high", 3.0, 1)), np.full(4, NOISE))
     nominal = data.by_channel(data.residual(rig))
     beside = Stepwise(Search(rig, data, data, data, CATALOGUE, lambda *_: None, ALONE, nominal))
-    found = beside.afresh((spring,))
+    found = beside.fit_from_zero((spring,))
     delays = [found.errors.values[f"delay_{sensor.name}"] for sensor in rig.sensors]
     assert found.errors.target.interpolated is interpolated
     np.testing.assert_allclose(delays, late, atol=0.01)
@@ -275,7 +275,7 @@ def test_a_comparison_that_time_cut_short_names_nothing(rig, measured):
     nominal = data.by_channel(data.residual(rig))
     beside = Stepwise(Search(rig, data, data, data, CATALOGUE, lambda *_: None, ALONE, nominal))
     beside.singles = [(spring,)]
-    assert len(beside.alone) == 1
+    assert len(beside.fitted_singles) == 1
     deadline._end = 0.0
     assert not beside.by_singles() and not beside.last.effects
     deadline._end = np.inf
@@ -291,7 +291,7 @@ def test_one_sensor_is_late_by_straight_lines_too(rig, measured):
     data = FitData((measured(real, "low", 0.3, 0), measured(real, "high", 3.0, 1)), np.full(4, NOISE))
     nominal = data.by_channel(data.residual(rig))
     beside = Stepwise(Search(rig, data, data, data, CATALOGUE, lambda *_: None, ALONE, nominal))
-    found = beside.afresh((replace(late, values={"delay": 1.2 * DT}),))
+    found = beside.fit_from_zero((replace(late, values={"delay": 1.2 * DT}),))
     assert found.errors.target.interpolated
     assert found.effects[0].values["delay"] == pytest.approx(1.4 * DT, rel=1e-3)
     assert beside.explains(found)

@@ -1,6 +1,6 @@
 """The catalogue: every kind of effect that a diagnosis tries.
 
-A kind of your own is one more `Kind`; hand `(*CATALOGUE, mine)` to the diagnosis. For a law f(w, v) at a point:
+A kind of your own is another `Kind`; pass `(*CATALOGUE, mine)` to the diagnosis. For a law f(w, v) at a point:
 
     from workbench.rig.elements import UserLaw
 
@@ -44,9 +44,9 @@ def kind_named(name: str, catalogue: tuple[Kind, ...] = CATALOGUE) -> Kind:
 
 
 def in_words(labels: str, catalogue: Iterable[Kind] = CATALOGUE) -> str:
-    """A set as a sentence names it, "a friction force and a constant force of an actuator (F2)", of its labels.
+    """A set of labels in words, such as "a friction force and a constant force of an actuator (F2)".
 
-    Kinds that the catalogue does not hold are named by their own names.
+    Kinds beyond the catalogue have their own names.
     """
     phrases = {kind.name: kind.words for kind in catalogue}
     words = []

@@ -1,4 +1,4 @@
-"""An effect: a change of rig, with parameters; their bounds and starts are relative to the rig's own scales."""
+"""Effects: parametrised changes of a rig, with bounds and start values relative to the rig's own scales."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,8 +19,8 @@ from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 
 ALL = "all"
-WEAKER, WEAKENINGS = 0.9, 40  # share of the strength of effects that a rig cannot have, and how often it is taken
-COORDINATES = ("at", "x", "y")  # parameters that say where, along an interval or on a rectangle
+WEAKER, WEAKENINGS = 0.9, 40  # factor on the strength of physically impossible effects, and how often it is applied
+COORDINATES = ("at", "x", "y")  # parameters of a place, along an interval or on a rectangle
 
 
 @dataclass(frozen=True)
@@ -78,18 +78,17 @@ def _mass(modes: Modes, structure: object) -> float:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect.
+    """One parameter of an effect.
 
     Attributes:
         name: as in the verdict.
         unit: as written beside it.
         low, high: bounds, in the unit.
-        logarithmic: fitted as its logarithm; with a negative lower bound as asinh(value / scale), which is the
-            logarithm of its size on either side of zero.
+        logarithmic: fitted as its logarithm; with a negative lower bound as asinh(value / scale), the signed logarithm.
         scale: a typical size, which makes the steps of a fit comparable.
-        neutral: the value at which the effect changes nothing; None where no single one does.
-        prior_std: standard deviation of a normal prior on the free coordinate, centred at 0; None for none.
-        sensor: the one whose readings alone it alters, by name; empty where it alters others, or the motion.
+        neutral: the value at which the effect changes nothing; None if there is no such value.
+        prior_std: standard deviation of a normal prior on the free coordinate, centred at 0; None for no prior.
+        sensor: name of the only sensor whose readings it alters; empty if it alters others, or the motion.
     """
 
     name: str
@@ -105,7 +104,7 @@ class Parameter:
     def to_free(self, value: float) -> float:
         """From the unit to the coordinate of the fit."""
         if self.logarithmic:
-            # an effect may start from nothing, whose logarithm is no number
+            # an effect may start from zero, which has no logarithm
             return float(np.arcsinh(value / self.scale) if self.low < 0 else np.log(max(value, self.low)))
         return value / self.scale
 
@@ -129,7 +128,7 @@ class Parameter:
 def positive(
     name: str, unit: str, size: float, low: float = 1e-12, high: float = 1e12, neutral: float | None = None
 ) -> Parameter:
-    """A parameter above zero, fitted as its logarithm, within `low` and `high` times a size that the rig has itself."""
+    """A positive parameter, fitted as its logarithm, between `low` and `high` times a typical size of the rig."""
     return Parameter(name, unit, low * size, high * size, logarithmic=True, neutral=neutral)
 
 
@@ -156,14 +155,14 @@ def place_values(where: Where) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Moved:
-    """The unmodelled force at a point and the motion there, one row per record joined end to end.
+class ForceAndMotion:
+    """The unmodelled force at a point and the motion there, all records end to end.
 
     Attributes:
-        at: on the structure.
+        at: place on the structure.
         force: (n_total,) N.
-        displacement, velocity, acceleration: (n_total,) there, of the real structure as far as the records tell.
-        bent: whether errors of the model may have taken linear parts of the force.
+        displacement, velocity, acceleration: (n_total,) estimates of the real motion there.
+        absorbed: whether nominal errors may have absorbed linear parts of the force.
     """
 
     at: Where
@@ -171,24 +170,24 @@ class Moved:
     displacement: Floats
     velocity: Floats
     acceleration: Floats
-    bent: bool = False
+    absorbed: bool = False
 
     def strength_along(self, basis: Floats) -> float:
-        """The k for which -k basis (n_total,) is nearest to the force, beside any linear force where that is bent."""
+        """Least-squares k of force ≈ -k basis (n_total,), plus any linear force if nominal errors may absorb one."""
         force = self.force
-        if self.bent:
+        if self.absorbed:
             force, basis = (each - self._linear @ (self._linear.T @ each) for each in (force, basis))
         return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
 
     @cached_property
     def _linear(self) -> Floats:
-        """Orthonormal columns (n_total, 3) that span what errors of stiffness, damping and mass do here."""
+        """Orthonormal columns (n_total, 3) that span the forces of stiffness, damping and mass errors here."""
         motion = np.column_stack([self.displacement, self.velocity, self.acceleration])
         return np.asarray(np.linalg.qr(motion)[0])
 
 
 class Measured(Protocol):
-    """The fit records, whole and without the samples at their start that are not counted."""
+    """The fit records, whole (`records`) and without the settling time at their start (`counted`)."""
 
     @property
     def records(self) -> tuple[Record, ...]: ...
@@ -197,9 +196,9 @@ class Measured(Protocol):
 
 
 class Evidence(Protocol):
-    """What a kind of effect may look at to say where a fit starts: rig, records, motion and residuals.
+    """Evidence from which a kind of effect derives start values: rig, records, motion and residuals.
 
-    `workbench.gap.localisation.evidence` computes it all.
+    `workbench.gap.localisation.evidence` computes it.
     """
 
     @property
@@ -213,47 +212,47 @@ class Evidence(Protocol):
     @property
     def domain(self) -> Domain: ...
     @property
-    def at_peaks(self) -> Sequence[Moved]: ...
+    def at_peaks(self) -> Sequence[ForceAndMotion]: ...
     @property
     def places_to_try(self) -> Sequence[Any]: ...
 
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """A kind of effect in the catalogue: all that a diagnosis knows of it, from where to start a fit to how to draw it.
+    """A kind of effect in the catalogue: all that a diagnosis knows of it, from start values to drawings.
 
     Attributes:
         name: as in the vocabulary.
         path: "actuator", "structure", "sensor" or "environment".
-        parameters: rig, target -> the parameters there.
+        parameters: rig, target -> its parameters.
         apply: rig, target, values by name -> the changed rig.
-        starts: evidence, target -> values to start a fit from (dicts by parameter name).
-        targets: rig -> what it can act on: input or output names, "all", an end; (None,) where there is no choice.
-        nonlinear: whether it makes the response depend on level.
-        phrase: how the sentence of the verdict calls it.
-        phrase_between: effect -> how the sentence calls one between two points; None for the same.
-        simpler: effect, rig -> its limiting cases at bounds of its parameters, with values to start a fit from.
-        more_general: effect -> what it is a limiting case of and records can mistake for it, with values to start a
-            fit from.
-        merged: effect, another -> the one effect that both together may be, with values to start a fit from; or None.
-        signed: whether the change is linear in its one number, which may be of either sign; one start is then enough.
-        found_in: "search", where its starts are tried; "readings", where it shows in them as they are; "residual",
-            where only its statistics can be found.
-        exclusive: whether one rules out another of the kind, whatever its target.
-        unpredictable: the part of the response that no model can predict, in a sentence; empty where there is none.
-        force_laws: "displacement" or "velocity" -> values, that motion (n,) -> force (n,), where it is a law of that
-            alone.
-        numbers: effect, rig -> the numbers that a verdict states, by name; None for its values, a place left out.
-        without_negligible: effect -> the same less parameters so near zero that records may not show them; itself where
-            it has none.
-        second_channel, conjunction: of a kind that acts on two inputs or two outputs: what the verdict calls the other,
-            and the word between the two in its sentence.
-        remark: effect, rig -> what the sentence says in brackets; None for its numbers.
-        fixed_place: effect, rig -> its place where no parameter holds it, and what the sentence calls it.
-        applied_first: whether it changes the nominal model itself, before any other effect acts on it.
-        adds_modes: whether it adds modes to the model, before errors of that: these may leave no structure to solve.
-        applied_last: whether it acts on modes as all other effects have made them: where modes keep their damping
-            ratios, a damper there before a mass would be of another strength.
+        starts: evidence, target -> start values of a fit (dicts by parameter name).
+        targets: rig -> its possible targets: names of inputs or outputs, "all", an end; (None,) if there is no choice.
+        nonlinear: whether the response then depends on level.
+        phrase: its name in the sentence of the verdict.
+        phrase_between: effect -> its name between two points; None for the same.
+        simpler: effect, rig -> its limiting cases at bounds of its parameters, with start values.
+        more_general: effect -> effects that it is a limiting case of and that records can mistake for it, with start
+            values.
+        merged: effect, another -> the one effect that both together may be, with start values; or None.
+        signed: whether the change is linear in its one parameter, of either sign, so that one start is enough.
+        found_in: "search" if it is found by fits; "readings" if it shows in the readings themselves; "residual" if
+            only the statistics of the residual show it.
+        exclusive: whether a set may have only one effect of the kind, whatever its target.
+        unpredictable: the part of the response that no model can predict, in a sentence; empty if there is none.
+        force_laws: "displacement" or "velocity" -> values, that motion (n,) -> force (n,), if the force is a function
+            of it alone.
+        numbers: effect, rig -> the parameters that a verdict states, by name; None for all but the place.
+        without_negligible: effect -> the same without parameters so small that records may not show them; itself if it
+            has none.
+        second_channel, conjunction: for a kind that acts on two inputs or two outputs, the verdict's name of the
+            second, and the word between the two in its sentence.
+        remark: effect, rig -> remark of the sentence in brackets; None for its parameters.
+        fixed_place: effect, rig -> its place, if it is no parameter, and its name in the sentence.
+        applied_first: whether it changes the nominal model itself, before all other effects.
+        adds_modes: whether it adds modes to the model, before nominal errors, which may leave no structure to solve.
+        applied_last: whether it acts on the modes with all other effects: if modes keep their damping ratios, a damper
+            added before a mass would change in strength.
     """
 
     name: str
@@ -292,6 +291,7 @@ class Kind:
 
     @property
     def words(self) -> str:
+        """Its name in a sentence."""
         return self.phrase or self.name.replace("_", " ")
 
 
@@ -309,7 +309,7 @@ Kind.__init__ = former_arguments(  # type: ignore[method-assign]
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """An effect with its numbers.
+    """An effect with values of its parameters.
 
     Attributes:
         kind: of the catalogue.
@@ -324,63 +324,65 @@ class Effect:
     deviations: dict[str, float] = field(default_factory=dict)
 
     def apply(self, rig: Rig) -> Rig:
-        """The rig with the effect in it."""
+        """The rig with the effect."""
         return self.kind.apply(rig, self.target, self.values)
 
     def parameters(self, rig: Rig) -> tuple[Parameter, ...]:
+        """Its parameters on a rig."""
         return self.kind.parameters(rig, self.target)
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """Its values, the place left out."""
+        """Its values without the place."""
         return {name: value for name, value in self.values.items() if name not in COORDINATES}
 
     def stands_out(self, rig: Rig) -> bool:
-        """Whether any number is farther from where it changes nothing than its standard deviation.
+        """Whether any parameter differs from its neutral value by more than its standard deviation.
 
-        True of an effect without such numbers, and of errors of the nominal model.
+        True for an effect without neutral values, and for nominal errors.
         """
         tested = [p for p in self.parameters(rig) if p.neutral is not None and self.deviations.get(p.name, 0.0) > 0]
         off = any(abs(self.values[p.name] - p.neutral) > self.deviations[p.name] for p in tested)
         return off or not tested or self.kind.applied_first
 
     def is_sure(self, rig: Rig) -> bool:
-        """Whether every number that a verdict states, but its place, is farther from nothing than its deviation."""
+        """Whether every stated parameter but the place differs from neutral by more than its standard deviation."""
         nothing = {p.name: p.neutral or 0.0 for p in self.parameters(rig) if p.name not in COORDINATES}
         stated = [(name, value) for name, value in self.stated(rig).items() if name in nothing]
         return all(not abs(value - nothing[name]) < self.deviations.get(name, 0.0) for name, value in stated)
 
     def stated(self, rig: Rig) -> dict[str, Any]:
-        """The numbers that a verdict states, by name."""
+        """The parameters that a verdict states, by name."""
         return self.numbers if self.kind.numbers is None else self.kind.numbers(self, rig)
 
     @property
     def at(self) -> Any:
-        """Where it stands: x, (x, y), the name of a point, or `Between` two; None where it has no place."""
+        """Its place: x, (x, y), the name of a point, or `Between` two; None if it has none."""
         return place_of(self.values)
 
     def moved_to(self, where: Where) -> "Effect":
-        """The same effect elsewhere."""
+        """The same effect at another place."""
         return replace(self, values={**self.values, **place_values(where)})
 
     @property
     def words(self) -> str:
-        """How a sentence calls it."""
+        """Its name in a sentence."""
         between = self.kind.phrase_between
         return between(self) if between is not None and isinstance(self.at, Between) else self.kind.words
 
     @property
     def label(self) -> str:
+        """Name of the kind with its target."""
         names = ", ".join(self.target) if type(self.target) is tuple else self.target
         return f"{self.kind.name}[{names}]" if isinstance(names, str | int) else self.kind.name
 
 
 def names_in(target: Any) -> tuple[str, ...]:
-    """Inputs, outputs or the end that the target of an effect names; empty where it names none."""
+    """Names of the inputs, outputs or the end that an effect acts on; empty if there are none."""
     return tuple(name for name in (target if isinstance(target, tuple) else (target,)) if isinstance(name, str))
 
 
-# of kinds whose name in words is not their identifier with spaces for underscores
+# Names in words that differ from the identifier with spaces for underscores.
 SPELLINGS = (
     ("bouc wen", "Bouc-Wen"),
     ("coulomb", "Coulomb"),
@@ -390,7 +392,7 @@ SPELLINGS = (
 
 
 def label_in_words(label: str) -> str:
-    """A label as a figure or a note shows it: actuator gain (F2), Bouc-Wen."""
+    """A label as shown in figures and notes: actuator gain (F2), Bouc-Wen."""
     words = label.replace("[", " (").replace("]", ")").replace("_", " ")
     for plain, spelt in SPELLINGS:
         words = words.replace(plain, spelt)
@@ -398,19 +400,19 @@ def label_in_words(label: str) -> str:
 
 
 def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
-    """What distinguishes a set of effects from another, but for numbers and order."""
+    """Identity of a set of effects, whatever their parameters and order."""
     return tuple(sorted(effect.label for effect in effects))
 
 
 def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
-    """The rig with every effect in it, in order: modes left out, errors of the nominal model, all others, dampers."""
+    """The rig with all effects, applied in this order: added modes, nominal errors, others, dampers."""
     for effect in sorted(effects, key=lambda e: (e.kind.applied_last, not e.kind.adds_modes, not e.kind.applied_first)):
         rig = effect.apply(rig)
     return rig
 
 
 def can_be(rig: Rig, effects: Iterable[Effect]) -> bool:
-    """Whether a rig can have these effects: one that buckles, or a stretch that leaves the structure, cannot be."""
+    """Whether a rig with these effects is physically possible: no buckling, no stretch beyond the structure."""
     try:
         apply_all(rig, effects)
     except (ValueError, np.linalg.LinAlgError):
@@ -419,9 +421,9 @@ def can_be(rig: Rig, effects: Iterable[Effect]) -> bool:
 
 
 def nearest_possible(rig: Rig, effects: Sequence[Effect], beside: Sequence[Effect] = ()) -> tuple[Effect, ...]:
-    """The effects, weaker until a rig can have them beside others: what a stiffer beam bears may buckle this one.
+    """The effects, weakened until a rig with them and others (`beside`) is possible; unchanged if none is.
 
-    As they are where no weaker ones can be either.
+    A load that a stiffer beam bears may buckle this one.
     """
     for share in WEAKER ** np.arange(WEAKENINGS):
         weaker = tuple(_weakened(effect, rig, float(share)) for effect in effects)
@@ -431,19 +433,19 @@ def nearest_possible(rig: Rig, effects: Sequence[Effect], beside: Sequence[Effec
 
 
 def _weakened(effect: Effect, rig: Rig, share: float) -> Effect:
-    """The effect with a share of what its numbers are off from where they change nothing."""
+    """The effect with its parameters at a share of their distance from neutral."""
     numbers = {p.name: p.neutral for p in effect.parameters(rig) if p.neutral is not None}
     moved = {name: none + share * (effect.values[name] - none) for name, none in numbers.items()}
     return replace(effect, values={**effect.values, **moved})
 
 
 def simpler_forms(effect: Effect, rig: Rig) -> tuple[Effect, ...]:
-    """Effects that this one turns into at a bound of its parameters, with values to start a fit from."""
+    """Limiting cases of an effect at bounds of its parameters, with start values."""
     return tuple(effect.kind.simpler(effect, rig))
 
 
-def fewer(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
-    """The set with two effects of one kind made one, with values to start a fit from: two springs may stand for one."""
+def with_two_as_one(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
+    """The sets with two effects of one kind replaced by one, with start values: two springs may approximate one."""
     for one, other in combinations(effects, 2):
         if one.kind is other.kind and one.target == other.target and one.at is not None:
             rest = [effect for effect in effects if effect is not one and effect is not other]
@@ -456,27 +458,27 @@ def fewer(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
 
 
 def with_one_simpler(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
-    """The set with one of its effects as what it turns into at a bound."""
+    """The sets with one effect replaced by a limiting case."""
     for i, effect in enumerate(effects):
         for simpler in simpler_forms(effect, rig):
             yield (*effects[:i], simpler, *effects[i + 1 :])
 
 
 def each_left_out(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
-    """The set without each of its effects in turn."""
+    """The sets with one effect left out, each in turn."""
     for effect in effects:
         yield tuple(other for other in effects if other is not effect)
 
 
 def more_general_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
-    """The sets with one effect as what it is a limiting case of."""
+    """The sets with one effect replaced by one that it is a limiting case of."""
     for i, effect in enumerate(effects):
         for more_general in effect.kind.more_general(effect):
             yield (*effects[:i], more_general, *effects[i + 1 :])
 
 
 def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
-    """The sets with two effects of different kinds as the one that both together may be."""
+    """The sets with two effects of different kinds replaced by the one that both together may be."""
     for one, other in permutations(effects, 2):
         merged = one.kind.merged(one, other)
         if merged is not None:
@@ -484,13 +486,13 @@ def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
 
 
 def simpler_sets(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
-    """The sets that this one comes to at a bound of one effect, or with two as one."""
-    yield from fewer(effects)
+    """The limiting cases of a set: two effects of one kind as one, or one effect as its limiting case."""
+    yield from with_two_as_one(effects)
     yield from with_one_simpler(effects, rig)
 
 
 def contained(effects: Sequence[Effect], rig: Rig) -> set[tuple[str, ...]]:
-    """The keys of all sets that this one comes to at bounds of its parameters."""
+    """The keys of all limiting cases of a set, and of their limiting cases."""
     found: set[tuple[str, ...]] = set()
     for simpler in simpler_sets(effects, rig):
         if key_of(simpler) not in found:

@@ -1,4 +1,4 @@
-"""Effects of the surroundings: forces that nobody commanded."""
+"""Effects of the environment: periodic and random disturbance forces."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -24,13 +24,13 @@ from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between
 
-SAME_LINE = 0.15  # of the resolution 1/T: so near is the strongest sinusoid to one that is there
-SLOW = 0.05  # of the first elastic frequency: a disturbance below may be constant
-ONE_LEVEL = 1.1  # ratio of the largest rms of an input to the least, at which records are of one level
+SAME_LINE = 0.15  # of the resolution 1/T: a sinusoid as close as this to a harmonic is that harmonic
+SLOW = 0.05  # of the first elastic frequency: a disturbance below it may be a constant force
+ONE_LEVEL = 1.1  # ratio of the largest rms of an input to the least: below, records are of one level
 
 
 def tone(force: np.ndarray, sample_time: float) -> tuple[float, float, float]:
-    """Frequency (Hz), amplitude and phase of the strongest sinusoid in a series, from its first sample on."""
+    """Frequency (Hz), amplitude and phase (at the first sample, rad) of the strongest sinusoid in a series."""
     n = force.size
     centred = force - force.mean()
     spectrum = np.abs(np.fft.rfft(centred * np.hanning(n), 8 * n))
@@ -43,9 +43,9 @@ def tone(force: np.ndarray, sample_time: float) -> tuple[float, float, float]:
 
 
 def _is_distortion(frequency: float, records: Sequence[Record]) -> bool:
-    """Whether a sinusoid is a harmonic of excitation that repeats at one level: any law of the motion makes those.
+    """Whether a sinusoid is a harmonic of a periodic excitation of one level, which any nonlinear law may cause.
 
-    At several levels a disturbance stays as it is, and a law does not.
+    With several levels, a fit distinguishes a disturbance, which does not depend on level.
     """
     rms = np.array([np.sqrt((record.inputs**2).mean()) for record in records])
     period, *others = {period_of(record.inputs) for record in records}
@@ -67,7 +67,7 @@ def _periodic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
         mean = np.mean([place.force[a : a + shortest] for a in ends[:-1]], axis=0)
         frequency, amplitude, phase = tone(mean, sample_time)
         lead = records[0].start_time - evidence.data.records[0].start_time
-        if lead:  # a phase counts from the start of the record
+        if lead:  # the phase refers to the start of the record
             turned = 2.0 * np.pi * frequency * lead
             phase = float(np.angle(np.exp(1j * (phase - turned))))
         if not _is_distortion(frequency, evidence.data.records):
@@ -75,7 +75,7 @@ def _periodic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
 
 
 def _constant(tone: Effect, rig: Rig) -> Iterator[Effect]:
-    """A disturbance so slow that it hardly turns within a record, as a constant force of an actuator."""
+    """The constant force of an actuator that a very slow disturbance is within a record."""
     elastic = rig.modes.frequencies_hz[rig.modes.omega > 0]
     if elastic.size and tone.values["frequency"] < SLOW * elastic[0]:
         force = float(tone.values["amplitude"] * np.sin(tone.values["phase"]))
@@ -104,7 +104,7 @@ RANDOM_DISTURBANCE = Kind(
     path="environment",
     parameters=lambda rig, _: (*place_parameters(rig), positive("rms", "N", Scales.of(rig).force, 1e-15, 1e9)),
     apply=lambda rig, _, v: with_element(rig, RandomForce(place_of(v), v["rms"])),
-    starts=lambda *_: [],  # found by what it does to the statistics
+    starts=lambda *_: [],  # found from the statistics of the residual
     found_in="residual",
     unpredictable="A random disturbance leaves an unpredictable residual; only its statistics were estimated.",
     phrase="a random disturbance",

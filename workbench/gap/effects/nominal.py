@@ -1,4 +1,4 @@
-"""Errors of the nominal model: small ones, with normal priors, beside every effect; figures that differ by record."""
+"""Nominal errors: small errors of the nominal model with normal priors; parameters that vary from record to record."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -29,41 +29,42 @@ from workbench.structure.member import Beam, Structure
 from workbench.structure.modes import Modes, PointShapes, Shapes
 from workbench.structure.profile import Profile
 
-STIFFNESS, TENSION = "stiffness", "axial load"  # the first stands for all that warmth does to a modulus too
-FEW = 9  # cosines that may be as large as one another; of more, those beyond SMOOTH half waves fall off by the square,
-SMOOTH = 3  # as those of any function do that has a slope at its ends
+STIFFNESS, TENSION = "stiffness", "axial load"  # the first includes the effect of temperature on a modulus
+EQUAL_WAVES = 9  # cosines up to which all have the same prior; with more, it falls with the square of the wave number
+HALF_WAVES = 3  # beyond so many half waves, as the series of any function with a slope at its ends does
 PROFILE_UNIT, RATIO_UNIT, DELAY_UNIT = 0.01, 0.1, 0.1  # of free coordinates: relative, of a logarithm, of a sample
 PLACE_UNIT = 0.001  # likewise, of the extent
-MOST_AHEAD = 0.9  # of a sample: the timing of a sensor is off by no more
-JUST_LATE = 1e-3  # of a sample: later, an accelerometer reads what was before a jump
-SURE = 1e-9  # of the largest variance of errors, each in units of its own: less is no doubt
-LITTLE, STRONG = 0.25, 25.0  # radians by which a coupling of one turns two modes: less is none, more is no small error
-WIDEST = 8.0  # prior deviations: bounds, far outside of what a nominal model can be off by
-PROFILE_LEAST = 0.02  # what errors of a profile are believed to be before any record
+LARGEST_DELAY = 0.9  # of a sample: bound of a sensor's delay or lead
+JUST_LATE = 1e-3  # of a sample: an accelerometer that is later reads the value before a jump
+NEGLIGIBLE = 1e-9  # of the largest variance of identified errors, normalised: directions below it are left out
+SMALLEST_ANGLE = 0.25  # radians by which a unit coupling rotates two modes: couplings below it are left out
+LARGEST_ANGLE = 25.0  # likewise: bound for close modes
+BOUND = 8.0  # prior standard deviations: bounds of an error
+PROFILE_STD = 0.02  # prior standard deviation of errors of a profile before any record
 
 
 @dataclass(frozen=True)
 class NominalPrior:
-    """Prior standard deviations of what may be a little off in a nominal model; 0 for what is exact.
+    """Prior standard deviations of the errors of a nominal model, by group; 0 for no error.
 
     Attributes:
-        stiffness, mass: relative, of each cosine along a structure whose profiles are known; of the modal mass else.
-        frequency: relative, of each natural frequency by itself.
-        coupling: of each two modes by an uneven stiffness, over the root of the product of their own; of a rigid mode
-            and an elastic one by an uneven mass, over the modal mass.
+        stiffness, mass: relative, of each cosine along a structure of known profiles; otherwise of the modal mass.
+        frequency: relative, of each natural frequency.
+        coupling: of each two modes by non-uniform stiffness, over the geometric mean of their modal stiffnesses; of a
+            rigid and an elastic mode by non-uniform mass, over the modal mass.
         damping: of the logarithm of each damping ratio.
         delay: of each sensor, in samples.
-        gain: relative, of each actuator and each sensor, as far as they were calibrated.
-        place: of each actuator and each sensor, in each coordinate, as a share of the structure's extent.
+        gain: relative, of each actuator and each sensor.
+        place: of each actuator and each sensor, in each coordinate, over the structure's extent.
         shape: of each mode at each actuator and each sensor, over the rms of that mode at all of them.
-        record: of a figure that differs from record to record, about a common value; see `record_to_record`.
+        record: of a parameter that varies from record to record, about its mean; see `record_to_record`.
         sample_time: s.
-        late, early: names of the sensors whose delay is positive, or at most zero: where inputs are held, acceleration
-            jumps at each sample, and no small step leads from one side to the other.
-        interpolated: whether sensors are late by straight lines between their samples: then nothing jumps.
-        waves: cosines of a smooth variation along the structure, the constant among them.
-        records, figure: names of the records between which a figure differs, and which.
-        by_mode: whether modes are off one by one.
+        late, early: names of the sensors whose delay is positive, or at most zero: with held inputs, acceleration jumps
+            at each sample, and no small step leads from one side to the other.
+        interpolated: whether delays are linear interpolations between samples, which have no jumps.
+        waves: number of cosines of a smooth variation along the structure, the constant included.
+        records, figure: names of the records between which a parameter varies, and its name.
+        by_mode: whether errors are those of each mode.
     """
 
     stiffness: float = 0.0
@@ -92,7 +93,7 @@ class NominalPrior:
 
 
 GROUPS = ("stiffness", "mass", "frequency", "coupling", "damping", "delay", "gain", "place", "shape", "record")
-OUTSIDE = ("delay", "gain", "place", "shape", "record")  # groups that leave the modes as they are
+OUTSIDE = ("delay", "gain", "place", "shape", "record")  # groups that do not change the modes
 
 
 @lru_cache(maxsize=4096)
@@ -102,10 +103,10 @@ def group_of(parameter: str) -> str:
 
 
 def weight_of(parameter: str, prior: NominalPrior) -> float:
-    """Prior standard deviation of a parameter over that of its group."""
-    if prior.waves <= FEW or group_of(parameter) not in ("stiffness", "mass"):
+    """Ratio of the prior standard deviation of a parameter to that of its group."""
+    if prior.waves <= EQUAL_WAVES or group_of(parameter) not in ("stiffness", "mass"):
         return 1.0
-    return min(1.0, (SMOOTH / max(int(parameter.split("_")[1]), 1)) ** 2)
+    return min(1.0, (HALF_WAVES / max(int(parameter.split("_")[1]), 1)) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +114,7 @@ class IdentifiedPrior:
     """Errors of a nominal rig that was itself identified: e = R z, z normal of unit covariance, R Rᵀ that of e.
 
     Attributes:
-        make: errors (n_parameters,) of what was identified -> the rig that has them.
+        make: errors (n_parameters,) of the identified parameters -> the rig with them.
         root: (n_parameters, n_free) R.
     """
 
@@ -122,15 +123,15 @@ class IdentifiedPrior:
 
     @classmethod
     def of(cls, make: Callable[[Floats], Rig], covariance: Floats) -> "IdentifiedPrior":
-        """Of parameters with that covariance (n_parameters, n_parameters), without directions that are all but sure."""
+        """The prior of a covariance (n_parameters, n_parameters), without directions of negligible variance."""
         scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         sizes, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
-        kept = sizes > SURE * sizes.max()
+        kept = sizes > NEGLIGIBLE * sizes.max()
         return cls(make, scale[:, None] * directions[:, kept] * np.sqrt(sizes[kept]))
 
     @classmethod
     def of_modes(cls, rig: Rig) -> "IdentifiedPrior | None":
-        """Of frequencies, damping and shapes of identified modes; None where their covariance is not known."""
+        """The prior of frequencies, damping and shapes of identified modes; None if their covariance is not known."""
         modes, n = rig.modes, rig.modes.n_modes
         if modes.covariance is None or not isinstance(modes.domain, NamedPoints):
             return None
@@ -147,60 +148,68 @@ class IdentifiedPrior:
 
 
 def _parameters(rig: Rig, prior: NominalPrior | IdentifiedPrior) -> tuple[Parameter, ...]:
+    """The parameters of the nominal errors of a rig."""
     if isinstance(prior, IdentifiedPrior):
         free = range(1, prior.root.shape[1] + 1)
-        return tuple(Parameter(f"identified_{k}", "", -WIDEST, WIDEST, prior_std=1.0) for k in free)
-    return tuple(_each(rig, prior))
+        return tuple(Parameter(f"identified_{k}", "", -BOUND, BOUND, prior_std=1.0) for k in free)
+    return tuple(_each_parameter(rig, prior))
 
 
-def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
+def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
+    """The parameters of the nominal errors, group by group."""
     along = isinstance(rig.structure, Structure)
 
-    def believed(
+    def with_prior(
         name: str, std: float, unit: float, low: float = -np.inf, high: float = np.inf, sensor: str = ""
     ) -> Parameter:
-        # a size that is learnt to be smaller than before leaves errors of a profile where they are
-        least = PROFILE_LEAST if along and group_of(name) in ("stiffness", "mass") else unit
-        reach, unit = WIDEST * max(std, least), unit * weight_of(name, prior)
+        # bounds do not shrink with an estimated prior, so that errors of a profile keep their values
+        least = PROFILE_STD if along and group_of(name) in ("stiffness", "mass") else unit
+        reach, unit = BOUND * max(std, least), unit * weight_of(name, prior)
         prior_std = max(std * weight_of(name, prior) / unit, 1e-6)
         return Parameter(name, "", max(low, -reach), min(high, reach), scale=unit, prior_std=prior_std, sensor=sensor)
 
     waves = prior.waves if along else 1
     if prior.stiffness and along:
-        yield from (believed(f"stiffness_{k}", prior.stiffness, PROFILE_UNIT) for k in range(waves))
+        yield from (with_prior(f"stiffness_{k}", prior.stiffness, PROFILE_UNIT) for k in range(waves))
     if prior.mass:
-        yield from (believed(f"mass_{k}", prior.mass, PROFILE_UNIT) for k in range(waves))
+        yield from (with_prior(f"mass_{k}", prior.mass, PROFILE_UNIT) for k in range(waves))
     modes = range(1, rig.modes.n_modes + 1)
     if prior.frequency:
         elastic = (r for r in modes if rig.modes.omega[r - 1] > 0)
-        yield from (believed(f"frequency_{r}", prior.frequency, PROFILE_UNIT) for r in elastic)
+        yield from (with_prior(f"frequency_{r}", prior.frequency, PROFILE_UNIT) for r in elastic)
     if prior.coupling:
-        yield from (believed(name, prior.coupling, PROFILE_UNIT) for name, *_ in _couplings(rig.modes.omega.tobytes()))
+        yield from (
+            with_prior(name, prior.coupling, PROFILE_UNIT) for name, *_ in _couplings(rig.modes.omega.tobytes())
+        )
     if prior.damping:
-        yield from (believed(f"damping_{r}", prior.damping, RATIO_UNIT) for r in modes)
+        yield from (with_prior(f"damping_{r}", prior.damping, RATIO_UNIT) for r in modes)
     if prior.delay:
         for sensor in rig.sensors:
-            low = JUST_LATE if sensor.name in prior.late else -MOST_AHEAD
-            high = 0.0 if sensor.name in prior.early else MOST_AHEAD
-            yield believed(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
+            low = JUST_LATE if sensor.name in prior.late else -LARGEST_DELAY
+            high = 0.0 if sensor.name in prior.early else LARGEST_DELAY
+            yield with_prior(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
     if prior.gain:
-        yield from (believed(_gain(actuator), prior.gain, PROFILE_UNIT) for actuator in rig.actuators)
-        yield from (believed(_gain(sensor), prior.gain, PROFILE_UNIT, sensor=sensor.name) for sensor in rig.sensors)
+        yield from (with_prior(_gain_name(actuator), prior.gain, PROFILE_UNIT) for actuator in rig.actuators)
+        yield from (
+            with_prior(_gain_name(sensor), prior.gain, PROFILE_UNIT, sensor=sensor.name) for sensor in rig.sensors
+        )
     ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
     if prior.place:
         for port in ports:
             own = port.name if isinstance(port, Sensor) else ""
-            for name, low, high in zip(_places(rig, port), *_room(rig, port), strict=True):
-                yield believed(name, prior.place, PLACE_UNIT, float(low), float(high), own)
+            for name, low, high in zip(_place_names(rig, port), *_place_bounds(rig, port), strict=True):
+                yield with_prior(name, prior.place, PLACE_UNIT, float(low), float(high), own)
     if prior.shape:
         for port in ports:
             own = port.name if isinstance(port, Sensor) else ""
-            yield from (believed(n, prior.shape, PROFILE_UNIT, sensor=own) for n in _shapes(port, rig.modes.n_modes))
+            yield from (
+                with_prior(n, prior.shape, PROFILE_UNIT, sensor=own) for n in _shape_names(port, rig.modes.n_modes)
+            )
     if prior.record:
-        yield from (believed(f"record_{name}", prior.record, PROFILE_UNIT) for name in prior.records)
+        yield from (with_prior(f"record_{name}", prior.record, PROFILE_UNIT) for name in prior.records)
 
 
-def _varied(profile: Profile, amplitudes: np.ndarray, length: float) -> Profile:
+def _with_variation(profile: Profile, amplitudes: np.ndarray, length: float) -> Profile:
     """The profile times exp(Σ a_k cos(k π x / L))."""
     if not amplitudes.any():
         return profile
@@ -210,13 +219,14 @@ def _varied(profile: Profile, amplitudes: np.ndarray, length: float) -> Profile:
     )
 
 
-def _numbered(values: dict[str, float], group: str) -> np.ndarray:
+def _values_of(values: dict[str, float], group: str) -> np.ndarray:
+    """The errors of a group, in their order."""
     return np.array([value for name, value in values.items() if group_of(name) == group])
 
 
-def _off_profiles(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
-    """The rig with the errors of its profiles, or of its modal mass."""
-    stiffness, mass = _numbered(values, "stiffness"), _numbered(values, "mass")
+def _with_profile_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
+    """The rig with errors of its profiles, or of its modal mass."""
+    stiffness, mass = _values_of(values, "stiffness"), _values_of(values, "mass")
     structure, modes = rig.structure, rig.modes
     if not isinstance(structure, Structure):
         if not mass.any():
@@ -224,7 +234,7 @@ def _off_profiles(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Ri
         return replace(rig, modes=replace(modes, shapes=_scaled(modes.shapes, float(np.exp(-0.5 * mass[0])))))
     profiles = {stiffness_name(structure): stiffness, "mass_per_length": mass}
     changed: dict[str, Any] = {
-        name: _varied(getattr(structure, name), amplitudes, structure.length)
+        name: _with_variation(getattr(structure, name), amplitudes, structure.length)
         for name, amplitudes in profiles.items()
         if amplitudes.any()
     }
@@ -234,19 +244,19 @@ def _off_profiles(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Ri
     return replace(rig, structure=structure, modes=structure.modes(modes.n_modes, tolerance=RESOLUTION))
 
 
-_with_profiles = solved_once(_off_profiles)
+_profiles_solved = solved_once(_with_profile_errors)
 
 
-def _off_structure(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
-    """The rig with the errors in its structure and modes; only those of the profiles ask for new modes."""
+def _with_structural_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
+    """The rig with errors of its structure and modes; only those of profiles require new modes."""
     along = {name: value for name, value in values.items() if group_of(name) in ("stiffness", "mass")}
     if not isinstance(rig.structure, Structure):
-        rig = replace(rig, structure=None)  # what follows must change these modes, not solve others anew
-    rig = _with_profiles(rig, prior, along)
+        rig = replace(rig, structure=None)  # later effects must change these modes, not solve the structure again
+    rig = _profiles_solved(rig, prior, along)
     if prior.coupling:
-        rig = replace(rig, modes=_turned(rig.modes, values))
+        rig = replace(rig, modes=_with_couplings(rig.modes, values))
     structure, modes = rig.structure, rig.modes
-    frequency, damping = (_by_mode(values, group, modes.n_modes) for group in ("frequency", "damping"))
+    frequency, damping = (_values_by_mode(values, group, modes.n_modes) for group in ("frequency", "damping"))
     if not (frequency.any() or damping.any()):
         return rig
     stretch, more = np.exp(frequency), np.exp(damping)
@@ -261,26 +271,26 @@ def _off_structure(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> R
 
 @lru_cache(maxsize=64)
 def _couplings(frequencies: bytes) -> tuple[tuple[str, int, int, float], ...]:
-    """Name of each two modes' coupling, both modes, and the angle by which a coupling of one turns them, rad.
+    """Name of the coupling of each two modes, their indices, and the angle by which a unit coupling rotates them, rad.
 
-    To first order φ_r gains k_rs / (ω_r² - ω_s²) φ_s and φ_s loses as much of φ_r, with k_rs = e ω_r ω_s. A rigid mode
-    no stiffness couples, and mass errors leave it one: with m_rs = -e an elastic φ_s gains e φ_r, and φ_r nothing.
+    To first order φ_r gains k_rs / (ω_r² - ω_s²) φ_s and φ_s loses as much of φ_r, with k_rs = e ω_r ω_s. Stiffness
+    does not couple a rigid mode, and mass errors leave it rigid: with m_rs = -e an elastic φ_s gains e φ_r.
     """
     omega = np.frombuffer(frequencies)
     found = []
     for r, s in combinations(range(omega.size), 2):
         apart = abs(omega[s] ** 2 - omega[r] ** 2)
         if omega[r] > 0:
-            angle = omega[r] * omega[s] / max(apart, omega[r] * omega[s] / STRONG)
+            angle = omega[r] * omega[s] / max(apart, omega[r] * omega[s] / LARGEST_ANGLE)
         else:
             angle = 1.0 if omega[s] > 0 else 0.0
-        if angle > LITTLE:
+        if angle > SMALLEST_ANGLE:
             found.append((f"coupling_{r + 1}_{s + 1}", r, s, float(angle)))
     return tuple(found)
 
 
-def _turned(modes: Modes, values: dict[str, float]) -> Modes:
-    """The modes turned into one another by the errors of their coupling; mass-normalised still."""
+def _with_couplings(modes: Modes, values: dict[str, float]) -> Modes:
+    """The modes rotated by the errors of their coupling, still mass-normalised."""
     angles = np.zeros((modes.n_modes, modes.n_modes))
     for name, r, s, angle in _couplings(modes.omega.tobytes()):
         angles[r, s] = angle * values.get(name, 0.0)
@@ -291,42 +301,53 @@ def _turned(modes: Modes, values: dict[str, float]) -> Modes:
 
 
 def _scaled(shapes: Shapes, factor: float) -> Shapes:
+    """Mode shapes times a factor."""
     return lambda located, derivative: factor * shapes(located, derivative)
 
 
-_solved = solved_once(_off_structure)
+_structure_solved = solved_once(_with_structural_errors)
 
 
-def _off(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, float]) -> Rig:
-    """The rig with the errors in its structure, modes and sensors, and between records."""
+def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, float]) -> Rig:
+    """The rig with all nominal errors: of its structure, modes, ports and between records."""
     if isinstance(prior, IdentifiedPrior):
         made = prior.make(prior.root @ np.array(list(values.values())))
         modes, kept = made.modes, rig.modes.n_modes
-        if modes.n_modes < kept and made.structure is not None:  # modes left out of the nominal rig are there
+        if modes.n_modes < kept and made.structure is not None:  # an effect has added modes to the rig
             modes = modes_of(made.structure, kept)
         return replace(rig, modes=modes, structure=made.structure, actuators=made.actuators)
-    rig = _solved(rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE})
+    rig = _structure_solved(
+        rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE}
+    )
     rig = differing(rig, prior.figure, deviations_of(values))
     ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
     units = _shape_units(rig.modes, ports) if prior.shape else np.zeros((len(ports), 0))
-    off = [_off_port(rig, port, unit, prior, values) for port, unit in zip(ports, units, strict=True)]
+    off = [_port_with_errors(rig, port, unit, prior, values) for port, unit in zip(ports, units, strict=True)]
     if all(one is other for one, other in zip(ports, off, strict=True)):
         return rig
     n = len(rig.actuators)
     return replace(rig, actuators=tuple(off[:n]), sensors=tuple(off[n:]))
 
 
-def _off_port(rig: Rig, port: Any, units: Floats, prior: NominalPrior, values: dict[str, float]) -> Any:
-    """An actuator or a sensor with the errors of its place, its calibration, its mode shapes (n_modes,), its timing."""
+def _port_with_errors(rig: Rig, port: Any, units: Floats, prior: NominalPrior, values: dict[str, float]) -> Any:
+    """An actuator or a sensor with errors of its place, gain, mode shapes and timing.
+
+    Args:
+        rig: with the modes.
+        port: actuator or sensor.
+        units: (n_modes,) units of the shape errors.
+        prior: of the errors.
+        values: of the errors, by name.
+    """
     changes: dict[str, Any] = {}
     if prior.place:
-        errors = tuple([values.get(name, 0.0) for name in _places(rig, port)])  # shares of the extent
+        errors = tuple([values.get(name, 0.0) for name in _place_names(rig, port)])  # shares of the extent
         if any(errors):
-            changes["at"] = _moved(rig.modes.domain, port.at, errors)
-    if gain := values.get(_gain(port), 0.0):
+            changes["at"] = _shifted(rig.modes.domain, port.at, errors)
+    if gain := values.get(_gain_name(port), 0.0):
         changes["gain"] = port.gain * float(np.exp(gain))
     if units.size:
-        own = [values.get(name, 0.0) for name in _shapes(port, units.size)]
+        own = [values.get(name, 0.0) for name in _shape_names(port, units.size)]
         changes["shape_error"] = tuple((units * own).tolist())
     if delay := values.get(f"delay_{port.name}", 0.0) if isinstance(port, Sensor) else 0.0:
         changes["delay"] = port.delay + delay * prior.sample_time
@@ -336,8 +357,8 @@ def _off_port(rig: Rig, port: Any, units: Floats, prior: NominalPrior, values: d
 
 
 @lru_cache(maxsize=4096)
-def _moved(domain: Any, where: Any, errors: tuple[float, ...]) -> Any:
-    """A place that is off by shares of the extent, on the structure still: exchanged outputs stand elsewhere."""
+def _shifted(domain: Any, where: Any, errors: tuple[float, ...]) -> Any:
+    """A place shifted by shares of the extent, within the structure, since exchanged outputs have other bounds."""
     at = np.atleast_1d(np.asarray(middle(where), float)) + np.array(errors) * domain.size
     at = np.clip(at, *reach(domain, where))
     return centred_at(where, tuple(at.tolist()) if at.size > 1 else float(at[0]))
@@ -345,12 +366,12 @@ def _moved(domain: Any, where: Any, errors: tuple[float, ...]) -> Any:
 
 @lru_cache(maxsize=4096)
 def _changed(port: Any, changes: tuple[tuple[str, Any], ...]) -> Any:
-    """The port with some of its attributes changed; a slope along one error leaves the other ports as they were."""
+    """The port with some attributes changed; cached, as a sensitivity changes one error at a time."""
     return replace(port, **dict(changes))
 
 
-def _room(rig: Rig, port: Actuator | Sensor) -> Floats:
-    """What a port can be off its place by at most, down and up: (2, n_coordinates), shares of the extent."""
+def _place_bounds(rig: Rig, port: Actuator | Sensor) -> Floats:
+    """Lower and upper bounds (2, n_coordinates) of the error of a port's place, as shares of the extent."""
     domain = rig.modes.domain
     assert not isinstance(domain, NamedPoints)
     room: Floats = (np.array(reach(domain, port.at)) - np.asarray(middle(port.at), float)) / domain.size
@@ -359,21 +380,21 @@ def _room(rig: Rig, port: Actuator | Sensor) -> Floats:
 
 @lru_cache(maxsize=64)
 def _shape_units(modes: Modes, ports: tuple[Actuator | Sensor, ...]) -> Floats:
-    """Rms of each mode, its displacement or its slope, at all ports of that kind: (n_ports, n_modes).
+    """Rms of each mode's displacement or slope over all ports of the same kind: (n_ports, n_modes).
 
-    Remembered: not to be written to.
+    Cached: not to be written to.
     """
     shapes, kinds = np.array([shape_of(modes, port) for port in ports]), [derivative_of(port) for port in ports]
     rms = {kind: np.sqrt((shapes[np.array(kinds) == kind] ** 2).mean(axis=0)) for kind in set(kinds)}
     return np.array([rms[kind] for kind in kinds])
 
 
-def _gain(port: Actuator | Sensor) -> str:
-    """Name of the error of its gain: an actuator and a sensor may have one name."""
+def _gain_name(port: Actuator | Sensor) -> str:
+    """Name of the gain error of a port; an actuator and a sensor may have the same name."""
     return f"gain_{_side(port)}_{port.name}"
 
 
-def _places(rig: Rig, port: Actuator | Sensor) -> list[str]:
+def _place_names(rig: Rig, port: Actuator | Sensor) -> list[str]:
     """Names of the errors of its place, one a coordinate; none at named points."""
     domain = rig.modes.domain
     coordinates = () if isinstance(domain, NamedPoints) else domain.coordinates
@@ -381,17 +402,18 @@ def _places(rig: Rig, port: Actuator | Sensor) -> list[str]:
 
 
 @lru_cache(maxsize=1024)
-def _shapes(port: Actuator | Sensor, n_modes: int) -> tuple[str, ...]:
-    """Names of the errors of the mode shapes there."""
+def _shape_names(port: Actuator | Sensor, n_modes: int) -> tuple[str, ...]:
+    """Names of the errors of the mode shapes at a port."""
     return tuple(f"shape_{_side(port)}_{port.name}_{r}" for r in range(1, n_modes + 1))
 
 
 def _side(port: Actuator | Sensor) -> str:
+    """Part of the name of a port's errors: of an actuator, or at a sensor."""
     return "of" if isinstance(port, Actuator) else "at"
 
 
 def parted(errors: Effect) -> tuple[Effect, Effect | None]:
-    """Errors of the nominal model in every record alike, and what differs from record to record; None for nothing."""
+    """The nominal errors common to all records, and those that vary from record to record (None if there are none)."""
     prior = errors.target
     if not isinstance(prior, NominalPrior) or not prior.record:
         return errors, None
@@ -405,20 +427,22 @@ def parted(errors: Effect) -> tuple[Effect, Effect | None]:
 
 
 def deviations_of(values: Mapping[str, float]) -> dict[str, float]:
-    """By name of record, what a figure deviates by in it."""
+    """Deviation of the varying parameter in each record, by name."""
     return {name.split("_", 1)[1]: value for name, value in values.items() if group_of(name) == "record"}
 
 
-def _by_mode(values: dict[str, float], group: str, n_modes: int) -> Floats:
+def _values_by_mode(values: dict[str, float], group: str, n_modes: int) -> Floats:
     """The errors of a group (n_modes,), zero for modes that have none."""
     return np.array([values.get(f"{group}_{r}", 0.0) for r in range(1, n_modes + 1)])
 
 
 def nominal_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, start: Mapping[str, float] | None = None) -> Effect:
-    """Errors of the nominal model, to be fitted beside effects.
+    """Nominal errors as an effect, to be fitted jointly with others.
 
     Args:
-        start: errors to start from; all others are zero.
+        rig: nominal.
+        prior: of the errors.
+        start: start values by name; all others are zero.
     """
     start = {} if start is None else start
     values = {p.name: float(np.clip(start.get(p.name, 0.0), p.low, p.high)) for p in _parameters(rig, prior)}
@@ -429,7 +453,7 @@ NOMINAL_ERRORS = Kind(
     name="nominal_errors",
     path="structure",
     parameters=_parameters,
-    apply=_off,
+    apply=_with_errors,
     starts=lambda evidence, _: [],
     phrase="small errors of the nominal model",
     applied_first=True,
@@ -438,11 +462,11 @@ NOMINAL_ERRORS = Kind(
 
 @dataclass(frozen=True)
 class OfOneRecord:
-    """What a figure is in one record, as a change of rig.
+    """The change of a rig by a parameter that varies from record to record, in one record.
 
     Attributes:
-        kind: of the catalogue, with no target and one number.
-        name, value: of that number.
+        kind: of the catalogue, with no target and one parameter.
+        name, value: of that parameter.
     """
 
     kind: Kind
@@ -454,18 +478,19 @@ class OfOneRecord:
 
 
 def figures_of(rig: Rig) -> tuple[str, ...]:
-    """Figures of a rig that may differ from record to record."""
+    """Names of the parameters of a rig that may vary from record to record."""
     if not rig.modes.omega.any():
         return ()
     return (STIFFNESS, TENSION) if isinstance(rig.structure, Beam) else (STIFFNESS,)
 
 
 def differing(rig: Rig, figure: str, deviations: Mapping[str, float]) -> Rig:
-    """The rig with a figure that differs from record to record.
+    """The rig with a parameter that varies from record to record.
 
     Args:
-        figure: of `figures_of`.
-        deviations: by name of record: of all stiffness, relative; of the axial load, over that which buckles the beam.
+        rig: nominal.
+        figure: the parameter, of `figures_of`.
+        deviations: by name of record: relative for the stiffness, over the buckling load for the axial load.
     """
 
     def change(deviation: float) -> OfOneRecord:
@@ -478,5 +503,5 @@ def differing(rig: Rig, figure: str, deviations: Mapping[str, float]) -> Rig:
 
 
 def label_of(figure: str) -> str:
-    """What a budget calls a figure that differs from record to record."""
+    """Label in the budget of a parameter that varies from record to record."""
     return f"{figure.replace(' ', '_')}_record_to_record"

@@ -1,4 +1,4 @@
-"""Effects of the structure that depend on level: contacts, friction, hysteresis, large motion, air."""
+"""Nonlinear effects of the structure: contact, friction, hysteresis, large motion, air drag."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -39,7 +39,7 @@ from workbench.rig.stepping import hysteresis
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.member import Structure
 
-AT_ONCE = 0.1  # of a smoothing speed that the records do not tell from none: friction that turns at once
+NEGLIGIBLE_SPEED = 0.1  # factor on a smoothing speed that the records cannot distinguish from zero
 
 
 def with_element(rig: Rig, element: Element) -> Rig:
@@ -152,7 +152,7 @@ def _contact_starts(two_sided: bool) -> Callable[[Evidence, object], Iterator[di
     def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
         for place in evidence.at_peaks:
             reach = np.abs(place.displacement) if two_sided else place.displacement
-            if not (reach > 0).any():  # it stays on the other side, as under a constant force
+            if not (reach > 0).any():  # the motion stays on the other side, as under a constant force
                 continue
             levels = np.quantile(reach[reach > 0], (0.3, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
             for gap in levels:
@@ -165,7 +165,7 @@ def _contact_starts(two_sided: bool) -> Callable[[Evidence, object], Iterator[di
     return starts
 
 
-def _spring_alone(effect: Effect, _: Rig) -> tuple[Effect, ...]:
+def _without_gap(effect: Effect, _: Rig) -> tuple[Effect, ...]:
     return (Effect(GROUND_SPRING, None, {**place_values(effect.at), "stiffness": effect.values["stiffness"]}),)
 
 
@@ -176,7 +176,7 @@ CLEARANCE = Kind(
     apply=lambda rig, _, v: with_element(rig, Clearance(place_of(v), v["stiffness"], v["gap"])),
     starts=_contact_starts(True),
     nonlinear=True,
-    simpler=_spring_alone,  # of no gap
+    simpler=_without_gap,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * np.sign(w) * np.maximum(np.abs(w) - v["gap"], 0.0)},
     phrase="a clearance closed on both sides by springs",
 )
@@ -206,49 +206,49 @@ def _friction_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
                 yield {**place_values(place.at), "force": 2 * force, "smoothing_speed": share * speed}
 
 
-def _viscous(friction: Effect, _: Rig) -> tuple[Effect, ...]:
-    """Far below its smoothing speed friction is a viscous damper."""
+def _as_damper(friction: Effect, _: Rig) -> tuple[Effect, ...]:
+    """The viscous damper that friction is far below its smoothing speed."""
     coefficient = friction.values["force"] / friction.values["smoothing_speed"]
     return (Effect(POINT_DAMPER, None, {**place_values(friction.at), "coefficient": coefficient}),)
 
 
-def _is_sudden(friction: Effect) -> bool:
-    """Whether its smoothing speed is too small for the records to tell it from none.
+def _has_negligible_speed(friction: Effect) -> bool:
+    """Whether the smoothing speed of friction is too small for the records to distinguish it from zero.
 
-    Where it is too large for them they tell the force as little, for it is a damper then.
+    If it is too large for them instead, the force is as uncertain, since friction is then a damper.
     """
     unsure = {name for name, deviation in friction.deviations.items() if deviation > friction.values[name]}
     return "smoothing_speed" in unsure and not any(name.startswith("force") for name in unsure)
 
 
-def _without_sudden(friction: Effect, _: Rig) -> dict[str, float]:
-    """Its numbers, without a smoothing speed that the records do not tell from none."""
+def _stated_numbers(friction: Effect, _: Rig) -> dict[str, float]:
+    """The parameters of friction, without a smoothing speed that cannot be distinguished from zero."""
     numbers = friction.numbers
-    return {name: v for name, v in numbers.items() if name != "smoothing_speed" or not _is_sudden(friction)}
+    return {name: v for name, v in numbers.items() if name != "smoothing_speed" or not _has_negligible_speed(friction)}
 
 
-def _sudden(friction: Effect) -> Effect:
-    """Friction that turns at once, whose smoothing speed is as unsure as it was large."""
+def _with_negligible_speed(friction: Effect) -> Effect:
+    """Friction with a much smaller smoothing speed, whose standard deviation is at least the former value."""
     speed = friction.values["smoothing_speed"]
     unsure = max(friction.deviations.get("smoothing_speed", 0.0), speed)
     return replace(
         friction,
-        values={**friction.values, "smoothing_speed": AT_ONCE * speed},
+        values={**friction.values, "smoothing_speed": NEGLIGIBLE_SPEED * speed},
         deviations={**friction.deviations, "smoothing_speed": unsure},
     )
 
 
-def _either_way(friction: Effect) -> tuple[Effect, ...]:
+def _direction_dependent(friction: Effect) -> tuple[Effect, ...]:
     force = friction.values["force"]
     numbers = {**friction.values, "force_forward": force, "force_backward": force}
     return (Effect(TWO_WAY_FRICTION, None, {n: v for n, v in numbers.items() if n != "force"}),)
 
 
-def _with_a_constant_force(friction: Effect, other: Effect) -> Effect | None:
-    """Friction and a constant force in one: what a drive's own offset reads like where the friction acts."""
+def _merged_with_bias(friction: Effect, other: Effect) -> Effect | None:
+    """Friction and a constant force as direction-dependent friction, which an offset of a drive looks like."""
     if other.kind is not ACTUATOR_BIAS:
         return None
-    (both,), force, offset = _either_way(friction), friction.values["force"], other.values["force"]
+    (both,), force, offset = _direction_dependent(friction), friction.values["force"], other.values["force"]
     if abs(offset) >= force:
         return None
     return replace(both, values={**both.values, "force_forward": force - offset, "force_backward": force + offset})
@@ -265,12 +265,12 @@ COULOMB_FRICTION = Kind(
     apply=lambda rig, _, v: with_element(rig, CoulombFriction(place_of(v), v["force"], v["smoothing_speed"])),
     starts=_friction_starts,
     nonlinear=True,
-    more_general=_either_way,
-    merged=_with_a_constant_force,
-    simpler=_viscous,
+    more_general=_direction_dependent,
+    merged=_merged_with_bias,
+    simpler=_as_damper,
     force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
-    numbers=_without_sudden,
-    without_negligible=_sudden,
+    numbers=_stated_numbers,
+    without_negligible=_with_negligible_speed,
     phrase="a friction force",
 )
 
@@ -279,7 +279,7 @@ COULOMB_FRICTION = Kind(
 
 
 def _bouc_wen_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    # between named points the likeliest places are not neighbours of the right one: it may come third
+    # with named points, the likeliest places need not be close to the right one, which may come third
     most = None if isinstance(evidence.rig.modes.domain, NamedPoints) else 2
     for place in evidence.at_peaks[:most]:
         size = float(np.sqrt(np.mean(place.displacement**2)))
@@ -290,8 +290,8 @@ def _bouc_wen_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
                 yield {**place_values(place.at), "stiffness": 2 * k, "yield_displacement": share * size}
 
 
-def _sliding(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
-    """One that always slides is friction: z is then as far as it goes, and turns round over about twice that path."""
+def _as_friction(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
+    """The friction that a hysteretic spring is if it always slides: z reverses over about twice its largest value."""
     v = spring.values
     speed = v["yield_displacement"] / Scales.of(rig).time
     numbers = {"force": v["stiffness"] * v["yield_displacement"], "smoothing_speed": speed}
@@ -309,7 +309,7 @@ BOUC_WEN = Kind(
     apply=lambda rig, _, v: with_element(rig, BoucWen(place_of(v), v["stiffness"], v["yield_displacement"])),
     starts=_bouc_wen_starts,
     nonlinear=True,
-    simpler=lambda spring, rig: (*_spring_alone(spring, rig), *_sliding(spring, rig)),
+    simpler=lambda spring, rig: (*_without_gap(spring, rig), *_as_friction(spring, rig)),
     phrase="a hysteretic spring",
 )
 
@@ -325,16 +325,16 @@ def _slip_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
                 yield {**place_values(place.at), "stiffness": part * k, "yield_displacement": share * size}
 
 
-def _slipping(rig: Rig, _: object, v: dict[str, Any]) -> Rig:
-    """The rig with + k (w - z), what the joint no longer holds: nothing while it sticks, all of k w once it slips."""
+def _with_slip(rig: Rig, _: object, v: dict[str, Any]) -> Rig:
+    """The rig with the stiffness force k (w - z) taken from a joint: zero while it sticks, k w when it slips."""
     where, stiffness = place_of(v), v["stiffness"]
     return with_element(
         with_element(rig, LinearSpring(where, -stiffness)), BoucWen(where, stiffness, v["yield_displacement"])
     )
 
 
-def _always_slipping(joint: Effect, _: Rig) -> tuple[Effect, ...]:
-    """One that holds nothing before it slips is a loss of stiffness."""
+def _as_stiffness_loss(joint: Effect, _: Rig) -> tuple[Effect, ...]:
+    """The loss of stiffness that a joint is if it always slips."""
     return (Effect(GROUND_SPRING, None, {**place_values(joint.at), "stiffness": -joint.values["stiffness"]}),)
 
 
@@ -342,11 +342,11 @@ JOINT_SLIP = Kind(
     name="joint_slip",
     path="structure",
     parameters=BOUC_WEN.parameters,
-    apply=_slipping,
+    apply=_with_slip,
     starts=_slip_starts,
     targets=lambda rig: (None,) if isinstance(rig.modes.domain, NamedPoints) and any(rig.modes.domain.pairs()) else (),
     nonlinear=True,
-    simpler=_always_slipping,
+    simpler=_as_stiffness_loss,
     phrase="a joint that slips",
 )
 
@@ -364,26 +364,26 @@ def _two_way_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
                 yield {**place_values(place.at), **both, "smoothing_speed": share * speed}
 
 
-def _sliding_both_ways(v: Mapping[str, Any]) -> tuple[float, float]:
-    """Friction force and offset."""
+def _force_and_offset(v: Mapping[str, Any]) -> tuple[float, float]:
+    """Mean friction force of both directions, and half their difference, N."""
     return 0.5 * (v["force_forward"] + v["force_backward"]), 0.5 * (v["force_forward"] - v["force_backward"])
 
 
-def _same_both_ways(friction: Effect, _: Rig) -> tuple[Effect, ...]:
+def _as_coulomb_friction(friction: Effect, _: Rig) -> tuple[Effect, ...]:
     numbers = {
-        "force": _sliding_both_ways(friction.values)[0],
+        "force": _force_and_offset(friction.values)[0],
         "smoothing_speed": friction.values["smoothing_speed"],
     }
     return (Effect(COULOMB_FRICTION, None, {**place_values(friction.at), **numbers}),)
 
 
 def _two_way_element(v: Mapping[str, Any]) -> CoulombFriction:
-    force, offset = _sliding_both_ways(v)
+    force, offset = _force_and_offset(v)
     return CoulombFriction(place_of(v), force, v["smoothing_speed"], offset)
 
 
 def _two_way_law(v: Mapping[str, Any], u: Floats) -> Floats:
-    force, offset = _sliding_both_ways(v)
+    force, offset = _force_and_offset(v)
     return -force * np.tanh(u / float(v["smoothing_speed"])) - offset
 
 
@@ -399,10 +399,10 @@ TWO_WAY_FRICTION = Kind(
     apply=lambda rig, _, v: with_element(rig, _two_way_element(v)),
     starts=_two_way_starts,
     nonlinear=True,
-    simpler=_same_both_ways,
+    simpler=_as_coulomb_friction,
     force_laws={"velocity": _two_way_law},
-    numbers=_without_sudden,
-    without_negligible=_sudden,
+    numbers=_stated_numbers,
+    without_negligible=_with_negligible_speed,
     phrase="a friction force that differs between the two directions",
 )
 
@@ -447,11 +447,11 @@ KINDS = (
 )
 
 
-EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # to start from
-SAME_POWER = 0.05  # nearer to that of a kind of the catalogue, an exponent differs by small errors, not by another law
+EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # start values
+SAME_POWER = 0.05  # an exponent as close as this to that of a kind of the catalogue is the same within small errors
 
 
-def _of_power(v: Mapping[str, Any], motion: Floats) -> Floats:
+def _power_force(v: Mapping[str, Any], motion: Floats) -> Floats:
     """-F |w / w_r|^p."""
     force, rms, exponent = float(v["force_at_rms"]), float(v["rms"]), float(v["exponent"])
     return -force * np.abs(motion / rms) ** exponent
@@ -479,7 +479,7 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
         starts=starts,
         nonlinear=True,
         phrase=words,
-        force_laws={motion: lambda v, u: (1.0 if even else np.sign(u)) * _of_power(v, u)},
+        force_laws={motion: lambda v, u: (1.0 if even else np.sign(u)) * _power_force(v, u)},
     )
 
 
@@ -488,7 +488,7 @@ EVEN_SPRING = _power_law(EvenSpring, "even_spring", "displacement", "an even pow
 POWER_DAMPER = _power_law(PowerDamper, "power_damper", "velocity", "a power-law damper")
 BEYOND = (POWER_SPRING, EVEN_SPRING, POWER_DAMPER)
 
-OF_POWER = {
+POWERS = {
     (POWER_SPRING, 1): (GROUND_SPRING, "stiffness"),
     (POWER_SPRING, 3): (CUBIC_SPRING, "stiffness"),
     (POWER_DAMPER, 1): (POINT_DAMPER, "coefficient"),
@@ -497,15 +497,15 @@ OF_POWER = {
 
 
 def in_catalogue(law: Effect) -> Effect | None:
-    """The effect of the catalogue that a law is, by its power; None where it is none of them."""
+    """The effect of the catalogue that has the exponent of a power law; None if there is none."""
     v = law.values
     power = round(v["exponent"])
-    if (law.kind, power) not in OF_POWER or abs(v["exponent"] - power) > SAME_POWER:
+    if (law.kind, power) not in POWERS or abs(v["exponent"] - power) > SAME_POWER:
         return None
-    kind, number = OF_POWER[law.kind, power]
+    kind, number = POWERS[law.kind, power]
     return Effect(kind, None, {**place_values(law.at), number: v["force_at_rms"] / v["rms"] ** power})
 
 
 def any_beyond(effects: Iterable[Effect]) -> bool:
-    """Whether one of the effects is a law that the catalogue does not hold."""
+    """Whether one of the effects is a law beyond the catalogue."""
     return any(effect.kind in BEYOND for effect in effects)

@@ -1,4 +1,4 @@
-"""Effects of the structure that leave it linear: its stiffness, mass, supports, damping, and what hangs on it."""
+"""Linear effects of the structure: stiffness, mass, supports, damping and attachments."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
@@ -10,8 +10,8 @@ import numpy as np
 from workbench.gap.effects.effect import (
     Effect,
     Evidence,
+    ForceAndMotion,
     Kind,
-    Moved,
     Parameter,
     Scales,
     place_of,
@@ -29,11 +29,11 @@ from workbench.structure.plate import Membrane, Plate
 from workbench.structure.profile import Field
 from workbench.structure.supports import HELD, Attachment, End, PointDamper, PointMass, PointSpring
 
-RESOLUTION, ROUGHLY = 1e-6, 1e-4  # of a frequency; of the highest of many
-MANY = 60  # modes of a plate in closed form, for each that is asked for
-SOLVED, BESIDES = 3, 20  # of others: solved to a tolerance, and further ones that come with them
-EDGE = 1e-9  # of the length
-BESIDE = 0.1  # of the length: farther out a spring does not turn the hinge, it holds the beam
+RESOLUTION, ROUGHLY = 1e-6, 1e-4  # relative tolerance of a frequency; of the highest of many
+MODES_CLOSED_FORM = 60  # modes of a plate in closed form, for each that is needed
+MODES_SOLVED, EXTRA_MODES = 3, 20  # of other plates: modes solved to a tolerance, and further ones without it
+EDGE = 1e-9  # of the length: tolerance at the ends
+NEAR_HINGE = 0.1  # of the length: a spring closer to a hinge acts as a rotational spring
 
 
 def resolved(rig: Rig, structure: Structure | Plate | Membrane) -> Rig:
@@ -42,30 +42,32 @@ def resolved(rig: Rig, structure: Structure | Plate | Membrane) -> Rig:
 
 
 def modes_of(structure: Structure | Plate | Membrane, n_modes: int) -> Modes:
-    """The modes of a structure as exactly as a search needs them."""
+    """The modes of a structure, to the accuracy of a search."""
     if isinstance(structure, Plate | Membrane):
         return _modes_of_surface(structure, n_modes)
     return structure.modes(n_modes, tolerance=RESOLUTION)
 
 
 def _modes_of_surface(surface: Plate | Membrane, n_modes: int, solved_for: int = 0) -> Modes:
-    """Modes with what stands on a plate or membrane, from those that it has without: a search asks for many.
+    """The modes of a plate or membrane with attachments, from cached modes without them.
 
     Args:
-        solved_for: how many modes the solution serves that these are taken from; so many where not given.
+        surface: with its attachments.
+        n_modes: number of modes.
+        solved_for: number of modes that the cached solution is made for; 0 for `n_modes`.
     """
     facts = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name != "attachments"}
     facts["edges"] = tuple(surface.edges.items())
-    base, factor = _stiffer_all_over(surface)
-    if base is not None:  # the modes of one solution, faster
+    base, factor = _base_stiffness(surface)
+    if base is not None:  # one solution serves all factors
         facts["bending_stiffness"] = base
     damping = facts["damping"]
-    if not isinstance(damping, ViscousDamping):  # which takes part in no solution
+    if not isinstance(damping, ViscousDamping):  # modal damping does not affect the undamped modes
         facts["damping"] = None
     kind: Any = type(surface)
-    bare = _bare_modes(kind, tuple(facts.items()), solved_for or n_modes)
+    bare = _modes_without_attachments(kind, tuple(facts.items()), solved_for or n_modes)
     if bare.n_modes < n_modes:
-        bare = _bare_modes(kind, tuple(facts.items()), n_modes)
+        bare = _modes_without_attachments(kind, tuple(facts.items()), n_modes)
     if base is not None:
         bare = _scaled_modes(bare, np.sqrt(factor))
     if not isinstance(damping, ViscousDamping):
@@ -87,13 +89,13 @@ def _residual_flexibility(surface: Plate | Membrane, omega: float) -> float:
     return float(weights.sum() / (4.0 * np.pi * (weights @ impedance) * omega))
 
 
-def _stiffer_all_over(surface: Plate | Membrane) -> tuple[Field | None, float]:
-    """The bending stiffness that a plate's is a multiple of, and the factor, where all of its strain energy is that."""
+def _base_stiffness(surface: Plate | Membrane) -> tuple[Field | None, float]:
+    """The bending stiffness that a plate's is a multiple of, and the factor; None if it has other strain energy."""
     if not isinstance(surface, Plate) or surface.bending_stiffness.multiple_of is None:
         return None, 1.0
     supports = [value for edge in surface.edges.values() for value in (edge.translation, edge.rotation)]
-    bends_alone = not any(surface.tension) and all(value in (0.0, HELD) for value in supports)
-    return surface.bending_stiffness.multiple_of if bends_alone else (None, 1.0)
+    is_bending_only = not any(surface.tension) and all(value in (0.0, HELD) for value in supports)
+    return surface.bending_stiffness.multiple_of if is_bending_only else (None, 1.0)
 
 
 def _attachments(structure: object) -> tuple[Attachment, ...]:
@@ -101,19 +103,19 @@ def _attachments(structure: object) -> tuple[Attachment, ...]:
 
 
 @lru_cache(maxsize=16)
-def _bare_modes(kind: Any, facts: tuple[tuple[str, Any], ...], n_modes: int) -> Modes:
-    """Modes of a plate or membrane without attachments, as many as describe what one does to the lowest `n_modes`."""
+def _modes_without_attachments(kind: Any, facts: tuple[tuple[str, Any], ...], n_modes: int) -> Modes:
+    """Modes of a plate or membrane without attachments, enough to describe the effect of one on the first `n_modes`."""
     given = dict(facts)
     surface = kind(**{**given, "edges": dict(given["edges"]), "damping": given["damping"] or ModalDamping()})
-    if not isinstance(surface, Plate):  # which carries nothing
+    if not isinstance(surface, Plate):  # a membrane has no attachments
         return surface.modes(n_modes, tolerance=RESOLUTION)  # type: ignore[no-any-return]
     if surface.is_navier:
-        return surface.modes(MANY * n_modes)
-    return surface.modes(SOLVED * n_modes, tolerance=ROUGHLY, beyond=BESIDES * n_modes)
+        return surface.modes(MODES_CLOSED_FORM * n_modes)
+    return surface.modes(MODES_SOLVED * n_modes, tolerance=ROUGHLY, beyond=EXTRA_MODES * n_modes)
 
 
 def solved_once(change: Callable[[Rig, Any, dict[str, float]], Rig]) -> Callable[[Rig, Any, dict[str, float]], Rig]:
-    """The change of a structure or of its modes, remembered: a search asks for one beside many other effects."""
+    """A cached change of a structure or of its modes, since a search combines each with many other effects."""
 
     @lru_cache(maxsize=256)
     def changed(
@@ -143,7 +145,7 @@ def _beam(rig: Rig) -> Beam:
 def _with_attachment(rig: Rig, part: Attachment) -> Rig:
     bare = None if isinstance(rig.structure, Membrane) else rig.structure
     structure = bare and replace(bare, attachments=(*bare.attachments, part))
-    if structure is None or isinstance(part, PointDamper):  # which leaves the modes what they are
+    if structure is None or isinstance(part, PointDamper):  # a damper does not change the undamped modes
         return replace(rig, structure=structure, modes=attach(rig.modes, (part,)))
     return resolved(rig, structure)
 
@@ -161,7 +163,7 @@ def _modulus(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     if rig.structure is None:
         return replace(rig, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
     if isinstance(rig.structure, Plate | Membrane):
-        return _stiffened(rig, rig.structure, factor)
+        return _with_scaled_stiffness(rig, rig.structure, factor)
     name = stiffness_name(rig.structure)
     structure = replace(rig.structure, **{name: getattr(rig.structure, name).scaled(factor)})
     if structure.attachments or (isinstance(structure, Beam) and structure.tension):
@@ -171,15 +173,15 @@ def _modulus(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     return replace(rig, structure=structure, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
 
 
-def _stiffened(rig: Rig, surface: Plate | Membrane, factor: float) -> Rig:
-    """A plate of `factor` times the bending stiffness; a membrane's stiffness is its tension, which is no property."""
+def _with_scaled_stiffness(rig: Rig, surface: Plate | Membrane, factor: float) -> Rig:
+    """The rig with `factor` times a plate's bending stiffness, or times all stiffness of a membrane."""
     if isinstance(surface, Membrane):
         return replace(rig, structure=None, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
     return resolved(rig, replace(surface, bending_stiffness=surface.bending_stiffness.scaled(factor)))
 
 
 def _scaled_modes(modes: Modes, factor: float) -> Modes:
-    """Frequencies times a factor, damping ratios and shapes as they are."""
+    """The modes with frequencies times a factor, and the same damping ratios and shapes."""
     return replace(modes, omega=modes.omega * factor, damping=modes.damping * factor)
 
 
@@ -200,11 +202,11 @@ MODULUS_ERROR = Kind(
 )
 
 
-# --- what hangs on the structure at a point
+# --- attachments at a point
 
 
-def _regressed(place: Moved, series: str) -> float:
-    """The coefficient k of force = -k series, by least squares."""
+def _regressed(place: ForceAndMotion, series: str) -> float:
+    """Least-squares coefficient k of force = -k x, with x the named series of the motion."""
     x = getattr(place, series)
     return float(-np.dot(place.force, x) / max(np.dot(x, x), 1e-300))
 
@@ -248,13 +250,13 @@ def _spring_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     return (*place_parameters(rig), stiffness)
 
 
-def _turning_spring(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
-    """A spring beside a hinge is a hinge that resists turning, by k a²."""
+def _as_rotational_spring(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
+    """The rotational spring k a² at a hinge that a spring k at a small distance a from it is."""
     if not isinstance(rig.structure, Structure):
         return ()
     length, v = rig.structure.length, spring.values
     end, arm = ("left", v["at"]) if v["at"] < 0.5 * length else ("right", length - v["at"])
-    if v["stiffness"] <= 0 or arm > BESIDE * length or end not in SUPPORT_ROTATION.targets(rig):
+    if v["stiffness"] <= 0 or arm > NEAR_HINGE * length or end not in SUPPORT_ROTATION.targets(rig):
         return ()
     return (Effect(SUPPORT_ROTATION, end, {"rotational_stiffness": v["stiffness"] * arm**2}),)
 
@@ -267,7 +269,7 @@ GROUND_SPRING = Kind(
     starts=_point_starts("stiffness", "displacement", "stiffness", signed=True),
     phrase="a spring to ground",
     phrase_between=lambda spring: "a spring" if spring.values["stiffness"] > 0 else "a loss of stiffness",
-    simpler=_turning_spring,
+    simpler=_as_rotational_spring,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * w},
 )
 
@@ -290,12 +292,12 @@ POINT_DAMPER = Kind(
 # --- local_stiffness_loss
 
 
-def _softened(rig: Rig, _: object, values: dict[str, float]) -> Rig:
+def _with_loss(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     member = _member(rig)
     name, length = stiffness_name(member), member.length
     start, stop = values["at"] - 0.5 * values["width"], values["at"] + 0.5 * values["width"]
     if start < -EDGE * length or stop > (1.0 + EDGE) * length:
-        # what lies beyond the end changes nothing: place and width could not be distinguished
+        # a stretch beyond the end has no effect, so place and width could not be distinguished
         raise ValueError(f"the stretch from {start:.4g} to {stop:.4g} reaches beyond the structure")
     profile = getattr(member, name).scaled(1.0 - values["loss"], max(start, 0.0), min(stop, length))
     return resolved(rig, replace(member, **{name: profile}))
@@ -321,7 +323,7 @@ LOCAL_STIFFNESS_LOSS = Kind(
     name="local_stiffness_loss",
     path="structure",
     parameters=_loss_parameters,
-    apply=solved_once(_softened),
+    apply=solved_once(_with_loss),
     starts=_loss_starts,
     targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
     phrase="a local loss of stiffness",
@@ -338,7 +340,7 @@ def _ends(rig: Rig) -> tuple[str, ...]:
     return tuple(name for name, end in ends if end.translation == HELD and end.rotation in (0.0, HELD))
 
 
-def _rotated(rig: Rig, end: str, values: dict[str, float]) -> Rig:
+def _with_rotational_spring(rig: Rig, end: str, values: dict[str, float]) -> Rig:
     support: Any = End(HELD, values["rotational_stiffness"])
     return resolved(rig, replace(_beam(rig), **{end: support}))
 
@@ -352,7 +354,7 @@ SUPPORT_ROTATION = Kind(
     name="support_rotation",
     path="structure",
     parameters=lambda rig, _: (positive("rotational_stiffness", "N m/rad", _end_stiffness(rig), 1e-4, 1e5),),
-    apply=solved_once(_rotated),
+    apply=solved_once(_with_rotational_spring),
     starts=lambda evidence, _: [
         {"rotational_stiffness": _end_stiffness(evidence.rig) * s} for s in np.geomspace(0.01, 3000.0, 16)
     ],
@@ -369,16 +371,16 @@ SUPPORT_ROTATION = Kind(
 
 
 def buckling_load(rig: Rig) -> float:
-    """The compression, N, that buckles a rig's beam."""
-    return _buckles_under(_beam(rig))
+    """The buckling load of a rig's beam, N."""
+    return _buckling_load(_beam(rig))
 
 
 @lru_cache(maxsize=64)
-def _buckles_under(beam: Beam) -> float:
+def _buckling_load(beam: Beam) -> float:
     return beam.buckling_load()
 
 
-def _pulled(rig: Rig, _: object, values: dict[str, float]) -> Rig:
+def _with_tension(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     beam = _beam(rig)
     return resolved(rig, replace(beam, tension=beam.tension + values["tension"]))
 
@@ -392,7 +394,7 @@ AXIAL_LOAD = Kind(
     name="axial_load",
     path="structure",
     parameters=_load_parameters,
-    apply=solved_once(_pulled),
+    apply=solved_once(_with_tension),
     starts=lambda evidence, _: [
         {"tension": share * buckling_load(evidence.rig)}
         for share in (-0.9, -0.6, -0.4, -0.25, -0.15, -0.08, -0.03)
@@ -403,23 +405,23 @@ AXIAL_LOAD = Kind(
 )
 
 
-# --- truncated_modes: no number to fit, one start a count
+# --- truncated_modes: no parameter to fit, one start for each number of modes
 
 
-def _truncated(rig: Rig, count: int, _: object) -> Rig:
+def _with_modes(rig: Rig, count: int, _: object) -> Rig:
     if rig.structure is None:
         raise ValueError("plain modal data have no further modes; describe the structure as a beam, a rod or a plate")
-    if isinstance(rig.structure, Plate):  # whose solution for the nominal modes has further ones
+    if isinstance(rig.structure, Plate):  # the cached solution for the nominal modes has further ones
         return replace(rig, modes=_modes_of_surface(rig.structure, count, solved_for=rig.modes.n_modes))
     return replace(rig, modes=modes_of(rig.structure, count))
 
 
-def _one_mode_fewer(truncation: Effect, rig: Rig) -> tuple[Effect, ...]:
+def _with_one_mode_fewer(truncation: Effect, rig: Rig) -> tuple[Effect, ...]:
     fewer = truncation.target - 1
     return (Effect(TRUNCATED_MODES, fewer, {}),) if fewer > rig.modes.n_modes else ()
 
 
-def _more_modes(truncation: Effect) -> tuple[Effect, ...]:
+def _with_more_modes(truncation: Effect) -> tuple[Effect, ...]:
     return tuple(Effect(TRUNCATED_MODES, truncation.target + more, {}) for more in (1, 2, 4))
 
 
@@ -427,12 +429,12 @@ TRUNCATED_MODES = Kind(
     name="truncated_modes",
     path="structure",
     parameters=lambda rig, _: (),
-    apply=solved_once(_truncated),
+    apply=solved_once(_with_modes),
     starts=lambda evidence, _: [{}],
     targets=lambda rig: () if rig.structure is None else tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)),
     phrase="modes left out of the model",
-    simpler=_one_mode_fewer,
-    more_general=_more_modes,
+    simpler=_with_one_mode_fewer,
+    more_general=_with_more_modes,
     exclusive=True,
     adds_modes=True,
     numbers=lambda truncation, rig: {"kept": rig.modes.n_modes, "needed": truncation.target},
@@ -443,7 +445,7 @@ TRUNCATED_MODES = Kind(
 # --- modal_damping
 
 
-def _damped(rig: Rig, _: object, values: dict[str, float]) -> Rig:
+def _with_scaled_damping(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     factor = values["factor"]
     structure = rig.structure
     if structure is None or not isinstance(structure.damping, ModalDamping):
@@ -458,7 +460,7 @@ MODAL_DAMPING = Kind(
     name="modal_damping",
     path="structure",
     parameters=lambda rig, _: (Parameter("factor", "", 1e-3, 100.0, logarithmic=True, neutral=1.0),),
-    apply=solved_once(_damped),
+    apply=solved_once(_with_scaled_damping),
     starts=lambda evidence, _: [{"factor": f} for f in (0.2, 0.4, 0.6, 0.8, 0.9, 1.1, 1.25, 1.6, 2.2, 3.0, 5.0, 8.0)],
     phrase="a damping error common to all modes",
 )
@@ -466,7 +468,7 @@ MODAL_DAMPING = Kind(
 
 # --- stiffness_drift
 
-DRIFTS = (0.02, 0.05, 0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # over a record, to start from either way
+DRIFTS = (0.02, 0.05, 0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # relative, over a record: start values of either sign
 
 
 def _duration(evidence: Evidence) -> float:

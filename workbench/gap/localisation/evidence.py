@@ -1,4 +1,4 @@
-"""What the records say before any effect is guessed: the unmodelled force, its place, and the motion there."""
+"""Evidence of an unmodelled force, before any effect is assumed: its place, the force, and the motion there."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from workbench.gap.effects.effect import Moved
+from workbench.gap.effects.effect import ForceAndMotion
 from workbench.gap.localisation.force_lines import Lines, lines_of, screened
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import (
@@ -27,42 +27,42 @@ from workbench.structure.domain import Between, Domain, Interval, NamedPoints, R
 
 @dataclass(frozen=True)
 class EvidenceSettings:
-    """Constants of the search for where a force acts."""
+    """Constants of the localisation of an unmodelled force by a Kalman filter."""
 
     levels: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0)  # rms of an unmodelled force over that of the inputs
     memories: tuple[float, ...] = (10.0, 1000.0)  # its correlation time, in samples
-    most_peaks: int = 3
-    places: int = 40  # where a force is looked for
-    beside: float = 0.95  # of the spacing of places: how far about a peak it is refined
-    resolved: float = 2e-3  # of the spacing of places: to how much
-    still: float = 1e-6  # of what moves most: a point, or what is between two, that no force moves
-    broad: float = 0.1  # of a rectangle's diagonal: between tops of its profile
-    narrow: float = 0.03  # likewise, once they are refined
-    finer: int = 5  # steps from one place of a rectangle's grid to the next, once the likeliest are known
-    points_tried: int = 4  # named points whose motion is looked at
+    most_peaks: int = 3  # of the likelihood that are kept
+    places: int = 40  # of the grid along an interval
+    beside: float = 0.95  # of the grid spacing: range about a peak in which it is refined
+    resolved: float = 2e-3  # of the grid spacing: tolerance of the refinement
+    still: float = 1e-6  # of the largest mode shape: a point, or a pair of points, that no force moves
+    broad: float = 0.1  # of a rectangle's diagonal: least distance between peaks
+    narrow: float = 0.03  # likewise, after refinement
+    finer: int = 5  # subdivisions of the grid of a rectangle, for the refinement
+    points_tried: int = 4  # named points that are candidates
     pairs_tried: int = 12  # pairs of them, likewise
-    alike: float = 1e-4  # 1 - cos² of the angle between the motions of two pairs of points: less is one place
-    many_points: int = 12  # named points, of which all are looked at
+    alike: float = 1e-4  # 1 - cos² of the angle between the mode shapes of two pairs: below, they are one place
+    many_points: int = 12  # named points up to which all are candidates
 
 
 EVIDENCE = EvidenceSettings()
-FEWER_PLACES = 20  # where a force is looked for beside what is given
+FEWER_PLACES = 20  # of the grid, when some effects are given
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The residual of a rig on the fit records, and what it says of an unmodelled force.
+    """The residual of a rig on the fit records, and the unmodelled force estimated from it.
 
     Attributes:
         rig: the rig that was simulated.
         data: fit records with their noise.
         motions: its motion, one per record.
         residuals: (n_sensors, n_samples) a record, in the sensors' units.
-        n_places: where a force is looked for.
-        given_places: places of the force, where they are known from elsewhere.
-        given_size: its rms, N, and correlation time, in samples, likewise.
+        n_places: number of places of the grid.
+        given_places: places of the force, if they are known.
+        given_size: its rms, N, and correlation time, in samples, if they are known.
         workers: processes that share the work.
-        bent: whether errors of the model were fitted to the records, which may have taken linear parts of the force.
+        absorbed: whether nominal errors were fitted to the records and may have absorbed linear parts of the force.
     """
 
     rig: Rig
@@ -73,18 +73,24 @@ class Evidence:
     given_places: tuple[Where, ...] = ()
     given_size: tuple[float, float] | None = None
     workers: Workers = ALONE
-    bent: bool = False
+    absorbed: bool = False
 
     @classmethod
     def of(
-        cls, rig: Rig, data: FitData, n_places: int = EVIDENCE.places, workers: Workers = ALONE, *, bent: bool = False
+        cls,
+        rig: Rig,
+        data: FitData,
+        n_places: int = EVIDENCE.places,
+        workers: Workers = ALONE,
+        *,
+        absorbed: bool = False,
     ) -> "Evidence":
-        """Simulate the rig on the fit records."""
+        """The evidence of a rig, simulated on the fit records."""
         motions = data.motions(rig)
-        return cls(rig, data, motions, tuple(data.differences(rig)), n_places, workers=workers, bent=bent)
+        return cls(rig, data, motions, tuple(data.differences(rig)), n_places, workers=workers, absorbed=absorbed)
 
     def without(self, names: Collection[str]) -> "Evidence":
-        """The same evidence without some of the sensors; with all of them where none would be left."""
+        """The same evidence without some of the sensors, unless none would be left."""
         kept = [j for j, sensor in enumerate(self.rig.sensors) if sensor.name not in names]
         if len(kept) in (0, len(self.rig.sensors)):
             return self
@@ -97,26 +103,28 @@ class Evidence:
         )
 
     def of_force_at(self, *places: Where) -> "Evidence":
-        """The same evidence of a force at places that are known."""
+        """The same evidence of a force at known places."""
         return replace(self, given_places=places, given_size=self.size)
 
     @property
     def domain(self) -> Domain:
+        """Of places on the structure."""
         return self.rig.modes.domain
 
     @cached_property
     def model(self) -> SampledModel:
+        """The rig's modes and sensors, discretised."""
         noise = self.data.noise
         return sampled_model(self.rig.modes, self.rig.sensors, noise, self.data.counted[0].sample_time)
 
     def filter_at(self, where: Where, rms: float, memory: float) -> ForceFilter:
-        """The filter for an unknown force somewhere of that rms, N, and correlation time, in samples."""
+        """The filter for an unknown force at a place, of an rms, N, and a correlation time `memory`, in samples."""
         modes, sample_time = self.rig.modes, self.data.counted[0].sample_time
         return wandering_force_filter(modes, self.model, modes.phi_at(where), rms, memory * sample_time, sample_time)
 
     @cached_property
     def places(self) -> Any:
-        """Where an unmodelled force is looked for: all over the structure, or at named points and between them."""
+        """Candidate places of an unmodelled force: a grid over the structure, or named points and pairs of them."""
         if isinstance(self.domain, Interval):
             return self.domain.length * np.arange(1, self.n_places) / self.n_places
         if isinstance(self.domain, NamedPoints):
@@ -127,7 +135,7 @@ class Evidence:
 
     @cached_property
     def places_to_try(self) -> Sequence[Any]:
-        """Fewer of them, spread out, where linear effects are tried in any case; of many points the likeliest."""
+        """Fewer places, spread out, at which linear effects are always tried; of many named points, the likeliest."""
         if isinstance(self.domain, Interval):
             return [float(x) for x in self.places[::2]]
         if isinstance(self.domain, NamedPoints):
@@ -143,7 +151,7 @@ class Evidence:
         quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
         sizes = [(share * self.data.force_rms, memory) for memory in EVIDENCE.memories for share in EVIDENCE.levels]
 
-        coarse = self._coarse
+        coarse = self._coarse_places
 
         def likelihood(size: tuple[float, float]) -> float:
             return max(log_likelihood(self.filter_at(x, *size), quick) for x in coarse)
@@ -151,18 +159,18 @@ class Evidence:
         return max(zip(self.workers.map(likelihood, sizes), sizes, strict=True), key=lambda each: each[0])[1]
 
     @property
-    def _coarse(self) -> Sequence[Any]:
-        """A few places, of which one is near enough to tell how large the force is."""
+    def _coarse_places(self) -> Sequence[Any]:
+        """A few places, close enough to any other to estimate the size of the force."""
         if isinstance(self.domain, Interval):
             every_fifth: Sequence[Any] = self.places[::5]
             return every_fifth
         if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= EVIDENCE.many_points:
             return self.domain.grid()
-        return self._screened[: EVIDENCE.most_peaks]
+        return self._likeliest_places[: EVIDENCE.most_peaks]
 
     @cached_property
     def profile(self) -> np.ndarray:
-        """Log-likelihood of an unknown force at each of `places`; but for an interval, the ends of records left out."""
+        """Log-likelihood of an unknown force at each of `places`; approximate, except for an interval."""
         if not isinstance(self.domain, Interval):
             return -0.5 * self._misfits(self.places)
         residuals, size = list(self.residuals), self.size
@@ -170,31 +178,30 @@ class Evidence:
         return np.array(along)
 
     def _misfits(self, places: Sequence[Any]) -> np.ndarray:
-        """What one force of any law at each of the places leaves, in units of the noise."""
+        """Residual sum of squares given one force of any law at each of the places, in units of the noise."""
         shapes = np.array([self.rig.modes.phi_at(where) for where in places])
         misfits: np.ndarray = np.sum([screened(lines, shapes) for lines in self.lines], axis=0)
         return misfits
 
     @cached_property
     def lines(self) -> list[Lines]:
-        """The lines of every record."""
+        """Spectral lines of every record's residual."""
         return lines_of(self.rig, self.model, self.residuals, self.data.counted[0].sample_time)
 
     @cached_property
-    def _screened(self) -> tuple[Any, ...]:
-        """The likeliest of `places`, best first: tops of a rectangle's profile, some named points and pairs of them."""
+    def _likeliest_places(self) -> tuple[Any, ...]:
+        """The likeliest of `places`, best first: peaks over a rectangle, or some named points and pairs of them."""
         order = np.argsort(-self.profile, kind="stable")
         ranked = [self.places[i] for i in order]
         if isinstance(self.domain, Rectangle):
-            return self._tops_over(self.domain, ranked)
+            return self._peaks_over(self.domain, ranked)
         pairs = [i for i, where in enumerate(ranked) if isinstance(where, Between)]
         points = [i for i, where in enumerate(ranked) if not isinstance(where, Between)]
         most = len(points) if len(points) <= EVIDENCE.many_points else EVIDENCE.points_tried
-        return tuple(ranked[i] for i in sorted((*points[:most], *self._unlike(ranked, pairs))))
+        return tuple(ranked[i] for i in sorted((*points[:most], *self._distinct_pairs(ranked, pairs))))
 
-    def _unlike(self, ranked: Sequence[Any], pairs: Sequence[int]) -> list[int]:
-        """The first few pairs that move unlike one another: the two ends of a stiff floor are one place, and would
-        displace others."""
+    def _distinct_pairs(self, ranked: Sequence[Any], pairs: Sequence[int]) -> list[int]:
+        """The first few pairs with different mode shapes: pairs across a stiff floor, say, count as one place."""
         kept: list[int] = []
         shapes: list[np.ndarray] = []
         for i in pairs:
@@ -209,13 +216,13 @@ class Evidence:
 
     @property
     def _along(self) -> int:
-        """Spacings along the longer side of a rectangle."""
+        """Number of grid spacings along the longer side of a rectangle."""
         return max(self.n_places // 2, 16)
 
-    def _tops_over(self, rectangle: Rectangle, ranked: Sequence[Any]) -> tuple[tuple[float, float], ...]:
-        """The tops of the profile over a rectangle, and their images: a symmetric plate all but repeats itself."""
-        (a, b), tops = rectangle.length, _apart(ranked, rectangle, EVIDENCE.broad, EVIDENCE.most_peaks)
-        mirrored = [image for x, y in tops for image in ((x, y), (a - x, y), (x, b - y), (a - x, b - y))]
+    def _peaks_over(self, rectangle: Rectangle, ranked: Sequence[Any]) -> tuple[tuple[float, float], ...]:
+        """Refined peaks over a rectangle, best first; mirrored places are tried too, as a plate is nearly symmetric."""
+        (a, b), peaks_found = rectangle.length, _spaced(ranked, rectangle, EVIDENCE.broad, EVIDENCE.most_peaks)
+        mirrored = [image for x, y in peaks_found for image in ((x, y), (a - x, y), (x, b - y), (a - x, b - y))]
         offsets = max(a, b) / self._along * np.arange(-EVIDENCE.finer, EVIDENCE.finer + 1) / EVIDENCE.finer
         around = [
             [(float(np.clip(x + dx, 0.0, a)), float(np.clip(y + dy, 0.0, b))) for dx in offsets for dy in offsets]
@@ -223,12 +230,12 @@ class Evidence:
         ]
         misfits = self._misfits([where for places in around for where in places]).reshape(len(around), -1)
         refined = [places[int(np.argmin(row))] for places, row in zip(around, misfits, strict=True)]
-        judged = self.workers.map(self._misfit, refined)
-        order = np.argsort(judged, kind="stable")
-        return tuple(_apart([refined[i] for i in order], rectangle, EVIDENCE.narrow, EVIDENCE.most_peaks))
+        misfits_there = self.workers.map(self._misfit, refined)
+        order = np.argsort(misfits_there, kind="stable")
+        return tuple(_spaced([refined[i] for i in order], rectangle, EVIDENCE.narrow, EVIDENCE.most_peaks))
 
     def _misfit(self, where: Where) -> float:
-        """What one force of any law there leaves, in units of the noise, the ends of records accounted for."""
+        """Residual sum of squares given one force of any law at a place, transients included, in units of the noise."""
         shape = self.rig.modes.phi_at(where)
         return float(sum(lines.misfit(shape) for lines in self.lines))
 
@@ -238,15 +245,17 @@ class Evidence:
         if self.given_places:
             return self.given_places
         if not isinstance(self.domain, Interval):
-            return self._screened
+            return self._likeliest_places
         profile, places = self.profile, np.asarray(self.places, float)
         padded = np.r_[-np.inf, profile, -np.inf]
-        tops = np.flatnonzero((profile >= padded[:-2]) & (profile >= padded[2:]))
-        refined = self.workers.map(self._refined, places[tops[np.argsort(-profile[tops])][: EVIDENCE.most_peaks]])
+        peaks_found = np.flatnonzero((profile >= padded[:-2]) & (profile >= padded[2:]))
+        refined = self.workers.map(
+            self._refined_peak, places[peaks_found[np.argsort(-profile[peaks_found])][: EVIDENCE.most_peaks]]
+        )
         return tuple(at for at, _ in sorted(refined, key=lambda top: -top[1]))
 
-    def _refined(self, at: float) -> tuple[float, float]:
-        """The top of the log-likelihood beside a place of the grid: where, and how high."""
+    def _refined_peak(self, at: float) -> tuple[float, float]:
+        """The peak of the log-likelihood near a place of the grid: position and height."""
         spacing, residuals = self.places[1] - self.places[0], list(self.residuals)
         found = minimize_scalar(
             lambda x: -log_likelihood(self.filter_at(x, *self.size), residuals),
@@ -257,13 +266,13 @@ class Evidence:
         return float(found.x), -float(found.fun)
 
     @cached_property
-    def at_peaks(self) -> tuple[Moved, ...]:
+    def at_peaks(self) -> tuple[ForceAndMotion, ...]:
         """The unmodelled force and the motion at the likeliest places."""
-        _ = self.size  # found once, before the work is shared
+        _ = self.size  # computed once, before processes are forked
         return tuple(self.workers.map(self.place, self.peaks))
 
-    def place(self, where: Where) -> Moved:
-        """The unmodelled force somewhere and the motion there, smoothed."""
+    def place(self, where: Where) -> ForceAndMotion:
+        """The smoothed unmodelled force at a place, and the motion there."""
         kalman = self.filter_at(where, *self.size)
         n, shape = self.rig.modes.n_modes, self.rig.modes.phi_at(where)
         pieces = []
@@ -280,17 +289,17 @@ class Evidence:
                 )
             )
         force, w, v, a = (np.concatenate(series) for series in zip(*pieces, strict=True))
-        return Moved(where, force, w, v, a, self.bent)
+        return ForceAndMotion(where, force, w, v, a, self.absorbed)
 
 
-def _apart(
+def _spaced(
     ranked: Sequence[tuple[float, float]], rectangle: Rectangle, share: float, most: int
 ) -> list[tuple[float, float]]:
-    """The first few places, best first, that stand a share of the diagonal apart from those before them."""
-    tops: list[tuple[float, float]] = []
+    """The first few places, best first, that are farther than a share of the diagonal from those before them."""
+    peaks_found: list[tuple[float, float]] = []
     for where in ranked:
-        if all(rectangle.separation(where, other) > share for other in tops):
-            tops.append(where)
-        if len(tops) == most:
+        if all(rectangle.separation(where, other) > share for other in peaks_found):
+            peaks_found.append(where)
+        if len(peaks_found) == most:
             break
-    return tops
+    return peaks_found

@@ -1,17 +1,18 @@
-"""One force at a point, of any law: what it leaves of a residual, line by line of the spectrum.
+"""Misfit of one force of any law at a point, from the lines of the residual's spectrum.
 
 At a line of frequency ω the residual of a record is
 
     r = h(x) g + T d + noise        h(x) = Φ_s (Ω² - ω² + iω C)⁻¹ φ(x),  T = Φ_s (z - A)⁻¹ z,  z = e^{iωΔt}
 
-with g, the force there, any number at all; d is the state at the start of the record less that at its end, one for all
-lines. What no g accounts for is noise where x is right. A line counts by how far the force stands out of the noise in
-it, with weights that do not depend on x: a wrong idea of the force's spectrum then costs precision, and biases nothing.
+with an arbitrary force g at each line; d, the same for all lines, is the state at the start of the record minus that at
+its end (the transient, or leakage). At the right x, the residual after projection onto h and T is noise. A line is
+weighted by the force's share of its power, with weights that do not depend on x: a wrong spectrum of the force then
+costs precision, but causes no bias.
 
-Where modes lie above half the sample rate and accelerations are read, a force between the samples rings them, and the
-sampling folds that onto lines below: r = Σ_k h(x, ω + k ω_s) g_k, with each g_k any number at all.
+If modes lie above half the sample rate and accelerations are measured, a force that varies between samples excites
+them, and their response is aliased: r = Σ_k h(x, ω + k ω_s) g_k, with arbitrary g_k.
 
-Velocities of a state are in units of the modes' own, so that no column of T is far larger than another.
+Velocities of a state are scaled by the natural frequencies, so that the columns of T have similar sizes.
 
 Projections on one unknown source: Stoica & Nehorai, IEEE Trans. Acoust. Speech Signal Process. 37 (1989) 720.
 """
@@ -30,19 +31,19 @@ from workbench.rig.simulate import reading_of
 
 @dataclass(frozen=True)
 class LinesSettings:
-    """Constants of the lines of a record that a force stands out in."""
+    """Constants of the selection and weighting of lines."""
 
-    top: float = 0.9  # of half the sample rate: above, what is folded down is no longer small
-    most_lines: int = 8192  # of a record: of a longer one every so many, which costs precision alone
-    width: int = 75  # lines over which the spectrum of the force is taken to be flat
-    chance: float = 2.0  # deviations by which noise may pass for a force in them
+    top: float = 0.9  # of half the sample rate: above, aliasing is not small
+    most_lines: int = 8192  # of a record: longer ones are thinned out, which only costs precision
+    width: int = 75  # lines over which the force spectrum is averaged
+    chance: float = 2.0  # standard errors of this average that are subtracted, as noise may cause them
     counting: float = 0.02  # weight below which a line is left out
-    screened: int = 300  # lines, the strongest, where many places are compared
-    rounds: int = 4  # of the spectrum of the force, each weighted by the one before
+    screened: int = 300  # strongest lines, that are used to compare many places
+    rounds: int = 4  # iterations of the force spectrum, each weighted by the one before
 
 
 LINES = LinesSettings()
-UNDAMPED = 1e-9j  # of the stiffness: what keeps a mode without damping finite on a line of its own
+UNDAMPED = 1e-9j  # of the stiffness: hysteretic damping that keeps the receptance of an undamped mode finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,33 +59,33 @@ class CoupledReceptances:
     tail: Complexes
 
     def to_force(self, shape: Floats) -> Complexes:
-        """Readings (n_lines, n_sensors) of a unit force where the modes have that shape (n_modes,)."""
+        """Receptances (n_lines, n_sensors) to a force at a point with mode shapes `shape` (n_modes,)."""
         return self.compliance @ shape
 
     def along(self, directions: Complexes) -> Complexes:
-        """T seen along a direction (n_lines, n_sensors) of the sensors: (n_lines, 2 n_modes)."""
+        """T projected on a direction of the sensors (n_lines, n_sensors): (n_lines, 2 n_modes)."""
         return (directions[:, None, :] @ self.tail)[:, 0]
 
     def products(self, left: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of T with itself and with what is left (n_lines, n_sensors), by weights of the lines."""
+        """Weighted products Tᴴ T and Tᴴ r, with the residual `left` (n_lines, n_sensors) and weights (n_lines,)."""
         tail, left = self.tail.reshape(-1, self.tail.shape[2]), left.ravel()
         weighted = tail * np.repeat(weights, self.tail.shape[1])[:, None]
         return real_product(weighted, tail), real_product(weighted, left)
 
     def on(self, kept: np.ndarray) -> "CoupledReceptances":
-        """On some of the lines."""
+        """The receptances at some of the lines."""
         return CoupledReceptances(self.compliance[kept], self.tail[kept])
 
 
 @dataclass(frozen=True, eq=False)
-class _Alike:
-    """Sensors that read the same derivative of the motion in time: which, their shapes, and what each mode shows them.
+class _SensorGroup:
+    """Sensors that measure the same time derivative of the motion.
 
     Attributes:
-        here: (n_here,) sensors.
-        shapes: (n_here, n_modes) in units of the noise.
-        rates: (n_lines,) of that derivative.
-        tail: (n_lines, 2 n_modes) of the mode itself.
+        here: (n_here,) indices of the sensors.
+        shapes: (n_here, n_modes) mode shapes there, in units of the noise.
+        rates: (n_lines,) factor (iω)ᵏ of the derivative.
+        tail: (n_lines, 2 n_modes) T of the modal coordinates.
     """
 
     here: np.ndarray
@@ -95,28 +96,28 @@ class _Alike:
 
 @dataclass(frozen=True, eq=False)
 class UncoupledReceptances:
-    """Receptances of modes that damping does not couple: a sensor reads its shape there, times the mode's own.
+    """Receptances of modes that damping does not couple: products of mode shapes and modal receptances.
 
     Attributes:
-        compliance: (n_lines, n_modes) of the modes themselves.
-        sensors: by what they read.
+        compliance: (n_lines, n_modes) modal receptances.
+        sensors: grouped by the derivative that they measure.
     """
 
     compliance: np.ndarray
-    sensors: tuple[_Alike, ...]
+    sensors: tuple[_SensorGroup, ...]
 
     def to_force(self, shape: Floats) -> Complexes:
         """See `CoupledReceptances`."""
         moved = self.compliance * shape
-        readings = np.empty((len(moved), sum(alike.here.size for alike in self.sensors)), complex)
-        for alike in self.sensors:
-            readings[:, alike.here] = (moved @ alike.shapes.T) * alike.rates[:, None]
+        readings = np.empty((len(moved), sum(group.here.size for group in self.sensors)), complex)
+        for group in self.sensors:
+            readings[:, group.here] = (moved @ group.shapes.T) * group.rates[:, None]
         return readings
 
     def along(self, directions: Complexes) -> Complexes:
         """See `CoupledReceptances`."""
         seen: list[Complexes] = [
-            np.tile(directions[:, alike.here] @ alike.shapes, 2) * alike.tail for alike in self.sensors
+            np.tile(directions[:, group.here] @ group.shapes, 2) * group.tail for group in self.sensors
         ]
         return sum(seen[1:], start=seen[0])
 
@@ -124,16 +125,16 @@ class UncoupledReceptances:
         """See `CoupledReceptances`."""
         size = 2 * self.compliance.shape[1]
         own, along = np.zeros((size, size)), np.zeros(size)
-        for alike in self.sensors:
-            weighted = weights[:, None] * alike.tail
-            own += np.tile(alike.shapes.T @ alike.shapes, (2, 2)) * real_product(weighted, alike.tail)
-            seen = np.tile(left[:, alike.here] @ alike.shapes, 2)
+        for group in self.sensors:
+            weighted = weights[:, None] * group.tail
+            own += np.tile(group.shapes.T @ group.shapes, (2, 2)) * real_product(weighted, group.tail)
+            seen = np.tile(left[:, group.here] @ group.shapes, 2)
             along += 2.0 * np.sum((weighted.conj() * seen).real, axis=0)
         return own, along
 
     def on(self, kept: np.ndarray) -> "UncoupledReceptances":
         """See `CoupledReceptances`."""
-        sensors = (replace(alike, rates=alike.rates[kept], tail=alike.tail[kept]) for alike in self.sensors)
+        sensors = (replace(group, rates=group.rates[kept], tail=group.tail[kept]) for group in self.sensors)
         return UncoupledReceptances(self.compliance[kept], tuple(sensors))
 
 
@@ -141,16 +142,20 @@ Receptances = UncoupledReceptances | CoupledReceptances
 
 
 def real_product(one: Complexes, other: Complexes) -> Floats:
-    """Sums over lines, those of negative frequency too: 2 Re(one* other)."""
+    """Sum over lines of positive and negative frequency: 2 Re(oneᴴ other)."""
     product: Floats = 2.0 * (one.real.T @ other.real + one.imag.T @ other.imag)
     return product
 
 
 def receptances_of(rig: Rig, model: SampledModel, omega: Floats, n_samples: int, sample_time: float) -> Receptances:
-    """The receptances of a rig at lines of frequency omega (n_lines,), rad/s, of a record of so many samples.
+    """The receptances of a rig at spectral lines of a record.
 
     Args:
-        model: the rig's sampled form, with the variance of each sensor's noise.
+        rig: with the modes.
+        model: its sampled form, with the variance of each sensor's noise.
+        omega: (n_lines,) rad/s.
+        n_samples: of the record.
+        sample_time: s.
     """
     z = (1.0 + abs(UNDAMPED)) * np.exp(1j * omega * sample_time)
     turn = _uncoupled if rig.modes.proportional else _coupled
@@ -168,7 +173,7 @@ def _coupled(
     compliance = rate[:, None, None] ** orders[:, None] * (rows @ np.linalg.inv(dynamic))
     transposed = z[:, None, None] * np.eye(model.transition.shape[0]) - model.transition.T
     outputs = np.broadcast_to(model.output.T, (z.size, *model.output.T.shape))
-    tail = z[:, None, None] * np.swapaxes(np.linalg.solve(transposed, outputs), 1, 2) * _velocities(rig)
+    tail = z[:, None, None] * np.swapaxes(np.linalg.solve(transposed, outputs), 1, 2) * _state_units(rig)
     return CoupledReceptances(compliance / noise[:, None], share * tail / noise[:, None])
 
 
@@ -183,34 +188,34 @@ def _uncoupled(
         [np.diag(model.transition[rows, columns]) for columns in (slice(n), slice(n, None))]
         for rows in (slice(n), slice(n, None))
     )
-    # displacement and velocity of each mode by the displacement and the velocity that it starts with
+    # transform of the free response (displacement and velocity) of each mode to its initial state
     common = share * z / ((z - qq) * (z - vv) - qv * vq)
-    displacement = np.hstack([common * (z - vv), common * qv]) * _velocities(rig)
-    velocity = np.hstack([common * vq, common * (z - qq)]) * _velocities(rig)
+    displacement = np.hstack([common * (z - vv), common * qv]) * _state_units(rig)
+    velocity = np.hstack([common * vq, common * (z - qq)]) * _state_units(rig)
     motions = displacement, velocity, -np.tile(stiffness, 2) * displacement - np.tile(damping, 2) * velocity
     rows, orders = reading_of(rig)
     sensors = []
     for order in set(orders.tolist()):
         here = np.flatnonzero(orders == order)
-        sensors.append(_Alike(here, rows[here] / noise[here, None], rate[:, 0] ** order, motions[order]))
+        sensors.append(_SensorGroup(here, rows[here] / noise[here, None], rate[:, 0] ** order, motions[order]))
     return UncoupledReceptances(compliance, tuple(sensors))
 
 
-def _velocities(rig: Rig) -> Floats:
-    """Units (2 n_modes,) of a state."""
+def _state_units(rig: Rig) -> Floats:
+    """Units (2 n_modes,) of a modal state: 1 for displacements, natural frequencies for velocities."""
     omega = rig.modes.omega
     return np.concatenate([np.ones(omega.size), np.maximum(omega, 0.1 * omega[-1])])
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """A record's residual at the lines of its spectrum, in units of the noise, and what it is made of.
+    """A record's residual at the lines of its spectrum, in units of the noise, with the rig's receptances.
 
     Attributes:
-        receptances: of the rig, to forces and to states at the ends.
+        receptances: of the rig, to forces and to the states at the ends.
         left: (n_lines, n_sensors) the residual; its noise has unit variance.
         weights: (n_lines,).
-        folded: of the rig, to forces whose frequencies are folded onto the lines, one for each fold.
+        folded: receptances to forces whose frequencies are aliased onto the lines, one for each alias.
     """
 
     receptances: Receptances
@@ -220,11 +225,12 @@ class Lines:
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted Tᴴ T and Tᴴ r."""
         return self.receptances.products(self.left, self.weights)
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Values that stay noise once a force, of any law, and the ends are accounted for."""
+        """Degrees of freedom of the residual given a force of any law and the states at the ends."""
         n_lines, n_sensors = self.left.shape
         return int(max(2 * n_lines * (n_sensors - 1 - len(self.folded)) - self._products[1].size, 0))
 
@@ -234,66 +240,72 @@ class Lines:
         return float(2.0 * self.weights @ np.sum(np.abs(self.left) ** 2, axis=1))
 
     def weighted(self, weights: np.ndarray) -> "Lines":
-        """The lines by other weights (n_lines,), without those that count for nothing."""
+        """The lines with other weights (n_lines,), without those of negligible weight."""
         kept = weights > LINES.counting
         return self._on(kept, weights[kept])
 
     def strongest(self, most: int) -> "Lines":
-        """At most so many lines, those of the most power."""
+        """At most `most` lines, those of the highest power."""
         strong = np.argsort(-self.weights * np.sum(np.abs(self.left) ** 2, axis=1))[:most]
         return self._on(strong, self.weights[strong])
 
     def _on(self, kept: np.ndarray, weights: np.ndarray) -> "Lines":
+        """Some of the lines, with their weights."""
         folded = tuple(each.on(kept) for each in self.folded)
         return Lines(self.receptances.on(kept), self.left[kept], weights, folded)
 
     def misfit(self, shape: np.ndarray) -> float:
-        """Sum of squares that a force leaves where the modes have that shape (n_modes,)."""
+        """Weighted residual sum of squares given a force at a point with mode shapes `shape` (n_modes,)."""
         root = np.sqrt(self.weights)
         seen = [self._along(direction) for direction in self._directions(shape)]
         u, a = np.concatenate([u * root[:, None] for u, _ in seen]), np.concatenate([a * root for _, a in seen])
-        end, along = self._end(u, a)
+        end, along = self._transient(u, a)
         return self.power - 2.0 * float(np.sum(np.abs(a) ** 2)) - float(along @ end)
 
     def force_share(self, shape: np.ndarray) -> np.ndarray:
-        """Share (n_lines,) of a force there in what is read along it: the weight of each line."""
+        """Share (n_lines,) of each line's power along the receptance that is due to a force there: its weight."""
         h = self.receptances.to_force(shape)
         power: Floats = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
         u, a = self._along(h / np.sqrt(power)[:, None])
-        share, sure = np.ones_like(power), np.ones_like(power)
+        share, precision = np.ones_like(power), np.ones_like(power)
         for _ in range(LINES.rounds):
             root = np.sqrt(share)
-            end, _ = self._end(u * root[:, None], a * root)
+            end, _ = self._transient(u * root[:, None], a * root)
             read = (np.abs(a - u @ end) ** 2 - 1.0) / power
-            chance = LINES.chance * np.sqrt(_smooth((sure / power) ** 2))
-            spectrum = np.maximum(_smooth(sure * read) - chance, 0.0) / _smooth(sure)
+            chance = LINES.chance * np.sqrt(_moving_sum((precision / power) ** 2))
+            spectrum = np.maximum(_moving_sum(precision * read) - chance, 0.0) / _moving_sum(precision)
             share = spectrum * power / (1.0 + spectrum * power)
-            # a force far above the noise has all of a line, but for rounding
-            sure = (power * np.maximum(1.0 - share, np.finfo(float).eps)) ** 2
+            # bounded by rounding, for a force far above the noise
+            precision = (power * np.maximum(1.0 - share, np.finfo(float).eps)) ** 2
         return share
 
-    def _end(self, u: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The ends by what a force leaves of the record, given the tail and the residual along it; and their pull."""
+    def _transient(self, u: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Least-squares state d of the transient given a force, and the right-hand side of its normal equations.
+
+        Args:
+            u: T projected on the directions of the force.
+            a: the residual, likewise.
+        """
         own, along = self._products
         along = along - real_product(u, a)
         return np.linalg.lstsq(own - real_product(u, u), along, rcond=1e-12)[0], along
 
     def _directions(self, shape: np.ndarray) -> list[np.ndarray]:
-        """Orthonormal directions (n_lines, n_sensors) that a force of any law is read along."""
+        """Orthonormal directions (n_lines, n_sensors) that span the response to a force of any law."""
         h = np.stack([each.to_force(shape) for each in (self.receptances, *self.folded)], axis=2)
         h = h / np.sqrt(np.maximum(np.sum(np.abs(h) ** 2, axis=1, keepdims=True), 1e-300))
         return [h[:, :, 0]] if not self.folded else list(np.moveaxis(np.linalg.qr(h)[0], 2, 0))
 
     def _along(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The tail and the residual along a direction."""
+        """T and the residual projected on a direction."""
         along = direction.conj()
         return self.receptances.along(along), np.sum(along * self.left, axis=1)
 
 
 def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
-    """About what a force leaves where the modes have each of many shapes (n_places, n_modes).
+    """Approximate misfits (n_places,) of a force at places of mode shapes `shapes` (n_places, n_modes).
 
-    The ends of the record are left out, and lines where little is read.
+    The transient and weak lines are left out.
     """
     left, lines = np.full(len(shapes), lines.power), lines.strongest(LINES.screened)
     to_force = [
@@ -304,7 +316,7 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
         directions: list[Complexes] = []
         for h in through:
             seen = h @ shapes.T
-            for _ in range(2 if directions else 0):  # once more takes away what rounding left
+            for _ in range(2 if directions else 0):  # Gram-Schmidt twice, against rounding
                 for other in directions:
                     seen = seen - other * np.sum(other.conj() * seen, axis=0)
             seen = seen / np.sqrt(np.maximum(np.sum(np.abs(seen) ** 2, axis=0), 1e-300))
@@ -313,13 +325,14 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
     return left
 
 
-def _smooth(values: np.ndarray) -> np.ndarray:
+def _moving_sum(values: np.ndarray) -> np.ndarray:
+    """Moving sum over `LINES.width` lines, (n_lines,)."""
     width = min(LINES.width, values.size)
     return np.convolve(np.pad(values, (width // 2, width - 1 - width // 2), mode="edge"), np.ones(width), mode="valid")
 
 
 def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sample_time: float) -> list[Lines]:
-    """The lines of every record.
+    """The spectral lines of every record's residual.
 
     Args:
         rig: nominal.
@@ -345,10 +358,10 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
 
 
 def _folds(rig: Rig, sample_time: float) -> list[int]:
-    """By how many times the sample rate the frequencies of forces differ that are folded onto lines: -1, 1, -2, ...
+    """Multiples of the sample rate by which aliased forces differ in frequency from the lines: -1, 1, -2, ...
 
-    As far up as there are modes, where these reach beyond the sample rate, accelerations are read, and the sensors can
-    tell them apart; displacements and velocities hardly follow a force so quick.
+    As many as the modes reach, and as the number of sensors can separate. None unless modes reach beyond the sample
+    rate and accelerations are measured: displacements and velocities hardly respond to such frequencies.
     """
     _, orders = reading_of(rig)
     top = int(rig.modes.omega[-1] * sample_time / np.pi)

@@ -1,4 +1,4 @@
-"""Where a simulation and a test disagree: at what place, in which records, modes, bands, times, sensors and levels."""
+"""Localisation of the gap between simulation and test: place, records, modes, bands, times, sensors and levels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,20 +25,20 @@ from workbench.threads import one_blas_thread
 class LocalisationSettings:
     """Constants of the localisation of one force."""
 
-    valleys: int = 3  # of the misfit that are gone into
-    rounds: int = 3  # in each: where the force is, which lines it stands out in
-    beside: float = 0.95  # of the spacing of places: how far about a valley it is refined
-    resolved: float = 1e-3  # of the spacing of places: to how much
+    valleys: int = 3  # local minima of the misfit that are refined
+    rounds: int = 3  # alternations between the place and the weights of the lines
+    beside: float = 0.95  # of the grid spacing: range about a minimum in which it is refined
+    resolved: float = 1e-3  # of the grid spacing: tolerance of the refinement
     pairs_shown: int = 12  # of named points
-    two_sigma: float = 4.0  # rise of the misfit
-    noise: float = 0.1  # of the noise, left by what may be one force
+    two_sigma: float = 4.0  # rise of the misfit at two standard errors
+    noise: float = 0.1  # of the noise power: largest excess of the residual given one force
     all_but: float = 1e-5  # of the gap, likewise
-    chance: float = 3.0  # deviations of a sum of squares
-    edge: float = 1e-4  # of the length: a place stays so far inside
-    near: float = 0.02  # of a rectangle's size: the first simplex about a peak
-    tolerance: float = 1e-2  # of the misfit, in squared deviations
-    evaluations: int = 60  # of the simplex
-    curved_over: float = 0.1  # of that simplex: half of the stretch over which the misfit's curvature is taken
+    chance: float = 3.0  # standard deviations of a sum of squares
+    edge: float = 1e-4  # of the length: least distance of a place from the ends
+    near: float = 0.02  # of a rectangle's size: first simplex about a peak
+    tolerance: float = 1e-2  # of the misfit, in units of the noise variance
+    evaluations: int = 60  # of the simplex search
+    curved_over: float = 0.1  # of that simplex: step of the second difference of the misfit
     bisections: int = 6  # of the distance at which the misfit has risen
 
 
@@ -47,17 +47,17 @@ LOCALISATION = LocalisationSettings()
 
 @dataclass(frozen=True, eq=False)
 class ForceLocation:
-    """How likely one force, of any law, is at each place, and where it is likeliest.
+    """Likelihood of one force of any law at each place, and the likeliest place.
 
     Attributes:
         places: (n_places,) on the structure.
-        profile: (n_places,) log-likelihood there, less that of the likeliest place.
+        profile: (n_places,) log-likelihood, relative to that of the likeliest place.
         at: the likeliest place.
-        at_std: a quarter of the way between where the misfit is two deviations higher, m, more by what is left
-            beyond the noise; on a rectangle along the longer axis of the region; 0 for named places.
-        share: of the gap's power above the noise, what one force there accounts for.
-        is_single_force: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing
-            shows it: no gap, one sensor, or records too short.
+        at_std: standard error of the place, m, from a quarter of the 2-sigma interval, inflated by the residual above
+            the noise; on a rectangle along the longer axis of the region; 0 for named places.
+        share: of the gap's power above the noise that one force there explains.
+        is_single_force: whether one force reduces the gap to noise, or to a negligible share; None if that cannot be
+            tested: no gap, one sensor, or records too short.
     """
 
     places: Sequence[Any]
@@ -72,22 +72,22 @@ class ForceLocation:
 
 @one_blas_thread
 def locate_force(evidence: Evidence) -> ForceLocation:
-    """Where one force, of any law, would make the simulation agree with the test.
+    """Locate the one force, of any law, that best explains the gap.
 
-    One sensor locates nothing: a force anywhere accounts for all that it reads. Sensors that lag are left out.
+    One sensor locates nothing, since a force anywhere explains its readings. Sensors with a lag are left out.
     """
     evidence = evidence.without([sensor.name for sensor in evidence.rig.sensors if sensor.time_constant > 0])
     domain, guess, places = evidence.domain, evidence.peaks[0], evidence.places
     if len(evidence.rig.sensors) < 2:
-        unsure = 0.0 if isinstance(domain, NamedPoints) else domain.size / np.sqrt(12.0)
-        return ForceLocation(places, np.zeros(len(places)), guess, unsure, 0.0, None)
+        std = 0.0 if isinstance(domain, NamedPoints) else domain.size / np.sqrt(12.0)
+        return ForceLocation(places, np.zeros(len(places)), guess, std, 0.0, None)
     search = _Search(evidence, evidence.lines)
     informative = search.informative(guess)
     at: Any
     if isinstance(domain, Interval):
         profile = search.along(informative, places)
         at = min(
-            evidence.workers.map(search.refined, _valleys(np.asarray(places, float), profile)),
+            evidence.workers.map(search.refined, _minima(np.asarray(places, float), profile)),
             key=search.unweighted_misfit,
         )
         informative = search.informative(at)
@@ -97,7 +97,7 @@ def locate_force(evidence: Evidence) -> ForceLocation:
         informative = search.informative(at)
         profile = search.screened(informative, places)
     else:
-        places = _shown(places, evidence.profile)
+        places = _points_and_best_pairs(places, evidence.profile)
         profile = search.along(informative, places)
         at, std = places[int(np.argmin(profile))], 0.0
     lowest = min(search.misfit(informative, at), profile.min())
@@ -105,14 +105,14 @@ def locate_force(evidence: Evidence) -> ForceLocation:
     return ForceLocation(places, -0.5 * (profile - lowest), at, std, *search.of_one_force(at))
 
 
-def _shown(places: Sequence[Any], profile: np.ndarray) -> list[Any]:
-    """All named points, and the likeliest pairs of them."""
+def _points_and_best_pairs(places: Sequence[Any], profile: np.ndarray) -> list[Any]:
+    """All named points, and the likeliest pairs."""
     ranked = [places[i] for i in np.argsort(-profile, kind="stable") if isinstance(places[i], Between)]
     return [*(where for where in places if not isinstance(where, Between)), *ranked[: LOCALISATION.pairs_shown]]
 
 
-def _valleys(places: np.ndarray, misfit: np.ndarray) -> np.ndarray:
-    """The places of the deepest valleys."""
+def _minima(places: np.ndarray, misfit: np.ndarray) -> np.ndarray:
+    """The places of the deepest local minima."""
     padded = np.r_[np.inf, misfit, np.inf]
     bottoms = np.flatnonzero((misfit <= padded[:-2]) & (misfit <= padded[2:]))
     return places[bottoms[np.argsort(misfit[bottoms])][: LOCALISATION.valleys]]
@@ -120,31 +120,41 @@ def _valleys(places: np.ndarray, misfit: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Search:
+    """The misfit of one force as a function of its place.
+
+    Attributes:
+        evidence: of the nominal rig.
+        lines: spectral lines of every record.
+    """
+
     evidence: Evidence
     lines: list[Lines]
 
     def shape(self, where: Any) -> np.ndarray:
+        """Mode shapes at a place (n_modes,)."""
         return self.evidence.rig.modes.phi_at(where)
 
     def informative(self, where: Any) -> list[Lines]:
-        """The lines weighted by the share of a force somewhere in them."""
+        """The lines, weighted by the share of their power that is due to a force at a place."""
         shape = self.shape(where)
         return [each.weighted(each.force_share(shape)) for each in self.lines]
 
     def misfit(self, lines: list[Lines], where: Any) -> float:
+        """Residual sum of squares given one force at a place."""
         shape = self.shape(where)
         return sum(each.misfit(shape) for each in lines)
 
     @property
     def degrees_of_freedom(self) -> int:
+        """Degrees of freedom of the residual given one force."""
         return sum(each.degrees_of_freedom for each in self.lines)
 
     def left(self, at: Any) -> float:
-        """What a force there leaves beyond the noise, per value, in units of the noise."""
+        """Residual power above the noise given a force at a place, in units of the noise power."""
         return self.misfit(self.lines, at) / max(self.degrees_of_freedom, 1) - 1.0
 
     def of_one_force(self, at: Any) -> tuple[float, bool | None]:
-        """Share of the gap's power that a force there accounts for, and whether it is all of it."""
+        """Share of the gap's power that a force at a place explains, and whether that is all of it."""
         values = 2 * sum(each.left.size for each in self.lines)
         gap = sum(each.power for each in self.lines) - values
         if self.degrees_of_freedom == 0 or gap < LOCALISATION.chance * np.sqrt(2.0 * values):
@@ -158,13 +168,13 @@ class _Search:
         return np.array(self.evidence.workers.map(lambda x: self.misfit(lines, x), places))
 
     def screened(self, lines: list[Lines], places: Sequence[Any]) -> np.ndarray:
-        """About the misfit at each of many places: the ends of the records are left out."""
+        """The approximate misfit at each of many places, without transients."""
         shapes = np.array([self.shape(where) for where in places])
         misfits: Floats = np.sum([screened(each, shapes) for each in lines], axis=0)
         return misfits
 
     def refined_over(self, top: tuple[float, float]) -> tuple[tuple[float, float], float]:
-        """The bottom of a valley over a rectangle, and one standard deviation along its longer axis, m."""
+        """The local minimum of the misfit on a rectangle, and its standard error along the longer axis, m."""
         rectangle, informative = self.evidence.domain, self.informative(top)
         assert isinstance(rectangle, Rectangle)
         extent = np.array(rectangle.length)
@@ -184,12 +194,12 @@ class _Search:
         found = minimize(misfit, top, method="Nelder-Mead", options=options)
         at = np.clip(found.x, LOCALISATION.edge * extent, (1.0 - LOCALISATION.edge) * extent)
         step = LOCALISATION.curved_over * reach
-        rises = [misfit(at + h) + misfit(at - h) - 2.0 * found.fun for h in step * np.array([(1, 0), (0, 1)])]
-        flattest = max(min(rises), 1e-12)  # of |r|², twice the logarithm of a likelihood ratio
+        curvatures = [misfit(at + h) + misfit(at - h) - 2.0 * found.fun for h in step * np.array([(1, 0), (0, 1)])]
+        flattest = max(min(curvatures), 1e-12)  # of |r|², twice the log-likelihood ratio
         return (float(at[0]), float(at[1])), float(min(step * np.sqrt(2.0 / flattest), rectangle.size))
 
     def refined(self, top: float) -> float:
-        """The bottom of a valley."""
+        """The local minimum of the misfit along an interval."""
         at, informative = float(top), self.informative(top)
         spacing = self.evidence.places[1] - self.evidence.places[0]
         for _ in range(LOCALISATION.rounds):
@@ -207,16 +217,16 @@ class _Search:
         return at
 
     def unweighted_misfit(self, at: Any) -> float:
-        """The misfit of a valley by all lines alike: weights of its own would favour it."""
+        """The misfit at a place with equal weights, for comparing minima: each one's own weights would favour it."""
         return self.misfit(self.lines, at)
 
     def deviation(self, lines: list[Lines], at: float) -> float:
-        """Half of one standard deviation either way, from where the misfit is two higher."""
+        """Standard error of a place, m: a quarter of the interval in which the misfit rises by less than 4."""
         lowest = self.misfit(lines, at)
-        return sum(self._rises(lines, at, side, lowest + LOCALISATION.two_sigma) for side in (-1.0, 1.0)) / 4.0
+        return sum(self._distance_to(lines, at, side, lowest + LOCALISATION.two_sigma) for side in (-1.0, 1.0)) / 4.0
 
-    def _rises(self, lines: list[Lines], at: float, side: float, level: float) -> float:
-        """How far on one side the misfit comes to a level."""
+    def _distance_to(self, lines: list[Lines], at: float, side: float, level: float) -> float:
+        """Distance on one side at which the misfit reaches a level, m."""
         length = self.evidence.domain.size
         inside, outside = 0.0, 1e-5 * length
         while outside < length and 0 < at + side * outside < length:
@@ -230,6 +240,7 @@ class _Search:
         return outside
 
     def _inside(self, low: float, high: float) -> tuple[float, float]:
+        """Bounds moved inside the structure."""
         length = self.evidence.domain.size
         edge = LOCALISATION.edge * length
         return max(low, edge), min(high, length - edge)
@@ -237,57 +248,57 @@ class _Search:
 
 @dataclass(frozen=True)
 class WhereSettings:
-    """Constants of what is said of where a gap is."""
+    """Constants of the breakdown of the gap."""
 
-    mode_share: float = 0.05  # of the gap, from which on a mode is named
-    one_sensor: float = 0.97  # of the gap, from which on it is that of one sensor
+    mode_share: float = 0.05  # of the gap: modes with more are named
+    one_sensor: float = 0.97  # of the gap: with more in one sensor, that sensor alone disagrees
     octaves: int = 8  # below half the sample rate
-    clear: float = 0.1  # of the noise: a gap that is larger by less is none
-    # of the frequency of a mode: resonators about it. A gap of lightly damped modes outlives any segment of a record,
-    # so that coherence by averaged spectra would miss most of it; a change of a mode's frequency, damping or gain lies
-    # nearly in the span of resonators close to the mode
+    clear: float = 0.1  # of the noise: a gap above it by less does not count
+    # of the frequency of a mode: resonators about it. The response of lightly damped modes is longer than any segment
+    # of a record, so that coherence by averaged spectra would miss most of it; a change of a mode's frequency, damping
+    # or gain lies nearly in the span of resonators close to the mode
     spread: tuple[float, ...] = (0.85, 0.93, 0.97, 0.99, 1.0, 1.01, 1.03, 1.07, 1.15)
     most_modes: int = 6  # that have resonators
     rigid: float = 0.5  # of the frequency of the first elastic mode: the end of the band of rigid modes
     above: float = 1.15  # of the frequency of the last mode: the end of its band
-    louder: float = 2.0  # of levels, gaps and floors: what is larger than others by less tells nothing of amplitude
-    linear: float = 0.9  # share of the gap's power that one linear reply explains, from which on the gap is linear
-    silent: float = 1e-3  # of the largest line of the inputs: a line that they do not have
-    distorted: float = 10.0  # power of the gap on such lines over that of its noise, from which on it is distortion
-    hum: int = 3  # such lines of an octave, the strongest, that mains hum may have: they do not count
-    periods: int = 3  # at the end of a record, the first of them before both that are compared
+    louder: float = 2.0  # ratio of levels or gaps: smaller ones say nothing of a dependence on amplitude
+    linear: float = 0.9  # of the gap's power: if a linear model explains more, the gap is linear
+    silent: float = 1e-3  # of the largest line of the inputs: lines below it are not excited
+    distorted: float = 10.0  # power of the gap on lines not excited over that of noise: more is distortion
+    hum: int = 3  # strongest of these lines in each octave that do not count, as they may be mains hum
+    periods: int = 3  # last periods of a record that are used; the first of them only for the drift
 
 
 WHERE = WhereSettings()
-RIDGES = np.logspace(-9, -1, 9)  # of the strongest direction, of which the one that predicts held-out samples is taken
+RIDGES = np.logspace(-9, -1, 9)  # ridge parameters, of the largest eigenvalue, for cross-validation
 
 
 @dataclass(frozen=True, eq=False)
 class Where:
-    """The gap of the nominal model, taken apart.
+    """Breakdown of the gap of the nominal model.
 
-    Shares are of the squared residual above the noise, each sensor scaled by its own standard deviation, in the records
-    with a gap that is clearly larger than their noise; in all where none is.
+    Shares are of the squared residual above the noise, each sensor scaled by its own standard deviation, over the
+    records whose gap is clearly above the noise, or over all records if there are none.
 
     Attributes:
         path: "actuator", "structure", "sensor", "environment", or "none".
-        modes: one-based numbers of the modes around whose frequencies at least a twentieth of the gap lies; of rigid
-            modes, which share one band, all or none.
-        amplitude_dependent: whether the gap changes with level; None where the records do not establish it.
-        mode_shares: (n_modes,) share of the gap in the band around each natural frequency; each rigid mode has an equal
-            part of what lies below half the first elastic one.
+        modes: one-based numbers of the modes with at least a twentieth of the gap around their frequencies; rigid
+            modes share one band, so all or none of them.
+        amplitude_dependent: whether the gap changes with level; None if the records do not show it.
+        mode_shares: (n_modes,) share of the gap in the band around each natural frequency; rigid modes have equal parts
+            of the band below half the first elastic frequency.
         share_above: of the gap, above the band of the last mode.
-        band_edges_hz: (n_bands + 1,) of octaves down from half the sample rate, the lowest open to zero.
+        band_edges_hz: (n_bands + 1,) octaves down from half the sample rate, the lowest open to zero.
         band_shares: (n_bands,) share of the gap in each.
         sensor_shares: (n_outputs,).
         time_shares: (n_records, 8) of each record's gap, by eighths of its length.
         record_gaps: (n_records,) gap as the case format defines it.
         record_floors: (n_records,) the same of the noise alone.
         input_levels: (n_records,) root mean square of the inputs.
-        linear_share: of the gap's power, what one linear reply to the inputs explains.
-        distortions: (n_records, 2) power of the gap on odd and on even lines that periodic inputs do not have, over
-            that of noise and of motion that has not settled; zero where inputs do not repeat.
-        place: of an unmodelled force at a point, whatever its law: `at` and `at_std`, m; and whether it is one force.
+        linear_share: of the gap's power that one linear model of the inputs explains.
+        distortions: (n_records, 2) power of the gap on odd and on even lines that periodic inputs do not excite, over
+            that of noise and transients; zero if inputs are not periodic.
+        place: of an unmodelled force of any law: `at` and `at_std`, m; and whether it is one force.
     """
 
     path: str
@@ -322,24 +333,24 @@ class Where:
 
     @property
     def beyond_noise(self) -> float:
-        """The largest gap of a record that is clearly above its noise, less that noise, as a share of the signal."""
+        """The largest gap of a record that is clearly above its noise, the noise subtracted, over the signal."""
         clear = _is_clear(self.record_gaps, self.record_floors)
         power = np.where(clear, self.record_gaps**2 - self.record_floors**2, 0.0)
         return float(np.sqrt(power.max()))
 
 
 def _is_clear(gaps: Floats, floors: Floats) -> Flags:
-    """(n_records,) whether the gap of a record is clearly larger than that of its noise."""
+    """Whether the gap of each record (n_records,) is clearly above its noise."""
     return np.asarray(gaps > (1.0 + WHERE.clear) * floors)
 
 
 def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) -> Where:
-    """Take the gap on the fit records apart.
+    """Break down the gap on the fit records.
 
     Args:
         evidence: of the nominal rig.
-        effects: that explain the gap, where they are known: the path is theirs.
-        place: of an unmodelled force, found without sensors that are known to be at fault.
+        effects: that explain the gap, if known; they give the path.
+        place: of an unmodelled force, located without faulty sensors.
     """
     data = evidence.data
     scaled = [
@@ -351,16 +362,16 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
     gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
     noise = np.array([np.sqrt(floor.mean()) for floor in floors])
     clear = _is_clear(gaps, noise)
-    telling = np.flatnonzero(clear if clear.any() else ~clear)  # scaled by itself, noise alone would count like a gap
-    by_sensor = np.maximum(excess[telling], 0.0).sum(axis=0)
-    seen = [(data.counted[i], scaled[i]) for i in telling]
+    with_gap = np.flatnonzero(clear if clear.any() else ~clear)  # noise alone, scaled by itself, would count as a gap
+    by_sensor = np.maximum(excess[with_gap], 0.0).sum(axis=0)
+    seen = [(data.counted[i], scaled[i]) for i in with_gap]
     frequencies = evidence.rig.modes.frequencies_hz
     mode_shares, above = _by_mode(frequencies, seen, data.noise)
     in_band = np.where(frequencies > 0, mode_shares, mode_shares[frequencies == 0].sum())
     octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - WHERE.octaves, 1)]
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
     share = linear_share(
-        evidence.rig, [data.counted[i] for i in telling], [evidence.residuals[i] for i in telling], mode_shares
+        evidence.rig, [data.counted[i] for i in with_gap], [evidence.residuals[i] for i in with_gap], mode_shares
     )
     each = zip(data.counted, evidence.residuals, strict=True)
     distortions = np.array([_distortion(evidence.rig, record, residual) for record, residual in each])
@@ -373,7 +384,7 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
         band_edges_hz=octaves,
         band_shares=_shares_between(octaves, seen, data.noise),
         sensor_shares=by_sensor / max(by_sensor.sum(), 1e-300),
-        time_shares=np.array([_by_eighths(s) for s in scaled]),
+        time_shares=np.array([_shares_of_eighths(s) for s in scaled]),
         record_names=tuple(record.name for record in data.counted),
         record_gaps=gaps,
         record_floors=noise,
@@ -387,15 +398,15 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
 def _by_mode(frequencies: Floats, scaled: Sequence[tuple[Record, Floats]], noise: Floats) -> tuple[Floats, float]:
     """Share of the residuals' power in the band of each mode (n_modes,), and above that of the last.
 
-    Rigid modes, which no frequency tells apart, have one band, in equal parts.
+    Rigid modes share one band in equal parts.
     """
     elastic = frequencies[frequencies > 0]
-    first = WHERE.rigid * elastic[:1] * (elastic.size < frequencies.size)  # zero: a band that is empty
-    # geometric means, for a peak is as wide as its frequency is high, and what lies above the last mode is told by
-    # itself; `setup.by_band` compares whole signals, and ends bands halfway
+    first = WHERE.rigid * elastic[:1] * (elastic.size < frequencies.size)  # zero: an empty band
+    # geometric means, as the width of a peak is proportional to its frequency; `setup.by_band`, which compares whole
+    # signals, takes arithmetic means
     edges = np.r_[0.0, first, np.sqrt(elastic[1:] * elastic[:-1]), WHERE.above * elastic[-1:], np.inf]
     rigid, *others = _shares_between(edges, scaled, noise)
-    above = others.pop() if others else 0.0  # of rigid modes alone nothing lies above
+    above = others.pop() if others else 0.0  # with only rigid modes, there is one band
     n_rigid = frequencies.size - len(others)
     return np.r_[np.full(n_rigid, rigid / max(n_rigid, 1)), others], float(above)
 
@@ -413,12 +424,14 @@ def _shares_between(edges: np.ndarray, scaled: Sequence[tuple[Record, Floats]], 
     return power / max(float(power.sum()), 1e-300)
 
 
-def _by_eighths(scaled: Floats) -> Floats:
+def _shares_of_eighths(scaled: Floats) -> Floats:
+    """Share of the power in each eighth of a record (8,)."""
     power: Floats = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
     return power / max(float(power.sum()), 1e-300)
 
 
 def _path(evidence: Evidence, excess: np.ndarray, power: np.ndarray, effects: Sequence[Effect]) -> str:
+    """Path of the first effect, or a guess from the sensors and inputs that show the gap."""
     paths = [effect.kind.path for effect in effects]
     if paths:
         return paths[0]
@@ -437,14 +450,14 @@ def _path(evidence: Evidence, excess: np.ndarray, power: np.ndarray, effects: Se
 
 
 def of_one_sensor(excess: np.ndarray) -> bool:
-    """Whether one sensor alone disagrees, by the power above the noise in each (n_outputs,)."""
+    """Whether one sensor alone disagrees, given the power above the noise of each (n_outputs,)."""
     return bool(excess.max() > WHERE.one_sensor * excess.sum())
 
 
 def _amplitude_dependent(
     effects: Sequence[Effect], gaps: Floats, floors: Floats, levels: Floats, linear: float, distortions: Floats
 ) -> bool | None:
-    """Whether the gap changes with level; None where that is not established."""
+    """Whether the gap changes with level; None if that is not established."""
     if effects:
         return any(effect.kind.nonlinear for effect in effects)
     above = np.sqrt(np.maximum(gaps**2 - floors**2, 0.0))
@@ -457,10 +470,10 @@ def _amplitude_dependent(
 
 
 def _distortion(rig: Rig, record: Record, residual: Floats) -> Floats:
-    """Power of the gap on odd and on even lines that periodic inputs do not have, over noise and unsettled motion.
+    """Power of the gap on odd and on even lines that periodic inputs do not excite, over that of noise and transients.
 
-    Motion that decays by exp(-a) a period stands on all lines, and the mean of two periods is 1 / tanh(a / 2) times
-    half of what they differ by. A drift of a sensor is taken off first.
+    A transient that decays by exp(-a) a period appears on all lines; its mean over two periods is 1 / tanh(a / 2) times
+    half their difference. A drift of a sensor is subtracted first.
     """
     period = period_of(record.inputs)
     if period is None or record.n_samples < WHERE.periods * period:
@@ -488,24 +501,25 @@ def _distortion(rig: Rig, record: Record, residual: Floats) -> Floats:
 
 
 def linear_share(rig: Rig, records: Sequence[Record], residuals: Sequence[np.ndarray], shares: np.ndarray) -> float:
-    """Share of the residuals' power that one linear reply to the inputs explains in all records.
+    """Share of the residuals' power that one linear model of the inputs explains in all records (cross-validated).
 
-    The reply is learnt on all records but one and judged on that one, each in turn: a narrow-band residual has so few
-    degrees of freedom that resonators fitted to it would explain it whatever made it. A lone record is halved.
+    Ridge regression on resonators is trained on all records but one and validated on that one, each in turn: without
+    validation, resonators would fit any narrow-band residual, which has few degrees of freedom. A single record is
+    halved.
 
     Args:
         rig: nominal.
         records: with their inputs.
-        residuals: (n_outputs, n_samples) a record, measured less predicted.
-        shares: (n_modes,) of the gap around each mode; the few largest are looked at.
+        residuals: (n_outputs, n_samples) a record, measured minus predicted.
+        shares: (n_modes,) of the gap around each mode; only the modes with the largest shares are used.
     """
     chosen = [int(r) for r in np.argsort(-shares)[: WHERE.most_modes] if shares[r] > 0]
     sizes = np.sqrt(np.mean([record.outputs.var(axis=1) for record in records], axis=0))[:, None]
     pieces = []
     for record, residual in zip(records, residuals, strict=True):
-        # a record's level is taken from both sides, so that every record counts alike and the reply stays the same
+        # regressors and residual are divided by the level, so that every record has equal weight in the same model
         level = np.sqrt(np.mean((record.outputs / sizes) ** 2))
-        pieces.append((_replies(rig, chosen, record) / level, residual / sizes / level))
+        pieces.append((_regressors(rig, chosen, record) / level, residual / sizes / level))
     if len(pieces) == 1:
         half = pieces[0][0].shape[1] // 2
         pieces = [(x[:, part], y[:, part]) for x, y in pieces for part in (slice(half), slice(half, None))]
@@ -515,7 +529,7 @@ def linear_share(rig: Rig, records: Sequence[Record], residuals: Sequence[np.nda
     left = np.zeros(RIDGES.size)
     for (x, y), own_normal, own_right in zip(pieces, normal, right, strict=True):
         strengths, axes = np.linalg.eigh(sum(normal) - own_normal)
-        if not (strengths > 0).any():  # no other record has inputs to learn a reply by
+        if not (strengths > 0).any():  # no other record has inputs to train on
             left += float((y**2).sum())
             continue
         target, shown = axes.T @ (sum(right) - own_right), axes.T @ x
@@ -525,11 +539,11 @@ def linear_share(rig: Rig, records: Sequence[Record], residuals: Sequence[np.nda
     return float(np.clip(1.0 - left.min() / sum(float((y**2).sum()) for _, y in pieces), 0.0, 1.0))
 
 
-def _replies(rig: Rig, chosen: Sequence[int], record: Record) -> np.ndarray:
-    """What each mode may reply with, (n_replies, n_samples).
+def _regressors(rig: Rig, chosen: Sequence[int], record: Record) -> np.ndarray:
+    """Regressors (n_regressors, n_samples) of a linear model of the gap.
 
-    A mode under each input by itself, where its participation has changed; resonators beside it under its modal force,
-    where its frequency or damping has.
+    The response of each mode to each input alone, for changed participation factors; and of resonators of neighbouring
+    frequencies to the modal force, for a changed frequency or damping.
     """
     if not chosen:
         return record.inputs

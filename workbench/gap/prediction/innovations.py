@@ -1,4 +1,4 @@
-"""Innovations: a rig, with all its laws, predicts one sample ahead, and every sample of a record corrects it."""
+"""Innovations: errors of one-step-ahead predictions by a rig with all its laws, corrected at every sample."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,19 +16,19 @@ from workbench.rig.simulate import KEPT, Motion, move, prediction_errors, read, 
 from workbench.structure.domain import Interval, Where
 from workbench.structure.modes import Modes
 
-LOOSE = 0.01  # of the inputs: random forces, by which an observer corrects a rig's motion
-DOUBLINGS = 12  # of the samples over which a corrected motion is seen to die away: eight are enough for most
-RUN_AWAY = 1e100  # squared norm of a power, whose square is a number still
+LOOSE = 0.01  # of the inputs' rms: process noise forces that set the observer gain
+DOUBLINGS = 12  # squarings of the transition matrix in the test of stability: eight are enough for most
+RUN_AWAY = 1e100  # squared norm of a matrix power that can be squared once more without overflow
 
 
 @dataclass(frozen=True, eq=False)
 class Observer:
-    """A steady-state Kalman filter of a rig's modes, under random forces on all of them.
+    """A steady-state Kalman filter of a rig's modes, with random forces on all of them.
 
     Attributes:
         gain: (2, n_modes, n_outputs) of their displacements and velocities.
-        whitening: (n_outputs, n_outputs) to errors of unit covariance.
-        sensors: that it is made for.
+        whitening: (n_outputs, n_outputs) matrix that gives innovations unit covariance.
+        sensors: that it is designed for.
     """
 
     gain: np.ndarray
@@ -47,10 +47,15 @@ class Observer:
         rms: float = 0.0,
         loose: float = LOOSE,
     ) -> "Observer":
-        """For sensors of that noise (n_outputs,), and inputs of that rms, N; and a random force at a place, N.
+        """The observer of a rig.
 
         Args:
-            loose: how far the rig may go its own way: random forces on it, as a share of the inputs, the less the more.
+            rig: with the modes.
+            noise: (n_outputs,) standard deviation of each sensor's noise.
+            force: rms of the inputs, N.
+            sample_time: s.
+            at, rms: place and rms, N, of a further random force.
+            loose: rms of the process noise forces over that of the inputs: the less, the lower the gain.
         """
         modes, n = rig.modes, rig.modes.n_modes
         domain = modes.domain
@@ -58,68 +63,70 @@ class Observer:
         forces = loose * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
         shape = np.zeros(n) if at is None else modes.phi_at(at)
         patterns, variances = np.column_stack([np.eye(n), shape]), np.r_[forces**2, rms**2]
-        model = sampled_model(modes, _at_once(rig).sensors, noise, sample_time)
+        model = sampled_model(modes, _instantaneous(rig).sensors, noise, sample_time)
         found = force_filter(model, patterns, variances)
-        # what an error says of the forces until the next sample is put into the state at this one
+        # from the predictor form to a correction of the state at this sample
         gain = np.linalg.solve(model.transition, found.gain[: 2 * n])
         whitening = np.linalg.inv(np.linalg.cholesky(found.innovation))
         return cls(gain.reshape(2, n, -1).copy(), whitening, rig.sensors)
 
-    def errors(self, rig: Rig, record: Record, substeps: int, motion: Callable[[], Motion] | None = None) -> np.ndarray:
-        """Errors (n_outputs, n_samples) of a rig whose predictions are stepped through time, of unit covariance.
+    def innovations(
+        self, rig: Rig, record: Record, substeps: int, motion: Callable[[], Motion] | None = None
+    ) -> np.ndarray:
+        """Innovations of unit covariance (n_outputs, n_samples) of a rig that is integrated in time.
 
-        What sensors lose by delay, lag or clipping is not observed: it is made up for as the whole record has it.
+        The effect of delay, lag and clipping of sensors is taken from a simulation of the whole record.
 
         Args:
             rig: with its laws.
             record: of its inputs and outputs.
             substeps: of a sample.
-            motion: of the whole record, by these substeps, where it may be at hand.
+            motion: returns that of the whole record with these substeps, if it may be cached.
         """
-        with np.errstate(over="ignore", invalid="ignore"):  # the motion of a rig that was tried may run away
-            errors: Floats = self.whitening @ self._one_step_errors(rig, record, substeps, motion)
+        with np.errstate(over="ignore", invalid="ignore"):  # the simulation may diverge
+            errors: Floats = self.whitening @ self._innovations(rig, record, substeps, motion)
         return errors
 
-    def left(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
-        """What a rig leaves of a whole record (n_outputs, n_samples) whose laws act on the motion that was measured.
+    def residual_on_measured_motion(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+        """Residual (n_outputs, n_samples) of a whole record with nonlinear laws acting on the measured motion.
 
-        The laws then make no more of what else is missing than they really did: what is left is the structure's linear
-        answer to it. That of a rig without laws is measured less predicted.
+        The laws then do not distort the response to an unmodelled force: the residual is the structure's linear
+        response to it. For a rig without laws, it is measured minus predicted.
         """
-        errors = self._one_step_errors(rig, record, substeps)
-        model = sampled_model(rig.modes, _at_once(rig).sensors, np.ones(len(rig.sensors)), record.sample_time)
+        errors = self._innovations(rig, record, substeps)
+        model = sampled_model(rig.modes, _instantaneous(rig).sensors, np.ones(len(rig.sensors)), record.sample_time)
         gain = self._gain_for(rig, record.sample_time).reshape(-1, errors.shape[0])
-        # every correction goes on to be a motion
+        # the response to all corrections is added back
         return errors + model.output @ driven(model.transition, model.transition @ gain @ errors)[:, :-1]
 
-    def _one_step_errors(
+    def _innovations(
         self, rig: Rig, record: Record, substeps: int, motion: Callable[[], Motion] | None = None
     ) -> np.ndarray:
-        """Errors one sample ahead, in the sensors' units."""
-        slow, measured, dt = _unrounded(rig), record.outputs, record.sample_time
-        quick = _at_once(slow)
-        if quick is not slow:
+        """Innovations (n_outputs, n_samples), in the sensors' units."""
+        unrounded, measured, dt = _without_rounding(rig), record.outputs, record.sample_time
+        instantaneous = _instantaneous(unrounded)
+        if instantaneous is not unrounded:
             if motion is None:
                 moved = move(rig, record.inputs, sample_time=dt, substeps=substeps, input_hold=record.input_hold)
             else:
                 moved = motion()
-            measured = measured + read(quick, moved, sample_time=dt) - read(slow, moved, sample_time=dt)
+            measured = measured + read(instantaneous, moved, sample_time=dt) - read(unrounded, moved, sample_time=dt)
         gain = self._gain_for(rig, dt)
         hold = record.input_hold
         return prediction_errors(
-            quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps, input_hold=hold
+            instantaneous, record.inputs, measured, gain, sample_time=dt, substeps=substeps, input_hold=hold
         )
 
-    def errors_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
-        """What the errors of a linear rig over a whole record leave of themselves when every sample sets it right.
+    def innovations_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
+        """Innovations of unit covariance (n_outputs, n_samples) of a linear rig, from its simulation residual.
 
         Args:
-            rig: with its predictions in closed form.
-            left: (n_outputs, n_samples) measured less predicted.
+            rig: linear.
+            left: (n_outputs, n_samples) measured minus predicted, of the whole record.
             sample_time: s.
-            substeps: of a sample, where damping couples the modes.
+            substeps: of a sample, if damping couples the modes.
         """
-        bare = _bare(rig)
+        bare = _structure_only(rig)
         gain, no_inputs = self._gain_for(rig, sample_time), np.zeros((0, left.shape[1]))
         substeps = 1 if rig.modes.proportional else substeps
         errors = prediction_errors(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
@@ -128,47 +135,47 @@ class Observer:
 
     @lru_cache(maxsize=KEPT)  # noqa: B019  an observer is a few arrays
     def _gain_for(self, rig: Rig, sample_time: float) -> np.ndarray:
-        """The gain, with none for modes that are more than it knows of.
+        """The gain (2, n_modes, n_outputs) for a rig; zero for modes that the observer was not designed for.
 
-        A sensor that stands elsewhere may make the correction of a rig run away: then it corrects none.
+        Where relocated sensors make the observer unstable, their gain is zero, and if need be the whole gain.
         """
         gain = np.zeros((2, rig.modes.n_modes, self.whitening.shape[0]))
         known = min(rig.modes.n_modes, self.gain.shape[1])
         gain[:, :known] = self.gain[:, :known]
-        moved = [j for j, each in enumerate(zip(rig.sensors, self.sensors, strict=True)) if not _alike(*each)]
-        if moved and _runs_away(rig, gain, sample_time):
+        moved = [j for j, each in enumerate(zip(rig.sensors, self.sensors, strict=True)) if not _reads_the_same(*each)]
+        if moved and _is_unstable(rig, gain, sample_time):
             gain[:, :, moved] = 0.0
-            if _runs_away(rig, gain, sample_time):
+            if _is_unstable(rig, gain, sample_time):
                 gain[:] = 0.0
         return gain
 
 
 @lru_cache(maxsize=KEPT)
-def _bare(rig: Rig) -> Rig:
-    """The rig with nothing but its structure, and sensors that read as they should."""
+def _structure_only(rig: Rig) -> Rig:
+    """The rig with only its structure and ideal sensors."""
     sensors = tuple(Sensor(s.name, s.at, s.quantity, gain=s.gain, direction=s.direction) for s in rig.sensors)
     return replace(rig, actuators=(), elements=(), sensors=sensors)
 
 
-def _alike(one: Sensor, other: Sensor) -> bool:
+def _reads_the_same(one: Sensor, other: Sensor) -> bool:
     """Whether two sensors measure the same quantity at the same place."""
     return (one.at, one.quantity, one.direction) == (other.at, other.quantity, other.direction)
 
 
-def _runs_away(rig: Rig, gain: Floats, sample_time: float) -> bool:
-    """Whether the modes grow when every sample corrects them: an eigenvalue of (I - K C) A is beyond 1."""
-    step = _step_of(rig.modes, sample_time)
+def _is_unstable(rig: Rig, gain: Floats, sample_time: float) -> bool:
+    """Whether the observer of a rig is unstable: an eigenvalue of (I - K C) A is beyond 1."""
+    step = _transition(rig.modes, sample_time)
     rows, orders = reading_of(rig)
     n = rig.modes.n_modes
     derivatives = np.vstack([np.eye(2 * n), rig.modes.state_matrix[n:]]).reshape(3, n, 2 * n)
     output = np.einsum("jr,jrs->js", rows, derivatives[orders])
-    return _grows(step - gain.reshape(2 * n, -1) @ (output @ step))
+    return _is_growing(step - gain.reshape(2 * n, -1) @ (output @ step))
 
 
-def _grows(step: Floats) -> bool:
-    """Whether a motion may grow, step after step: an eigenvalue is beyond 1."""
+def _is_growing(step: Floats) -> bool:
+    """Whether a transition matrix has an eigenvalue beyond 1."""
     power = step
-    for _ in range(DOUBLINGS):  # none is where the norm of a power is not, which is quicker to see
+    for _ in range(DOUBLINGS):  # a power of norm below 1 proves stability, and is cheaper than eigenvalues
         power = power @ power
         size = float(np.einsum("ij,ij->", power, power))
         if size < 1.0:
@@ -179,23 +186,23 @@ def _grows(step: Floats) -> bool:
 
 
 @lru_cache(maxsize=4)
-def _step_of(modes: Modes, sample_time: float) -> Floats:
-    """The free motion of modes over a sample, (2 n_modes, 2 n_modes)."""
+def _transition(modes: Modes, sample_time: float) -> Floats:
+    """Transition matrix of the modes over a sample, (2 n_modes, 2 n_modes)."""
     step: Floats = expm(modes.state_matrix * sample_time)
     return step
 
 
 @lru_cache(maxsize=KEPT)
-def _unrounded(rig: Rig) -> Rig:
-    """The rig itself where no sensor rounds."""
+def _without_rounding(rig: Rig) -> Rig:
+    """The rig without rounding of sensors; the same object if none rounds."""
     if not any(sensor.step for sensor in rig.sensors):
         return rig
     return replace(rig, sensors=tuple(replace(s, step=0.0) if s.step else s for s in rig.sensors))
 
 
 @lru_cache(maxsize=KEPT)
-def _at_once(rig: Rig) -> Rig:
-    """The rig itself where no sensor is late, lags or clips."""
+def _instantaneous(rig: Rig) -> Rig:
+    """The rig without delay, lag, crosstalk and clipping of sensors; the same object if there is none."""
     if not any(
         sensor.crosstalk or sensor.delay or sensor.time_constant or np.isfinite(sensor.limit) for sensor in rig.sensors
     ):

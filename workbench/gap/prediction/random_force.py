@@ -1,4 +1,4 @@
-"""A random disturbance: no prediction can hold it, so it is found by what it does to the statistics."""
+"""Maximum-likelihood fit of a random disturbance force, which no simulation can predict, to the residuals."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,32 +30,32 @@ from workbench.structure.domain import NamedPoints, Where, same_place
 class RandomForceSettings:
     """Constants of the fit of a random force."""
 
-    sizes: tuple[float, ...] = (3e-3, 3e-2, 3e-1)  # of a typical force
-    longest_memory: float = 0.9995  # a sample: beyond, the force is a drift
+    sizes: tuple[float, ...] = (3e-3, 3e-2, 3e-1)  # start values of its rms, over a typical force
+    longest_memory: float = 0.9995  # pole, a sample: beyond, the force is a drift
     first_place: float = 0.03  # of the extent: first step of the simplex along each coordinate of the place
     first_log_rms: float = 0.5  # likewise, along the logarithm of its rms
     first_logit: float = 0.7  # likewise, along the logit of its memory
-    tolerance: float = 1e-4  # shares and logarithms
-    loss_tolerance: float = 0.1  # twice a log-likelihood
+    tolerance: float = 1e-4  # of the simplex, in these coordinates
+    loss_tolerance: float = 0.1  # of twice the log-likelihood
     evaluations: int = 160
-    families: int = 3  # of colours, likeliest first, that are fitted to two records before one is to all
-    curved_over: float = 2e-3  # of the extent: half of the stretch over which the likelihood's curvature is taken
-    # what may be one random force of the surroundings: by how much its level spreads between records, relative; how far
-    # the mean square of what is left may be from one; what share of it inputs and motion may account for
+    families: int = 3  # shaping filters, likeliest first, that are fitted to two records before the best is to all
+    curved_over: float = 2e-3  # of the extent: step of the second difference of the likelihood
+    # one random force of the surroundings: largest spread of its rms between records, relative; largest deviation of
+    # the mean square of the whitened residual from 1; largest share of it that inputs and motion predict
     level_spread: float = 0.15
     whitened: float = 0.08
     follows: float = 0.1
 
 
 RANDOM_FORCE = RandomForceSettings()
-# Memory, stages and whether they are flat, the likeliest of which a fit starts from.
+# Memory, stages and flatness (see `colour_of`) of the shaping filters; a fit starts from the likeliest.
 COLOURS = (
     *((memory, 1, False) for memory in (0.0, 0.6, 0.9)),
     *((memory, 2, False) for memory in (0.5, 0.8, 0.95)),
     *((memory, 3, False) for memory in (0.6, 0.85)),
     *((memory, stages, True) for stages in (2, 4) for memory in (0.1, 0.4, 0.7, 0.9)),
 )
-TONAL = 0.7  # share of it that its mean and one sinusoid account for, at most
+TONAL = 0.7  # largest share of the force's power in its mean and one sinusoid
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,18 +64,17 @@ class RandomForceFit:
 
     Attributes:
         at: where it acts.
-        rms: of the process, N; its part above what the structure answers to is a guess.
-        at_std: standard deviation of each coordinate of the place, m; none of a named point.
+        rms: of the process, N; extrapolated above the frequencies at which the structure responds.
+        at_std: standard error of each coordinate of the place, m; empty for a named point.
         colour: (n_stages, n_stages) of the force; see `colour_of`.
         cost: minus twice the log-likelihood per value, on the scale where a residual of pure sensor noise costs 1.
         chi2_by_record: (n_records,) mean squares of the whitened residual.
-        left: mean square of what the smoothed force leaves of whole records, in units of the noise.
-        rms_by_record: (n_records,) of the smoothed force, N: of what acted, as far as the records show.
-        hidden_rms: of what the process has beyond that, N.
-        between: share of the force's power that may be the model's alone, which holds it over each sample: one that
-            acts continuously does more than that by as much.
-        follows: largest share of the force that the inputs and the motion of its record account for.
-        tonal: least share of the force of a record that its mean and one sinusoid account for.
+        left: mean square residual of whole records given the smoothed force, in units of the noise.
+        rms_by_record: (n_records,) of the smoothed force, N: the part that the records show.
+        hidden_rms: of the part that they do not show, N.
+        between: share of power by which the rms is uncertain, since the model holds the force over each sample.
+        follows: largest share of the force that the inputs and the motion of its record predict.
+        tonal: smallest share of the force's power, of all records, in its mean and one sinusoid.
     """
 
     at: Where
@@ -93,10 +92,10 @@ class RandomForceFit:
 
     @property
     def acting_rms(self) -> tuple[float, float]:
-        """Rms over all records of the force that acted, N, and the standard deviation of that.
+        """Rms of the force over all records, N, and its standard error.
 
-        From the scatter between records; what they do not show is guessed by the colour, so that none of it or twice as
-        much may be there, and whether it acts between samples is not known.
+        The standard error combines the scatter between records with two unknowns: the part that they do not show, of
+        which the process may have none or twice as much, and whether the force varies between samples.
         """
         seen, hidden = self.rms_by_record**2, self.hidden_rms**2
         power = seen.mean() + hidden
@@ -107,14 +106,15 @@ class RandomForceFit:
 
     @property
     def holds(self) -> bool:
-        """Whether the force is the same in every record, whatever the level, follows nothing that the rig does, and is
-        no constant or single tone, which could be predicted.
-        """
+        """Whether the whitened residual is white and the force is random: see `is_steady`."""
         return self.is_steady and bool(np.abs(self.chi2_by_record - 1.0).max() < RANDOM_FORCE.whitened)
 
     @property
     def is_steady(self) -> bool:
-        """Whether the force is the same in every record, follows nothing and is no tone, whatever else is left."""
+        """Whether the force is equally strong in every record, unrelated to inputs and motion, and no constant or tone.
+
+        A force that fails could be predicted. The whiteness of the residual is not tested.
+        """
         spread = np.ptp(self.rms_by_record) / self.rms_by_record.mean()
         steady = spread < RANDOM_FORCE.level_spread
         return bool(steady and self.follows < RANDOM_FORCE.follows and self.tonal < TONAL)
@@ -123,11 +123,13 @@ class RandomForceFit:
 def fit_random_force(
     rig: Rig, data: FitData, residuals: Sequence[np.ndarray], places: Sequence[Where], size: float
 ) -> RandomForceFit:
-    """Maximum likelihood of place, strength and colour, from the best of a grid.
+    """Maximum-likelihood estimate of place, strength and colour, from the best of a grid.
 
     Args:
+        rig: that the force acts on.
+        data: records, with the sensors' noise.
         residuals: (n_outputs, n_samples) a record, in the sensors' units.
-        places: to start from; named points are compared as they are.
+        places: to start from; for named points, all candidates.
         size: a typical force, N.
     """
     model = sampled_model(rig.modes, rig.sensors, data.noise, data.counted[0].sample_time)
@@ -136,7 +138,7 @@ def fit_random_force(
     extent = np.zeros(0) if isinstance(domain, NamedPoints) else np.atleast_1d(domain.length)
     d = extent.size  # coordinates of a place that can be fitted
 
-    def placed_at(point: np.ndarray, start: Where) -> Where:
+    def place_of(point: np.ndarray, start: Where) -> Where:
         return start if d == 0 else same_place(point[:d] * extent)
 
     def memory_at(point: np.ndarray) -> float:
@@ -147,7 +149,7 @@ def fit_random_force(
         memory = memory_at(point)
         if not ((point[:d] > 0.0) & (point[:d] < 1.0)).all() or memory > RANDOM_FORCE.longest_memory:
             return 1e300
-        kalman = _filter(model, rig, placed_at(point, start), np.exp(point[d]), colour_of(memory, stages, flat=flat))
+        kalman = _filter(model, rig, place_of(point, start), np.exp(point[d]), colour_of(memory, stages, flat=flat))
         value = -2.0 * log_likelihood(kalman, records)
         return value if np.isfinite(value) else 1e300
 
@@ -173,14 +175,14 @@ def fit_random_force(
     likely: dict[tuple[int, bool], tuple[np.ndarray, tuple[Where, int, bool]]] = {}
     for start, family in sorted(grid, key=lambda each: loss(each[0], each[1], quick)):
         likely.setdefault(family[1:], (start, family))
-    briefly = RANDOM_FORCE.evaluations // 2
-    nearer = [
-        (refined(first, family, quick, briefly), family)
+    half_evaluations = RANDOM_FORCE.evaluations // 2
+    refined_quick = [
+        (refined(first, family, quick, half_evaluations), family)
         for first, family in list(likely.values())[: RANDOM_FORCE.families]
     ]
-    nearest, family = min(nearer, key=lambda each: float(each[0].fun))
+    nearest, family = min(refined_quick, key=lambda each: float(each[0].fun))
     found, (beside, stages, flat) = refined(nearest.x, family, residuals, RANDOM_FORCE.evaluations), family
-    at, log_rms = placed_at(found.x, beside), found.x[d]
+    at, log_rms = place_of(found.x, beside), found.x[d]
     colour = colour_of(memory_at(found.x), stages, flat=flat)
     kalman = _filter(model, rig, at, np.exp(log_rms), colour)
     n_values = sum(r.size for r in residuals)
@@ -192,7 +194,8 @@ def fit_random_force(
         at=at,
         rms=float(np.exp(log_rms)),
         at_std=tuple(
-            _deviation(lambda p: loss(p, family, residuals), found.x, i, RANDOM_FORCE.curved_over) * float(extent[i])
+            _curvature_std(lambda p: loss(p, family, residuals), found.x, i, RANDOM_FORCE.curved_over)
+            * float(extent[i])
             for i in range(d)
         ),
         colour=colour,
@@ -211,9 +214,9 @@ def fit_random_force(
 
 
 def lost_between_samples(forces: Sequence[np.ndarray]) -> float:
-    """Share of the power of forces (n_samples,) that a force with these spectra lacks where it acts continuously.
+    """Share of the power of forces (n_samples,) that is lost by a hold over each sample.
 
-    A force held over each sample acts as a continuous one that is weaker at every frequency by the sinc of the hold.
+    A force held over each sample acts as a continuous one times the sinc of the hold at every frequency.
     """
     powers = [np.abs(np.fft.rfft(force)) ** 2 for force in forces]
     kept = [float(power @ np.sinc(np.fft.rfftfreq(f.size)) ** 2) for power, f in zip(powers, forces, strict=True)]
@@ -221,7 +224,7 @@ def lost_between_samples(forces: Sequence[np.ndarray]) -> float:
 
 
 def tonal(force: np.ndarray, sample_time: float) -> float:
-    """Share of a force's power that its mean and its strongest sinusoid account for."""
+    """Share of a force's power in its mean and its strongest sinusoid."""
     mean = float(force.mean())
     _, amplitude, _ = tone(force, sample_time)
     return float(min((mean**2 + 0.5 * amplitude**2) / max(float(force @ force) / force.size, 1e-300), 1.0))
@@ -233,22 +236,26 @@ def model_filter(model: SampledModel, rig: Rig, found: RandomForceFit) -> ForceF
 
 
 def _filter(model: SampledModel, rig: Rig, at: Where, rms: float, colour: Floats) -> ForceFilter:
+    """The Kalman filter for a random force of a place, an rms (N) and a colour."""
     variance = np.array([rms**2 / _power(colour)])
     return force_filter(model, rig.modes.phi_at(at)[:, None], variance, colour)
 
 
 def _power(colour: Floats) -> float:
-    """Variance of a force per variance of what drives its colour."""
+    """Variance of a coloured force per variance of the white noise that drives its shaping filter."""
     drive = np.zeros_like(colour)
     drive[-1, -1] = 1.0
     return float(accumulated(colour, drive)[0, 0])
 
 
 def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float:
-    """Share of the force that the inputs and the motion they cause account for, chance taken off.
+    """Share of a force's power that linear regression on inputs and motion explains, less what chance would.
 
-    The motion (2, n_samples), displacement and velocity at the force, is the model's without the force: that of the
-    real structure has part of the force in it, whatever the force follows.
+    Args:
+        force: (n_samples,) N.
+        inputs: (n_inputs, n_samples); several lags of each are regressors.
+        motion: (2, n_samples) displacement and velocity at the force, simulated without it: the measured motion always
+            correlates with the force.
     """
     active = [row for row in inputs if np.any(row)]
     if not active:
@@ -262,8 +269,8 @@ def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float
     return float(max(fitted @ fitted / (target @ target) - 3.0 * followed.shape[1] / target.size, 0.0))
 
 
-def _deviation(loss: Callable[[np.ndarray], float], point: np.ndarray, j: int, step: float) -> float:
-    """From the curvature of minus twice the log-likelihood."""
+def _curvature_std(loss: Callable[[np.ndarray], float], point: np.ndarray, j: int, step: float) -> float:
+    """Standard error of a coordinate from the curvature of `loss`, minus twice the log-likelihood; 0 if not convex."""
     ahead, behind = point.copy(), point.copy()
     ahead[j] += step
     behind[j] -= step

@@ -1,4 +1,4 @@
-"""The residual of the fit records: measured less predicted, in units of the noise."""
+"""The residual of the fit records: measured minus predicted, in units of the noise."""
 
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -18,34 +18,33 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion, is_stepped, move, read, steps_exactly
 from workbench.structure.modes import Modes
 
-REMEMBERED = 2  # motions of a record: of 45,000 that searches ask for, 4,400 are the last or the one before, 140 older
+REMEMBERED = 2  # cached motions a record: of 45,000 requests in searches, 4,400 are of the last two, 140 of older ones
 
 
 def lead_of(record: Record, settle: float) -> int:
-    """Samples at the start of a record that last so many seconds."""
+    """Number of samples in the first `settle` seconds of a record."""
     return min(round(settle / record.sample_time), record.n_samples - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class FitData:
-    """Records that a fit may see. Validation records never become part of one.
+    """Records of a fit, never validation records, and how their residual is formed.
 
     Attributes:
         records: measured, all with the rig's inputs and outputs.
         noise: (n_outputs,) standard deviation of each sensor's noise, rounding included.
-        substeps: of a sample, for rigs that are not linear.
-        settle: seconds at the start of each record that are simulated but not counted, while the rig settles from the
-            rest that the simulation assumes to the motion it really had.
-        whiteners: filter of random forces on the structure, by record, through which its residual is seen; none where
-            there are none. With an observer, laws then act on the motion that was measured: that of the rig has no such
-            force.
-        given_way: (n_values, k) W: a residual r becomes r - W Wᵀ r, for uncertain parameters that are re-estimated
-            with every candidate to first order; None where none are.
-        observer: of the rig's state by the records, so that its predictions are of one sample ahead; None where
-            they are of the whole record.
-        guessed: names of the sensors whose noise nobody stated.
-        heat: mean square of a residual that counts as noise, for now.
-        deadline: of the search that these records are for; fits end with the best that they have when it is past.
+        substeps: of a sample, for nonlinear rigs.
+        settle: seconds at the start of each record that are simulated but not counted, since the simulation starts
+            from rest and the rig did not.
+        whiteners: by record, the filter that whitens the response to random forces; empty for none. With an observer,
+            nonlinear laws then act on the measured motion, since the simulated one lacks these forces.
+        nuisance: (n_values, k) W: a residual r becomes r - W Wᵀ r, for nuisance parameters that are re-estimated with
+            every candidate to first order; None for none.
+        observer: estimates the rig's state from the records, for one-step-ahead predictions; None for simulations of
+            whole records.
+        guessed: names of the sensors without a stated noise.
+        temperature: mean square of the residual that counts as noise (tempered likelihood); 1 for the stated noise.
+        deadline: of the search; fits end with the best that they have when it is past.
     """
 
     records: tuple[Record, ...]
@@ -53,10 +52,10 @@ class FitData:
     substeps: int = 4
     settle: float = 0.0
     whiteners: Mapping[str, ForceFilter] = field(default_factory=dict)
-    given_way: Floats | None = None
+    nuisance: Floats | None = None
     observer: Observer | None = None
     guessed: frozenset[str] = frozenset()
-    heat: float = 1.0
+    temperature: float = 1.0
     deadline: Deadline = NEVER
     _memory: OrderedDict[Any, tuple[Modes, Motion]] = field(default_factory=OrderedDict, repr=False, init=False)
     _lock: Lock = field(default_factory=Lock, repr=False, init=False)
@@ -87,58 +86,59 @@ class FitData:
         """The same residual with other standard deviations of the sensors' noise (n_outputs,)."""
         return replace(self, noise=noise)
 
-    def tempered(self, heat: float) -> "FitData":
-        """The same residual with that mean square as noise."""
-        return replace(self, heat=heat)
+    def tempered(self, temperature: float) -> "FitData":
+        """The same residual over the root of a mean square that counts as noise."""
+        return replace(self, temperature=temperature)
 
     def through(self, whitener: ForceFilter, observer: Observer) -> "FitData":
-        """The same residual beside a random force."""
+        """The same residual, whitened for a random force."""
         return replace(self, whiteners={record.name: whitener for record in self.records}, observer=observer)
 
-    def beside_inputs(self, whiteners: Mapping[str, ForceFilter]) -> "FitData":
-        """The same residual beside noise of the logged inputs."""
+    def with_input_noise(self, whiteners: Mapping[str, ForceFilter]) -> "FitData":
+        """The same residual, whitened for input noise."""
         return replace(self, whiteners=whiteners)
 
-    def giving_way(self, sensitivity: np.ndarray) -> "FitData":
-        """The same measure with residuals as small as uncertain parameters make them, to first order.
+    def with_nuisance(self, sensitivity: np.ndarray) -> "FitData":
+        """The same residual, minimised over nuisance parameters with normal priors to first order.
 
-        Their squares sum to min over δ of |r + S δ|² + |δ|²: that of r times the root of I - S (Sᵀ S + I)⁻¹ Sᵀ.
+        Its sum of squares is min over δ of |r + S δ|² + |δ|²: the new residual is (I - S (Sᵀ S + I)⁻¹ Sᵀ)^½ r.
 
         Args:
-            sensitivity: (n_values, n_parameters) S, in prior standard deviations of each.
+            sensitivity: (n_values, n_parameters) S, each column times the prior standard deviation of its parameter.
         """
         if not sensitivity.size:
-            return replace(self, given_way=None)
+            return replace(self, nuisance=None)
         _, sizes, turned = np.linalg.svd(_triangle(sensitivity))
         root = np.sqrt(1.0 + sizes**2)
-        return replace(self, given_way=sensitivity @ (turned[: root.size].T / np.sqrt(root * (root + 1.0))))
+        return replace(self, nuisance=sensitivity @ (turned[: root.size].T / np.sqrt(root * (root + 1.0))))
 
     def one_step_ahead(self, rig: Rig, loose: float = LOOSE) -> "FitData":
-        """The same residual on predictions one sample ahead, by the observer gain of this rig.
+        """The residual of one-step-ahead predictions, with a steady-state Kalman filter of this rig.
 
         Args:
-            loose: random forces on it, as a share of the inputs: the less, the more it goes its own way.
+            rig: that the filter is designed for.
+            loose: rms of process noise forces, as a share of the inputs: the less, the lower the observer gain.
         """
-        if self.observer is not None:  # innovations beside a random force are errors one sample ahead as they are
-            return replace(self, given_way=None)
+        if self.observer is not None:  # innovations with a random force are one-step-ahead errors already
+            return replace(self, nuisance=None)
         observer = Observer.of(rig, self.noise, self.force_rms, self.records[0].sample_time, loose=loose)
-        return replace(self, observer=observer, whiteners={}, given_way=None)
+        return replace(self, observer=observer, whiteners={}, nuisance=None)
 
     @cached_property
     def force_rms(self) -> float:
-        """Root mean square of the inputs that are not at rest, N."""
+        """Root mean square of the nonzero inputs, N."""
         squares = [row[row != 0] ** 2 for record in self.counted for row in record.inputs if np.any(row)]
         return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 1.0
 
     @cached_property
     def counted(self) -> tuple[Record, ...]:
-        """The records without their lead."""
+        """The records without the samples of `settle` at their start."""
         if self.settle == 0:
             return self.records
         return tuple(record.between(record.time[lead_of(record, self.settle)]) for record in self.records)
 
     def motions(self, rig: Rig) -> tuple[Motion, ...]:
-        """The rig's motion on each record; the last few are remembered, since a sensor's fault does not change it."""
+        """The rig's motion on each record; the last few are cached, since a sensor's fault does not change it."""
         return tuple(self._motion(rig.in_record(record.name), record) for record in self.records)
 
     def _motion(self, rig: Rig, record: Record) -> Motion:
@@ -161,32 +161,33 @@ class FitData:
         return motion
 
     def predictions(self, rig: Rig) -> tuple[np.ndarray, ...]:
-        """(n_outputs, n_samples) a record."""
+        """Predicted outputs (n_outputs, n_samples) of each record."""
         return tuple(
             read(rig.in_record(record.name), motion, sample_time=record.sample_time)
             for record, motion in zip(self.counted, self.motions(rig), strict=True)
         )
 
     def residual(self, rig: Rig) -> np.ndarray:
-        """(measured - predicted) / noise, or their innovations of unit variance, all records joined: (n_values,)."""
-        residual = self._left(rig)
-        self.give_way(residual)
-        return residual if self.heat == 1.0 else residual / np.sqrt(self.heat)
+        """(measured - predicted) / noise, or innovations of unit variance, of all records end to end: (n_values,)."""
+        residual = self._residual(rig)
+        self.project_out(residual)
+        return residual if self.temperature == 1.0 else residual / np.sqrt(self.temperature)
 
-    def give_way(self, residuals: np.ndarray) -> None:
-        """Let residuals (..., n_values) of `standing` become as small as uncertain parameters make them, in place."""
-        if self.given_way is not None:
-            residuals -= (residuals @ self.given_way) @ self.given_way.T
+    def project_out(self, residuals: np.ndarray) -> None:
+        """Minimise residuals (..., n_values) of `unprojected` over the nuisance parameters, in place."""
+        if self.nuisance is not None:
+            residuals -= (residuals @ self.nuisance) @ self.nuisance.T
 
     @cached_property
-    def standing(self) -> "FitData":
-        """The same residual without uncertain parameters."""
-        return self if self.given_way is None else replace(self, given_way=None)
+    def unprojected(self) -> "FitData":
+        """The same residual without nuisance parameters."""
+        return self if self.nuisance is None else replace(self, nuisance=None)
 
-    def _left(self, rig: Rig) -> np.ndarray:
+    def _residual(self, rig: Rig) -> np.ndarray:
+        """The residual (n_values,) before projection and tempering."""
         observer = self.observer
         if self.whiteners:
-            each = zip(self.records, self.left_beside(rig, observer), strict=True)
+            each = zip(self.records, self.residual_on_measured_motion(rig, observer), strict=True)
             return np.concatenate([whiten(self.whiteners[record.name], left).ravel() for record, left in each])
         if observer is None:
             return np.concatenate([(r / self.noise[:, None]).ravel() for r in self.differences(rig)])
@@ -194,12 +195,12 @@ class FitData:
         if is_stepped(rig) or (on_samples and steps_exactly(rig)):
             substeps, first = self.substeps if is_stepped(rig) else 1, self._from_the_first_sample
             rigs = [(rig.in_record(record.name), record) for record in self.records]
-            # a sensor's fault does not change the motion, which may be known
-            ahead = [observer.errors(r, record, substeps, partial(first._motion, r, record)) for r, record in rigs]
+            # a sensor's fault does not change the motion, which may be cached
+            ahead = [observer.innovations(r, record, substeps, partial(first._motion, r, record)) for r, record in rigs]
         else:
             whole = zip(self.records, self._from_the_first_sample.differences(rig), strict=True)
             ahead = [
-                observer.errors_of_linear(rig.in_record(record.name), left, record.sample_time, self.substeps)
+                observer.innovations_of_linear(rig.in_record(record.name), left, record.sample_time, self.substeps)
                 for record, left in whole
             ]
         each_ahead = zip(self.records, ahead, strict=True)
@@ -215,25 +216,30 @@ class FitData:
 
     @property
     def mixes_sensors(self) -> bool:
-        """Whether values of the residual are of several sensors at once."""
-        return bool(self.whiteners) or self.observer is not None or self.given_way is not None
+        """Whether a value of the residual depends on several sensors."""
+        return bool(self.whiteners) or self.observer is not None or self.nuisance is not None
 
     @cached_property
     def sources(self) -> np.ndarray:
-        """The number of the sensor that each value of the residual is of, (n_values,)."""
+        """Index of the sensor of each value of the residual, (n_values,)."""
         return np.concatenate([np.repeat(np.arange(len(r.outputs)), r.n_samples) for r in self.counted])
 
-    def left_beside(self, rig: Rig, observer: Observer | None) -> list[np.ndarray]:
-        """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with an observer."""
+    def residual_on_measured_motion(self, rig: Rig, observer: Observer | None) -> list[np.ndarray]:
+        """Measured minus predicted (n_outputs, n_samples) of each record, in the sensors' units.
+
+        With an observer, nonlinear laws act on the measured motion.
+        """
         if observer is None or not is_stepped(rig) or rig.stiffness_rate:
             return self.differences(rig)
         return [
-            observer.left(rig.in_record(record.name), record, self.substeps)[:, lead_of(record, self.settle) :]
+            observer.residual_on_measured_motion(rig.in_record(record.name), record, self.substeps)[
+                :, lead_of(record, self.settle) :
+            ]
             for record in self.records
         ]
 
     def differences(self, rig: Rig) -> list[np.ndarray]:
-        """Measured less predicted on whole records (n_outputs, n_samples), one per record, in the sensors' units."""
+        """Measured minus simulated outputs (n_outputs, n_samples) of each record, in the sensors' units."""
         both = zip(self.counted, self.predictions(rig), strict=True)
         return [record.outputs - prediction for record, prediction in both]
 
@@ -242,14 +248,14 @@ class FitData:
         rows, start = [], 0
         for record in self.counted:
             size = record.outputs.size
-            with np.errstate(over="ignore"):  # of a motion that runs away
+            with np.errstate(over="ignore"):  # the simulation may diverge
                 rows.append((residual[start : start + size].reshape(record.outputs.shape) ** 2).mean(axis=1))
             start += size
         return np.array(rows)
 
 
 def _triangle(matrix: Floats) -> Floats:
-    """R of a tall matrix = Q R, by blocks of rows that stay in a processor's cache."""
+    """R (n_columns, n_columns) of a tall matrix = Q R, by blocks of rows that fit a processor's cache."""
     n_columns = matrix.shape[1]
     n_rows = 4 * n_columns
     whole = len(matrix) // n_rows * n_rows

@@ -1,8 +1,8 @@
-"""The unmodelled force: what force at a point, of any form, would make the simulation agree with the test?
+"""Estimation of an unmodelled force at a point, without any assumption on its law.
 
-The residual of the nominal model obeys the model's own equations, driven by whatever the model leaves out. A Kalman
-filter with an unknown force at x (a first-order random process) gives the likelihood of that place without a guess
-of the law, and its smoother gives the force, and the motion there, to look at.
+The residual of the nominal model obeys the model's own equations, driven by the unmodelled force. A Kalman filter with
+an unknown force at x (a first-order random process) gives the likelihood of that place; its smoother gives the force
+and the motion there.
 """
 
 from dataclasses import dataclass, replace
@@ -18,9 +18,9 @@ from workbench.rig.stepping import FAST, LANES
 from workbench.structure.modes import Modes
 
 RUNAWAY = 1e100
-WHITE = np.zeros((1, 1))  # colour of a force that no sample tells of the next
-TETHER = 1e-4  # radians a sample
-DOUBLINGS = 40  # of samples, at most, over which a memory is summed
+WHITE = np.zeros((1, 1))  # colour of a force that is uncorrelated from sample to sample
+TETHER = 1e-4  # radians a sample: frequency given to rigid modes
+DOUBLINGS = 40  # of the number of samples summed over, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,9 @@ class SampledModel:
     Attributes:
         transition: (2n, 2n) of the state (q, q').
         growth: (2n, n) response of the state to modal forces held over the interval.
-        output: (n_sensors, 2n) and feedthrough (n_sensors, n) of modal forces.
-        before: (n_sensors, n) likewise of those of the interval before, which sensors that are late still read.
+        output: (n_sensors, 2n) of the state.
+        feedthrough: (n_sensors, n) of modal forces.
+        before: (n_sensors, n) of the modal forces of the interval before, which late sensors still read.
         noise_variance: (n_sensors,).
     """
 
@@ -44,16 +45,16 @@ class SampledModel:
 
 
 def _tethered(modes: Modes, sample_time: float) -> Modes:
-    """Modes, the rigid ones on a spring too soft to show: sensors of velocity see no displacement of theirs."""
+    """The modes with rigid ones on a very soft spring, as velocity sensors do not observe their displacement."""
     if modes.omega.all():
         return modes
     return replace(modes, omega=np.where(modes.omega > 0, modes.omega, TETHER / sample_time), damping=modes.damping)
 
 
 def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, sample_time: float) -> SampledModel:
-    """Discretise the modes for sensors with noise standard deviations `noise` (n_sensors,).
+    """The modes, discretised, with sensors of noise standard deviations `noise` (n_sensors,).
 
-    Of a sensor that is late by more than a sample, the forces are taken as held for so long.
+    For a sensor that is late by more than a sample, forces are taken as held over the delay.
     """
     n = modes.n_modes
     own = _tethered(modes, sample_time).state_matrix
@@ -81,7 +82,7 @@ def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, 
 
 @dataclass(frozen=True, eq=False)
 class ForceFilter:
-    """A steady Kalman filter of the state (q, q', g_1..g_m) with m unknown forces.
+    """A steady-state Kalman filter of the state (q, q', g_1..g_m) with m unknown forces.
 
     Attributes:
         a, h: transition and output of the augmented state.
@@ -103,7 +104,7 @@ def force_filter(
     """The filter for forces along `patterns` (n_modes, n_forces) with the given process variances.
 
     Args:
-        colour: (n_stages, n_stages) of each force from one sample to the next, from the force itself to the last stage,
+        colour: (n_stages, n_stages) transition of each force's shaping filter, from the force itself to the last stage,
             which white noise drives; see `colour_of`.
     """
     n_state, m = model.transition.shape[0], patterns.shape[1]
@@ -120,21 +121,20 @@ def force_filter(
     h[:, forces:] = (model.before @ patterns)[:, :late]
     q = np.zeros_like(a)
     q[forces - m : forces, forces - m : forces] = np.diag(variances)
-    return _steady(a, h, q, model.noise_variance)
+    return _steady_state(a, h, q, model.noise_variance)
 
 
 def colour_of(memory: float, stages: int, *, flat: bool = False) -> Floats:
-    """How a coloured force goes on from one sample to the next: (stages, stages).
+    """Transition matrix (stages, stages) of a shaping filter that makes a coloured force of white noise.
 
     Args:
-        memory: of each stage, from one sample to the next: 0 for white, near 1 for a random walk.
-        stages: in a row, each of which makes the force smoother.
-        flat: with the poles of a Butterworth filter in place of equal real ones: as strong at all frequencies up to a
-            corner, as noise that is limited to a band.
+        memory: pole of each stage: 0 for white, near 1 for a random walk.
+        stages: first-order filters in series, each of which makes the force smoother.
+        flat: Butterworth poles instead of equal real ones: a flat spectrum up to a corner, as of band-limited noise.
     """
-    turns = np.pi * (1.0 - (2.0 * np.arange(stages) + 1.0) / stages) / 2.0 if flat else np.zeros(stages)
-    poles = max(memory, 1e-12) ** np.exp(1j * turns)
-    # in sections of one pole or a pair: the polynomial of all of them loses digits where they are near 1
+    angles = np.pi * (1.0 - (2.0 * np.arange(stages) + 1.0) / stages) / 2.0 if flat else np.zeros(stages)
+    poles = max(memory, 1e-12) ** np.exp(1j * angles)
+    # first- and second-order sections: the polynomial of all poles loses digits where they are near 1
     colour = np.diag(np.where(np.abs(poles.imag) < 1e-12, poles.real, 0.0)) + np.eye(stages, k=1)
     for k, pole in enumerate(np.sort_complex(poles[poles.imag > 1e-12])):
         i = 2 * k
@@ -147,9 +147,9 @@ def colour_of(memory: float, stages: int, *, flat: bool = False) -> Floats:
 def wandering_force_filter(
     modes: Modes, model: SampledModel, shape: np.ndarray, rms: float, correlation_time: float, sample_time: float
 ) -> ForceFilter:
-    """The filter for one force that wanders within a sample too, as the forces of contact and friction do.
+    """The filter for one force that is an Ornstein-Uhlenbeck process, discretised exactly.
 
-    An Ornstein-Uhlenbeck process, integrated exactly.
+    Forces of contact and friction vary within a sample too.
 
     Args:
         modes, model: of the rig, and its sampled form.
@@ -165,7 +165,7 @@ def wandering_force_filter(
     a[: 2 * n, : 2 * n] = modes.state_matrix
     a[n : 2 * n, -1] = shape
     a[-1, -1] = -1.0 / correlation_time
-    # displacements as velocities, so that the matrix is no larger than the highest frequency
+    # displacements scaled as velocities, so that the norm of the matrix is about the highest frequency
     scale = np.r_[np.maximum(modes.omega, 0.1 * modes.omega[-1]), np.ones(n + 1)]
     a = a * scale[:, None] / scale
     drive = np.zeros((size, size))
@@ -175,10 +175,11 @@ def wandering_force_filter(
     transition = transition / scale[:, None] * scale
     noise = 0.5 * (noise + noise.T) / scale[:, None] / scale
     h = np.hstack([model.output, (model.feedthrough + model.before) @ shape[:, None]])
-    return _steady(transition, h, noise, model.noise_variance)
+    return _steady_state(transition, h, noise, model.noise_variance)
 
 
-def _steady(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray) -> ForceFilter:
+def _steady_state(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray) -> ForceFilter:
+    """The steady-state filter of a transition, an output and a process noise covariance."""
     covariance = steady_covariance(a, h, q, noise_variance)
     s = h @ covariance @ h.T + np.diag(noise_variance)
     gain = np.linalg.solve(s, h @ covariance @ a.T).T
@@ -186,7 +187,7 @@ def _steady(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndar
 
 
 def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:
-    """Steady prediction covariance of the Kalman filter, by structure-preserving doubling.
+    """Steady-state prediction covariance (n_states, n_states) of the Kalman filter, by structure-preserving doubling.
 
     Chu, Fan, Lin & Wang, Int. J. Control 77 (2004) 767. A filter needs about fifteen doublings.
     """
@@ -206,10 +207,9 @@ def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_varianc
 
 
 def accumulated(a: Floats, q: Floats) -> Floats:
-    """Σ Aᵏ Q (Aᵏ)ᵀ, (n, n), of a stable A, over twice as many k each time.
+    """Σ Aᵏ Q (Aᵏ)ᵀ, (n, n), of a stable A, by doubling: Smith, SIAM J. Appl. Math. 16 (1968) 198.
 
-    Smith, SIAM J. Appl. Math. 16 (1968) 198. States of sizes far apart, or stages in a row near a random walk, are too
-    much for a linear solution.
+    A linear solution is inaccurate for badly scaled states, or several stages near a random walk.
     """
     whole, step = q, a
     for _ in range(DOUBLINGS):
@@ -221,7 +221,7 @@ def accumulated(a: Floats, q: Floats) -> Floats:
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _carry_on(a: Floats, x: Floats) -> None:
+def _propagate(a: Floats, x: Floats) -> None:
     """Add a x_k to x_k+1, row after row of x (n_samples + 1, n_lanes); a (n_states, n_lanes)."""
     for k in range(x.shape[0] - 1):
         for i in range(a.shape[0]):
@@ -237,7 +237,7 @@ def driven(a: Floats, drive: Floats) -> Floats:
     n_lanes = LANES * -(-n // LANES)
     wide, states = np.zeros((n, n_lanes)), np.zeros((n_samples + 1, n_lanes))
     wide[:, :n], states[1:, :n] = a, drive.T
-    _carry_on(wide, states)
+    _propagate(wide, states)
     return states[:, :n].T
 
 
@@ -250,7 +250,7 @@ def innovations(filter_: ForceFilter, residual: Floats) -> Floats:
 def log_likelihoods(filter_: ForceFilter, residual: Floats) -> Floats:
     """Gaussian log-likelihood of each sample of a residual given those before it, constants left out: (n_samples,).
 
-    -∞ where the motion runs away, or rounding leaves no positive covariance, as of readings beyond all measure.
+    -∞ if the innovations diverge, or if the covariance is not positive by rounding, as with absurdly large readings.
     """
     e = innovations(filter_, residual)
     if not np.abs(e).max() < RUNAWAY:
@@ -274,15 +274,16 @@ def whiten(filter_: ForceFilter, residual: Floats) -> Floats:
 
 
 def _of_unit_covariance(filter_: ForceFilter, errors: Floats) -> Floats:
-    # errors of a motion that ran away are no numbers, and stay none
+    """Innovations (n_sensors, n_samples) scaled to unit covariance."""
+    # innovations that have diverged may be nan, and stay so
     white: Floats = solve_triangular(np.linalg.cholesky(filter_.innovation), errors, lower=True, check_finite=False)
     return white
 
 
 def smoothed_states(filter_: ForceFilter, residual: Floats) -> Floats:
-    """Smoothed augmented states (2n + m, n_samples): the error of the motion, and the unmodelled forces.
+    """Smoothed augmented states (2n + m, n_samples): the error of the simulated motion, and the unmodelled forces.
 
-    Bryson-Frazier form: a backward pass of the adjoint, so that no covariance is inverted.
+    Bryson-Frazier form: the adjoint, integrated backwards, avoids the inverse of a covariance.
     """
     e = innovations(filter_, residual)
     weighted = filter_.h.T @ np.linalg.solve(filter_.innovation, e)

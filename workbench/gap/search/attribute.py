@@ -1,4 +1,4 @@
-"""Which effects: every kind of the catalogue tried alone, then in pairs, until the residual is noise."""
+"""Attribution of the gap to effects: each kind alone, then with nominal errors and in pairs, until noise is left."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,14 +18,14 @@ from workbench.gap.prediction.noise import is_noise_alone, logging_noise, noise_
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search.beside_random import decide_on_random, random_beside, random_beside_errors
+from workbench.gap.search.beside_random import decide_on_random, random_with_effects, random_with_nominal_errors
 from workbench.gap.search.finish import best_of_each, finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import with_all_errors
-from workbench.gap.search.nominal_figures import beside_modes, beside_records
+from workbench.gap.search.nominal_figures import with_mode_errors, with_record_deviations
 from workbench.gap.search.pairs import Pairs
-from workbench.gap.search.plain import are_common, common_as_errors, may_be_error
+from workbench.gap.search.plain import are_uniform_errors, is_plausible_error, uniform_as_nominal_errors
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, best_of_each_kind, most_informative, nearest, promise
 from workbench.gap.search.settings import ATTRIBUTION, LAW, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
@@ -38,24 +38,24 @@ from workbench.threads import one_blas_thread
 
 @dataclass(frozen=True, eq=False)
 class Attribution:
-    """What the search found on the fit records.
+    """Result of the search on the fit records.
 
     Attributes:
         outcome: "none", "explained", "part" or "unknown".
-        best: the chosen set of effects, fitted; empty for none; for "part" and "unknown" the nearest one, which may be
-            a law beyond the catalogue.
-        random: statistics of a random disturbance, where the set holds one.
+        best: the selected set of effects, fitted; empty for "none"; for "part" and "unknown" the set with the smallest
+            residual, which may hold a law beyond the catalogue.
+        random: statistics of a random disturbance, if the set has one.
         alternatives: other sets, best first, with their probabilities against the best.
-        nominal_cost: mean square of the nominal residual in noise units.
-        tried: effects alone that were fitted to whole records; beside the random disturbance, where one holds.
-        ahead: the likeliest of every kind alone, fitted to predictions one sample ahead.
+        nominal_cost: mean square of the nominal residual, in units of the noise.
+        tried: single effects fitted to whole records, with the random disturbance if there is one.
+        ahead: the best fit of each kind alone to one-step-ahead predictions.
         evidence: of the nominal rig.
-        search: what was searched in, the records with the noise of rounded sensors among it.
-        weighed: the records as the best set was fitted to them, beside noise of the logged inputs where there is some.
-        noise: (n_outputs,) standard deviation of each sensor's noise as it was found, in its unit.
-        logged: noise of the logged inputs, as a share of their rms, as what is left shows it.
+        search: records (with the noise of rounded sensors), rig and candidate kinds of the search.
+        weighed: the records that the best set was fitted to, whitened for input noise if there is some.
+        noise: (n_outputs,) estimated standard deviation of each sensor's noise, in its unit.
+        logged: input noise estimated from the residual, as a share of the inputs' rms.
         seen: effects that show in the readings themselves, which no fit alters.
-        is_cut: whether the search ended for want of time, with the best that it had.
+        is_cut: whether the search reached its deadline and ended with the best so far.
     """
 
     outcome: str
@@ -75,21 +75,21 @@ class Attribution:
 
     @property
     def noise_ratio(self) -> float:
-        """Noise found over noise stated, the median of all sensors."""
+        """Estimated over stated noise, median of all sensors."""
         return float(np.median(self.noise / self.search.data.noise))
 
     def without(self, *effects: Effect) -> "Attribution":
-        """The same without some effects: the others are fitted anew, with intervals of their own."""
+        """The attribution without some effects; the others are refitted, with new intervals."""
         search = self.search
         others = [e for e in self.best.effects if e not in effects and e not in self.seen]
-        best = _anew(search, others, self.weighed)
+        best = _refitted(search, others, self.weighed)
         best = with_intervals(search.rig, best, self.weighed, search.workers, logged=self.logged)
         best = replace(best, effects=(*self.seen, *best.effects))
         return replace(self, best=best, noise=noise_of(search, best))
 
     @cached_property
     def singles(self) -> tuple[Fit, ...]:
-        """The likeliest kinds alone on whole records, best first; those that were no rivals are fitted now."""
+        """The best effect of each likely kind alone, on whole records, best first; missing ones are fitted now."""
         kinds = {f.effects[0].kind for f in self.tried if f.effects}
         others = [f for f in best_of_each_kind(self.ahead) if f.effects[0].kind not in kinds][: ATTRIBUTION.shown]
 
@@ -109,13 +109,13 @@ def baseline(
     workers: Workers,
     deadline: Deadline,
 ) -> tuple[tuple[Effect, ...], Evidence, Evidence]:
-    """What shows in the readings themselves, and the evidence of the nominal rig and of the rig with that.
+    """Effects that show in the readings themselves; evidence of the nominal rig, and of the rig with these effects.
 
     Args:
         rig: nominal.
-        records: to fit; validation records have no business here.
+        records: fit records; no validation records.
         settle: seconds at the start of each record that are simulated but not counted.
-        guessed: names of the sensors whose noise nobody stated.
+        guessed: names of the sensors without a stated noise.
         workers: processes that share the work.
         deadline: of the search that follows.
     """
@@ -123,10 +123,10 @@ def baseline(
     if not (noise > 0).all():
         name = rig.sensors[int(np.argmin(noise))].name
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weights every residual by it")
-    seen, heard = _plain_to_see(rig, records, noise)
+    seen, heard = _seen_in_readings(rig, records, noise)
     data = FitData(tuple(records), heard, settle=settle, guessed=guessed, deadline=deadline)
     evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
-    _ = evidence.at_peaks  # found once, before the work parts
+    _ = evidence.at_peaks  # computed once, before processes are forked
     if not seen:
         return seen, evidence, evidence
     nominal = replace(Evidence.of(rig, data, workers=workers), given_size=evidence.size)
@@ -134,8 +134,8 @@ def baseline(
     return seen, nominal, evidence
 
 
-def _plain_to_see(rig: Rig, records: Sequence[Record], noise: Floats) -> tuple[tuple[Effect, ...], Floats]:
-    """Rounding and clipping show in the readings themselves; rounding then adds its own noise to the channel's."""
+def _seen_in_readings(rig: Rig, records: Sequence[Record], noise: Floats) -> tuple[tuple[Effect, ...], Floats]:
+    """Rounding and clipping seen in the readings, and the noise (n_outputs,) with that of rounding added."""
     seen, noise = [], noise.copy()
     for j, sensor in enumerate(rig.sensors):
         readings = [record.outputs[j] for record in records]
@@ -161,19 +161,18 @@ def attribute(
     tolerance: float,
     identified: IdentifiedPrior | None,
 ) -> Attribution:
-    """Find the effects that turn the residual of a rig on its fit records into noise.
+    """Find the effects that reduce the residual of a rig on its fit records to noise.
 
-    Each kind is tried alone from many starts; if none alone leaves only noise, the best few are each joined by a
-    second. A set counts as an explanation only when every record is left at its noise floor; else the outcome is
-    "part" or "unknown".
+    Each kind is tried alone from many starts, then jointly with nominal errors and in pairs. A set explains the gap
+    only if the residual of every record is at its noise floor; else the outcome is "part" or "unknown".
 
     Args:
         seen, nominal, evidence: of `baseline`.
         catalogue: kinds of effects to try.
         report: called with (what, share done) as the search proceeds.
-        uncertain_nominal: fit errors of the nominal model beside every effect from the first, for a model that is
-            known to be a little off; otherwise where no single effect explains the records without.
-        tolerance: of the signal's rms: a smaller gap beyond the noise is not searched for causes.
+        uncertain_nominal: fit nominal errors jointly with every effect from the first, for a model known to be
+            inexact; otherwise only if no single effect explains the records.
+        tolerance: of the signal's rms: a smaller gap above the noise is not searched for causes.
         identified: errors of a nominal rig that was itself identified.
     """
     rig, data, workers = evidence.rig, evidence.data, evidence.workers
@@ -188,7 +187,7 @@ def attribute(
     elif not search.explains(start) and is_noise_alone(evidence.residuals, data.counted):
         decision = Decision("none", start, noise=noise_found(evidence.residuals))
     elif uncertain_nominal and not search.explains(start):
-        decision = _beside_nominal_errors(search, tolerance)
+        decision = _decide_with_nominal_errors(search, tolerance)
     elif not search.explains(start) and not _of_one_sensor(start):
         decision, singles = decide_on_random(search, evidence)
     if decision is None:
@@ -196,38 +195,42 @@ def attribute(
         screened = Screening.of(search, (), evidence)
         ahead = one_more(search, (), evidence, screened)
         report("one effect, on whole records", 0.3)
-        singles = _alone(search, start, ahead)
-        alone, singles = _without_a_second(search, start, singles)
-        decision = unless_another(search, alone, evidence) if alone else None
-        decision = decision or _beside_one_sensor(search, start, evidence)
-        decision = decision or _with_a_second(search, start, singles, ahead, screened, evidence, tolerance)
+        singles = _single_effects(search, start, ahead)
+        alone, singles = _decide_on_singles(search, start, singles)
+        decision = unless_other_law(search, alone, evidence) if alone else None
+        decision = decision or _random_at_one_sensor(search, start, evidence)
+        decision = decision or _decide_beyond_singles(search, start, singles, ahead, screened, evidence, tolerance)
         decision = nearest(search, start, decision, singles)
-    outcome, best, random, rivals, noise, beside_inputs = decision
+    outcome, best, random, rivals, noise, own_search = decision
     is_cut = search.is_over
-    within = beside_inputs or search
-    best = common_as_errors(search, best, alone=random is not None)
+    final_search = own_search or search
+    best = uniform_as_nominal_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
-        best = widened(within, best)
+        best = widened(final_search, best)
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
     best = replace(best, effects=exchanged_last(best.effects))
-    beside = identified if random is None and not any(effect.kind.applied_first for effect in best.effects) else None
-    if beside is not None:
-        best = beside_identified(within, best, beside, seen)
-    logged = within.logged
+    identified_prior = (
+        identified if random is None and not any(effect.kind.applied_first for effect in best.effects) else None
+    )
+    if identified_prior is not None:
+        best = with_identified_errors(final_search, best, identified_prior, seen)
+    logged = final_search.logged
     if random is None:
-        logged = logged or _logged(search, best, noise_of(search, best) if noise is None else noise)
+        logged = logged or _input_noise_of(search, best, noise_of(search, best) if noise is None else noise)
         if outcome == "explained":
-            best = replace(best, effects=with_all_errors(within, best.effects))
-        best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None, logged=logged)
-        best = _settled(search, best)
+            best = replace(best, effects=with_all_errors(final_search, best.effects))
+        best = with_intervals(
+            search.rig, best, final_search.data, workers, wide=identified_prior is not None, logged=logged
+        )
+        best = _without_negligible_parameters(search, best)
         if outcome == "explained":
-            best = _as_it_stands(within, best, seen, logged)
+            best = _significant(final_search, best, seen, logged)
             named = [e for e in best.effects if not e.kind.applied_first]
-            # no number of it is known: something is there, and that is all
-            vague = any(not e.stands_out(search.rig) for e in named if e not in seen)
-            outcome = "none" if not named else "unknown" if vague else outcome
+            # an effect without any significant parameter only shows that there is a gap
+            is_insignificant = any(not e.stands_out(search.rig) for e in named if e not in seen)
+            outcome = "none" if not named else "unknown" if is_insignificant else outcome
     if noise is None:
         noise = noise_of(search, best) if random is None else search.data.noise
     report("done", 1.0)
@@ -241,7 +244,7 @@ def attribute(
         ahead=tuple(ahead),
         evidence=nominal,
         search=search,
-        weighed=within.data,
+        weighed=final_search.data,
         noise=noise,
         logged=logged,
         seen=seen,
@@ -249,17 +252,17 @@ def attribute(
     )
 
 
-def _anew(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
-    """The effects fitted to all records, from where they are near; where the search was cut off too."""
+def _refitted(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
+    """The effects refitted to all records from good start values, whether or not the deadline is past."""
     finely = replace(data.finely(SELECTION.fine), deadline=NEVER)
     return fit(search.rig, effects, finely, iterations=ATTRIBUTION.together, workers=search.workers, chord=Chord())
 
 
-def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
-    """The fit without effects of which a number does not stand out of its deviation, or with a limiting case of it.
+def _significant(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
+    """The fit without effects that have an insignificant parameter, or with limiting cases of them.
 
-    Where the records need it all the same, they tell two of its numbers together alone, friction far below its
-    smoothing speed is a damper, or hardly one: a joint of hardly any yield displacement is a loss of stiffness.
+    An effect stays if the records need it: they may determine only a combination of its parameters. A limiting case
+    is, for example, a damper for friction far below its smoothing speed.
     """
     data, rig = search.data.finely(SELECTION.fine), search.rig
 
@@ -269,17 +272,20 @@ def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: flo
         others = [e for e in best.effects if e is not effect and e not in seen]
         here = cost_of(rig, best.effects, data)
         sets = (others, *((*others, form) for form in simpler_forms(effect, rig)))
-        simpler = [_anew(search, each, search.data) for each in sets]
+        simpler = [_refitted(search, each, search.data) for each in sets]
         for fewer in sorted(simpler, key=lambda f: f.n_parameters):
             if not search.tells_apart(here, fewer.cost, max(best.n_parameters - fewer.n_parameters, 0)):
                 fewer = with_intervals(rig, fewer, search.data, search.workers, logged=logged)
-                settled = _settled(search, fewer).effects
-                return _as_it_stands(search, replace(fewer, effects=(*seen, *settled)), seen, logged)
+                settled = _without_negligible_parameters(search, fewer).effects
+                return _significant(search, replace(fewer, effects=(*seen, *settled)), seen, logged)
     return best
 
 
-def _settled(search: Search, best: Fit) -> Fit:
-    """The fit with numbers as good as none that leave as much: no deviation at one point of a stiff law tells so."""
+def _without_negligible_parameters(search: Search, best: Fit) -> Fit:
+    """The fit with parameters near zero set to zero, where the cost is the same.
+
+    The standard error at one point of a stiff law does not show that.
+    """
     data = search.data.finely(SELECTION.fine)
     for effect in best.effects:
         settled = effect.kind.without_negligible(effect)
@@ -292,22 +298,22 @@ def _settled(search: Search, best: Fit) -> Fit:
     return best
 
 
-def beside_identified(search: Search, best: Fit, identified: IdentifiedPrior, seen: Sequence[Effect]) -> Fit:
-    """The set fitted anew beside errors of the identified rig; what was read off the records stays.
+def with_identified_errors(search: Search, best: Fit, identified: IdentifiedPrior, seen: Sequence[Effect]) -> Fit:
+    """The set refitted jointly with errors of the identified rig; the effects `seen` in the readings stay.
 
-    Of several effects one may have stood for these errors: it is left out where the records do as well without.
+    An effect that these errors make unnecessary is left out, if another remains.
     """
     others = [effect for effect in best.effects if effect not in seen]
     if not others:
         return best
 
-    def beside(effects: Sequence[Effect], errors: Effect) -> Fit:
+    def fitted_with(effects: Sequence[Effect], errors: Effect) -> Fit:
         return fit(search.rig, (*effects, errors), search.data, iterations=ATTRIBUTION.together, workers=search.workers)
 
-    found = beside(others, nominal_errors(search.rig, identified))
+    found = fitted_with(others, nominal_errors(search.rig, identified))
     while len(found.effects) > 2:
         *effects, errors = found.effects
-        fewer = min((beside(some, errors) for some in each_left_out(effects)), key=lambda f: f.cost)
+        fewer = min((fitted_with(some, errors) for some in each_left_out(effects)), key=lambda f: f.cost)
         if search.tells_apart(found.cost, fewer.cost, found.n_parameters - fewer.n_parameters):
             break
         found = fewer
@@ -315,62 +321,62 @@ def beside_identified(search: Search, best: Fit, identified: IdentifiedPrior, se
 
 
 def _is_small(nominal: Evidence, tolerance: float) -> bool:
-    """Whether the gap beyond the noise is within a tolerance, or a tenth of the noise, in every record."""
+    """Whether the gap above the noise is within a tolerance, or a tenth of the noise, in every record."""
     for record, residual in zip(nominal.data.counted, nominal.residuals, strict=True):
         scale = record.outputs.std(axis=1, keepdims=True)
-        floor = float(((nominal.data.noise[:, None] / scale) ** 2).mean())
-        if float(((residual / scale) ** 2).mean()) - floor > max(tolerance**2, ATTRIBUTION.a_tenth * floor):
+        noise_floor = float(((nominal.data.noise[:, None] / scale) ** 2).mean())
+        if float(((residual / scale) ** 2).mean()) - noise_floor > max(tolerance**2, ATTRIBUTION.a_tenth * noise_floor):
             return False
     return tolerance > 0
 
 
-def _logged(search: Search, best: Fit, noise: np.ndarray) -> float:
-    """Noise of the logged inputs, as a share of their rms, by what a set leaves above the noise of the sensors."""
-    left = search.data.by_channel(search.data.residual(apply_all(search.rig, best.effects)))
-    if (left.mean(axis=1) < (1.0 + ATTRIBUTION.a_tenth) * ((noise / search.data.noise) ** 2).mean()).all():
+def _input_noise_of(search: Search, best: Fit, noise: np.ndarray) -> float:
+    """Input noise, as a share of the inputs' rms, from the residual of a set above the sensor noise (n_outputs,)."""
+    residual_power = search.data.by_channel(search.data.residual(apply_all(search.rig, best.effects)))
+    if (residual_power.mean(axis=1) < (1.0 + ATTRIBUTION.a_tenth) * ((noise / search.data.noise) ** 2).mean()).all():
         return 0.0
-    return logging_noise(left, (noise / search.data.noise) ** 2, search.logging_noise)
+    return logging_noise(residual_power, (noise / search.data.noise) ** 2, search.logging_noise)
 
 
 def noise_of(search: Search, best: Fit) -> np.ndarray:
-    """Standard deviation of each sensor's noise (n_outputs,), by what a set leaves.
+    """Standard deviation of each sensor's noise (n_outputs,), estimated from the residual of a set.
 
-    What lies within the stated noise is noise: coloured noise has peaks, under which there is less, and is louder in
-    one record than in another.
+    A residual within the stated noise is all noise: coloured noise has peaks, which an estimate from the quiet bands
+    misses, and differs between records.
     """
-    left = search.data.differences(apply_all(search.rig, best.effects))
-    rms = np.sqrt(np.mean([(residual**2).mean(axis=1) for residual in left], axis=0))
-    noise: np.ndarray = np.maximum(noise_found(left), np.minimum(rms, search.data.noise))
+    residuals = search.data.differences(apply_all(search.rig, best.effects))
+    rms = np.sqrt(np.mean([(residual**2).mean(axis=1) for residual in residuals], axis=0))
+    noise: np.ndarray = np.maximum(noise_found(residuals), np.minimum(rms, search.data.noise))
     return noise
 
 
-def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
+def _single_effects(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
     """Single effects on whole records, best first."""
     promising = [f for f in ahead if f.cost < SELECTION.promising] or ahead[:1]
     if not search.explains(start):
         return on_whole_records(search, promising, ATTRIBUTION.finalists)
-    # only what leaves far less is of use, and there may be none
-    enough = start.cost - SEARCH.significant
-    return on_whole_records(search, promising, ATTRIBUTION.finalists, to_cost=enough, at_first=ATTRIBUTION.briefly)
+    # only a significant gain matters, and there may be no effect at all
+    to_cost = start.cost - SEARCH.significant
+    return on_whole_records(search, promising, ATTRIBUTION.finalists, to_cost=to_cost, at_first=ATTRIBUTION.briefly)
 
 
 def _of_one_sensor(start: Fit) -> bool:
-    """Whether one of several disagrees alone: its own fault is likelier than a random force, and quicker to find."""
+    """Whether only one of several sensors disagrees: its own fault is likelier than a random force."""
     excess = np.maximum(start.cost_by_channel.mean(axis=0) - 1.0, 0.0)
     return excess.size > 1 and of_one_sensor(excess)
 
 
-def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decision | None:
-    """A random disturbance that one sensor alone shows, where its own faults do not explain that."""
+def _random_at_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decision | None:
+    """The decision for a random disturbance that only one sensor shows, if its own faults do not explain it."""
     return decide_on_random(search, evidence)[0] if _of_one_sensor(start) else None
 
 
-def _without_a_second(search: Search, start: Fit, singles: list[Fit]) -> tuple[Decision | None, list[Fit]]:
-    """What needs no second effect, None where nothing alone explains the records; and singles, where they fit best."""
+def _decide_on_singles(search: Search, start: Fit, singles: list[Fit]) -> tuple[Decision | None, list[Fit]]:
+    """The decision if at most one effect explains the records, else None; and the single effects, best first."""
     good = [f for f in singles if search.significant(f, start.cost)]
     if search.explains(start) and not good:
         return Decision("none", start), singles
-    ended = _ended(search, good[:4])
+    ended = _finished_best(search, good[:4])
     explaining = [f for f in ended if search.explains(f)]
     if not explaining:
         near = [f for f in ended[:2] if search.near(f, RANDOM.near)]
@@ -385,8 +391,8 @@ def _without_a_second(search: Search, start: Fit, singles: list[Fit]) -> tuple[D
     return None, singles
 
 
-def _ended(search: Search, fits: Sequence[Fit]) -> list[Fit]:
-    """The fits, best first; those that more or finer steps may bring to the noise floor are taken to their end."""
+def _finished_best(search: Search, fits: Sequence[Fit]) -> list[Fit]:
+    """The fits; those that more iterations or finer substeps may bring to the noise floor are refined."""
     promising = [f for f in fits if f.cost < ATTRIBUTION.far_behind * fits[0].cost]
     if fits and search.explains(fits[0]):
         near = fits[0].cost + SEARCH.rival
@@ -396,7 +402,7 @@ def _ended(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     return [*search.side_by_side(finished, promising), *(f for f in fits if f not in promising)]
 
 
-def _with_a_second(
+def _decide_beyond_singles(
     search: Search,
     start: Fit,
     singles: Sequence[Fit],
@@ -405,82 +411,82 @@ def _with_a_second(
     evidence: Evidence,
     tolerance: float,
 ) -> Decision:
-    """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
-    at_once = Pairs.at_once(search, screened)
-    pair = _clean_pair(at_once.further(), start, singles[:1])
+    """The decision among nominal errors, several effects, random forces and a law beyond the catalogue."""
+    all_pairs = Pairs.at_once(search, screened)
+    pair = _pair_at_noise_floor(all_pairs.copy(), start, singles[:1])
     if pair is not None:
         return pair
-    beside = Stepwise(search, tolerance, ahead)
-    alone = _by_noise_found(search, start, singles, beside)
+    stepwise = Stepwise(search, tolerance, ahead)
+    alone = _single_in_louder_noise(search, start, singles, stepwise)
     if alone is not None:
         return alone
-    near = min(f.cost for f in (start, *singles)) < 1.0 + STEPWISE.no_gap
-    # damping is hardly known: where its errors alone are large, an effect that makes them smaller is asked for, no more
-    enough = beside.is_enough or beside.without_errors() or beside.by_singles() or beside.by_few()
-    enough = enough or (beside.is_quiet and beside.is_believed)
-    if not (enough or near or search.is_over):
-        random = random_beside(search, singles) or random_beside_errors(search, beside.steps[0])
+    is_near_noise = min(f.cost for f in (start, *singles)) < 1.0 + STEPWISE.no_gap
+    # damping is hardly known: if only its errors are large, only an effect that makes them smaller is searched for
+    is_explained = stepwise.is_sufficient or stepwise.without_errors() or stepwise.by_singles() or stepwise.by_few()
+    is_explained = is_explained or (stepwise.is_noise_only and stepwise.has_plausible_errors)
+    if not (is_explained or is_near_noise or search.is_over):
+        random = random_with_effects(search, singles) or random_with_nominal_errors(search, stepwise.steps[0])
         if random is not None:
             return random
-    if enough:
-        beside.run()
-    by_mode = None if search.is_over or (enough and beside.is_believed) else beside_modes(beside)
-    if by_mode is not None or enough:
-        return (by_mode or beside).decision()
-    varied = None if search.is_over else beside_records(beside)
+    if is_explained:
+        stepwise.run()
+    by_mode = None if search.is_over or (is_explained and stepwise.has_plausible_errors) else with_mode_errors(stepwise)
+    if by_mode is not None or is_explained:
+        return (by_mode or stepwise).decision()
+    varied = None if search.is_over else with_record_deviations(stepwise)
     if varied is not None:
         return varied.decision()
-    law = None if search.is_over else one_law(search, evidence)
-    pairs = at_once.further()
-    # beside errors that no model has, something is missing that may stand in for them: few effects without come first
-    nearer = beside.last.is_plausible and beside.last.fit.cost < min(f.cost for f in (start, *singles))
-    if law is None and nearer:
-        beside.run()
-        if beside.is_settled:
-            return beside.decision()
-    explained = pairs.explain or (law is None and pairs.with_a_third())
+    other_law = None if search.is_over else force_of_other_law(search, evidence)
+    pairs = all_pairs.copy()
+    # implausible nominal errors show a missing effect, so sets of few effects without nominal errors come first
+    is_better = stepwise.last.is_plausible and stepwise.last.fit.cost < min(f.cost for f in (start, *singles))
+    if other_law is None and is_better:
+        stepwise.run()
+        if stepwise.is_conclusive:
+            return stepwise.decision()
+    explained = pairs.explain or (other_law is None and pairs.with_a_third())
     decision = pairs.decision(start)
-    if law is not None:
-        return compared_with(law, search, decision)
-    if explained and not (are_common(decision.best.effects) and beside.is_nothing):
+    if other_law is not None:
+        return law_or_decision(other_law, search, decision)
+    if explained and not (are_uniform_errors(decision.best.effects) and stepwise.needs_no_effect):
         return decision
-    beside.run()
-    if not beside.is_settled and beside.decision().outcome != "explained" and pairs.by_exchange():
+    stepwise.run()
+    if not stepwise.is_conclusive and stepwise.decision().outcome != "explained" and pairs.by_exchange():
         decision = pairs.decision(start)
-        if not (are_common(decision.best.effects) and beside.is_nothing):
+        if not (are_uniform_errors(decision.best.effects) and stepwise.needs_no_effect):
             return decision
-    decision = nearest(search, start, beside.decision(), pairs.found)
+    decision = nearest(search, start, stepwise.decision(), pairs.found)
     if decision.outcome in ("explained", "none") or search.is_over:
         return decision
-    random = random_beside(search, pairs.found[:1])
-    return random or random_beside_errors(search, beside.steps[0], surely=False) or decision
+    random = random_with_effects(search, pairs.found[:1])
+    return random or random_with_nominal_errors(search, stepwise.steps[0], surely=False) or decision
 
 
-def _clean_pair(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> Decision | None:
-    """Two effects that leave only the stated noise of the sensors, neither of which a model may be off by; None else.
+def _pair_at_noise_floor(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> Decision | None:
+    """Two effects that explain the records with the stated sensor noise, or None.
 
-    None either where no number of one is known: an error of the model is likelier than what may be nothing. Errors of
-    the model come to that only where the model has them, and cost more to ask for.
+    None also if one is a plausible error of the model, or has no significant parameter. A search with nominal errors
+    takes longer, so these pairs come first.
     """
     search = pairs.search
     near = [effect for f in singles if search.near(f, PAIRS.most) for effect in f.effects]
-    if not (pairs.explain or pairs.beside_any(near)):
+    if not (pairs.explain or pairs.with_any(near)):
         return None
     decision = pairs.decision(start)
     effects = decision.best.effects
-    if are_common(effects) or any(may_be_error(effect, search) for effect in effects):
+    if are_uniform_errors(effects) or any(is_plausible_error(effect, search) for effect in effects):
         return None
     sure = with_intervals(search.rig, decision.best, search.data, search.workers).effects
     return decision if all(effect.stands_out(search.rig) for effect in sure) else None
 
 
-def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: Stepwise) -> Decision | None:
-    """A single effect that leaves only noise, where noise is louder than stated; None where none does.
+def _single_in_louder_noise(search: Search, start: Fit, singles: Sequence[Fit], stepwise: Stepwise) -> Decision | None:
+    """The decision for a single effect that explains the records if the noise is louder than stated, or None.
 
-    One effect says the same with fewer numbers than errors of the nominal model that stand in for it.
+    One effect has fewer parameters than nominal errors that fit equally well.
     """
     stated, best = search.data.noise, singles[0] if singles else start
-    under_errors = np.sqrt(beside.last.sensor_noise) * stated
+    under_errors = np.sqrt(stepwise.last.sensor_noise) * stated
     noise = np.clip(noise_of(search, best), stated, (1.0 + ATTRIBUTION.a_tenth) ** 0.5 * under_errors)
     if np.median(noise / stated) ** 2 < 1.0 + ATTRIBUTION.a_tenth:
         return None
@@ -491,44 +497,46 @@ def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: 
         return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
 
     promising = [f for f in map(in_louder, singles) if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
-    decision = _without_a_second(louder, in_louder(start), promising)[0] if promising else None
+    decision = _decide_on_singles(louder, in_louder(start), promising)[0] if promising else None
     if decision is None or decision.outcome != "explained":
         return None
     return decision._replace(noise=noise)
 
 
-def _beside_nominal_errors(search: Search, tolerance: float) -> Decision:
-    """What holds beside errors of the nominal model."""
-    beside = Stepwise(search, tolerance)
-    varied = None if beside.is_enough else beside_records(beside)
+def _decide_with_nominal_errors(search: Search, tolerance: float) -> Decision:
+    """The decision with nominal errors from the first."""
+    stepwise = Stepwise(search, tolerance)
+    varied = None if stepwise.is_sufficient else with_record_deviations(stepwise)
     if varied is not None:
         return varied.decision()
-    beside.run()
-    return beside.decision()
+    stepwise.run()
+    return stepwise.decision()
 
 
-def one_law(search: Search, evidence: Evidence) -> Fit | None:
-    """The force that explains the records alone, of another law or by its power of the catalogue, or None.
+def force_of_other_law(search: Search, evidence: Evidence) -> Fit | None:
+    """A force at one point that explains the records alone, with a law beyond the catalogue or a power law in it.
 
-    Two effects side by side bend to many a law between them, so it is sought before any two are believed.
+    Two effects at one place can fit many laws, so this comes before pairs are accepted. None if there is none.
     """
-    search.report("one force of another law", 0.35)
+    search.report("one force of a law beyond the catalogue", 0.35)
     beyond = replace(search, catalogue=BEYOND)
     promising = [f for f in one_more(beyond, (), evidence) if f.cost < SELECTION.promising]
-    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.enough)
-    return next((f for f in (_named(search, f) for f in fits) if search.explains(f)), None)
+    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.cost_limit)
+    return next((f for f in (_as_catalogue_kind(search, f) for f in fits) if search.explains(f)), None)
 
 
-def _named(search: Search, law: Fit) -> Fit:
-    """A force of another law; where its power is that of a kind of the catalogue, that kind fitted from there."""
+def _as_catalogue_kind(search: Search, law: Fit) -> Fit:
+    """A fit of a force of another law, replaced by the kind of the catalogue that has its power, if there is one."""
     known = in_catalogue(law.effects[0])
     return law if known is None else finished(search, fit(search.rig, (known,), search.data))
 
 
-def unless_another(search: Search, decision: Decision, evidence: Evidence) -> Decision:
-    """The decision for one law of the catalogue at a point, or for another law where the records are sure of that one.
+def unless_other_law(search: Search, decision: Decision, evidence: Evidence) -> Decision:
+    """The decision, or that for a law beyond the catalogue if the records surely prefer it to one law at a point.
 
     Args:
+        search: records and nominal rig.
+        decision: to be compared.
         evidence: of the nominal rig.
     """
     best = decision.best
@@ -537,19 +545,19 @@ def unless_another(search: Search, decision: Decision, evidence: Evidence) -> De
     (effect,) = best.effects
     if not effect.kind.nonlinear or effect.at is None:
         return decision
-    search.report("one force of another law", 0.9)
+    search.report("one force of a law beyond the catalogue", 0.9)
     beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.at)
     as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
     promising = [f for f in one_more(beyond, (), there) if f.cost < as_near]
-    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.enough)
+    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.cost_limit)
     other = [f for f in fits if in_catalogue(f.effects[0]) is None]
     sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
     law = next(sure, None)
-    return decision if law is None else compared_with(law, search, decision)
+    return decision if law is None else law_or_decision(law, search, decision)
 
 
-def compared_with(law: Fit, search: Search, decision: Decision) -> Decision:
-    """What is claimed where one force of another law explains the records: the likelier of it and of the decision's."""
+def law_or_decision(law: Fit, search: Search, decision: Decision) -> Decision:
+    """The decision for the likelier of a force of another law and the sets of a decision."""
     named = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
     best, rivals = ranked(search, [law, *named])
     return Decision("unknown" if any_beyond(best.effects) else "explained", best, rivals=rivals)

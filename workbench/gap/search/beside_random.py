@@ -1,4 +1,4 @@
-"""What holds beside a random disturbance, which no search for effects can predict away."""
+"""Search for a random disturbance, alone or with effects: a force that can be whitened but not predicted."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,7 +24,7 @@ from workbench.structure.domain import Between, NamedPoints
 
 
 def looks_random(evidence: Evidence) -> bool:
-    """Whether the unmodelled force is as strong in every record, follows little that the rig does, and is no tone."""
+    """Whether the unmodelled force is equally strong in every record, unrelated to inputs and motion, and no tone."""
     records, place = evidence.data.counted, evidence.at_peaks[0]
     forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
     elastic = evidence.rig.modes.omega[evidence.rig.modes.omega > 0] / (2.0 * np.pi)
@@ -48,122 +48,129 @@ def _rms_above(frequency: float, force: Floats, sample_time: float) -> float:
 
 
 def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:
-    """A random disturbance, alone or beside one effect, and all that was tried; None where it does not hold.
+    """The decision for a random disturbance, alone or with one effect, and all fits that were tried.
 
-    It takes much upon itself: where an effect explains the records without it, there is none.
+    The decision is None if the whitened residual is not white, or if an effect explains the records without a random
+    disturbance, which over-fits easily.
     """
     search, evidence = _without_clipped(search, (), evidence)
-    evidence = _by_laws_on_measured_motion(search, evidence)
+    evidence = _with_laws_on_measured_motion(search, evidence)
     if not looks_random(evidence):
         return None, []
-    alone = with_random(search, _nothing(search), evidence)
+    alone = fitted_with_random(search, _fit_without_effects(search), evidence)
     if not search.near(alone[0], RANDOM.near) or alone[1].tonal > TONAL:
         return None, []
-    beside = search.through(model_filter(evidence.model, search.rig, alone[1]), _observer(search, search.rig, alone[1]))
-    search.report("beside a random disturbance", 0.2)
-    gaining = beside.side_by_side(simplest, _gaining(search, beside, evidence)[: RANDOM.tried])
+    whitened = search.through(
+        model_filter(evidence.model, search.rig, alone[1]), _observer(search, search.rig, alone[1])
+    )
+    search.report("effects with a random disturbance", 0.2)
+    gaining = whitened.side_by_side(simplest, _improving_singles(search, whitened, evidence)[: RANDOM.tried])
     if any(search.explains(finished(search, single)) for single in gaining):
         return None, []
-    tried = [alone, *(with_random(search, single) for single in gaining)]
-    found = _likeliest(search, tried)
+    tried = [alone, *(fitted_with_random(search, single) for single in gaining)]
+    found = _best_decision(search, tried)
     return found, [each[0] for each in tried]
 
 
-def random_beside(search: Search, found: Sequence[Fit]) -> Decision | None:
-    """A random disturbance beside stronger effects that leave what looks random; None where none holds."""
+def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None:
+    """The decision for a random disturbance with stronger effects, whose residual looks random; None if none holds."""
     tried = []
     for given in best_of_each_kind(found)[: RANDOM.likeliest_sets]:
         evidence = search.evidence_of(apply_all(search.rig, given.effects))
         unclipped, evidence = _without_clipped(search, given.effects, evidence)
-        evidence = _by_laws_on_measured_motion(unclipped, evidence)
+        evidence = _with_laws_on_measured_motion(unclipped, evidence)
         if looks_random(evidence):
             unclipped_fit = replace(
                 given, cost_by_channel=unclipped.data.by_channel(unclipped.data.residual(evidence.rig))
             )
-            tried.append(with_random(unclipped, unclipped_fit, evidence))
-    return _likeliest(search, tried)
+            tried.append(fitted_with_random(unclipped, unclipped_fit, evidence))
+    return _best_decision(search, tried)
 
 
-def random_beside_errors(search: Search, step: Step, *, surely: bool = True) -> Decision | None:
-    """A random disturbance beside errors of the nominal model, and effects; None where none holds.
+def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = True) -> Decision | None:
+    """The decision for a random disturbance with nominal errors and effects; None if none holds.
 
-    The errors are fitted to what the filter of the force leaves, and that to what they do, in turns. What is left may
-    be more than noise, by a trifle of the gap: no model is exact, and a trifle without the force is none of it.
+    The nominal errors and the whitening filter of the force are fitted in turns. Since no model is exact, the residual
+    may exceed the noise by a negligible share of the gap, and a force must account for more than that.
 
     Args:
-        step: effects and errors to start from, which were fitted without it.
-        surely: what is there to start from must look random already.
+        search: records and nominal rig.
+        step: effects and nominal errors to start from, fitted without the force.
+        surely: require that the force at the start looks random already.
     """
-    evidence = _beside(search, step.fit)
+    evidence = _evidence_with(search, step.fit)
     if surely and not looks_random(evidence):
         return None
-    found, random = _random_beside(search, step.fit, evidence)
+    found, random = _random_given(search, step.fit, evidence)
     for _ in range(RANDOM.turns):
         before = random.cost
-        beside = search.through(
+        whitened = search.through(
             model_filter(evidence.model, evidence.rig, random), _observer(search, search.rig, random)
         )
-        step = fit_jointly(beside, step.effects, step.errors)
-        evidence = _beside(search, step.fit)
-        found, random = _random_beside(search, step.fit, evidence)
+        step = fit_jointly(whitened, step.effects, step.errors)
+        evidence = _evidence_with(search, step.fit)
+        found, random = _random_given(search, step.fit, evidence)
         if random.cost > (1.0 - RANDOM.settled) * before:
             break
-    whole = cost_of(search.rig, step.fit.effects, search.data)
-    closed = random.left - 1.0 < STEPWISE.explained * whole
-    counts = whole - 1.0 > STEPWISE.least * float(search.nominal.mean())
-    holds = closed and counts and random.is_steady and looks_random(evidence)
+    cost = cost_of(search.rig, step.fit.effects, search.data)
+    is_closed = random.left - 1.0 < STEPWISE.explained * cost
+    is_noticeable = cost - 1.0 > STEPWISE.least * float(search.nominal.mean())
+    holds = is_closed and is_noticeable and random.is_steady and looks_random(evidence)
     return Decision("explained", found, random) if holds else None
 
 
-def _beside(search: Search, given: Fit) -> Evidence:
-    """What the records say beside given effects, laws on the measured motion."""
-    return _by_laws_on_measured_motion(search, search.evidence_of(apply_all(search.rig, given.effects)))
+def _evidence_with(search: Search, given: Fit) -> Evidence:
+    """Evidence of the rig with the given effects, nonlinear laws acting on the measured motion."""
+    return _with_laws_on_measured_motion(search, search.evidence_of(apply_all(search.rig, given.effects)))
 
 
-def _gaining(search: Search, beside: Search, evidence: Evidence) -> list[Fit]:
-    """The fits of single effects that the filter of a random force leaves something to explain, best first.
+def _improving_singles(search: Search, whitened: Search, evidence: Evidence) -> list[Fit]:
+    """Fits of single effects that improve on a random force alone, best first.
 
-    The unmodelled force stands where the random one does; where the best of them stands, all laws are tried again.
+    The unmodelled force is located where the random one acts, so all laws are tried again at the best effect's place.
 
     Args:
-        search: without that filter.
+        search: without the whitening filter of the force.
+        whitened: the search with it.
+        evidence: of the rig without effects.
     """
-    cost = cost_of(beside.rig, (), beside.data)
+    cost = cost_of(whitened.rig, (), whitened.data)
 
     def fitted(evidence: Evidence) -> list[Fit]:
-        fits = on_whole_records(beside, one_more(beside, (), evidence), RANDOM.finalists)
-        return [f for f in fits if beside.surely_better(f, cost, f.n_parameters)]
+        fits = on_whole_records(whitened, one_more(whitened, (), evidence), RANDOM.finalists)
+        return [f for f in fits if whitened.surely_better(f, cost, f.n_parameters)]
 
     found = fitted(evidence)
     places = [f.effects[0].at for f in found if f.effects[0].at is not None]
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
-    likely = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.rival]
-    return [f for f in likely if _matters(search, f)]
+    rivals = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.rival]
+    return [f for f in rivals if _removes_enough(search, f)]
 
 
-def _matters(search: Search, single: Fit) -> bool:
-    """Whether a single effect takes away more of the gap than gains and places do that are hardly off."""
+def _removes_enough(search: Search, single: Fit) -> bool:
+    """Whether a single effect removes more of the gap than small errors of gains and places would."""
     before, after = (cost_of(search.rig, effects, search.data) for effects in ((), single.effects))
     return before - after > STEPWISE.least * before
 
 
-def _nothing(search: Search) -> Fit:
+def _fit_without_effects(search: Search) -> Fit:
+    """The fit of no effects."""
     left = search.data.by_channel(search.data.residual(search.rig))
     return Fit((), float(left.mean()), left, 0)
 
 
 def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
-    """The search and its evidence without the sensors that clip; with them where an effect is of one of them."""
+    """The search and its evidence without the sensors that clip, unless an effect is at one of them."""
     unclipped = search.without_clipped()
-    deaf = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in unclipped.rig.sensors}
-    if not deaf or any(name in deaf for effect in effects for name in names_in(effect.target)):
+    clipped = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in unclipped.rig.sensors}
+    if not clipped or any(name in clipped for effect in effects for name in names_in(effect.target)):
         return search, evidence
     return unclipped, unclipped.evidence_of(apply_all(unclipped.rig, effects))
 
 
-def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
-    """The likeliest that holds; one effect more must be worth its numbers, and so must a law over a simpler one."""
+def _best_decision(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
+    """The decision for the best set whose residual is white; more effects or a wider law must be justified."""
     holding = [found for found in tried if found[1].holds]
     if not holding:
         return None
@@ -175,18 +182,21 @@ def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> D
 
 
 def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
+    """Whether a candidate surely improves on a simpler fit."""
     return search.surely_better(candidate, simpler.cost, candidate.n_parameters - simpler.n_parameters)
 
 
-def with_random(search: Search, given: Fit, evidence: Evidence | None = None) -> tuple[Fit, RandomForceFit]:
-    """The given effects and a random disturbance, each fitted beside the other.
+def fitted_with_random(search: Search, given: Fit, evidence: Evidence | None = None) -> tuple[Fit, RandomForceFit]:
+    """The given effects and a random disturbance, fitted in turns.
 
     Args:
-        evidence: of the rig with the given effects, where it is at hand.
+        search: records and nominal rig.
+        given: effects.
+        evidence: of the rig with the given effects, if available.
     """
     if evidence is None:
-        evidence = _beside(search, given)
-    found = _random_beside(search, given, evidence)
+        evidence = _evidence_with(search, given)
+    found = _random_given(search, given, evidence)
     if given.effects and not found[1].holds and search.near(found[0], RANDOM.near):
         observer = _observer(search, evidence.rig, found[1])
         data = search.data.through(model_filter(evidence.model, evidence.rig, found[1]), observer)
@@ -194,41 +204,45 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
         rig = apply_all(search.rig, refitted.effects)
         again = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
         evidence = search.evidence_of(rig)
-        evidence = _by_laws_on_measured_motion(search, evidence, observer)
-        found = _random_beside(search, again, evidence)
+        evidence = _with_laws_on_measured_motion(search, evidence, observer)
+        found = _random_given(search, again, evidence)
     return found
 
 
 def _observer(search: Search, rig: Rig, found: RandomForceFit | None = None) -> Observer:
-    """The observer of a rig beside a random force."""
+    """The observer of a rig that a random force acts on."""
     data = search.data
     force, at = (0.0, None) if found is None else (found.rms, found.at)
     return Observer.of(rig, data.noise, data.force_rms, data.records[0].sample_time, at=at, rms=force)
 
 
-def _by_laws_on_measured_motion(search: Search, evidence: Evidence, observer: Observer | None = None) -> Evidence:
-    """The evidence as it is where laws have not made much else of a force that the rig lacks."""
+def _with_laws_on_measured_motion(search: Search, evidence: Evidence, observer: Observer | None = None) -> Evidence:
+    """The evidence with residuals for which nonlinear laws act on the measured motion.
+
+    Acting on the simulated motion, which lacks the force, they would distort its response.
+    """
     if not is_stepped(evidence.rig):
         return evidence
     observer = observer or _observer(search, evidence.rig)
-    return replace(evidence, residuals=tuple(search.data.left_beside(evidence.rig, observer)))
+    return replace(evidence, residuals=tuple(search.data.residual_on_measured_motion(evidence.rig, observer)))
 
 
-def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
+def _random_given(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
+    """The given effects with a random force fitted to their residual, and the statistics of that force."""
     domain = evidence.domain
     most = RANDOM.points if isinstance(domain, NamedPoints) else RANDOM.starts
     places = [where for where in evidence.peaks if not isinstance(where, Between)][:most]
     found = fit_random_force(evidence.rig, search.data, evidence.residuals, places, evidence.data.force_rms)
     rms, rms_std = found.acting_rms
-    # no surer than what is left is white, nor than two good models of one structure are alike
+    # standard errors are no smaller than a residual that is not white allows, nor than two good models differ by
     level = np.sqrt(max(float(found.chi2_by_record.mean()), 1.0))
     least = INTERVALS.alike * domain.size if found.at_std else 0.0
     at_std = (max(float(level * std), least) for std in found.at_std)
     spread = dict(zip(domain.coordinates, at_std, strict=True))
-    # the force is known by what it does to mass and stiffness, which are off by so much
+    # the force is inferred from its response, so it is as uncertain as mass and stiffness
     priors = (e.target for e in given.effects if isinstance(e.target, NominalPrior))
-    off = max((float(np.hypot(prior.mass, prior.stiffness)) for prior in priors), default=INTERVALS.alike)
-    deviations = {**spread, "rms": float(np.hypot(level * rms_std, off * rms))}
+    model_uncertainty = max((float(np.hypot(prior.mass, prior.stiffness)) for prior in priors), default=INTERVALS.alike)
+    deviations = {**spread, "rms": float(np.hypot(level * rms_std, model_uncertainty * rms))}
     effect = Effect(RANDOM_DISTURBANCE, None, {**place_values(found.at), "rms": rms}, deviations)
     fitted = given.n_parameters + 1 + len(spread)
     combined = Fit((*given.effects, effect), found.cost, given.cost_by_channel, fitted)

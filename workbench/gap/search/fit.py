@@ -1,4 +1,4 @@
-"""Fit of a set of effects to the fit records: nonlinear least squares of the simulation error."""
+"""Nonlinear least-squares fit of a set of effects to the simulation error of the fit records."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -22,18 +22,18 @@ HOPELESS = 1e300
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A set of effects with fitted numbers.
+    """A set of effects with fitted parameters.
 
     Attributes:
         effects: with values and standard deviations.
-        cost: what was minimised per measured value: 1 at the noise floor.
-        cost_by_channel: (n_records, n_outputs) of the same, without the share of a random disturbance's statistics.
-        n_parameters: numbers fitted.
-        falling: share of the cost that the last iteration took away; 0 where the fit came to rest.
+        cost: sum of squares per measured value; 1 at the noise floor.
+        cost_by_channel: (n_records, n_outputs) the same by channel, without the statistics of a random disturbance.
+        n_parameters: number of fitted parameters.
+        falling: relative decrease of the cost in the last iteration; 0 if the fit has converged.
         covariance: (n, n) of the free coordinates of all parameters, in the order of `parameters_of`; None before
             `with_intervals`.
-        stepping: (n_records,) mean square error of the steps of time, in units of the noise, where it was measured.
-        normal: (n, n) Jᵀ J of the free coordinates of all parameters, with the precision of what is believed.
+        stepping: (n_records,) mean square error of time integration, in units of the noise, if it was measured.
+        normal: (n, n) Jᵀ J of the free coordinates of all parameters, with the precision of the priors.
     """
 
     effects: tuple[Effect, ...]
@@ -51,23 +51,23 @@ class Fit:
 
     @property
     def named(self) -> str:
-        """Labels of the effects, without errors of the nominal model, in one string."""
+        """Labels of the effects, without nominal errors, in one string."""
         return " + ".join(effect.label for effect in self.effects if not effect.kind.applied_first)
 
     @property
     def key(self) -> tuple[str, ...]:
-        """What tells this set from another, numbers apart."""
+        """Identity of the set of effects, whatever its parameters."""
         return key_of(self.effects)
 
 
 def cost_of(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
-    """Cost per measured value; `HOPELESS` where the rig cannot be (a buckled beam, say)."""
+    """Cost per measured value; `HOPELESS` if the rig is physically impossible (a buckled beam, say)."""
     residual = finite_residual(rig, effects, data)
     return HOPELESS if residual is None else float(residual @ residual) / residual.size
 
 
 def finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray | None:
-    """The residual (n_values,) of a rig with effects, or None where it cannot be or its motion runs away."""
+    """The residual (n_values,) of a rig with effects; None if the rig is impossible or its simulation diverges."""
     with np.errstate(over="ignore", invalid="ignore"):
         try:
             residual = data.residual(apply_all(rig, effects))
@@ -78,33 +78,33 @@ def finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.nd
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """Numbers that are moved at once, to see what each does to the residual.
+    """A finite-difference perturbation of one or more parameters.
 
     Attributes:
-        free: (n_parameters,) all of them.
-        to: where they are moved.
-        numbers: which of them.
-        coarsely: whether the residual is taken by coarser steps of time.
-        of_sensors_alone: whether each alters the readings of a sensor of its own, and no other's.
+        free: (n_parameters,) free coordinates of all parameters.
+        to: (n_parameters,) the perturbed coordinates.
+        indices: of the perturbed parameters.
+        coarsely: whether the residual is simulated with coarse substeps.
+        of_sensors_alone: whether each of them alters only the readings of a different sensor.
     """
 
     free: Floats
     to: Floats
-    numbers: list[int]
+    indices: list[int]
     coarsely: bool
     of_sensors_alone: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """A step that may lower the cost.
+    """A Levenberg-Marquardt step to be tried.
 
     Attributes:
-        free: (n_parameters,) where it starts.
-        coarsely: whether slopes there are taken by coarser steps of time.
+        free: (n_parameters,) start point.
+        coarsely: whether the sensitivities there are simulated with coarse substeps.
         normal, gradient: Jᵀ J and Jᵀ r there.
         damping: as a share of the diagonal of Jᵀ J.
-        worth: the least decrease of the cost, to second order, for which it is tried.
+        worth: least predicted decrease of the cost for which the step is tried.
     """
 
     free: Floats
@@ -120,10 +120,12 @@ Shared = Callable[[Sequence[Move | Attempt]], list[Any]]
 
 @dataclass(eq=False)
 class Chord:
-    """Slopes along believed values that fits of the same records keep: small errors move a residual all but linearly.
+    """Sensitivities to parameters with priors that several fits of the same records share (chord method).
+
+    The residual is nearly linear in small errors, so they need not be updated.
 
     Attributes:
-        columns: (n_values, n_believed), in units of the noise; None until a fit has taken them.
+        columns: (n_values, n_with_prior), in units of the noise; None until a fit has computed them.
     """
 
     columns: Floats | None = None
@@ -156,161 +158,172 @@ class _Problem:
         )
         self.low = np.array([p.to_free(p.low) for _, p in self.parameters])
         self.high = np.array([p.to_free(p.high) for _, p in self.parameters])
-        # a believed value is one more measurement: of itself, by its own standard deviation
-        self.believed = [j for j, (_, p) in enumerate(self.parameters) if p.prior_std is not None]
-        self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.believed])
-        # whether the slopes along believed values stay as they are
-        self.is_known = chord is not None and chord.columns is not None
-        # a row a number, of what it does to each value, and one of the residual beside which it does
+        # a normal prior adds one residual: the value over its prior standard deviation
+        self.with_prior = [j for j, (_, p) in enumerate(self.parameters) if p.prior_std is not None]
+        self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.with_prior])
+        # whether the sensitivities to parameters with priors are kept
+        self.has_known_slopes = chord is not None and chord.columns is not None
+        # one row of sensitivities a parameter, then the residual at the base point
         self._columns = np.zeros((len(self.parameters) + 1, 0))
         self._normal: Floats | None = None
 
     @cached_property
     def is_coarsened(self) -> bool:
-        """Whether slopes are taken by coarser steps of time than residuals."""
+        """Whether sensitivities are simulated with coarser substeps than residuals."""
         return self.data.substeps > FIT.slope_substeps and is_stepped(apply_all(self.rig, (*self.effects, *self.held)))
 
     def at(self, free: np.ndarray) -> tuple[Effect, ...]:
         values = [dict(effect.values) for effect in self.effects]
-        # what is no logarithm at once, as `from_free` has it: errors are dozens
-        numbers = np.minimum(np.maximum(free * self.scale, self.least), self.most).tolist()
-        for (i, parameter), z, number in zip(self.parameters, free, numbers, strict=True):
+        # linear parameters all at once, as `from_free` has it: there are dozens of nominal errors
+        indices = np.minimum(np.maximum(free * self.scale, self.least), self.most).tolist()
+        for (i, parameter), z, number in zip(self.parameters, free, indices, strict=True):
             values[i][parameter.name] = parameter.from_free(z) if parameter.logarithmic else number
         return tuple(replace(e, values=v) for e, v in zip(self.effects, values, strict=True))
 
     def residual(self, free: np.ndarray, *, coarsely: bool = False) -> np.ndarray | None:
         data = self.coarse if coarsely else self.data
         residual = finite_residual(self.rig, (*self.at(free), *self.held), data)
-        if residual is None or not self.believed:
+        if residual is None or not self.with_prior:
             return residual
-        return np.concatenate([residual, free[self.believed] / self.prior_std])
+        return np.concatenate([residual, free[self.with_prior] / self.prior_std])
 
-    def near(self, free: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, bool]:
-        """The residual that slopes start from, and whether it is by coarser steps of time, as it is for a stepped rig.
+    def slope_base(self, free: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Base residual of the finite differences, and whether it has coarse substeps, as for a nonlinear rig.
 
-        Slopes need not be as exact as residuals.
+        Sensitivities need less accuracy than residuals.
         """
         on_coarse = self.residual(free, coarsely=True) if self.is_coarsened else None
         return (residual, False) if on_coarse is None else (on_coarse, True)
 
-    def _moved(self, free: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
-        """The free coordinates with some a small step away, inside their bounds."""
+    def _perturbed(self, free: np.ndarray, indices: Sequence[int]) -> np.ndarray:
+        """The free coordinates with some perturbed by a small step inside their bounds."""
         moved = free.copy()
-        for j in numbers:
+        for j in indices:
             parameter = self.parameters[j][1]
             step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name in COORDINATES else self.steps[j]
             moved[j] = free[j] - step if self.high[j] < free[j] + step else free[j] + step
         return moved
 
-    def _of_sensors_alone(self, numbers: Sequence[int]) -> list[list[int]]:
-        """Groups of numbers of different sensors, which one move tells apart; none where values mix their readings."""
+    def _groups_of_sensors(self, indices: Sequence[int]) -> list[list[int]]:
+        """Groups of parameters of different sensors, whose sensitivities one simulation gives.
+
+        Empty if values of the residual mix the readings of several sensors.
+        """
         both = (e for e in (*self.effects, *self.held) if e.kind.path == "sensor" and isinstance(e.target, tuple))
         if self.data.mixes_sensors or any(both) or any(sensor.crosstalk for sensor in self.rig.sensors):
             return []
         by_sensor: dict[str, list[int]] = {}
-        for j in numbers:
+        for j in indices:
             by_sensor.setdefault(self.parameters[j][1].sensor, []).append(j)
         own = [each for name, each in by_sensor.items() if name]
         return [[each[k] for each in own if k < len(each)] for k in range(max(map(len, own), default=0))]
 
-    def _altered(self, j: int) -> Integers:
-        """The values that a number of one sensor alters."""
-        believed = [self.data.n_values + self.believed.index(j)] if j in self.believed else []
-        return np.append(self._read_by[self.parameters[j][1].sensor], believed).astype(int)
+    def _rows_altered(self, j: int) -> Integers:
+        """Indices of the values that a parameter of one sensor alters."""
+        with_prior = [self.data.n_values + self.with_prior.index(j)] if j in self.with_prior else []
+        return np.append(self._read_by[self.parameters[j][1].sensor], with_prior).astype(int)
 
     @cached_property
     def _read_by(self) -> dict[str, Integers]:
-        """By name of sensor, the values that are its readings."""
+        """Indices of the values that are readings of each sensor, by name."""
         return {s.name: np.flatnonzero(self.data.sources == i) for i, s in enumerate(self.rig.sensors)}
 
     def slope(self, move: Move) -> bool:
-        """Write the columns of what a move tells, from the residual beside; False where the rig cannot be there."""
-        beside = self.residual(move.to, coarsely=move.coarsely)
-        if beside is None:
+        """Write the sensitivities to the perturbed parameters; False if the rig is impossible there."""
+        perturbed = self.residual(move.to, coarsely=move.coarsely)
+        if perturbed is None:
             return False
-        for j in move.numbers:
-            rows = self._altered(j) if move.of_sensors_alone else slice(None)
-            self._columns[j, rows] = (beside[rows] - self._columns[-1, rows]) / (move.to[j] - move.free[j])
+        for j in move.indices:
+            rows = self._rows_altered(j) if move.of_sensors_alone else slice(None)
+            self._columns[j, rows] = (perturbed[rows] - self._columns[-1, rows]) / (move.to[j] - move.free[j])
         return True
 
     def attempt(self, attempt: Attempt) -> tuple[Floats, Floats | None] | None:
-        """Where a step leads, and the residual there if the rig can be; None where it promises too little."""
+        """End point of a step and the residual there; None if the predicted decrease is too small."""
         free, normal = attempt.free, attempt.normal
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
         damped = normal + attempt.damping * np.diag(diagonal)
-        straight, moving = _straight(self, free, attempt.gradient, damped)
+        straight, moving = _damped_step(self, free, attempt.gradient, damped)
         if -(2.0 * attempt.gradient + normal @ straight) @ straight < attempt.worth:
             return None
-        to = free + _bounded(self, free, straight + self._bend(attempt, damped, straight, moving))
+        to = free + _bounded_step(self, free, straight + self._geodesic_acceleration(attempt, damped, straight, moving))
         return to, self.residual(to)
 
-    def _bend(self, attempt: Attempt, damped: Floats, step: Floats, moving: Flags) -> Floats:
-        """What a step turns by in a valley that bends: geodesic acceleration, none where it is no small correction.
+    def _geodesic_acceleration(self, attempt: Attempt, damped: Floats, step: Floats, moving: Flags) -> Floats:
+        """Geodesic acceleration: second-order correction of a step along a curved valley; zero if it is not small.
 
-        Transtrum & Sethna (2012), arXiv:1201.5885. A place and a strength make up for one another along such a valley.
+        Transtrum & Sethna (2012), arXiv:1201.5885. Along such a valley, the place and the strength of an effect
+        compensate each other.
         """
-        turn = np.zeros_like(step)
+        acceleration = np.zeros_like(step)
         if moving.sum() < 2:
-            return turn
-        beside = self.residual(attempt.free + FIT.bent * step, coarsely=attempt.coarsely)
-        if beside is None:
-            return turn
+            return acceleration
+        perturbed = self.residual(attempt.free + FIT.curvature_step * step, coarsely=attempt.coarsely)
+        if perturbed is None:
+            return acceleration
         # J' times the second derivative along the step
         columns, residual = self._columns[:-1], self._columns[-1]
-        curvature = 2.0 / FIT.bent * (columns @ (beside - residual) / FIT.bent - attempt.normal @ step)
-        turn[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], curvature[moving])
+        curvature = (
+            2.0 / FIT.curvature_step * (columns @ (perturbed - residual) / FIT.curvature_step - attempt.normal @ step)
+        )
+        acceleration[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], curvature[moving])
         with np.errstate(over="ignore"):
-            small = 2.0 * np.linalg.norm(turn) < FIT.most_bent * np.linalg.norm(step)
-        return turn if small else np.zeros_like(step)
+            small = 2.0 * np.linalg.norm(acceleration) < FIT.largest_curvature * np.linalg.norm(step)
+        return acceleration if small else np.zeros_like(step)
 
-    def done(self, job: Move | Attempt) -> Any:
-        """A share of the work of an iteration."""
+    def run(self, job: Move | Attempt) -> Any:
+        """The result of one job of an iteration."""
         return self.slope(job) if isinstance(job, Move) else self.attempt(job)
 
     def jacobian(self, free: Floats, residual: Floats, coarsely: bool, share: Shared) -> Floats:
-        """Differences from the residual that `near` gives; the next call overwrites them."""
-        if self._columns.shape[1] != residual.size:  # before helpers are forked, which write into them
+        """Jacobian (n_values, n_parameters) by differences from the residual of `slope_base`.
+
+        The next call overwrites it.
+        """
+        if self._columns.shape[1] != residual.size:  # before the processes that write into it are forked
             self._columns = self.workers.array(len(self.parameters) + 1, residual.size)
             if self.chord is not None and self.chord.columns is not None:
-                self._columns[self.believed, : self.data.n_values] = self.chord.columns.T / np.sqrt(self.data.heat)
-                self._columns[self.believed, self.data.n_values :] = 0.0
+                self._columns[self.with_prior, : self.data.n_values] = self.chord.columns.T / np.sqrt(
+                    self.data.temperature
+                )
+                self._columns[self.with_prior, self.data.n_values :] = 0.0
         jacobian = self._columns[:-1].T
-        fresh = [j for j in range(len(self.parameters)) if not self.is_known or j not in self.believed]
-        groups = self._of_sensors_alone(fresh)
+        fresh = [j for j in range(len(self.parameters)) if not self.has_known_slopes or j not in self.with_prior]
+        groups = self._groups_of_sensors(fresh)
         self._columns[[j for group in groups for j in group]], self._columns[-1] = 0.0, residual
         alone = [j for j in fresh if all(j not in group for group in groups)]
-        moves = [Move(free, self._moved(free, group), group, coarsely, of_sensors_alone=True) for group in groups]
-        moves += (Move(free, self._moved(free, [j]), [j], coarsely) for j in alone)
-        # where the rig cannot be: each number alone, and then to its other side
+        moves = [Move(free, self._perturbed(free, group), group, coarsely, of_sensors_alone=True) for group in groups]
+        moves += (Move(free, self._perturbed(free, [j]), [j], coarsely) for j in alone)
+        # where the perturbed rig is impossible: each parameter alone, then to its other side
         failed = [move for move, can_be in zip(moves, share(moves), strict=True) if not can_be]
-        self._columns[[j for move in failed for j in move.numbers]] = 0.0
-        single = [j for move in failed if len(move.numbers) > 1 for j in move.numbers]
-        moves = [Move(free, self._moved(free, [j]), [j], coarsely) for j in single]
-        failed = [move for move in failed if len(move.numbers) == 1]
+        self._columns[[j for move in failed for j in move.indices]] = 0.0
+        single = [j for move in failed if len(move.indices) > 1 for j in move.indices]
+        moves = [Move(free, self._perturbed(free, [j]), [j], coarsely) for j in single]
+        failed = [move for move in failed if len(move.indices) == 1]
         failed += (move for move, can_be in zip(moves, share(moves), strict=True) if not can_be)
-        share([Move(free, 2.0 * free - move.to, move.numbers, coarsely) for move in failed])
-        if self.is_known:
-            jacobian[residual.size - len(self.believed) :, self.believed] = np.diag(1.0 / self.prior_std)
-        self.is_known = self.is_known or self.chord is not None
+        share([Move(free, 2.0 * free - move.to, move.indices, coarsely) for move in failed])
+        if self.has_known_slopes:
+            jacobian[residual.size - len(self.with_prior) :, self.with_prior] = np.diag(1.0 / self.prior_std)
+        self.has_known_slopes = self.has_known_slopes or self.chord is not None
         return jacobian
 
-    def keep(self) -> None:
-        """Hand on the slopes along believed values, where they are to be kept and are not yet."""
+    def store_chord(self) -> None:
+        """Store the sensitivities to parameters with priors in the chord, if it has none yet."""
         chord = self.chord
-        if chord is not None and chord.columns is None and self.is_known:
-            chord.columns = np.sqrt(self.data.heat) * self._columns[self.believed, : self.data.n_values].T
+        if chord is not None and chord.columns is None and self.has_known_slopes:
+            chord.columns = np.sqrt(self.data.temperature) * self._columns[self.with_prior, : self.data.n_values].T
 
-    def end(self) -> None:
-        """No slope is asked for any more."""
+    def close(self) -> None:
+        """Release the memory of the sensitivities."""
         self.workers.give_back(self._columns)
         self._columns = self._columns[:, :0]
 
     def normal(self, jacobian: np.ndarray) -> np.ndarray:
-        """Jᵀ J; the part of sensitivities that are known is multiplied once."""
-        if not self.is_known or self._normal is None:
+        """Jᵀ J; the block of kept sensitivities is computed once."""
+        if not self.has_known_slopes or self._normal is None:
             self._normal = jacobian.T @ jacobian
             return self._normal
-        fresh = np.setdiff1d(np.arange(jacobian.shape[1]), self.believed)
+        fresh = np.setdiff1d(np.arange(jacobian.shape[1]), self.with_prior)
         product = self._normal.copy()
         product[:, fresh] = jacobian.T @ jacobian[:, fresh]
         product[fresh] = product[:, fresh].T
@@ -331,10 +344,10 @@ def slopes(
     *,
     wide: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The residual (n_values,), and its derivative by each parameter of effects, in its free coordinate.
+    """The residual (n_values,) and its derivatives (n_values, n_parameters) by the free coordinates of effects.
 
     Args:
-        wide: by longer steps, both ways, over which errors of modes that are solved anew do not show.
+        wide: central differences with long steps, which average out numerical errors of the modes.
 
     Raises:
         ValueError: the rig cannot be simulated with these effects.
@@ -348,17 +361,17 @@ def slopes(
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")
-    with workers.standing(problem.done) as share:
-        near = problem.near(problem.start, residual)
-        jacobian = problem.jacobian(problem.start, *near, share)
+    with workers.pool(problem.run) as share:
+        slope_base = problem.slope_base(problem.start, residual)
+        jacobian = problem.jacobian(problem.start, *slope_base, share)
         if wide:
             jacobian, problem.steps = jacobian.copy(), -problem.steps
-            jacobian = 0.5 * (jacobian + problem.jacobian(problem.start, *near, share))
+            jacobian = 0.5 * (jacobian + problem.jacobian(problem.start, *slope_base, share))
     return residual[: data.n_values], jacobian[: data.n_values]
 
 
 def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData, workers: Workers = ALONE) -> np.ndarray:
-    """The slopes along the numbers of believed effects, each in units of its belief."""
+    """Sensitivities (n_values, n_parameters) to parameters with priors, each times its prior standard deviation."""
     along: np.ndarray = slopes(rig, effects, data, workers=workers)[1]
     scaled: np.ndarray = along * _Problem(rig, effects, data).prior_std
     return scaled
@@ -376,18 +389,18 @@ def fit(
     chord: Chord | None = None,
     damping: float = FIT.damping,
 ) -> Fit:
-    """Levenberg-Marquardt over all parameters of the effects, from the values they carry.
+    """Levenberg-Marquardt fit of all parameters of the effects, from the values they carry.
 
     Args:
         rig: nominal.
         effects: with start values.
         data: fit records.
-        held: effects that are there too, and stay as they are.
+        held: further effects that stay fixed.
         iterations: at most.
         tolerance: relative decrease of the cost at which to stop.
         workers: processes that share the sensitivities, where they are many.
-        chord: slopes along parameters with priors that are kept, those of the first iteration where none are yet;
-            None to take them anew.
+        chord: sensitivities to parameters with priors that are kept, or filled in at the first iteration; None to
+            update them in every iteration.
         damping: of the first step, as a share of the diagonal of Jᵀ J.
     """
     problem = _Problem(rig, effects, data, held, workers, chord)
@@ -395,17 +408,17 @@ def fit(
     if residual is None:
         shape = (len(data.records), data.noise.size)
         return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), problem.start.size)
-    with workers.standing(problem.done) as share:
-        found = _descended(problem, share, residual, iterations, tolerance, damping)
-    problem.keep()
-    problem.end()
+    with workers.pool(problem.run) as share:
+        found = _minimised(problem, share, residual, iterations, tolerance, damping)
+    problem.store_chord()
+    problem.close()
     return found
 
 
-def _descended(
+def _minimised(
     problem: _Problem, share: Shared, residual: Floats, iterations: int, tolerance: float, damping: float
 ) -> Fit:
-    """The fit from where the problem starts, with this residual."""
+    """The fit by Levenberg-Marquardt iterations from the start point, where the residual is given."""
     free = problem.start.copy()
     cost = float(residual @ residual)
     falling = 0.0
@@ -414,13 +427,13 @@ def _descended(
         if problem.data.deadline.is_past:
             falling = 0.0
             break
-        nearly, coarsely = problem.near(free, residual)
-        jacobian = problem.jacobian(free, nearly, coarsely, share)
+        base, coarsely = problem.slope_base(free, residual)
+        jacobian = problem.jacobian(free, base, coarsely, share)
         normal, gradient = problem.normal(jacobian), jacobian.T @ residual
         dampings = accumulate([damping, *[FIT.less_far] * (FIT.attempts - 1)], mul)
         worth = FIT.promised * tolerance * cost
         attempts = (Attempt(free, coarsely, normal, gradient, each, worth) for each in dampings)
-        found = _first_below(cost, attempts, share, problem.workers.at_once)
+        found = _first_descent(cost, attempts, share, problem.workers.at_once)
         if found is None:
             falling = 0.0
             break
@@ -433,12 +446,12 @@ def _descended(
     return _result(problem, free, residual, normal, falling)
 
 
-def _first_below(
+def _first_descent(
     cost: float, attempts: Iterator[Attempt], share: Shared, at_once: int
 ) -> tuple[tuple[Floats, Floats], float] | None:
-    """Where the first step leads that lowers the cost, with the residual there, and its damping.
+    """End point and residual of the first step that lowers the cost, and its damping; None if none does.
 
-    As many are tried at once as there are processes: every other one fails, and the next would wait for it.
+    As many steps are tried at once as there are processes, since about half of them fail.
     """
     while some := list(islice(attempts, at_once)):
         for attempt, ended in zip(some, share(some), strict=True):
@@ -449,8 +462,8 @@ def _first_below(
     return None
 
 
-def _straight(problem: _Problem, free: Floats, gradient: Floats, damped: Floats) -> tuple[Floats, Flags]:
-    """The damped step, and which numbers it moves: one at a bound that it would pass stays, the others do without."""
+def _damped_step(problem: _Problem, free: Floats, gradient: Floats, damped: Floats) -> tuple[Floats, Flags]:
+    """The damped step, and which parameters it moves: those at a bound that they would pass stay fixed."""
     moving: Flags = np.ones(free.size, bool)
     step = np.zeros(free.size)
     for _ in range(free.size):
@@ -464,15 +477,15 @@ def _straight(problem: _Problem, free: Floats, gradient: Floats, damped: Floats)
     return step, moving
 
 
-def _bounded(problem: _Problem, free: Floats, step: Floats) -> Floats:
-    """The step, no longer than is sensible, and inside the bounds."""
-    reach = _reach(problem)
+def _bounded_step(problem: _Problem, free: Floats, step: Floats) -> Floats:
+    """The step, limited in length and to the bounds."""
+    reach = _longest_steps(problem)
     step = np.clip(step, -reach, reach)
     ended: Floats = np.clip(free + step, problem.low, problem.high)
     return ended - free
 
 
-def _reach(problem: _Problem) -> np.ndarray:
+def _longest_steps(problem: _Problem) -> np.ndarray:
     """Longest step of each free coordinate: a factor e, a tenth of the length, or its own size."""
     return np.array(
         [

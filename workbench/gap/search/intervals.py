@@ -1,4 +1,4 @@
-"""Standard deviations of fitted parameters that hold where the model is a little wrong too."""
+"""Standard errors of fitted parameters that hold for an imperfect model and coloured residuals."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,64 +20,66 @@ from workbench.rig.rig import Rig
 def with_intervals(
     rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE, *, wide: bool = False, logged: float = 0.0
 ) -> Fit:
-    """The fit with standard deviations by which 95 % intervals hold although what is left is not white.
+    """The fit with standard errors whose 95 % intervals hold although the residual is not white.
 
-    With J the sensitivities, r what is left, in units of the noise, and P the precision of the priors,
+    With J the sensitivities, r the residual in units of the noise, and P the precision of the priors,
 
         cov = Σ_b d_b d_bᵀ + s⁴ A⁻¹ P A⁻¹,    (A - J_bᵀ J_b) d_b = J_bᵀ r_b,
         A = Jᵀ J + s² P,    s² = max(|r|² / n, 1)
 
-    or s² A⁻¹ where that is larger, over blocks b of each record: d_b is what the numbers change by without block b, so
-    the many numbers that few blocks tell do not make it too small (the jackknife of clusters: MacKinnon, Nielsen &
-    Webb, J. Applied Econometrics 38 (2023) 671). P is of errors as large as `_as_believed` has them. Noise of the
-    logged inputs goes through the laws of the structure, which no filter of a linear one makes white, so it is drawn
-    too: each draw changes what is left by δ, and the numbers by A⁻¹ Jᵀ δ. The joint covariance is no smaller than any
-    of these in any direction. No number of an effect is known to better than a part in ten thousand.
+    or s² A⁻¹ where that is larger, over blocks b of each record: d_b is the change of the parameters without block b.
+    This cluster jackknife (MacKinnon, Nielsen & Webb, J. Applied Econometrics 38 (2023) 671) is not biased low by many
+    parameters and few blocks. P is the precision of `_with_plausible_errors`. Input noise passes through nonlinear
+    laws, for which no linear filter whitens it, so it is drawn: each draw changes the residual by δ and the parameters
+    by A⁻¹ Jᵀ δ. The joint covariance is no smaller than any of these in any direction. The relative standard error of a
+    parameter of an effect is at least 1e-4.
 
     Args:
         rig: nominal.
-        found: effects, and errors of the nominal model where they were fitted too.
+        found: effects, and nominal errors if they were fitted.
         data: fit records.
         workers: processes that share the work.
-        wide: as of `slopes`.
-        logged: noise of the logged inputs, as a share of their rms.
+        wide: as in `slopes`.
+        logged: input noise, as a share of the inputs' rms.
     """
-    data = data.finely(SELECTION.fine)  # errors of stepping are no noise: they would count as scatter
+    data = data.finely(SELECTION.fine)  # integration errors would count as scatter
     residual, jacobian = slopes(rig, found.effects, data, workers=workers, wide=wide)
     if jacobian.shape[1] == 0:
         return found
     parameters = parameters_of(rig, found.effects)
     level = max(float(residual @ residual) / residual.size, 1.0)
-    jacobian = _along_places(rig, found.effects, data, residual, jacobian, level)
-    least = np.array([_least(found.effects[i], p) for i, p in parameters])
-    priors = np.array([_precision(p) for _, p in parameters_of(rig, _as_believed(rig, found.effects, jacobian, level))])
+    jacobian = _with_secants_of_places(rig, found.effects, data, residual, jacobian, level)
+    model_scatter = np.array([_model_scatter(found.effects[i], p) for i, p in parameters])
+    priors = np.array(
+        [_precision(p) for _, p in parameters_of(rig, _with_plausible_errors(rig, found.effects, jacobian, level))]
+    )
     scale = np.sqrt(np.maximum((jacobian**2).sum(axis=0) + level * priors, 1e-300))
     jacobian, priors = jacobian / scale, priors / scale**2
     information = jacobian.T @ jacobian + level * np.diag(priors)
     inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
-    root = _root(information)
-    without = _without_each_block(residual, jacobian, data, root)
+    root = _square_root(information)
+    without = _jackknife(residual, jacobian, data, root)
     spread = without.T @ without + level**2 * inverse @ np.diag(priors) @ inverse
-    drawn = _by_noise_of_inputs(apply_all(rig, found.effects), data, residual, logged) @ jacobian @ inverse
+    drawn = _changes_by_input_noise(apply_all(rig, found.effects), data, residual, logged) @ jacobian @ inverse
     of_inputs = drawn.T @ drawn / INTERVALS.draws
     variances = np.max([np.diag(spread), level * np.diag(inverse), np.diag(of_inputs)], axis=0).clip(0.0)
     deviations: list[dict[str, float]] = [{} for _ in found.effects]
-    for (i, parameter), deviation in zip(parameters, np.sqrt(variances / scale**2 + least**2), strict=True):
+    for (i, parameter), deviation in zip(parameters, np.sqrt(variances / scale**2 + model_scatter**2), strict=True):
         value = found.effects[i].values[parameter.name]
         deviations[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
     effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
-    joint = _joint(root, information @ spread @ information, level, len(without))
+    joint = _no_smaller_sandwich(root, information @ spread @ information, level, len(without))
     joint = _no_smaller(joint, of_inputs)
-    return replace(found, effects=tuple(effects), covariance=joint / np.outer(scale, scale) + np.diag(least**2))
+    return replace(found, effects=tuple(effects), covariance=joint / np.outer(scale, scale) + np.diag(model_scatter**2))
 
 
-def _along_places(
+def _with_secants_of_places(
     rig: Rig, effects: Sequence[Effect], data: FitData, residual: np.ndarray, jacobian: np.ndarray, level: float
 ) -> np.ndarray:
-    """The slopes, along a place that its tangent leaves open by the secant over its deviation.
+    """The Jacobian with secants over the standard error, instead of tangents, for places.
 
-    Where the structure moves most, at the free end of a bar or in the middle of a beam, the tangent is none: readings
-    change with the square of the distance, and a deviation of half the extent would be said of a place known well.
+    At an antinode, such as the free end of a bar or the middle of a beam, the tangent vanishes: readings change with
+    the square of the distance, and the tangent would give a standard error of half the extent.
     """
     jacobian = jacobian.copy()
     for j, (i, parameter) in enumerate(parameters_of(rig, effects)):
@@ -86,12 +88,12 @@ def _along_places(
         value = effects[i].values[parameter.name]
         room = max(value - parameter.low, parameter.high - value) / parameter.scale
         inwards = 1.0 if parameter.high - value > value - parameter.low else -1.0
-        far = INTERVALS.straight * (parameter.high - parameter.low) / parameter.scale
-        step = deviation = _alone(jacobian[:, j], level, parameter)
+        linear_range = INTERVALS.straight * (parameter.high - parameter.low) / parameter.scale
+        step = deviation = _conditional_std(jacobian[:, j], level, parameter)
         for _ in range(INTERVALS.secants):
-            # a square's secant is half as steep over half the distance: the mean of logarithms meets it at once
+            # for a quadratic, the secant is proportional to the step: the geometric mean converges at once
             step = min(np.sqrt(step * deviation), room)
-            if step < far:
+            if step < linear_range:
                 break
             there = {**effects[i].values, parameter.name: value + inwards * step * parameter.scale}
             moved = (*effects[:i], replace(effects[i], values=there), *effects[i + 1 :])
@@ -99,17 +101,17 @@ def _along_places(
             if changed is None:
                 break
             jacobian[:, j] = inwards * (changed[: residual.size] - residual) / step
-            deviation = _alone(jacobian[:, j], level, parameter)
+            deviation = _conditional_std(jacobian[:, j], level, parameter)
     return jacobian
 
 
-def _alone(slope: np.ndarray, level: float, parameter: Parameter) -> float:
-    """Standard deviation of a free coordinate, were all others known."""
+def _conditional_std(slope: np.ndarray, level: float, parameter: Parameter) -> float:
+    """Standard error of a free coordinate, all others given."""
     return float(1.0 / np.sqrt(slope @ slope / level + _precision(parameter)))
 
 
 def _precision(parameter: Parameter) -> float:
-    """What is known of a free coordinate before any record: of errors what is believed, of a place that it is one."""
+    """Prior precision of a free coordinate: that of its normal prior, or for a place of a uniform one."""
     if parameter.prior_std is not None:
         return 1.0 / parameter.prior_std**2
     if parameter.name in COORDINATES:  # the variance of a uniform distribution over the extent
@@ -117,24 +119,26 @@ def _precision(parameter: Parameter) -> float:
     return 0.0
 
 
-def _as_believed(rig: Rig, effects: Sequence[Effect], jacobian: np.ndarray, level: float) -> list[Effect]:
-    """The effects, with errors of the nominal model that a careful one may have although none were learnt.
+def _with_plausible_errors(rig: Rig, effects: Sequence[Effect], jacobian: np.ndarray, level: float) -> list[Effect]:
+    """The effects, with prior variances of nominal errors that a careful model may have, even if estimated to be zero.
 
-    An effect may do what these would, and then the records do not show that they are none. Of each group
+    An effect may mimic nominal errors; the records then do not show that these are zero. For each group
 
         s² = (k c² + Σ (a² + v)) / (k + n),
 
-    over its n errors a, with variances v beside all else: what the records do not tell has v = s², and leaves c, a
-    careful model's; no less than was learnt.
+    over its n errors a with posterior variances v: errors that the records do not determine have v = s², which leaves
+    c, the size in a careful model. s is no smaller than estimated.
     """
     return [
-        replace(e, target=_careful(rig, effects, i, jacobian, level)) if isinstance(e.target, NominalPrior) else e
+        replace(e, target=_plausible_prior(rig, effects, i, jacobian, level))
+        if isinstance(e.target, NominalPrior)
+        else e
         for i, e in enumerate(effects)
     ]
 
 
-def _careful(rig: Rig, effects: Sequence[Effect], i: int, jacobian: np.ndarray, level: float) -> NominalPrior:
-    """The sizes of `_as_believed`, of the errors that are effect i."""
+def _plausible_prior(rig: Rig, effects: Sequence[Effect], i: int, jacobian: np.ndarray, level: float) -> NominalPrior:
+    """The prior variances of `_with_plausible_errors` for the nominal errors, effect i."""
     learnt: NominalPrior = effects[i].target
     normal = jacobian.T @ jacobian / level
     careful = {g: max(INTERVALS.careful * size, getattr(learnt, g)) for g, size in JOINT.widest if g in learnt.groups}
@@ -144,10 +148,10 @@ def _careful(rig: Rig, effects: Sequence[Effect], i: int, jacobian: np.ndarray, 
         parameters = parameters_of(rig, [*effects[:i], believed, *effects[i + 1 :]])
         precision = np.array([_precision(p) for _, p in parameters])
         free = np.array([p.to_free(effects[k].values[p.name]) for k, p in parameters])
-        # each mean square over that which is believed: 1 of what the records do not tell
-        told = precision * (free**2 + np.diag(scaled_inverse(normal + np.diag(precision))))
+        # posterior mean square over prior variance: 1 for an error that the records do not determine
+        ratio = precision * (free**2 + np.diag(scaled_inverse(normal + np.diag(precision))))
         groups = np.array([group_of(p.name) if k == i else "" for k, p in parameters])
-        sums = {g: size**2 * told[groups == g].sum() for g, size in sizes.items()}
+        sums = {g: size**2 * ratio[groups == g].sum() for g, size in sizes.items()}
         n = {g: INTERVALS.counts + (groups == g).sum() for g in sizes}
         sizes = {
             g: max(np.sqrt((INTERVALS.counts * c**2 + sums[g]) / n[g]), getattr(learnt, g)) for g, c in careful.items()
@@ -155,8 +159,8 @@ def _careful(rig: Rig, effects: Sequence[Effect], i: int, jacobian: np.ndarray, 
     return replace(learnt, **sizes)
 
 
-def _least(effect: Effect, parameter: Parameter) -> float:
-    """Standard deviation of a free coordinate that two good models of one structure differ by; none of their errors."""
+def _model_scatter(effect: Effect, parameter: Parameter) -> float:
+    """Difference of a free coordinate between two good models of one structure; 0 for nominal errors."""
     if parameter.prior_std is not None:
         return 0.0
     if parameter.logarithmic:
@@ -166,41 +170,47 @@ def _least(effect: Effect, parameter: Parameter) -> float:
     return INTERVALS.alike * size / parameter.scale
 
 
-def _root(information: np.ndarray) -> np.ndarray:
-    """R of A⁻¹ = R Rᵀ, without directions of which nothing is known."""
+def _square_root(information: np.ndarray) -> np.ndarray:
+    """R of A⁻¹ = R Rᵀ, without directions of no information."""
     values, vectors = np.linalg.eigh(information)
     there = values > 1e-12 * values[-1]
     return np.asarray(vectors[:, there] / np.sqrt(values[there]))
 
 
-def _joint(root: np.ndarray, scatter: np.ndarray, level: float, n_blocks: int) -> np.ndarray:
-    """The least covariance no smaller than A⁻¹ S A⁻¹ or s² A⁻¹ in any direction, of a root of A⁻¹, with S `scatter`.
+def _no_smaller_sandwich(root: np.ndarray, scatter: np.ndarray, level: float, n_blocks: int) -> np.ndarray:
+    """The smallest covariance no smaller than A⁻¹ S A⁻¹ or s² A⁻¹ in any direction.
 
-    Few blocks tell little of many parameters, so S is drawn towards a multiple of s² A, the more the fewer they are.
+    With few blocks for many parameters, S is shrunk towards a multiple of s² A.
+
+    Args:
+        root: R of A⁻¹ = R Rᵀ.
+        scatter: S.
+        level: s².
+        n_blocks: that S was estimated from.
     """
     relative = root.T @ scatter @ root / level
     own = n_blocks / (n_blocks + len(relative))
     relative = own * relative + (1.0 - own) * np.trace(relative) / len(relative) * np.eye(len(relative))
-    return _stretched(np.sqrt(level) * root, relative)
+    return _inflated(np.sqrt(level) * root, relative)
 
 
 def _no_smaller(covariance: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The least covariance no smaller than either in any direction that the first has."""
+    """The smallest covariance no smaller than either in any direction of the first."""
     values, vectors = np.linalg.eigh(covariance)
     there = values > 1e-12 * values[-1]
     vectors, sizes = vectors[:, there], np.sqrt(values[there])
-    return _stretched(vectors * sizes, (vectors / sizes).T @ other @ (vectors / sizes))
+    return _inflated(vectors * sizes, (vectors / sizes).T @ other @ (vectors / sizes))
 
 
-def _stretched(root: np.ndarray, relative: np.ndarray) -> np.ndarray:
+def _inflated(root: np.ndarray, relative: np.ndarray) -> np.ndarray:
     """R max(C, I) Rᵀ, with R `root` and C `relative`."""
     larger, axes = np.linalg.eigh(relative)
     half = root @ (axes * np.sqrt(np.maximum(larger, 1.0)))
     return np.asarray(half @ half.T)
 
 
-def _by_noise_of_inputs(rig: Rig, data: FitData, residual: np.ndarray, logged: float) -> np.ndarray:
-    """What draws of noise of the logged inputs change a residual by: (n_draws, n_values); none without such noise."""
+def _changes_by_input_noise(rig: Rig, data: FitData, residual: np.ndarray, logged: float) -> np.ndarray:
+    """Changes of the residual by draws of input noise: (n_draws, n_values); no draws without such noise."""
     if not logged:
         return np.zeros((0, residual.size))
     rng = np.random.default_rng(0)
@@ -212,8 +222,8 @@ def _by_noise_of_inputs(rig: Rig, data: FitData, residual: np.ndarray, logged: f
     return np.array([each.residual(rig) - residual for each in draws])
 
 
-def _without_each_block(residual: np.ndarray, jacobian: np.ndarray, data: FitData, root: np.ndarray) -> np.ndarray:
-    """What the parameters change by without each block: (n_blocks, n_parameters)."""
+def _jackknife(residual: np.ndarray, jacobian: np.ndarray, data: FitData, root: np.ndarray) -> np.ndarray:
+    """Change of the parameters when each block is left out: (n_blocks, n_parameters)."""
     changes, start = [], 0
     for record in data.counted:
         n_outputs, n_samples = record.outputs.shape

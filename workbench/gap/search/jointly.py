@@ -1,4 +1,4 @@
-"""Effects fitted beside errors of the nominal model, or noise of the inputs, of sizes that the records tell."""
+"""Effects fitted jointly with nominal errors or input noise, whose variances are estimated from the records."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,36 +24,38 @@ from workbench.rig.rig import Rig
 
 
 def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
-    """Whether a careful laboratory could have a nominal model with these errors; those of damping where they count."""
+    """Whether nominal errors are as small as in a careful laboratory; those of damping count if `damping`."""
     return not [group for group in too_large(errors) if damping or group != "damping"]
 
 
 def too_large(errors: Effect) -> list[str]:
-    """The groups of errors that are larger than in a careful laboratory."""
-    return [group for group, size in _widest(errors.target) if size_of(errors, group) >= JOINT.plausible * size]
+    """Groups of nominal errors that are larger than in a careful laboratory."""
+    return [
+        group for group, size in _largest_plausible(errors.target) if size_of(errors, group) >= JOINT.plausible * size
+    ]
 
 
 def size_of(errors: Effect, group: str) -> float:
-    """Rms of a group of errors, as large as they are, not as is believed of a careful model."""
-    values, spread = _drawn(errors, group)
+    """Posterior rms of a group of nominal errors, estimates and their variances together."""
+    values, spread = _scaled_errors(errors, group)
     return float(np.sqrt(np.mean(values**2 + spread**2))) if values.size else 0.0
 
 
-def _widest(prior: NominalPrior) -> list[tuple[str, float]]:
-    """Largest standard deviation believed of each group; of modes that are off one by one, damping is a guess."""
+def _largest_plausible(prior: NominalPrior) -> list[tuple[str, float]]:
+    """(group, largest plausible standard deviation); with errors of each mode, damping ratios are mere guesses."""
     return [(g, JOINT.guessed if g == "damping" and prior.by_mode else size) for g, size in JOINT.widest]
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Effects beside nominal errors, fitted together.
+    """A set of effects fitted jointly with nominal errors.
 
     Attributes:
-        fit: of both, the errors last.
-        sensor_noise: (n_outputs,) mean square of each sensor's noise as found, over that of the stated noise.
-        logged: noise of the logged inputs, as a share of their rms.
-        noise_power: (n_records, n_outputs) mean square of both, over that of the stated noise of the sensors.
-        others: sets that it was chosen from, fitted to all records too.
+        fit: of the effects and the nominal errors, which come last.
+        sensor_noise: (n_outputs,) estimated noise power of each sensor over the stated one.
+        logged: input noise, as a share of the inputs' rms.
+        noise_power: (n_records, n_outputs) power of sensor and input noise over the stated power of sensor noise.
+        others: the candidates that this set was selected from, fitted to all records.
     """
 
     fit: Fit
@@ -64,21 +66,26 @@ class Step:
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """Without the errors."""
+        """The effects without the nominal errors."""
         return self.fit.effects[:-1]
 
     @property
     def errors(self) -> Effect:
-        """Of the nominal model."""
+        """The nominal errors."""
         return self.fit.effects[-1]
 
     @property
     def is_plausible(self) -> bool:
-        """Whether a careful laboratory could have a nominal model with these errors."""
+        """Whether the nominal errors are as small as in a careful laboratory."""
         return are_plausible(self.errors)
 
     def description(self, noise_power: np.ndarray, *, of_errors_alone: bool = False) -> float:
-        """Description length, nats, of what is left above that noise and of the errors."""
+        """Description length, nats, of the residual above a noise power (n_records, n_outputs) and the nominal errors.
+
+        Args:
+            noise_power: as of the class.
+            of_errors_alone: leave out the residual.
+        """
         left = 0.0
         if not of_errors_alone:
             left = JOINT.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
@@ -88,7 +95,7 @@ class Step:
         return float(left)
 
     def excess(self, noise_power: np.ndarray) -> float:
-        """Mean square left above that noise, in units of the stated one."""
+        """Residual power above a noise power (n_records, n_outputs), mean of all channels, in units of the stated."""
         return float(np.maximum(self.fit.cost_by_channel - noise_power, 0.0).mean())
 
 
@@ -99,91 +106,91 @@ def fit_jointly(
     *,
     rounds: int | None = None,
     known: np.ndarray | None = None,
-    to_the_end: bool = False,
+    until_convergence: bool = False,
 ) -> Step:
-    """Effects and nominal errors fitted together, the sizes of the errors learnt from the records.
+    """Effects and nominal errors fitted jointly, with prior variances of the errors by evidence maximisation.
 
-    The likeliest sizes follow MacKay, Neural Computation 4 (1992) 415: s² = Σ a² / Σ (1 - v / s²) over the errors a of
-    a group and their posterior variances v. What is left counts as noise meanwhile, so that errors do not bend to an
-    effect that is not there yet.
+    The most probable variances follow MacKay, Neural Computation 4 (1992) 415: s² = Σ a² / Σ (1 - v / s²) over the
+    errors a of a group and their posterior variances v. In each round the residual of the last counts as noise, so that
+    the nominal errors do not over-fit an effect that is still missing.
 
     Args:
-        search: with its records.
-        effects: with values to start from.
-        errors: of the nominal model, likewise.
-        rounds: of sizes; as the settings have it unless given.
-        known: (n_values, n_errors) sensitivities to the errors on the two most telling records, in units of the stated
-            noise, where they are at hand: then the fit is of these records alone.
-        to_the_end: until no step lowers the cost, by fine steps of time where a law needs them.
+        search: records, nominal rig and candidate kinds.
+        effects: with start values.
+        errors: nominal errors, with start values.
+        rounds: updates of the prior variances; None for `JOINT.rounds`.
+        known: (n_values, n_errors) sensitivities to the nominal errors on the two most informative records, in units
+            of the stated noise; if given, only these records are fitted.
+        until_convergence: fit until the cost is stationary, with fine substeps.
     """
     rounds = JOINT.rounds if rounds is None else rounds
-    whole, before = search.data.finely(SELECTION.fine) if to_the_end else search.data, np.inf
-    if to_the_end:
+    whole, before = search.data.finely(SELECTION.fine) if until_convergence else search.data, np.inf
+    if until_convergence:
         errors = replace(errors, target=replace(errors.target, waves=JOINT.last_waves))
     if known is None:
-        errors = opened(search, errors)
-    i, counted, chord = 0, 0, Chord(known)
-    while counted < rounds and i < JOINT.most_rounds:
-        # the two most telling records lead the way
-        quickly = known is not None or (i == 0 and not to_the_end)
-        data = search.quick.stepped(whole.substeps) if quickly else whole
-        level = _level(search.rig, (*effects, errors), data)
-        if level > (1.0 - (JOINT.last_settled if to_the_end else JOINT.settled)) * before:
+        errors = with_all_groups(search, errors)
+    i, n_counted, chord = 0, 0, Chord(known)
+    while n_counted < rounds and i < JOINT.most_rounds:
+        # the two most informative records come first
+        on_quick = known is not None or (i == 0 and not until_convergence)
+        data = search.quick.stepped(whole.substeps) if on_quick else whole
+        power = _residual_level(search.rig, (*effects, errors), data)
+        if power > (1.0 - (JOINT.last_settled if until_convergence else JOINT.settled)) * before:
             break
-        falls = level < JOINT.falling * before
-        counted += not falls or not np.isfinite(before)
-        # far from where the slopes were taken, as exact as can be, or taken at once
-        if known is None and (falls or to_the_end or len(errors.values) < JOINT.few):
+        fell = power < JOINT.falling * before
+        n_counted += not fell or not np.isfinite(before)
+        # new sensitivities: far from the last ones, in the final fit, or if there are few
+        if known is None and (fell or until_convergence or len(errors.values) < JOINT.few):
             chord = Chord()
-        before = level if known is not None or not quickly else np.inf
+        before = power if known is not None or not on_quick else np.inf
         i += 1
         found = fit(
             search.rig,
             (*effects, errors),
-            data.tempered(level),
-            iterations=JOINT.last_iterations if to_the_end else JOINT.iterations,
-            tolerance=JOINT.last_tolerance if to_the_end else JOINT.tolerance,
+            data.tempered(power),
+            iterations=JOINT.last_iterations if until_convergence else JOINT.iterations,
+            tolerance=JOINT.last_tolerance if until_convergence else JOINT.tolerance,
             workers=search.workers,
             chord=chord,
         )
         *effects, errors = found.effects
-        errors = _sized(errors, _next_sizes(errors))
-    if to_the_end:
-        return measured(search, replace(found, effects=(*effects, errors)), whole.substeps)
-    moving = measured(search, replace(found, effects=(*effects, _closed(errors))), whole.substeps)
-    # of what is far from noise the sizes say little
-    near = moving.excess(moving.noise_power) < JOINT.near * float(moving.noise_power.mean())
-    resting = _at_rest(search, found, whole, chord) if known is None and near else found
-    if resting is found:
-        return moving
-    *effects, errors = resting.effects
-    rested = measured(search, replace(resting, effects=(*effects, _closed(errors))), whole.substeps)
-    # errors that come to rest far off bend to what no error of the model is
-    return min((rested, moving), key=lambda step: step.description(rested.noise_power))
+        errors = _with_prior_stds(errors, _next_prior_stds(errors))
+    if until_convergence:
+        return evaluated(search, replace(found, effects=(*effects, errors)), whole.substeps)
+    last = evaluated(search, replace(found, effects=(*effects, _without_negligible_groups(errors))), whole.substeps)
+    # far above the noise floor, the prior variances mean little
+    is_near_noise = last.excess(last.noise_power) < JOINT.near * float(last.noise_power.mean())
+    at_limit = _at_fixed_point(search, found, whole, chord) if known is None and is_near_noise else found
+    if at_limit is found:
+        return last
+    *effects, errors = at_limit.effects
+    limit = evaluated(search, replace(at_limit, effects=(*effects, _without_negligible_groups(errors))), whole.substeps)
+    # large nominal errors at the fixed point have fitted something else
+    return min((limit, last), key=lambda step: step.description(limit.noise_power))
 
 
-def _at_rest(search: Search, found: Fit, data: FitData, chord: Chord) -> Fit:
-    """The fit with the sizes of errors where they come to rest, which the records may be slow to lead to.
+def _at_fixed_point(search: Search, found: Fit, data: FitData, chord: Chord) -> Fit:
+    """The fit with the prior standard deviations of the nominal errors at the fixed point of MacKay's update.
 
-    Where they hardly tell errors apart, the cost does not change on the way.
+    The update alone converges slowly where the records hardly distinguish the errors; the cost is then flat.
 
     Args:
-        search: with its records.
-        found: effects and errors.
+        search: records, nominal rig and candidate kinds.
+        found: fit of effects and nominal errors.
         data: all records.
-        chord: slopes of them along the errors.
+        chord: sensitivities to the nominal errors.
     """
     for _ in range(JOINT.rests):
         errors = found.effects[-1]
-        sizes = _likeliest_sizes(search, found)
+        sizes = _limit_of_prior_stds(search, found)
         changes = [abs(np.log(size / getattr(errors.target, group))) for group, size in sizes.items()]
         if max(changes, default=0.0) < JOINT.sized:
             break
-        effects = (*found.effects[:-1], _sized(errors, sizes))
+        effects = (*found.effects[:-1], _with_prior_stds(errors, sizes))
         found = fit(
             search.rig,
             effects,
-            data.tempered(_level(search.rig, effects, data)),
+            data.tempered(_residual_level(search.rig, effects, data)),
             iterations=JOINT.iterations,
             tolerance=JOINT.tolerance,
             workers=search.workers,
@@ -193,102 +200,125 @@ def _at_rest(search: Search, found: Fit, data: FitData, chord: Chord) -> Fit:
     return found
 
 
-def _level(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
-    """Mean square of what effects and errors leave, in units of the noise; no less than that."""
+def _residual_level(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
+    """Residual power of effects and nominal errors, in units of the noise power; at least 1."""
     left = data.residual(apply_all(rig, effects))
-    with np.errstate(over="ignore"):  # of a motion that runs away
+    with np.errstate(over="ignore"):  # the simulation may diverge
         return max(float(left @ left) / left.size, 1.0)
 
 
-def _sized(errors: Effect, sizes: dict[str, float]) -> Effect:
-    """The errors with prior deviations of those sizes."""
+def _with_prior_stds(errors: Effect, sizes: dict[str, float]) -> Effect:
+    """The nominal errors with other prior standard deviations, by group."""
     return replace(errors, target=replace(errors.target, **sizes))
 
 
-def measured(search: Search, found: Fit, substeps: int | None = None) -> Step:
-    """Effects and errors, the errors last, as they leave the records of a search, by its substeps unless others are."""
-    whole, rig = search.data.stepped(substeps or search.data.substeps), apply_all(search.rig, found.effects)
-    if whole.whiteners:
-        by_channel = whole.by_channel(whole.residual(rig))
+def evaluated(search: Search, found: Fit, substeps: int | None = None) -> Step:
+    """A fit of effects and nominal errors (last) with its residual and noise evaluated on all records of a search.
+
+    Args:
+        search: with the records.
+        found: the fit.
+        substeps: of a sample; None for those of the search.
+    """
+    data, rig = search.data.stepped(substeps or search.data.substeps), apply_all(search.rig, found.effects)
+    if data.whiteners:
+        by_channel = data.by_channel(data.residual(rig))
         of_noise = np.ones_like(by_channel)
         step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
         return Step(step, of_noise[0], search.logged, of_noise)
-    residuals = whole.differences(rig)
-    with np.errstate(over="ignore", invalid="ignore"):  # of a motion that runs away
-        by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
+    residuals = data.differences(rig)
+    with np.errstate(over="ignore", invalid="ignore"):  # the simulation may diverge
+        by_channel = np.array([((r / data.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
         coloured = are_coloured(residuals)
-        credible = np.inf if is_noise_alone(residuals, whole.counted, coloured) else _credible(whole, coloured)
-        sensor_noise = np.minimum(noise_found(residuals, coloured) / whole.noise, credible) ** 2
+        credible = np.inf if is_noise_alone(residuals, data.counted, coloured) else _largest_noise_ratio(data, coloured)
+        sensor_noise = np.minimum(noise_found(residuals, coloured) / data.noise, credible) ** 2
     step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
     per_unit = search.logging_noise
     logged = logging_noise(by_channel, sensor_noise, per_unit)
     return Step(step, sensor_noise, logged, sensor_noise + logged**2 * per_unit)
 
 
-def _credible(data: FitData, coloured: np.ndarray) -> Floats:
-    """How many times the noise of each sensor (n_outputs,) that of the data may turn out to be."""
+def _largest_noise_ratio(data: FitData, coloured: np.ndarray) -> Floats:
+    """Largest credible ratio of estimated to stated noise, by sensor (n_outputs,)."""
     guessed = np.array([name in data.guessed for name in data.records[0].output_names])
     return np.where(guessed & coloured, JOINT.credible_guess, JOINT.credible)
 
 
-def _next_sizes(errors: Effect) -> dict[str, float]:
-    """Prior deviations as large as the records make the errors of each group, one step nearer to the likeliest."""
+def _next_prior_stds(errors: Effect) -> dict[str, float]:
+    """Prior standard deviation of each group of nominal errors after one of MacKay's updates."""
     prior = errors.target
-    return {g: _size(_drawn(errors, g), getattr(prior, g), widest) for g, widest in _widest(prior) if g in prior.groups}
+    return {
+        g: _next_prior_std(_scaled_errors(errors, g), getattr(prior, g), widest)
+        for g, widest in _largest_plausible(prior)
+        if g in prior.groups
+    }
 
 
-def _size(drawn: Floats, size: float, widest: float) -> float:
-    """The next size of errors, drawn (2, n_errors) with their posterior standard deviations, after MacKay."""
-    values, spread = drawn
-    known = np.clip(1.0 - (spread / size) ** 2, 0.0, 1.0).sum()
-    return float(np.clip(np.sqrt((values**2).sum() / max(known, 1e-3)), JOINT.narrowest * widest, widest))
+def _next_prior_std(scaled: Floats, size: float, widest: float) -> float:
+    """Prior standard deviation of a group after one of MacKay's updates.
+
+    Args:
+        scaled: (2, n_errors) the errors and their posterior standard deviations.
+        size: prior standard deviation before.
+        widest: the largest plausible one.
+    """
+    values, spread = scaled
+    n_determined = np.clip(1.0 - (spread / size) ** 2, 0.0, 1.0).sum()
+    return float(np.clip(np.sqrt((values**2).sum() / max(n_determined, 1e-3)), JOINT.narrowest * widest, widest))
 
 
-def _likeliest_sizes(search: Search, found: Fit) -> dict[str, float]:
-    """The sizes where `_next_sizes` comes to rest, errors and effects going with them to first order.
+def _limit_of_prior_stds(search: Search, found: Fit) -> dict[str, float]:
+    """Fixed point of `_next_prior_stds`, by group, with errors and effects re-estimated to first order.
 
-    Simulations are not asked again: where the records hardly tell errors apart, the cost does not change on the way.
+    No simulation is needed: where the records hardly distinguish the errors, the cost is flat.
     """
     errors, prior = found.effects[-1], found.effects[-1].target
     each = [parameter for _, parameter in parameters_of(search.rig, found.effects)]
-    mine = np.arange(len(each) - len(errors.values), len(each))
-    names, free = [each[j].name for j in mine], np.array([each[j].to_free(errors.values[each[j].name]) for j in mine])
+    of_errors = np.arange(len(each) - len(errors.values), len(each))
+    names, free = (
+        [each[j].name for j in of_errors],
+        np.array([each[j].to_free(errors.values[each[j].name]) for j in of_errors]),
+    )
     groups = np.array([group_of(name) for name in names])
     sizes = {group: float(getattr(prior, group)) for group in prior.groups}
-    unit = np.array([each[j].prior_std for j in mine], float) / [sizes[g] for g in groups]
-    widest = dict(_widest(prior))
+    unit = np.array([each[j].prior_std for j in of_errors], float) / [sizes[g] for g in groups]
+    widest = dict(_largest_plausible(prior))
 
     def precision() -> Floats:
-        of_each: Floats = np.zeros(len(each))
-        of_each[mine] = 1.0 / (unit * [sizes[g] for g in groups]) ** 2
-        return of_each
+        diagonal: Floats = np.zeros(len(each))
+        diagonal[of_errors] = 1.0 / (unit * [sizes[g] for g in groups]) ** 2
+        return diagonal
 
     assert found.normal is not None
-    was = precision()
+    start = precision()
     for _ in range(JOINT.likeliest):
         now, before = precision(), dict(sizes)
-        inverse = scaled_inverse(found.normal + np.diag(now - was))
-        moved = inverse[mine][:, mine] @ ((was - now)[mine] * free)
-        drawn = np.array([free + moved, np.sqrt(np.maximum(np.diag(inverse)[mine], 0.0))]) / unit
+        inverse = scaled_inverse(found.normal + np.diag(now - start))
+        change = inverse[of_errors][:, of_errors] @ ((start - now)[of_errors] * free)
+        scaled = np.array([free + change, np.sqrt(np.maximum(np.diag(inverse)[of_errors], 0.0))]) / unit
         for group in sizes:
-            sizes[group] = _size(drawn[:, groups == group], sizes[group], widest[group])
+            sizes[group] = _next_prior_std(scaled[:, groups == group], sizes[group], widest[group])
         if all(abs(np.log(sizes[g] / before[g])) < 0.1 * JOINT.sized for g in sizes):
             break
     return sizes
 
 
-def _drawn(errors: Effect, group: str) -> Floats:
-    """The errors (2, n_errors) of a group and their standard deviations, each over its weight."""
+def _scaled_errors(errors: Effect, group: str) -> Floats:
+    """Nominal errors of a group and their posterior standard deviations, each over its weight: (2, n_errors)."""
     names = [name for name in errors.values if group_of(name) == group]
     weights = [weight_of(name, errors.target) for name in names]
     each = [[found.get(name, 0.0) for name in names] for found in (errors.values, errors.deviations)]
-    drawn: Floats = np.array(each).reshape(2, len(names)) / np.array(weights)
-    return drawn
+    scaled: Floats = np.array(each).reshape(2, len(names)) / np.array(weights)
+    return scaled
 
 
-def _closed(errors: Effect) -> Effect:
-    """The errors without the groups that were learnt to be none: what is not there costs no time."""
-    none = [g for g, widest in _widest(errors.target) if getattr(errors.target, g) <= 1.01 * JOINT.narrowest * widest]
+def _without_negligible_groups(errors: Effect) -> Effect:
+    """The nominal errors without the groups whose prior standard deviation has fallen to its lower bound."""
+    none = [
+        g
+        for g, widest in _largest_plausible(errors.target)
+        if getattr(errors.target, g) <= 1.01 * JOINT.narrowest * widest
+    ]
     none = [group for group in none if group != "delay" or not errors.target.late]
     kept = {name: value for name, value in errors.values.items() if group_of(name) not in none}
     deviations = {name: errors.deviations[name] for name in kept if name in errors.deviations}
@@ -296,98 +326,103 @@ def _closed(errors: Effect) -> Effect:
     return replace(errors, target=target, values=kept, deviations=deviations)
 
 
-def opened(search: Search, errors: Effect) -> Effect:
-    """The errors with all groups, those that were closed at none and with the sizes they had before any record."""
+def with_all_groups(search: Search, errors: Effect) -> Effect:
+    """The nominal errors with all groups; those that were dropped start from zero with their original priors."""
     before = search.prior
     closed = {g: getattr(before, g) for g, _ in JOINT.widest if not getattr(errors.target, g)}
     return nominal_errors(search.rig, replace(errors.target, **closed), errors.values)
 
 
 def with_all_errors(search: Search, effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The effects, errors beside them with all groups: a model that is a little off may be so in all.
+    """The effects, the nominal errors among them with all groups, so that intervals allow for every group.
 
-    Those that were closed at none are open at as good as none, for intervals to allow for.
+    Groups that were dropped get the smallest prior standard deviation.
     """
-    return tuple(_with_all(search, e) if isinstance(e.target, NominalPrior) else e for e in effects)
+    return tuple(_with_every_group(search, e) if isinstance(e.target, NominalPrior) else e for e in effects)
 
 
-def _with_all(search: Search, errors: Effect) -> Effect:
-    """The errors as they are, with a value of every group."""
+def _with_every_group(search: Search, errors: Effect) -> Effect:
+    """The nominal errors with values of every group."""
     groups = replace(search, by_mode=errors.target.by_mode).prior.groups
     closed = {g: JOINT.narrowest * size for g, size in JOINT.widest if g in set(groups) - set(errors.target.groups)}
     return nominal_errors(search.rig, replace(errors.target, waves=JOINT.last_waves, **closed), errors.values)
 
 
 def surely_late(errors: Effect) -> Effect:
-    """The errors with the sides of accelerometers open, but for those that are later than a gap makes them seem."""
+    """The nominal errors with no accelerometer assigned to a side of the input steps, except the clearly late ones."""
     late = tuple(name for name in errors.target.late if errors.values[f"delay_{name}"] > JOINT.surely_late)
     return replace(errors, target=replace(errors.target, late=late, early=()))
 
 
-def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = ()) -> Effect:
-    """The errors with each accelerometer on that side of the jumps at the samples which the records show it to read.
+def with_reading_sides(search: Search, errors: Effect, effects: Sequence[Effect] = ()) -> Effect:
+    """The nominal errors with each accelerometer assigned to the side of the input steps that it reads.
 
-    Those that are known to be late stay so. Predictions one sample ahead tell: what a wrong frequency does to whole
-    records looks like any delay.
+    With held inputs, acceleration jumps at the samples: a late sensor reads the value before the jump, others the one
+    after. Sensors known to be late stay so. One-step-ahead predictions decide, since over whole records a wrong
+    frequency looks like a delay.
     """
-    known = errors.target.late
-    jumping = tuple(s.name for s in search.rig.sensors if s.quantity == "acceleration" and s.name not in known)
-    if not jumping or not errors.target.delay or errors.target.interpolated:
+    known_late = errors.target.late
+    accelerometers = tuple(
+        s.name for s in search.rig.sensors if s.quantity == "acceleration" and s.name not in known_late
+    )
+    if not accelerometers or not errors.target.delay or errors.target.interpolated:
         return errors
-    none = {**errors.values, **{f"delay_{name}": 0.0 for name in jumping}}
+    zero_delays = {**errors.values, **{f"delay_{name}": 0.0 for name in accelerometers}}
 
-    def left(delay: float) -> np.ndarray:
-        tried = nominal_errors(search.rig, replace(errors.target, late=known, early=()), none)
-        tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in jumping}})
+    def residual_with(delay: float) -> np.ndarray:
+        tried = nominal_errors(search.rig, replace(errors.target, late=known_late, early=()), zero_delays)
+        tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in accelerometers}})
         return search.ahead.residual(apply_all(search.rig, (*effects, tried)))
 
-    # where motion is quick between samples, what a sensor reads a while before a jump is not what it reads at once
+    # if the motion changes much between samples, a reading well before a jump differs from one just before
     delays = np.array([*(-delay for delay in JOINT.delays), 0.0, JUST_LATE, *JOINT.delays])
-    residuals = {float(delay): left(float(delay)) for delay in delays}
-    before, at, after = left(-JUST_LATE), residuals[0.0], residuals[JUST_LATE]
-    with np.errstate(invalid="ignore"):  # of a motion that runs away nothing is late
+    residuals = {float(delay): residual_with(float(delay)) for delay in delays}
+    before, at, after = residual_with(-JUST_LATE), residuals[0.0], residuals[JUST_LATE]
+    with np.errstate(invalid="ignore"):  # of a diverging simulation nothing is late
         step, smooth = (search.ahead.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
     powers = np.array([search.ahead.by_channel(residual).sum(axis=0) for residual in residuals.values()])
-    rows = [j for j, s in enumerate(search.rig.sensors) if s.name in jumping and step[j] > JOINT.jump * smooth[j]]
-    sided = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}
-    late = (*known, *(name for name, delay in sided.items() if delay > 0))
-    early = tuple(name for name, delay in sided.items() if delay <= 0)
-    starts = {**errors.values, **{f"delay_{name}": delay for name, delay in sided.items()}}
+    rows = [
+        j for j, s in enumerate(search.rig.sensors) if s.name in accelerometers and step[j] > JOINT.jump * smooth[j]
+    ]
+    best_delays = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}
+    late = (*known_late, *(name for name, delay in best_delays.items() if delay > 0))
+    early = tuple(name for name, delay in best_delays.items() if delay <= 0)
+    starts = {**errors.values, **{f"delay_{name}": delay for name, delay in best_delays.items()}}
     return nominal_errors(search.rig, replace(errors.target, late=late, early=early), starts)
 
 
-def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Search | None:
-    """The search beside noise of the logged inputs as a set shows it; None where that is not what the set leaves.
+def with_input_noise(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Search | None:
+    """The search with input noise of the likeliest level given a fit, or None if that does not whiten the residual.
 
-    What most records would have louder than any logger's noise is none: a law that is missing grows with the level too.
+    None also if most records would need more noise than any logger has: a missing law grows with the level too.
 
     Args:
-        search: without that noise.
-        fitted: the set, errors of the nominal model among it.
-        sensor_noise: (n_outputs,) mean square of each sensor's noise as found without it, over that of the stated one.
+        search: without input noise.
+        fitted: effects and nominal errors.
+        sensor_noise: (n_outputs,) noise power of each sensor estimated without input noise, over the stated one.
     """
     rig = apply_all(search.rig, fitted.effects)
-    left, found = search.data.differences(rig), search.with_noise(np.sqrt(sensor_noise) * search.data.noise)
-    # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
-    shares = [likeliest_share(rig, s.data, left) for s in (search, found)]
-    (share, _, is_beyond), louder = min(zip(shares, (search, found), strict=True), key=lambda each: each[0].loss)
+    residuals, found = search.data.differences(rig), search.with_noise(np.sqrt(sensor_noise) * search.data.noise)
+    # input noise inflates the estimate of sensor noise, so the stated sensor noise is tried as well
+    shares = [likeliest_share(rig, s.data, residuals) for s in (search, found)]
+    (share, _, is_beyond), best = min(zip(shares, (search, found), strict=True), key=lambda each: each[0].loss)
     if share < LEAST_LOGGED or is_beyond:
         return None
-    beside = louder.beside_inputs(rig, share)
-    white = measured(beside, fitted).fit
-    if INPUTS.white < white.cost < INPUTS.bent * fitted.cost:
-        fitted = white = fit_jointly(beside, fitted.effects[:-1], fitted.effects[-1]).fit
+    noisy = best.with_input_noise(rig, share)
+    white = evaluated(noisy, fitted).fit
+    if INPUTS.white < white.cost < INPUTS.over_fitted * fitted.cost:
+        fitted = white = fit_jointly(noisy, fitted.effects[:-1], fitted.effects[-1]).fit
         rig = apply_all(search.rig, fitted.effects)
-        left = search.data.differences(rig)
+        residuals = search.data.differences(rig)
     if white.cost > INPUTS.white:
         return None
-    for _ in range(INPUTS.rounds):  # each sensor's noise by the power of its innovations
-        louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
-        beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
-        white = measured(beside, fitted).fit
-    return beside
+    for _ in range(INPUTS.rounds):  # sensor noise from the power of the innovations
+        best = best.with_noise(best.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
+        noisy = best.with_input_noise(rig, likeliest_share(rig, best.data, residuals).share)
+        white = evaluated(noisy, fitted).fit
+    return noisy
 
 
 def likeliest_loss(search: Search, rig: Rig) -> float:
-    """Minus the log-likelihood of what a rig leaves, beside as much noise of the logged inputs as is likeliest."""
+    """Minus the log-likelihood of a rig's residual, with input noise of the likeliest level."""
     return likeliest_share(rig, search.data, search.data.differences(rig)).loss

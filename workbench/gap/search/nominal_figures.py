@@ -1,4 +1,4 @@
-"""Nominal figures that are off in a way of their own: of one mode, or of one record."""
+"""Nominal errors that vary by record, and nominal errors of each mode by itself."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import differing, figures_of
 from workbench.gap.search.fit import finite_residual
 from workbench.gap.search.jointly import Step, too_large
-from workbench.gap.search.plain import OF_PORTS
+from workbench.gap.search.plain import PORT_GROUPS
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import RECORDS, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
@@ -18,12 +18,12 @@ from workbench.gap.search.stepwise import Stepwise
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
-    """What one figure would deviate by in each record, all else as it is.
+    """Estimated deviations of one nominal parameter in each record, all else fixed.
 
     Attributes:
-        figure: of `figures_of`.
-        values, spread: (n_records,) about their mean, and their standard deviations.
-        left: mean square that records leave with them, in units of the noise.
+        figure: the parameter, of `figures_of`.
+        values, spread: (n_records,) deviations from their mean, and their standard errors.
+        left: mean square residual with these deviations, in units of the noise.
         in_common: likewise with one deviation common to all records.
     """
 
@@ -41,15 +41,15 @@ class Deviations:
 
 
 def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviations | None:
-    """The deviation of each record that leaves least of it, of a few that are tried and a parabola between them.
+    """Least-squares deviations of a parameter in each record, by parabolic interpolation of the cost.
 
-    None where the structure cannot have one of them: a beam that is free at both ends bears no compression.
-
-    Its standard deviation is that of a linear fit, from the scatter of its gradient over blocks of the record.
+    None if the structure cannot have a deviation that is tried: a beam free at both ends bears no compression. The
+    standard errors are those of a linear fit, from the scatter of the gradient over blocks of the record.
 
     Args:
-        effects: errors of the nominal model among them.
-        figure: of `figures_of`.
+        search: records and nominal rig.
+        effects: nominal errors among them.
+        figure: the parameter, of `figures_of`.
     """
     rig, data = apply_all(search.rig, effects), search.data
     names = [record.name for record in data.records]
@@ -61,19 +61,19 @@ def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviat
             return None
         residuals.append(np.split(residual, ends))
     costs = np.array([[float(r @ r) / r.size for r in each] for each in residuals])
-    least = [_least(cost) for cost in costs.T]
+    least = [_parabola_minimum(cost) for cost in costs.T]
     values = np.array([at for at, _ in least])
     return Deviations(
         figure=figure,
         values=values - values.mean(),
-        spread=np.array([_spread([each[i] for each in residuals], data.noise.size) for i in range(len(names))]),
+        spread=np.array([_standard_error([each[i] for each in residuals], data.noise.size) for i in range(len(names))]),
         left=float(np.mean([cost for _, cost in least])),
-        in_common=_least(costs.mean(axis=1))[1],
+        in_common=_parabola_minimum(costs.mean(axis=1))[1],
     )
 
 
-def _least(costs: Floats) -> tuple[float, float]:
-    """Where a parabola through the least of the costs at deviations tried, and its neighbours, is least; how small."""
+def _parabola_minimum(costs: Floats) -> tuple[float, float]:
+    """Minimum (position, value) of the parabola through the least cost at `RECORDS.tried` and its neighbours."""
     tried = np.array(RECORDS.tried)
     i = int(np.clip(costs.argmin(), 1, tried.size - 2))
     x = tried[i - 1 : i + 2]
@@ -82,8 +82,8 @@ def _least(costs: Floats) -> tuple[float, float]:
     return at, float(np.clip(np.polyval(curve, at), 0.0, costs.min()))
 
 
-def _spread(residuals: Sequence[Floats], n_outputs: int) -> float:
-    """Standard deviation of a record's deviation, by its residuals (n_values,) at each deviation tried."""
+def _standard_error(residuals: Sequence[Floats], n_outputs: int) -> float:
+    """Standard error of a record's deviation, from its residuals (n_values,) at each deviation tried."""
     i = int(np.clip(np.argmin([r @ r for r in residuals]), 1, len(RECORDS.tried) - 2))
     along = (residuals[i + 1] - residuals[i - 1]) / (RECORDS.tried[i + 1] - RECORDS.tried[i - 1])
     # by time, all sensors together
@@ -92,99 +92,102 @@ def _spread(residuals: Sequence[Floats], n_outputs: int) -> float:
     return float(np.sqrt(((blocks - blocks.mean()) ** 2).sum()) / max(float(along @ along), 1e-300))
 
 
-def likeliest(search: Search, step: Step) -> Deviations | None:
-    """The figure whose deviations from record to record take much of what a step leaves above the noise, surely.
-
-    None where no figure does, or there is one record.
-    """
+def varying_parameter(search: Search, step: Step) -> Deviations | None:
+    """The parameter whose variation from record to record surely removes much of the residual of a step, or None."""
     if len(search.data.records) < 2:
         return None
     noise = float(step.noise_power.mean())
-    found = [deviations(search, step.fit.effects, figure) for figure in figures_of(search.rig)]
-    sure = [d for d in found if d is not None and d.is_sure]
+    candidates = [deviations(search, step.fit.effects, figure) for figure in figures_of(search.rig)]
+    sure = [d for d in candidates if d is not None and d.is_sure]
     promising = [d for d in sure if d.in_common - d.left > RECORDS.enough * (d.in_common - noise)]
-    return min(promising, key=lambda d: d.left * (RECORDS.clearly if d is found[0] else 1.0), default=None)
+    return min(promising, key=lambda d: d.left * (RECORDS.clearly if d is candidates[0] else 1.0), default=None)
 
 
-def beside_records(before: Stepwise) -> Stepwise | None:
-    """What holds beside a figure of the nominal model that differs from record to record.
+def with_record_deviations(before: Stepwise) -> Stepwise | None:
+    """The stepwise selection with a nominal parameter that varies from record to record.
 
-    What effects explain without is theirs: a law of the motion, too, makes records of other levels look stiffer. None
-    where the records do not ask for such a figure, or it does not halve what they leave.
+    Effects that explain the records without it are preferred: a nonlinear law also makes records of other levels look
+    stiffer. None if no parameter varies significantly, or if its variation does not halve the residual.
 
     Args:
-        before: what holds without, its likeliest single effects tried; where a figure is asked for, it is run.
+        before: the selection without, single effects tried; it is run if a parameter varies.
     """
     search, nearest = before.at_first, before.nearest
-    asked = likeliest(search, nearest)
-    if asked is None:
+    varying = varying_parameter(search, nearest)
+    if varying is None:
         return None
     before.run()
     if before.decision().outcome == "explained":
         return before
-    search.report(f"{asked.figure} that differs from record to record", 0.5)
-    varied = replace(search, differs=asked.figure)
-    beside = Stepwise(varied, before.tolerance, before.ahead)
-    if not (beside.is_believed or search.prior.shape):  # a profile bends to shapes that are off by themselves
-        by_mode = Stepwise(replace(varied, by_mode=True), before.tolerance, before.ahead)
-        # no effect of the structure hides among errors of ports and of records
-        if by_mode.is_quiet and set(too_large(by_mode.last.errors)) <= {"damping", "record", *OF_PORTS}:
+    search.report(f"{varying.figure} that varies from record to record", 0.5)
+    varying_search = replace(search, differs=varying.figure)
+    with_deviations = Stepwise(varying_search, before.tolerance, before.ahead)
+    if not (
+        with_deviations.has_plausible_errors or search.prior.shape
+    ):  # errors of profiles over-fit errors of single shapes
+        by_mode = Stepwise(replace(varying_search, by_mode=True), before.tolerance, before.ahead)
+        # errors of ports and records cannot absorb an effect in the structure
+        if by_mode.is_noise_only and set(too_large(by_mode.last.errors)) <= {"damping", "record", *PORT_GROUPS}:
             by_mode.run(most=0)
             return by_mode
     noise = nearest.noise_power
-    if beside.is_enough or beside.by_singles() or beside.nearest.excess(noise) < RECORDS.half * nearest.excess(noise):
-        beside.run()
-        return beside
+    if (
+        with_deviations.is_sufficient
+        or with_deviations.by_singles()
+        or with_deviations.nearest.excess(noise) < RECORDS.half * nearest.excess(noise)
+    ):
+        with_deviations.run()
+        return with_deviations
     return None
 
 
-def beside_modes(before: Stepwise) -> Stepwise | None:
-    """What holds beside errors of each mode, in frequency and in shape: nothing, or effects; None where none does.
+def with_mode_errors(before: Stepwise) -> Stepwise | None:
+    """The stepwise selection with nominal errors of the frequency and shape of each mode, or None if it fails.
 
-    Errors of a structure that is a little off everywhere are fewer and come first; those of its modes take linear
-    effects for their own, so one effect more beside the few is asked for first. Where only errors larger than a careful
-    model's leave nothing, an effect beside which they are such may be what is missing.
+    Errors of each mode absorb linear effects, so one more effect with the fewer errors of profiles is tried first. If
+    only implausibly large errors of the modes explain the records, an effect that makes them plausible is searched.
 
     Args:
-        before: what holds without, its likeliest single effects tried.
+        before: the selection with errors of profiles, single effects tried.
     """
     nearest = before.nearest
-    if before.at_first.prior.shape:  # asked from the start
+    if before.at_first.prior.shape:  # errors of each mode were included from the start
         return None
     if nearest.excess(nearest.noise_power) > STEPWISE.of_modes * float(before.search.nominal.mean()):
         return None
     before.search.report("errors of each mode", 0.5)
-    beside = Stepwise(replace(before.at_first, by_mode=True), before.tolerance, before.ahead)
-    if beside.is_quiet:
-        found = len(beside.last.effects)
-        if not beside.is_believed:
-            beside.calibrate()
-        if beside.is_believed and beside.is_quiet:
-            if _with_one_more(before, found):
+    with_modes = Stepwise(replace(before.at_first, by_mode=True), before.tolerance, before.ahead)
+    if with_modes.is_noise_only:
+        n_effects = len(with_modes.last.effects)
+        if not with_modes.has_plausible_errors:
+            with_modes.calibrate()
+        if with_modes.has_plausible_errors and with_modes.is_noise_only:
+            if _explained_with_one_more(before, n_effects):
                 return before
-            beside.run(most=0)
-            return beside
-        beside.singles = [step.effects for step in before.alone]
+            with_modes.run(most=0)
+            return with_modes
+        with_modes.singles = [step.effects for step in before.fitted_singles]
     else:
-        again = beside.afresh(nearest.effects)
-        left = nearest.excess(nearest.noise_power)
-        if before.is_believed and again.excess(again.noise_power) > STEPWISE.halved * left:
+        refitted = with_modes.fit_from_zero(nearest.effects)
+        excess = nearest.excess(nearest.noise_power)
+        if before.has_plausible_errors and refitted.excess(refitted.noise_power) > STEPWISE.halved * excess:
             return None
-        beside.known = [again] if len(again.effects) == 1 else []
-    if not beside.by_singles():
-        # gains that are off by more than any calibration, though the errors beside them are large
-        return beside if beside.last.effects and beside.is_quiet and not before.is_closed else None
-    beside.run()
-    if not (beside.is_closed and beside.is_believed):
+        with_modes.known = [refitted] if len(refitted.effects) == 1 else []
+    if not with_modes.by_singles():
+        # gain errors too large for any calibration count even with large other errors
+        return with_modes if with_modes.last.effects and with_modes.is_noise_only and not before.closes_gap else None
+    with_modes.run()
+    if not (with_modes.closes_gap and with_modes.has_plausible_errors):
         return None
-    return before if _with_one_more(before, len(beside.last.effects)) else beside
+    return before if _explained_with_one_more(before, len(with_modes.last.effects)) else with_modes
 
 
-def _with_one_more(before: Stepwise, found: int) -> bool:
-    """Whether one effect more beside the few errors of the structure does what errors of each mode do.
+def _explained_with_one_more(before: Stepwise, found: int) -> bool:
+    """Whether one more effect with errors of profiles explains the records as well as errors of each mode.
 
     Args:
-        found: effects beside errors of each mode, gains that are off apart.
+        before: the selection with errors of profiles.
+        found: number of effects with errors of each mode, wrong gains not counted.
     """
     before.run(most=found + 1)
-    return bool(before.is_believed and (before.plain or (before.last.effects and before.is_quiet)))
+    return bool(before.has_plausible_errors and (before.plain or (before.last.effects and before.is_noise_only)))

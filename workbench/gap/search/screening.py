@@ -1,4 +1,4 @@
-"""The likeliest sets of effects: by predictions one sample ahead to first order, fitted to these, to whole records."""
+"""Screening of candidate effects to first order, then fits to one-step-ahead predictions, then to whole records."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,29 +12,29 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all, contained
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit, slopes
-from workbench.gap.search.search import Search, apart, best_of_each_kind, in_one_valley, promise
+from workbench.gap.search.search import Search, apart, best_of_each_kind, in_one_minimum, promise
 from workbench.gap.search.settings import SCREENING, SEARCH, SELECTION
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Domain, NamedPoints
 
-RUNAWAY = 1e10  # mean square, in noise units, of errors that tell nothing
-NOTHING = 1e-300  # square of a move that given effects make up for whole
+RUNAWAY = 1e10  # mean square of a change of the residual, in units of the noise, beyond which a start is unusable
+NOTHING = 1e-300  # square of a change that the given effects explain entirely
 
 
 @dataclass(frozen=True, eq=False)
 class Screening:
-    """Starts of every kind and target, and what each moves the errors by on the most telling record.
+    """Candidate start values of every kind and target, and the change of the innovations by each.
 
-    An effect acts on a motion that the records hold in place, so errors of predictions one sample ahead are nearly
-    linear in its strength, stiff as it may be. With r the errors and m_i what start i moves them by, |r + a m_i|² and
-    |r + a m_i + b m_j|² at their least tell what one effect or two can come to, from the products of each with each.
+    An observer keeps the simulated motion close to the measured one, so innovations are nearly linear in the strength
+    of an effect, even a stiff one. With r the innovations of the most informative record and m_i their change by start
+    i, the minima of |r + a m_i|² and |r + a m_i + b m_j|² over a and b rank single effects and pairs.
 
     Attributes:
-        starts: those of one kind and target after those of another.
-        moves: (n_starts, n_values); what the numbers of effects given before can make up for is taken away.
-        left: (n_values,) the errors, likewise.
-        least, most: (n_starts,) bounds of a strength, in units of the start's.
+        starts: grouped by kind and target.
+        moves: (n_starts, n_values) changes m_i, orthogonal to the sensitivities to the effects that are given.
+        left: (n_values,) innovations r, likewise.
+        least, most: (n_starts,) bounds of the strength, in units of the start's.
         domain: the places of the structure.
     """
 
@@ -47,56 +47,58 @@ class Screening:
 
     @classmethod
     def of(cls, search: Search, given: tuple[Effect, ...], evidence: Evidence) -> "Screening":
-        """Weigh what may be there beside the given effects.
+        """Screen all effects that may be present in addition to the given ones.
 
         Args:
+            search: records, nominal rig and candidate kinds.
+            given: effects.
             evidence: of the rig with the given effects.
         """
-        data, standing = search.first_ahead, search.first_ahead.standing
-        before = finite_residual(search.rig, (*given, *search.held), standing)
+        data, unprojected = search.first_ahead, search.first_ahead.unprojected
+        before = finite_residual(search.rig, (*given, *search.held), unprojected)
         if before is None:
             return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.domain)
-        thin = slice(None, None, max(1, before.size // SCREENING.most_values))
+        every = slice(None, None, max(1, before.size // SCREENING.most_values))
 
         tasks = _starts(search, given, evidence)
         starts = [start for task in tasks for start in task]
         bounds = [_bounds(task) for task in tasks for _ in task]
         left = before.copy()
-        data.give_way(left)
-        left = left[thin]
+        data.project_out(left)
+        left = left[every]
         moves = search.workers.array(len(starts), left.size)  # the one large array
 
         def moved_by(some: range) -> list[bool]:
-            # errors of the model give way to many starts at once: their directions are large
+            # nuisance parameters are projected out of many starts at once: the projection matrix is large
             moved = np.zeros((len(some), before.size))
             for row, i in zip(moved, some, strict=True):
-                there = finite_residual(search.rig, (*given, starts[i], *search.held), standing)
+                there = finite_residual(search.rig, (*given, starts[i], *search.held), unprojected)
                 row[:] = 0.0 if there is None else there - before
-            data.give_way(moved)
-            moves[some] = moved[:, thin]
+            data.project_out(moved)
+            moves[some] = moved[:, every]
             return [bool(0 < moves[i] @ moves[i] < RUNAWAY * left.size) for i in some]
 
         for i in {start.kind: i for i, start in enumerate(starts) if start.kind not in CATALOGUE}.values():
             moved_by(range(i, i + 1))  # a law of the user's own is compiled here, not in each process
         at_once = [range(i, min(i + SCREENING.at_once, len(starts))) for i in range(0, len(starts), SCREENING.at_once)]
-        shown = [shows for some in search.workers.map(moved_by, at_once) for shows in some]
-        telling = [i for i, shows in enumerate(shown) if shows]
-        for row, i in enumerate(telling):  # those that tell nothing are closed up in place
+        usable_starts = [is_usable for some in search.workers.map(moved_by, at_once) for is_usable in some]
+        usable = [i for i, is_usable in enumerate(usable_starts) if is_usable]
+        for row, i in enumerate(usable):  # unusable rows are overwritten
             moves[row] = moves[i]
-        moves = moves[: len(telling)]
-        if given and telling:
-            basis, _ = np.linalg.qr(slopes(search.rig, given, data, held=search.held)[1][thin])
+        moves = moves[: len(usable)]
+        if given and usable:
+            basis, _ = np.linalg.qr(slopes(search.rig, given, data, held=search.held)[1][every])
             left = left - basis @ (basis.T @ left)
             for row in moves:
                 row -= basis @ (basis.T @ row)
-        least, most = np.array([bounds[i] for i in telling]).reshape(-1, 2).T
-        return cls(tuple(starts[i] for i in telling), moves, left, least, most, search.rig.modes.domain)
+        least, most = np.array([bounds[i] for i in usable]).reshape(-1, 2).T
+        return cls(tuple(starts[i] for i in usable), moves, left, least, most, search.rig.modes.domain)
 
     def likeliest(self) -> list[Effect]:
-        """The best start of every kind and target, and the best elsewhere, in the order of what they can come to."""
+        """The best start of every kind and target, and the best at another place, by increasing cost."""
         own, along = np.einsum("ij,ij->i", self.moves, self.moves).clip(NOTHING), self.moves @ self.left
         a = (-along / own).clip(self.least, self.most)
-        # of places that are one and the same, the first comes first
+        # rounded, so that of identical places the first comes first
         costs = np.round(a * (2.0 * along + a * own) / max(self.left @ self.left, 1e-300), 9)
         chosen: list[Effect] = []
         for i in np.argsort(costs, kind="stable"):
@@ -107,19 +109,19 @@ class Screening:
         return chosen
 
     def likeliest_pairs(self, most: int) -> list[tuple[Effect, Effect]]:
-        """The best starts of every two kinds and targets, and the best elsewhere, likewise."""
+        """The best starts of every two kinds and targets, and the best at other places, by increasing cost."""
         if len(self.starts) < 2:
             return []
-        costs = self._of_pairs()
+        costs = self._pair_costs()
         labels = [start.label for start in self.starts]
         begins = [i for i, label in enumerate(labels) if i == 0 or label != labels[i - 1]]
         blocks = [slice(*ends) for ends in pairwise((*begins, len(labels)))]
-        beside = self._beside
+        beside = self._share_minimum
         for one in blocks:
             for other in blocks:
-                if one.start > other.start or _repeats(self.starts[one.start], self.starts[other.start]):
+                if one.start > other.start or _duplicates(self.starts[one.start], self.starts[other.start]):
                     costs[one, other] = np.inf
-            # the same twice at one place is the same, twice as strong
+            # two effects of one kind at one place are one of the summed strength
             costs[one, one][beside[one, one]] = np.inf
         best = np.minimum.reduceat(np.minimum.reduceat(costs, begins, axis=0), begins, axis=1)
         found = []
@@ -134,8 +136,8 @@ class Screening:
         return [pair for _, pair in sorted(found, key=lambda entry: entry[0])[:most]]
 
     @property
-    def _beside(self) -> np.ndarray:
-        """Whether two starts of one kind are in one valley: (n_starts, n_starts)."""
+    def _share_minimum(self) -> np.ndarray:
+        """Whether two starts are close enough in place to share a local minimum: (n_starts, n_starts)."""
         if isinstance(self.domain, NamedPoints):
             names = np.array([str(start.at) for start in self.starts])
             alike: Flags = names[:, None] == names
@@ -144,7 +146,7 @@ class Screening:
         beside: Flags = np.linalg.norm(at[:, None] - at, axis=2) <= SEARCH.elsewhere * self.domain.size
         return beside
 
-    def _of_pairs(self) -> np.ndarray:
+    def _pair_costs(self) -> np.ndarray:
         """min |left + a m_i + b m_j|² - |left|² over a and b within their bounds: (n_starts, n_starts)."""
         products, along = self.moves @ self.moves.T, self.moves @ self.left
         i, j = along[:, None], along
@@ -161,26 +163,26 @@ class Screening:
 
 
 def _bounds(starts: list[Effect]) -> tuple[float, float]:
-    """Of the strength of one kind and target, in units of a start's."""
+    """Bounds of the strength of one kind and target, in units of the start's."""
     if not starts[0].values:
         return 1.0, 1.0
     return (-SCREENING.stronger if starts[0].kind.signed else SCREENING.weaker), SCREENING.stronger
 
 
 def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[list[Effect]]:
-    """Where to start every kind and target that may be there beside the given effects: one list a kind and target."""
+    """Start values of every kind and target that may join the given effects: one list for each kind and target."""
     left = search.data.by_channel(search.data.residual(apply_all(search.rig, (*given, *search.held))))
     starts = [
         [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
         for kind in search.catalogue
         if kind.found_in == "search"
-        for target in _targets_worth_trying(kind, search.rig, left)
+        for target in _plausible_targets(kind, search.rig, left)
     ]
-    return [task for task in starts if task and not any(_repeats(task[0], effect) for effect in given)]
+    return [task for task in starts if task and not any(_duplicates(task[0], effect) for effect in given)]
 
 
-def _targets_worth_trying(kind: Kind, rig: Rig, left: np.ndarray) -> tuple[Any, ...]:
-    """Targets of a kind; a fault of one sensor is only looked for where that sensor disagrees."""
+def _plausible_targets(kind: Kind, rig: Rig, left: np.ndarray) -> tuple[Any, ...]:
+    """Targets of a kind; for a fault of a sensor, only sensors with a large residual (n_records, n_outputs)."""
     targets = kind.targets(rig)
     if kind.path != "sensor":
         return targets
@@ -195,8 +197,8 @@ def _targets_worth_trying(kind: Kind, rig: Rig, left: np.ndarray) -> tuple[Any, 
     return tuple(target for target in targets if disagrees(target))
 
 
-def _repeats(one: Effect, other: Effect) -> bool:
-    """Whether two effects are the same figure of the same thing, which twice says nothing new."""
+def _duplicates(one: Effect, other: Effect) -> bool:
+    """Whether two effects have the same parameter of the same target, so that the second adds nothing."""
     kind = one.kind
     if other.kind is not kind or not (kind.path in ("actuator", "sensor") or other.at is None):
         return False
@@ -206,11 +208,13 @@ def _repeats(one: Effect, other: Effect) -> bool:
 def one_more(
     search: Search, given: tuple[Effect, ...], evidence: Evidence, screened: Screening | None = None
 ) -> list[Fit]:
-    """The likeliest fits, one sample ahead, of the given effects with one more, best first.
+    """The best fits of the given effects with one more to one-step-ahead predictions, best first.
 
     Args:
+        search: records, nominal rig and candidate kinds.
+        given: effects.
         evidence: of the rig with the given effects.
-        screened: what may be there beside them, where it is at hand.
+        screened: the screening with these effects given, if it is available.
     """
     screened = Screening.of(search, given, evidence) if screened is None else screened
     chosen: list[Effect] = []
@@ -220,13 +224,13 @@ def one_more(
     found = fitted_ahead(search, [(*given, effect) for effect in chosen])
     if not (search.held and found):
         return found
-    # beside errors that give way, a start that stands a little off its place comes to nothing
-    there = fitted_ahead(search, [(*given, effect) for effect in _exchanged(found, screened)])
-    return distinct_valleys(search, sorted((*found, *there), key=lambda f: f.cost))
+    # nuisance parameters absorb a start slightly off its place, so exact places are tried too
+    at_likely_places = fitted_ahead(search, [(*given, effect) for effect in _at_likely_places(found, screened)])
+    return distinct_minima(search, sorted((*found, *at_likely_places), key=lambda f: f.cost))
 
 
-def _exchanged(found: Sequence[Fit], screened: Screening) -> list[Effect]:
-    """Linear kinds of the structure, each where the likeliest of others stand; other faults of the likeliest port."""
+def _at_likely_places(found: Sequence[Fit], screened: Screening) -> list[Effect]:
+    """Linear structural kinds at the places of the best other ones, and other faults of the likeliest port."""
 
     def is_linear(effect: Effect) -> bool:
         return effect.kind.path == "structure" and not effect.kind.nonlinear and effect.at is not None
@@ -242,35 +246,36 @@ def _exchanged(found: Sequence[Fit], screened: Screening) -> list[Effect]:
 
 
 def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:
-    """Fits of sets to predictions one sample ahead, best first: all to the most telling record, fewer to another too.
+    """Fits of sets to one-step-ahead predictions, best first: all to the most informative record, the best to two.
 
     Args:
-        sets: the likeliest first.
+        search: records and nominal rig.
+        sets: of effects, the likeliest first.
     """
 
-    first, both = search.first_ahead, search.ahead  # before helpers are forked, which would each find them
+    first, both = search.first_ahead, search.ahead  # computed once, before processes are forked
 
     def ahead(task: tuple[tuple[Effect, ...], bool, int]) -> Fit:
         effects, alone, iterations = task
         data = first if alone else both
         return fit(search.rig, effects, data, held=search.held, iterations=iterations, tolerance=1e-4)
 
-    with search.workers.standing(ahead) as share:
+    with search.workers.pool(ahead) as share:
         tried = share([(effects, True, 2) for effects in sets[: SELECTION.tried]])
         likely = sorted(tried, key=promise)[: SELECTION.likely]
-        fits = distinct_valleys(search, sorted(share([(f.effects, False, 3) for f in likely]), key=promise))
+        fits = distinct_minima(search, sorted(share([(f.effects, False, 3) for f in likely]), key=promise))
         falling = [
             f for f in fits[: SELECTION.likeliest] if f.falling and promise(f) < SELECTION.far_behind * promise(fits[0])
         ]
         longer = share([(f.effects, False, 8) for f in falling])
-    return distinct_valleys(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
+    return distinct_minima(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
 
 
-def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
-    """The fits without those that came to where a better one of the same set came."""
+def distinct_minima(search: Search, fits: Sequence[Fit]) -> list[Fit]:
+    """The fits without those that converged to the local minimum of a better fit of the same set."""
     distinct: list[Fit] = []
     for candidate in fits:
-        if not any(in_one_valley(candidate, other, search.rig.modes.domain) for other in distinct):
+        if not any(in_one_minimum(candidate, other, search.rig.modes.domain) for other in distinct):
             distinct.append(candidate)
     return distinct
 
@@ -278,26 +283,27 @@ def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
 def on_whole_records(
     search: Search, ahead: Sequence[Fit], most: int, *, to_cost: float = float("inf"), at_first: int | None = None
 ) -> list[Fit]:
-    """The best of fits ahead, fitted to whole records, best first.
+    """The best one-step-ahead fits, refitted to whole records, best first.
 
     Args:
-        ahead: best first.
-        most: at most so many, and none that is far behind.
-        to_cost: what a fit must come to, to be of use; those on their way to more stay where they are.
-        at_first: iterations before that is asked; as the settings have it unless given.
+        search: records and nominal rig.
+        ahead: one-step-ahead fits, best first.
+        most: number of fits, at most; those of a much higher cost are left out.
+        to_cost: cost that a fit must reach to be useful; fits that will not are stopped early.
+        at_first: iterations before that is predicted; None for `SELECTION.at_first`.
     """
     at_first = SELECTION.at_first if at_first is None else at_first
     close = [f for f in ahead[:most] if f.cost < SELECTION.close * ahead[0].cost]
     simpler = contained(close[0].effects, search.rig) if close else set()
     first = [f for f in close if f is close[0] or f.key in simpler]
     fits = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), first)
-    rest = [f for f in close if f not in first]
+    remaining = [f for f in close if f not in first]
     if any(search.explains(f) for f in fits):
-        rest = [f for f in rest if f.cost < ahead[0].cost + SEARCH.rival]
-    others = _none_that_contains(search, fits, rest)
+        remaining = [f for f in remaining if f.cost < ahead[0].cost + SEARCH.rival]
+    others = _without_generalisations(search, fits, remaining)
     more = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), others)
     fits = sorted((*fits, *more), key=promise)
-    fits = _none_that_contains(search, fits, fits)
+    fits = _without_generalisations(search, fits, fits)
     to_cost = min([to_cost, *(f.cost + SEARCH.rival for f in fits if search.explains(f))])
     running = [f for f in fits if f.falling and promise(f) < SELECTION.running * promise(fits[0])]
     running = [f for f in running if promise(f, SEARCH.further) < to_cost]
@@ -305,19 +311,22 @@ def on_whole_records(
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
 
 
-def _none_that_contains(search: Search, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
-    """The others but those that come, at bounds of their numbers, to a fit that leaves nothing worth an effect."""
+def _without_generalisations(search: Search, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
+    """The others without those that have a limiting case among the fits at the noise floor."""
     enough = {f.key for f in fits if f.cost < 1.0 + SEARCH.significant and search.explains(f)}
     return [f for f in others if enough.isdisjoint(contained(f.effects, search.rig))]
 
 
 def by_continuation(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
-    """The set fitted to predictions one sample ahead, which go smoothly with its numbers, then to whole records.
+    """The set fitted to one-step-ahead predictions, then to whole records, by continuation in the observer gain.
 
-    Where a stiff law lets motions run apart, half a percent of a place is too far for whole records to tell the way;
-    where a thousandth of a percent is, the observer gain is lowered by steps (continuation).
+    One-step-ahead residuals are smooth in the parameters. With a stiff law, a fit to whole records does not converge
+    from half a percent off a place; where even a thousandth of a percent is too far, the observer gain is lowered in
+    steps until the residual on whole records is small.
 
     Args:
+        search: records and nominal rig.
+        effects: with start values.
         iterations: on whole records, at most.
     """
     rig = apply_all(search.rig, effects)
@@ -335,6 +344,6 @@ def by_continuation(search: Search, effects: tuple[Effect, ...], iterations: int
 
 
 def whole(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
-    """The set fitted to whole records."""
+    """The set fitted to whole records, with fine substeps."""
     data = search.data.finely(SELECTION.fine)
     return fit(search.rig, effects, data, held=search.held, iterations=iterations)

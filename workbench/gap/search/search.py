@@ -1,4 +1,4 @@
-"""What every step of a search for effects works on, and what it may call an explanation."""
+"""The data that every step of a search for effects shares, and its criteria of what explains the records."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -26,22 +26,22 @@ from workbench.structure.member import Structure
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What every step of a search works on.
+    """Records, nominal rig and candidate kinds of a search for effects.
 
     Attributes:
-        rig: nominal, with what shows in the readings themselves.
-        data: all records to fit.
-        quick: the two most telling of them.
-        first: the most telling one.
+        rig: nominal, with the effects that show in the readings themselves (rounding, clipping).
+        data: all fit records.
+        quick: the two most informative records.
+        first: the most informative record.
         catalogue: kinds of effects to try.
         report: called with (what, share done).
         workers: processes that share the work.
-        nominal: (n_records, n_outputs) mean squares that the nominal rig leaves, in noise units.
-        held: effects that every candidate stands beside, as they are.
-        logged: noise of the logged inputs, as a share of their rms, beside which residuals are seen.
-        differs: the figure of the nominal model that may differ from record to record; empty for none.
-        by_mode: whether frequencies and shapes of the nominal modes are off by themselves, the latter at every port,
-            not by smooth variations of mass and stiffness.
+        nominal: (n_records, n_outputs) mean square residuals of the nominal rig, in units of the noise.
+        held: fixed effects that are added to every candidate.
+        logged: input noise, as a share of the inputs' rms, that the residuals are whitened for; 0 for none.
+        differs: the nominal parameter that varies from record to record; empty for none.
+        by_mode: whether nominal errors are those of each mode (its frequency, its shape at every port) instead of
+            smooth variations of mass and stiffness.
     """
 
     rig: Rig
@@ -59,30 +59,33 @@ class Search:
 
     @property
     def is_over(self) -> bool:
-        """Whether its time is spent: what is sought next is not, and fits end with what they have."""
+        """Whether the deadline is past: no further step starts, and fits end with the best that they have."""
         return self.data.deadline.is_past
 
     def explains(self, candidate: Fit) -> bool:
-        """Whether what is left is noise, in every record, up to the error of integration.
+        """Whether the residual of a fit is at the noise floor in every record, up to the integration error.
 
-        Effects that cluster about one place stand for one law that the catalogue does not hold.
+        False for effects that cluster at one place: they approximate a law that the catalogue lacks.
         """
         if self.clustered(candidate.effects):
             return False
-        left = candidate.cost_by_channel.mean(axis=1)
+        residual_power = candidate.cost_by_channel.mean(axis=1)
         per_record = self.data.counted[0].outputs.size
         slack = SEARCH.slack + 5.0 * np.sqrt(2.0 / per_record) + SEARCH.integration_share * self.nominal.mean(axis=1)
         slack = slack + candidate.stepping
-        return bool((left < 1.0 + slack).all() and left.mean() < self.enough + np.mean(candidate.stepping))
+        return bool(
+            (residual_power < 1.0 + slack).all()
+            and residual_power.mean() < self.cost_limit + np.mean(candidate.stepping)
+        )
 
     @property
-    def enough(self) -> float:
-        """The cost of a set that explains the records, at most."""
+    def cost_limit(self) -> float:
+        """Largest cost of a set that explains the records."""
         slack = max(SEARCH.slack, SEARCH.chance * np.sqrt(2.0 / self.data.n_values))
         return float(1.0 + slack + SEARCH.integration_share * self.nominal.mean())
 
     def clustered(self, effects: Sequence[Effect]) -> bool:
-        """Whether nonlinear effects stand for one law: two of a kind, or three of any, side by side."""
+        """Whether nonlinear effects cluster at one place: two of one kind, or three of any."""
         point = [effect for effect in effects if effect.kind.nonlinear and effect.at is not None]
 
         def side_by_side(some: Sequence[Effect]) -> bool:
@@ -92,75 +95,81 @@ class Search:
         return alike or any(side_by_side(three) for three in combinations(point, 3))
 
     def surely_better(self, candidate: Fit, than: float, extra: int) -> bool:
-        """Whether the gain in likelihood pays for `extra` more numbers."""
+        """Whether the gain in likelihood justifies `extra` more parameters."""
         n = self.data.n_values
         return bool(n * (than - candidate.cost) > SEARCH.sure + extra * np.log(n))
 
     def significant(self, candidate: Fit, than: float) -> bool:
-        """Whether the gain is sure and large enough to be an effect rather than an imperfect model."""
+        """Whether a fit improves on a cost surely, and by more than the imperfection of any model."""
         return (
             self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > SEARCH.significant
         )
 
     def tells_apart(self, better: float, cost: float, extra: int) -> bool:
-        """Whether records surely prefer the lower of two costs, for `extra` more numbers, and by more than a trifle."""
+        """Whether the lower of two costs is surely and not negligibly better, given `extra` more parameters."""
         return self.pays(float(np.log(cost / better)), extra)
 
     def pays(self, gain: float, extra: int, n_values: int | None = None) -> bool:
-        """The same of a gain: twice the log-likelihood, a value, of all records unless their number is given."""
+        """Whether a gain justifies `extra` more parameters, and is not negligible.
+
+        Args:
+            gain: twice the log-likelihood ratio per measured value.
+            extra: parameters.
+            n_values: number of measured values; None for those of all records.
+        """
         n = self.data.n_values if n_values is None else n_values
         return gain > SEARCH.trifle and n * gain > SEARCH.sure + extra * np.log(n)
 
     def near(self, candidate: Fit, share: float) -> bool:
-        """Whether at most this share of the gap's power is left."""
+        """Whether the residual power of a fit above the noise is below this share of the gap's."""
         return candidate.cost - 1.0 < share * float(self.nominal.mean() - 1.0)
 
     def with_noise(self, noise: np.ndarray) -> "Search":
-        """The same search with other standard deviations of the sensors' noise (n_outputs,)."""
+        """The same search with other standard deviations of sensor noise (n_outputs,)."""
         nominal = self.nominal * (self.data.noise / noise) ** 2
-        return replace(self._in(lambda data: data.with_noise(noise)), nominal=nominal)
+        return replace(self._with_data(lambda data: data.with_noise(noise)), nominal=nominal)
 
     def through(self, whitener: ForceFilter, observer: Observer) -> "Search":
-        """The same search beside a random force."""
-        return self._in(lambda data: data.through(whitener, observer))
+        """The same search with residuals whitened for a random force."""
+        return self._with_data(lambda data: data.through(whitener, observer))
 
-    def beside_inputs(self, rig: Rig, share: float) -> "Search":
-        """The same search beside noise of the logged inputs.
+    def with_input_noise(self, rig: Rig, share: float) -> "Search":
+        """The same search with residuals whitened for input noise.
 
         Args:
-            rig: whose modes answer to it.
-            share: of the inputs' rms.
+            rig: with the modes that the noise excites.
+            share: standard deviation of the noise, over the inputs' rms.
         """
         filters = input_filters(rig, self.data, share)
-        beside = self._in(lambda data: data.beside_inputs(filters))
-        return replace(beside, nominal=beside.data.by_channel(beside.data.residual(self.rig)), logged=share)
+        whitened = self._with_data(lambda data: data.with_input_noise(filters))
+        return replace(whitened, nominal=whitened.data.by_channel(whitened.data.residual(self.rig)), logged=share)
 
-    def _in(self, changed: Callable[[FitData], FitData]) -> "Search":
-        """The same search in its records once changed."""
+    def _with_data(self, changed: Callable[[FitData], FitData]) -> "Search":
+        """The same search with each of its selections of records changed."""
         return replace(self, data=changed(self.data), quick=changed(self.quick), first=changed(self.first))
 
     def evidence_of(self, rig: Rig) -> Evidence:
-        """What the records say of an unmodelled force beside what a rig has."""
+        """Evidence of a force that a rig lacks."""
         return Evidence.of(rig, self.data, FEWER_PLACES, self.workers)
 
     def without_clipped(self) -> "Search":
-        """The same search without sensors that clip or round coarsely: what they do not show would pass for a force."""
+        """The same search without sensors that clip or round coarsely, whose errors would pass for a force."""
         kept = [j for j, s in enumerate(self.rig.sensors) if np.isinf(s.limit) and s.step < SEARCH.coarse * s.noise_std]
         if not kept or len(kept) == len(self.rig.sensors):
             return self
         sensors = tuple(self.rig.sensors[j] for j in kept)
         names = tuple(sensor.name for sensor in sensors)
         rig = replace(self.rig, sensors=sensors)
-        return replace(self._in(lambda data: data.of_outputs(names)), rig=rig, nominal=self.nominal[:, kept])
+        return replace(self._with_data(lambda data: data.of_outputs(names)), rig=rig, nominal=self.nominal[:, kept])
 
-    def beside(self, figures: Effect) -> "Search":
-        """The same search beside believed figures, which give way to every candidate to first order."""
-        data = self.data.giving_way(sensitivity(self.rig, (figures,), self.data, self.workers))
-        return replace(self, data=data, held=(figures,))
+    def with_nominal_errors(self, errors: Effect) -> "Search":
+        """The same search with nominal errors that are re-estimated with every candidate, to first order."""
+        data = self.data.with_nuisance(sensitivity(self.rig, (errors,), self.data, self.workers))
+        return replace(self, data=data, held=(errors,))
 
     @property
     def prior(self) -> NominalPrior:
-        """What the nominal model may be off by before any record is seen."""
+        """Prior standard deviations of the nominal errors, before any record is seen."""
         structured, by_mode = isinstance(self.rig.structure, Structure), self.by_mode
         return NominalPrior(
             stiffness=0.02 if structured and not by_mode else 0.0,
@@ -169,9 +178,10 @@ class Search:
             coupling=0.0 if structured else 0.01,
             damping=0.2,
             delay=0.1,
-            gain=0.01 if len(self.rig.actuators) + len(self.rig.sensors) > 2 else 0.0,  # of one each: the mass says it
+            # with one actuator and one sensor, an error of the mass is the same
+            gain=0.01 if len(self.rig.actuators) + len(self.rig.sensors) > 2 else 0.0,
             place=0.0 if isinstance(self.rig.modes.domain, NamedPoints) else 0.001,
-            # of one mode, gains and the mass say it
+            # with one mode, errors of gains and mass are the same
             shape=0.01 if (by_mode or self.rig.structure is None) and self.rig.modes.n_modes > 1 else 0.0,
             record=0.005 if self.differs else 0.0,
             sample_time=self.data.records[0].sample_time,
@@ -182,40 +192,43 @@ class Search:
 
     @cached_property
     def logging_noise(self) -> np.ndarray:
-        """Power that noise of the logged inputs leaves (n_records, n_outputs); see `logging_noise_power`."""
+        """Residual power due to input noise (n_records, n_outputs); see `logging_noise_power`."""
         return logging_noise_power(self.rig, self.data)
 
     @cached_property
     def ahead(self) -> FitData:
-        """The two most telling records, by predictions one sample ahead."""
+        """One-step-ahead predictions (innovations) of the two most informative records."""
         return self._ahead(self.quick)
 
     @cached_property
     def first_ahead(self) -> FitData:
-        """The most telling record, likewise."""
+        """One-step-ahead predictions of the most informative record."""
         return self._ahead(self.first)
 
     @cached_property
     def nominal_ahead(self) -> float:
-        """What the nominal rig leaves of predictions one sample ahead, per value, in units of the noise."""
+        """Mean square of the nominal rig's one-step-ahead residual, in units of the noise."""
         return cost_of(self.rig, self.held, self.ahead)
 
     def _ahead(self, data: FitData) -> FitData:
         data = data.one_step_ahead(self.rig)
-        if not self.held or finite_residual(self.rig, self.held, data) is None:  # predictions run away beside errors
+        if not self.held or finite_residual(self.rig, self.held, data) is None:  # the predictions diverge
             return data
-        return data.giving_way(sensitivity(self.rig, self.held, data, self.workers))
+        return data.with_nuisance(sensitivity(self.rig, self.held, data, self.workers))
 
     def side_by_side(self, function: Callable[..., Fit], candidates: Sequence[Fit]) -> list[Fit]:
-        """`function(search, candidate)` of each, in their order."""
+        """`function(search, candidate)` of each candidate, computed in parallel, in their order."""
         return self.workers.map(lambda candidate: function(self, candidate), candidates)
 
 
 def most_informative(data: FitData, by_channel: np.ndarray) -> tuple[FitData, FitData]:
-    """The two records that say most, and the first of them: largest against the noise, and against the signal.
+    """The two most informative records, and the first of them.
+
+    The first has the largest residual over the noise, the other the largest residual over the signal.
 
     Args:
-        by_channel: (n_records, n_outputs) mean squares of what is left, in units of the noise.
+        data: records.
+        by_channel: (n_records, n_outputs) mean square residuals, in units of the noise.
     """
     by_record = by_channel.mean(axis=1)
     scale = np.array([np.mean((r.outputs.std(axis=1) / data.noise) ** 2) for r in data.counted])
@@ -225,7 +238,7 @@ def most_informative(data: FitData, by_channel: np.ndarray) -> tuple[FitData, Fi
 
 
 def best_of_each_kind(fits: Sequence[Fit]) -> list[Fit]:
-    """The first fit of every kind that its last effect is of, in the order of the fits, but for hopeless ones."""
+    """The first fit for each kind of its last effect, in the order of the fits; failed ones are left out."""
     chosen: dict[str, Fit] = {}
     for candidate in fits:
         if candidate.cost < HOPELESS:
@@ -234,15 +247,15 @@ def best_of_each_kind(fits: Sequence[Fit]) -> list[Fit]:
 
 
 def apart(one: Effect, other: Effect, domain: Domain) -> bool:
-    """Whether two effects stand far enough apart to be in different valleys; those of no place always do."""
+    """Whether two effects are far enough apart for different local minima; those without a place always are."""
     return one.at is None or domain.separation(one.at, other.at) > SEARCH.elsewhere
 
 
-def in_one_valley(one: Fit, other: Fit, domain: Domain) -> bool:
-    """Whether two fits are of one set, with places so near that they go on to the same end."""
+def in_one_minimum(one: Fit, other: Fit, domain: Domain) -> bool:
+    """Whether two fits are of one set and so close in place that they converge to the same local minimum."""
 
     def in_order(candidate: Fit) -> list[Effect]:
-        return sorted(candidate.effects, key=lambda effect: (effect.label, _sorted_by(effect.at)))
+        return sorted(candidate.effects, key=lambda effect: (effect.label, _sort_key(effect.at)))
 
     if one.key != other.key:
         return False
@@ -250,21 +263,21 @@ def in_one_valley(one: Fit, other: Fit, domain: Domain) -> bool:
     return all(here is None or domain.separation(here, there) < SEARCH.same_place for here, there in both)
 
 
-def _sorted_by(where: Any) -> tuple[Any, ...]:
-    """What places are sorted by, whatever they are."""
+def _sort_key(where: Any) -> tuple[Any, ...]:
+    """A place of any type as a sort key."""
     return where if isinstance(where, tuple) else () if where is None else (where,)
 
 
 def promise(candidate: Fit, iterations: int = 1) -> float:
-    """The cost that one more iteration like the last would come to, or so many more."""
+    """The cost after so many more iterations that each decrease it as the last one did."""
     return candidate.cost * (1.0 - candidate.falling) ** iterations
 
 
 class Decision(NamedTuple):
-    """What is claimed; see `Attribution` for its parts.
+    """The verdict of a search; see `Attribution` for the other attributes.
 
     Attributes:
-        beside: the search that it was found in, where that was beside noise of the logged inputs.
+        beside: the search that it is based on, if that has input noise or finer substeps.
     """
 
     outcome: str
@@ -276,21 +289,21 @@ class Decision(NamedTuple):
 
 
 def unexplained(start: Fit, best: Fit, rivals: tuple[tuple[Fit, float], ...]) -> Decision:
-    """What is said where no set reaches the noise floor: in part, or not at all.
+    """The verdict where no set reaches the noise floor: explained in part, or unknown.
 
     Args:
-        start: what is there with no effect.
-        best: the nearest set.
-        rivals: others, with their probabilities.
+        start: the fit without effects.
+        best: the set with the smallest residual.
+        rivals: other sets with their probabilities.
     """
-    closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
-    return Decision("part" if closed > 0.5 else "unknown", best, rivals=rivals)
+    share_closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
+    return Decision("part" if share_closed > 0.5 else "unknown", best, rivals=rivals)
 
 
 def nearest(search: Search, start: Fit, decision: Decision, fits: Sequence[Fit]) -> Decision:
-    """The decision, or what is said of one of these fits where it is nearer than a set that does not explain the gap.
+    """The decision, or that for the best of these fits if the decision does not explain the gap and costs more.
 
-    A search that its time has cut short may have found its nearest set before it looked beside errors of the model.
+    A search cut short by its deadline may have found a better set before it tried nominal errors.
     """
     best = min(fits, key=lambda f: f.cost, default=start)
     is_open = decision.outcome in ("part", "unknown")

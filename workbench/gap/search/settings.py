@@ -1,4 +1,4 @@
-"""Constants of the search for effects: all of them, by the step that reads them, each with its unit and reason."""
+"""Constants of the search for effects, one class for each step that reads them, with units and evidence."""
 
 from dataclasses import dataclass
 
@@ -7,169 +7,169 @@ from workbench.gap.prediction.innovations import LOOSE
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Constants of what counts as an explanation, and as a better one."""
+    """Constants that decide whether a set of effects explains the records, and which of two sets is better."""
 
-    slack: float = 0.03  # of the noise power: what two good finite-element models may differ by
-    # standard deviations of the mean square of noise, which in records of fewer than 20,000 values is more than that
+    slack: float = 0.03  # of the noise power: two good finite-element models differ by so much
+    # standard deviations of the mean square of noise: in records of fewer than 20,000 values more than the slack
     chance: float = 3.0
-    integration_share: float = 2e-6  # of the gap's power: errors of stepping
-    sure: float = 30.0  # twice the logarithm of a likelihood ratio that settles a choice
-    # of the noise power: no set is preferred to a simpler one for less, whatever the likelihood says
+    integration_share: float = 2e-6  # of the gap's power: error of time integration
+    sure: float = 30.0  # twice the log-likelihood ratio that settles a choice
+    # of the noise power: no set is preferred to a simpler one for a smaller gain, whatever the likelihood ratio
     trifle: float = 0.005
-    significant: float = 0.01  # of the noise power: less is no effect but an imperfect model
-    elsewhere: float = 0.1  # of the extent: nearer, two places are in one valley of the cost at first
-    same_place: float = 0.02  # of the extent: nearer, fits go on to the same end
-    rival: float = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
-    further: int = 100  # iterations like the last: a cost that they leave too high comes no lower in time
-    coarse: float = 2.0  # times the noise: below, rounding errors are all but white and of no signal
+    significant: float = 0.01  # of the noise power: a smaller gain shows an imperfect model, not an effect
+    elsewhere: float = 0.1  # of the extent: fits that start closer usually reach the same local minimum
+    same_place: float = 0.02  # of the extent: fits as close as this have the same local minimum
+    rival: float = 0.02  # of the noise power: a set whose cost is higher by more is no rival of one that explains
+    further: int = 100  # iterations like the last: a fit that would still be too high after them is given up
+    coarse: float = 2.0  # times the noise: quantisation in smaller steps adds nearly white noise
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Constants of a fit."""
+    """Constants of the nonlinear least-squares fit."""
 
-    damping: float = 1e-3  # of the first step, of the diagonal of the normal equations; less is free to go astray
-    bent: float = 0.1  # of a step: the stretch over which its curvature is taken
-    # of a step: what it may turn by, twice that turn over its length (Transtrum & Sethna, 2012)
-    most_bent: float = 0.75
-    # of an error of the model, in its unit (a hundredth, say): the step of its slope. Mass, stiffness and gains may
-    # alter nothing together, though each by itself turns the phase of a long record: what a long step bends hides that
+    damping: float = 1e-3  # of the diagonal of the normal equations, at the first step; less lets fits diverge
+    curvature_step: float = 0.1  # of a step: distance over which its curvature is measured
+    # bound of geodesic acceleration: twice the correction over the length of the step (Transtrum & Sethna, 2012)
+    largest_curvature: float = 0.75
+    # of a nominal error, in its unit (a hundredth, say): step of its finite difference. Errors of mass, stiffness and
+    # gains may cancel in the response, though each alone shifts the phase of a long record: a longer step is nonlinear
     short: float = 1e-4
-    slope_substeps: int = 2  # of a sample, for slopes: they need not be as exact as residuals
-    wider: float = 30.0  # times the steps of a fit: of numbers a hundredth
-    wider_place: float = 1000.0  # likewise: of a place a thousandth
-    attempts: int = 7  # steps that are tried from one place
-    less_far: float = 6.0  # times the damping of a step that failed: of the next, shorter one
-    promised: float = 0.1  # of the tolerance: a step that promises less is not worth trying
+    slope_substeps: int = 2  # of a sample, for sensitivities, which need less accuracy than residuals
+    wider: float = 30.0  # times the usual finite-difference step, where wide steps are asked for: a hundredth
+    wider_place: float = 1000.0  # likewise for coordinates of places: a thousandth of the extent
+    attempts: int = 7  # steps that are tried from one point
+    less_far: float = 6.0  # factor on the damping after a step that failed
+    promised: float = 0.1  # of the tolerance: a step with a smaller predicted decrease is not tried
 
 
 @dataclass(frozen=True)
 class ScreeningSettings:
     """Constants of the screening of candidate effects."""
 
-    weaker: float = 0.03  # times its strength at the start: the least that an effect may turn out to have
-    stronger: float = 30.0  # likewise, the most
-    most_values: int = 20_000  # of the errors that are screened
-    at_once: int = 32  # starts: of more, the errors of whole records no longer stay in a processor's cache
+    weaker: float = 0.03  # times the start value: lower bound of an effect's strength
+    stronger: float = 30.0  # likewise, upper bound
+    most_values: int = 20_000  # values of the residual that are used
+    at_once: int = 32  # starts in one batch: with more, residuals of whole records exceed a processor's cache
 
 
 @dataclass(frozen=True)
 class SelectionSettings:
-    """Constants of fits one sample ahead, and of those to whole records that follow."""
+    """Constants of fits to one-step-ahead predictions, and of fits to whole records that follow."""
 
     fine: int = 8  # substeps of a sample
-    targets_a_kind: int = 3  # of single effects that are tried
-    tried: int = 16  # sets that are fitted one sample ahead to one record
-    likely: int = 10  # likewise, to two
-    likeliest: int = 5  # likewise, to their end
-    exchanged: int = 2  # likeliest effects in whose places other kinds are tried
-    far_behind: float = 10.0  # times the least promise: what is not fitted to its end
-    # times the noise one sample ahead, or this share of what the nominal rig leaves there, where steps of half a sample
-    # cost more than a small noise: more is left by no set that explains the records
+    targets_a_kind: int = 3  # targets of each kind that are tried as single effects
+    tried: int = 16  # sets fitted to one-step-ahead predictions of one record
+    likely: int = 10  # of these, sets fitted to two records
+    likeliest: int = 5  # of these, sets fitted until convergence
+    exchanged: int = 2  # best linear effects at whose places the other linear kinds are tried
+    far_behind: float = 10.0  # times the best predicted cost: fits above it are not continued
+    # times the noise power one step ahead, or this share of the nominal residual there (with coarse time steps, small
+    # noise is below the integration error): a set with a larger residual does not explain the records
     promising: float = 5.0
     promising_share: float = 0.05
-    # random forces of the observers of a continuation, one after the other: the less, the lower the gain
+    # process noise of the observers of a continuation, one after the other: the smaller, the lower the observer gain
     continuation: tuple[float, ...] = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)
-    at_hand: float = 10.0  # times the noise: so near, whole records tell the way
-    close: float = 2.0  # times the least cost ahead: what may still come first on whole records
-    at_first: int = 5  # iterations on whole records, before it is seen which sets go on
-    running: float = 2.0  # times the least promise on whole records: what is fitted to its end
+    at_hand: float = 10.0  # times the noise power on whole records: from there, a fit to them converges
+    close: float = 2.0  # times the least one-step-ahead cost: sets above it are not fitted to whole records
+    at_first: int = 5  # iterations on whole records before the best fits are chosen
+    running: float = 2.0  # times the best predicted cost on whole records: fits above it are not continued
 
 
 @dataclass(frozen=True)
 class FinishSettings:
-    """Constants of what brings a set of effects to its end."""
+    """Constants of the last refinement of a set of effects."""
 
     finest: int = 32  # substeps of a sample
-    all_but: float = 1.5  # cost below which they are tried
-    stepping: float = 1e-4  # of the gap's power: what coarser substeps may leave of it
-    idle: float = 0.5  # of the noise power: what an effect may take away and still be none
-    # of what a fit at rest leaves above the noise: finer steps that leave more bring it no nearer
+    all_but: float = 1.5  # cost below which the finest substeps are tried
+    stepping: float = 1e-4  # of the gap's power: integration error that coarser substeps may leave
+    idle: float = 0.5  # of the noise power: an effect that removes less may be left out
+    # of the residual above the noise: where finer substeps leave more than this share, a converged fit is not refined
     no_nearer: float = 0.9
-    at_first: int = 4  # iterations of a simpler form on the quick records
-    too_far: float = 30.0  # times a set's cost after them: it is no simpler form of it
-    tried: int = 2  # iterations at each other place, before the likeliest are chosen
-    lower: float = 0.98  # of the cost on the quick records: no lower, another place is the same valley or a worse one
-    apart: float = 0.02  # of the extent: nearer, a place is the same valley
-    widening: int = 8  # iterations of a set with an effect as what it is a limiting case of
-    # of its strength, that an effect is tried with at another place
+    at_first: int = 4  # iterations of a simpler form on the most informative records
+    too_far: float = 30.0  # times the cost of the set: a simpler form that costs more after them is dropped
+    tried: int = 2  # iterations at each other place before the best places are chosen
+    lower: float = 0.98  # of the cost on these records: another place with a higher cost is no better minimum
+    apart: float = 0.02  # of the extent: closer places have the same local minimum
+    widening: int = 8  # iterations of a set with an effect replaced by a more general one
+    # times its strength: start values of an effect at another place
     factors: tuple[float, ...] = (1.0, 0.01, 0.1, 10.0, 100.0)
 
 
 @dataclass(frozen=True)
 class RandomSettings:
-    """Constants of the search beside a random disturbance."""
+    """Constants of the search for a random disturbance."""
 
-    near: float = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
-    rival: float = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
-    starts: int = 2  # places that the fit of a random force starts from
-    points: int = 4  # named points that it is tried at
-    finalists: int = 4  # effects beside it that are fitted to whole records
-    tried: int = 3  # of them, those fitted with it
-    likeliest_sets: int = 2  # of other effects, that a random force is tried beside
-    turns: int = 4  # of it and errors of the nominal model, each beside the other, at most
-    settled: float = 0.02  # of what is left: a turn that takes away less is the last
-    # of the unmodelled force's level over records: most forces of the rig's own follow the inputs' level
+    near: float = 0.1  # of the gap's power: a set with less left may only be in another local minimum
+    rival: float = 0.05  # of the noise power: an effect whose cost is higher by more than the best one's is no rival
+    starts: int = 2  # places from which the fit of a random force starts
+    points: int = 4  # named points at which it is tried
+    finalists: int = 4  # effects that are fitted to whole records through its whitening filter
+    tried: int = 3  # of these, effects that are fitted jointly with it
+    likeliest_sets: int = 2  # other sets of effects with which a random force is tried
+    turns: int = 4  # alternations between its fit and that of the nominal errors, at most
+    settled: float = 0.02  # relative decrease of the cost below which the alternation ends
+    # range of the unmodelled force's rms over records, relative: that of forces in the rig follows the input level
     spread: float = 0.5
-    # of the first elastic frequency: sensors of rates hardly see a force below, and its estimate drifts
+    # of the first elastic frequency: below it, sensors of rates hardly observe a force, and its estimate drifts
     drifting: float = 0.1
-    follows: float = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
+    follows: float = 0.3  # share of its power that inputs and motion predict: friction is as strong at every level
 
 
 @dataclass(frozen=True)
 class InputSettings:
-    """Constants of the search beside noise of the logged inputs."""
+    """Constants of the search with input noise."""
 
-    white: float = 2.0  # mean square, white, that a set may leave beside that noise for a search to go on beside it
-    # of what a set leaves without that noise: errors of the model that bent to it may leave so much beside it
-    bent: float = 0.1
-    rounds: int = 2  # rounds of learning the sensors' noise beside it
+    white: float = 2.0  # mean square of the whitened residual up to which input noise is accepted
+    # of the residual power without input noise: up to this, nominal errors may have over-fitted it and are refitted
+    over_fitted: float = 0.1
+    rounds: int = 2  # updates of the sensor noise with input noise given
 
 
 @dataclass(frozen=True)
 class RecordSettings:
-    """Constants of a figure that differs from record to record."""
+    """Constants of a nominal parameter that varies from record to record."""
 
-    # deviations, a parabola between them
+    # relative deviations at which the cost is evaluated; a parabola interpolates
     tried: tuple[float, ...] = (-0.02, -0.01, -0.005, -0.002, 0.0, 0.002, 0.005, 0.01, 0.02)
-    enough: float = 0.3  # share of what a step leaves above the noise that deviations of records must take away
-    half: float = 0.5  # of what is left without: what a figure that differs must leave, at most
-    clearly: float = 0.9  # of what another figure leaves: the first is preferred to what leaves more
-    blocks: int = 12  # a record, whose scatter tells how sure its deviation is
-    sure: float = 4.0  # standard deviations that two records must be apart by, for the scatter to be more than chance
+    enough: float = 0.3  # share of the residual power above the noise that the deviations must remove
+    half: float = 0.5  # of the residual power without: largest residual with a parameter that varies
+    clearly: float = 0.9  # of the residual power with a varying stiffness: another parameter must leave less
+    blocks: int = 12  # of a record: the scatter over them gives the standard error of its deviation
+    sure: float = 4.0  # standard errors by which two records must differ
 
 
 @dataclass(frozen=True)
 class PlainSettings:
-    """Constants of few effects in place of many small errors."""
+    """Constants of few effects in place of many nominal errors."""
 
-    # logarithms: more is an effect of its own
+    # logarithms of the factors: larger uniform errors are effects
     most_common: tuple[tuple[str, float], ...] = (("modulus_error", 0.05), ("modal_damping", 0.5))
-    # likewise, where only one of them is there
+    # likewise, if only one of them is present
     most_alone: tuple[tuple[str, float], ...] = (("modulus_error", 0.015), ("modal_damping", 0.25))
-    plainly: int = 8  # iterations without errors
-    briefly: int = 3  # likewise, after which those go on that may come near
-    punctual: float = 0.01  # of a sample: sensors that are late by less are not
-    sure: float = 4.0  # standard deviations that a sensor must be late by to be so
-    near: float = 2.0  # times the noise power that a fit may leave of the quick records, to be fitted to all
-    needless: float = 6.0  # twice the log-likelihood that one number more may gain by chance
-    several: int = 3  # sensors, of which one alone is hardly late by chance
-    by_chance: float = 1e-3  # probability that sensors, each late by itself, are as late as one another
-    likeliest: int = 4  # kinds of the one more that are tried
-    # logarithm of a gain: more is an effect of its own, where it is `outlying` times the rms of the others besides. Of
+    plainly: int = 8  # iterations without nominal errors
+    briefly: int = 3  # of these, iterations before hopeless fits are dropped
+    smallest_delay: float = 0.01  # of a sample: a sensor that is late by less counts as on time
+    sure: float = 4.0  # standard errors by which a sensor must be late
+    near: float = 2.0  # times the noise power on the most informative records: fits above it go no further
+    needless: float = 6.0  # twice the log-likelihood ratio that one more parameter may gain by chance
+    several: int = 3  # sensors: among so many, one alone is hardly late by chance
+    by_chance: float = 1e-3  # probability that independent delays agree as closely
+    likeliest: int = 4  # kinds that are tried as the one additional effect
+    # logarithm of a gain: a larger error is an effect, if it is also `outlying` times the rms of the other gains. Of
     # ten gains calibrated to 2 %, one is so by chance in 1.7 % of draws, and beyond 5 % alone in 12 %; to 1 %, in none
     most_gain: float = 0.05
     outlying: float = 4.0
-    most_moved: float = 0.01  # of the extent: an actuator or a sensor that stands farther off is an effect of its own
-    suspect: float = 0.4  # share of most_gain from which on a gain is asked: a wrong one gives some of itself to others
-    wrong_gains: int = 2  # how many are asked
+    most_moved: float = 0.01  # of the extent: an actuator or sensor that is farther off its place is an effect
+    suspect: float = 0.4  # of most_gain: gains above it are tested, since a wrong gain biases the others
+    wrong_gains: int = 2  # gains that are tested
 
 
 @dataclass(frozen=True)
 class JointSettings:
-    """Constants of fits beside errors of the nominal model."""
+    """Constants of joint fits of effects and nominal errors."""
 
-    # largest standard deviation that is believed of each group of nominal errors; relative, but for damping (of its
+    # largest plausible standard deviation of each group of nominal errors: relative, but for damping (of its
     # logarithm), delay (of a sample) and place (of the extent). Laboratories keep within them; larger ones are effects
     widest: tuple[tuple[str, float], ...] = (
         ("stiffness", 0.015),
@@ -183,11 +183,11 @@ class JointSettings:
         ("shape", 0.05),
         ("record", 0.02),
     )
-    guessed: float = 0.6  # likewise of damping, where each mode is off by itself: a guess is off by a factor of two
-    # share of the widest that errors of a careful laboratory keep within; where they are larger, an effect that makes
-    # them smaller is named although they leave little
+    guessed: float = 0.6  # likewise of damping, with errors of each mode: a guess is wrong by a factor of two
+    # share of the widest that nominal errors of a careful laboratory keep within; if they are larger, an effect that
+    # makes them smaller is named even though the residual is small
     plausible: float = 0.95
-    # standard deviations below which smaller ones save nothing
+    # standard deviations below which a smaller one no longer shortens the description
     small: tuple[tuple[str, float], ...] = (
         ("stiffness", 0.004),
         ("mass", 0.004),
@@ -200,43 +200,44 @@ class JointSettings:
         ("shape", 0.002),
         ("record", 0.001),
     )
-    decisive: float = 300.0  # description length, nats, of a factor e in the power that is left above the noise
-    last_waves: int = 13  # cosines of a variation in the last fit, so that intervals allow for what fewer cannot follow
-    narrowest: float = 1e-3  # smallest, as a share of the widest: what is learnt to be none stays differentiable
-    # rounds, most_rounds: of learning the sizes, at most; those that a fall of the cost went before do not count as
-    # such, but are not without end
+    decisive: float = 300.0  # description length, nats, of a factor e in the residual power above the noise
+    last_waves: int = 13  # cosines of a profile error in the last fit, so that intervals allow for short waves
+    narrowest: float = 1e-3  # smallest prior standard deviation, of the widest: zero would not be differentiable
+    # rounds, most_rounds: updates of the prior variances, at most; rounds after a large decrease of the cost do not
+    # count, but most_rounds bounds them
     rounds: int = 4
     most_rounds: int = 12
-    falling: float = 0.3  # share of what was left that a round leaves where the cost falls
-    few: int = 16  # errors, of which slopes are taken anew: kept ones took a servo's friction for a damper
-    # settled, last_settled: share of what is left that a round must have taken away for another; in the last fit
+    falling: float = 0.3  # residual power over that of the round before: a smaller ratio is a large decrease
+    # nominal errors: sensitivities to fewer are always taken anew; kept ones took a servo's friction for a damper
+    few: int = 16
+    # settled, last_settled: relative decrease of the residual power below which the rounds end; in the last fit
     settled: float = 0.02
     last_settled: float = 1e-3
-    # anew, still: fits one sample ahead, at most, and share of the cost that the last iteration of one must have taken
-    # away for another
+    # anew, still: one-step-ahead fits with new sensitivities, at most, and the relative decrease of the cost in the
+    # last iteration of one below which no other follows
     anew: int = 4
     still: float = 0.1
-    near: float = 1.0  # times the noise: where more is left above it, sizes are not led to rest
-    rests: int = 3  # fits to where sizes come to rest, at most
-    sized: float = 0.2  # logarithm of a size: what it must change by for another of these
-    likeliest: int = 200  # steps of the sizes to where they come to rest, at most, without a simulation
-    # first damping of these fits: more holds what the records hardly tell apart where it is
+    near: float = 1.0  # times the noise power: with a larger residual above it, no fixed point is sought
+    rests: int = 3  # fits with prior variances at the fixed point, at most
+    sized: float = 0.2  # change of the logarithm of a prior standard deviation that asks for another of these
+    likeliest: int = 200  # updates towards the fixed point, at most, none with a simulation
+    # damping of the first step of these fits: more keeps poorly determined errors at their start values
     undamped: float = 1e-8
     iterations: int = 4  # iterations, tolerance: of the fit in each round
     tolerance: float = 1e-4
-    last_iterations: int = 6  # last_iterations, last_tolerance: of the last fit, which intervals are taken from
+    last_iterations: int = 6  # last_iterations, last_tolerance: of the last fit, which gives the intervals
     last_tolerance: float = 1e-7
-    credible: float = 3.0  # times the stated noise that noise found may be; more is a gap
-    # times noise guessed by the quietest bands: white noise through a low pass of 0.97 a sample is 8.1 times as loud
+    credible: float = 3.0  # times the stated noise: larger noise is a gap
+    # times noise guessed from the quietest bands: white noise through a low pass of 0.97 a sample is 8.1 times as loud
     credible_guess: float = 10.0
-    # of a sample: an accelerometer that is later stays on its side of the jumps when an effect is added; what was seen
-    # of the others may have been the gap
+    # of a sample: an accelerometer that is later stays on its side of the input steps when an effect is added; a
+    # smaller delay may have been due to the gap
     surely_late: float = 0.05
-    # times the noise one sample ahead: errors alone that leave more may miss that sensors are late by straight lines
+    # times the noise power one step ahead: if nominal errors alone leave more, delays by interpolation are tried
     straight: float = 2.0
-    # of a sample: what accelerometers are tried to be late or early by, to see which side of jumps they read
+    # of a sample: delays and leads of accelerometers that are tried, to find the side of the input steps they read
     delays: tuple[float, ...] = (0.1, 0.25, 0.5)
-    # times the power of the change over the span before a sample that the change after it has at a jump
+    # ratio of the power of the change just after a sample to that just before it, at a jump
     jump: float = 10.0
 
 
@@ -244,50 +245,49 @@ class JointSettings:
 class StepwiseSettings:
     """Constants of the stepwise selection."""
 
-    shorter: float = 30.0  # description length, nats, that an effect which makes errors plausible must save
-    # likewise where errors alone are plausible and leave only noise: of 19 trials that hide nothing no effect saved
-    # over 3, of 13 that hide one which errors stood in for five saved 15 to 140
+    shorter: float = 30.0  # description length, nats, that an effect must save to make nominal errors plausible
+    # likewise if nominal errors alone are plausible and explain the records: of 19 trials without an effect none saved
+    # over 3, of 13 with one that nominal errors had absorbed five saved 15 to 140
     fewer_words: float = 10.0
-    singles: int = 3  # effects alone, the likeliest beside errors, that are tried as the first
-    candidates: int = 4  # sets fitted on whole records at each step
-    # finalists, near: how many of them are fitted to all records, and times the least cost of what may come first
+    singles: int = 3  # single effects that are tried as the first
+    candidates: int = 4  # sets fitted to the most informative records at each step
+    # finalists, near: sets that are fitted to all records, and the largest ratio of their cost to the least
     finalists: int = 2
     near: float = 2.0
-    most: int = 4  # effects of a set; no case of the format hides more than three
-    # share of what errors of the nominal model leave above the noise that the first effect must take away. On practice
-    # cases the right one takes over 0.9, the best wrong one under 0.1
+    most: int = 4  # effects of a set; no case of the format has more than three
+    # share of the residual power above the noise, with nominal errors alone, that the first effect must remove. On
+    # practice cases the right one removes over 0.9, the best wrong one under 0.1
     excess: float = 0.5
-    # likewise of what other effects leave, for one more beside them: of three, two leave much
+    # likewise for each further effect: of three, the first two leave much
     further_excess: float = 0.25
-    # share of the nominal gap's power above the noise: one more that takes away less must take away as much of what
-    # others leave as the first does. What is left of a measured gap bends to any law; a servo drive's friction varies
-    # by a tenth along its rail
+    # of the nominal gap's power above the noise: a further effect that removes less must remove as large a share as the
+    # first. Any law fits some of a measured gap: friction of a servo drive varies by a tenth along its rail
     least: float = 0.002
-    # share of what the best candidate takes away one sample ahead that another must take away to be tried
+    # share of the best candidate's one-step-ahead gain that another must reach to be tried
     promising: float = 0.2
-    as_good: float = 0.9  # likewise, for a kind to be tried at a second place too, or one of fewer numbers in its stead
-    ahead: float = 0.005  # share of the cost one sample ahead that the best candidate must take away to be tried at all
-    simpler: float = 0.05  # share by which a set may leave more above the noise and still be taken for being simpler
+    as_good: float = 0.9  # likewise, to be tried at a second place, or as a simpler effect in its stead
+    ahead: float = 0.005  # relative one-step-ahead gain of the best candidate below which none is tried
+    simpler: float = 0.05  # relative increase of the residual above the noise that is accepted for a simpler set
     needless: float = 0.3  # likewise, for a set with one effect less
-    # share of the nominal gap's power from which on errors of each mode, small as they are, cannot be what is missing
+    # of the nominal gap's power: a larger residual is not due to errors of single modes
     of_modes: float = 0.1
-    halved: float = 0.5  # share of what others leave above the noise that makes errors of each mode worth a search
-    explained: float = 0.01  # share of the nominal gap's power above the noise that an explanation may leave
-    further: float = 1e-3  # likewise, that a further effect is looked for to explain
-    in_part: float = 0.2  # likewise, for effects that are named although something else is there
-    # share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power
+    halved: float = 0.5  # of the residual above the noise: errors of each mode that leave less are searched further
+    explained: float = 0.01  # of the nominal gap's power above the noise: largest residual of an explanation
+    further: float = 1e-3  # likewise: a larger residual calls for another effect
+    in_part: float = 0.2  # likewise: largest residual of a set of effects that is named as a partial explanation
+    # excess of the residual over the noise power that still counts as noise: a tenth of the noise by amplitude is 0.2
     no_gap: float = 0.15
-    # likewise, that errors of the model alone leave in trials that hide nothing: under 0.02 in 40 of them
-    spotless: float = 0.05
-    # likewise, that substeps twice as fine may move the readings by; where it is more, the search goes on by finer ones
+    # likewise, what nominal errors alone leave without any effect: under 0.02 in 40 trials
+    noise_floor: float = 0.05
+    # likewise, change of the readings with twice the substeps: if it is larger, finer ones are used
     stepping: float = 0.05
-    excluded: float = 1e-3  # probability below which another set that explains the records is no rival
-    # share of the nominal gap's power from which on a fit that began one sample ahead may have gone astray
+    excluded: float = 1e-3  # probability below which another set is no rival
+    # of the nominal gap's power: with a larger residual, a fit that began one step ahead may have diverged
     astray: float = 0.02
-    # times the noise of the sensors that a set must leave above it for noise of the inputs to be estimated from it;
-    # less of it does no harm to a mean square
+    # times the sensor noise power: the residual above it must be larger for input noise to be estimated; less does not
+    # matter to a mean square
     loud: float = 0.5
-    # mean square, white, beside noise of the inputs, for less of which that was not what was left
+    # mean square of the whitened residual: if it is smaller, the input noise was overestimated
     too_white: float = 0.8
 
 
@@ -295,56 +295,56 @@ class StepwiseSettings:
 class PairSettings:
     """Constants of the search for pairs of effects."""
 
-    finalists: int = 4  # pairs that are fitted to whole records, of all at once
-    more: int = 2  # likewise, of those with one given
-    astray: float = 1e4  # times the gap's power: the motion of whole records runs away
-    moved: float = 0.1  # of a number: what makes the half of a pair another one than it was alone
-    nearer: float = 0.5  # of what another near miss leaves: what makes one worth the same search again
-    same: float = 1.1  # of the gap left by a set: nearer, its fits end alike
-    # of the gap's power: what is tried in simpler forms, and from other places before other singles
+    finalists: int = 4  # pairs that are fitted to whole records when all are searched at once
+    more: int = 2  # likewise with one effect given
+    astray: float = 1e4  # times the gap's power: the simulation diverges
+    moved: float = 0.1  # relative change of a parameter: beyond, half of a pair differs from the effect tried alone
+    nearer: float = 0.5  # of the residual of another near miss: below, the same search is repeated
+    same: float = 1.1  # of the residual of another fit of the set: below, both converge to the same end
+    # of the gap's power: below, simpler forms of a set and other places are tried before other effects
     very_near: float = 0.2 * 0.1
-    most: float = 0.3  # of the gap's power left: a pair that leaves less may be two of three
-    least: float = 0.002  # likewise: what is left of a measured gap bends to any law
-    exchanges: int = 2  # rounds of keeping either half of the best pair ahead
-    tried_further: int = 2  # pairs, best first, that are tried from other places too
-    named: int = 4  # sets, best first, that may be named or be rivals
+    most: float = 0.3  # of the gap's power: a pair with a smaller residual may be two of three effects
+    least: float = 0.002  # likewise: a smaller residual asks for no third, as any law fits some of a measured gap
+    exchanges: int = 2  # rounds in which either half of the best pair is kept and the other exchanged
+    tried_further: int = 2  # best pairs that are tried from other places
+    named: int = 4  # best sets that may be named or be rivals
 
 
 @dataclass(frozen=True)
 class LawSettings:
     """Constants of the search for a law beyond the catalogue."""
 
-    tried: int = 2  # fits of such a law, one sample ahead, that go on to whole records
+    tried: int = 2  # one-step-ahead fits of such a law that are continued on whole records
 
 
 @dataclass(frozen=True)
 class AttributionSettings:
-    """Constants of the course of a search, from single effects to the verdict."""
+    """Constants of the whole search, from single effects to the verdict."""
 
     finalists: int = 8  # single effects that are fitted to whole records
-    # finer steps bring no set this many times as costly as another to the noise floor before it
+    # times the cost of the best: finer substeps bring no worse set to the noise floor before it
     far_behind: float = 2.0
-    together: int = 8  # iterations of effects and errors of an identified rig
-    briefly: int = 2  # iterations, where there may be no effect at all
-    shown: int = 7  # others that are, where they are to be shown beside them
-    a_tenth: float = 1.1**2 - 1.0  # of the noise by amplitude, as a share of its power
-    very_near: float = 0.01  # of the gap's power: what is left by an effect that explains all but louder noise
-    alike: float = 0.01  # of a cost: nearer, two look the same on an axis of decades
+    together: int = 8  # iterations of effects with errors of an identified rig
+    briefly: int = 2  # iterations if there may be no effect at all
+    shown: int = 7  # other single effects that are fitted only for display
+    a_tenth: float = 1.1**2 - 1.0  # excess power of noise that is a tenth larger in amplitude
+    very_near: float = 0.01  # of the gap's power: largest residual of an effect that leaves only louder noise
+    alike: float = 0.01  # relative tolerance of the cost: smaller differences do not show on an axis of decades
 
 
 @dataclass(frozen=True)
 class IntervalSettings:
-    """Constants of the standard deviations of what is found."""
+    """Constants of the standard errors of parameters."""
 
-    alike: float = 1e-4  # of a number, or of the extent: how far two numerical routes to the same records put it apart
-    most_leverage: float = 0.5  # of a block on a direction that it alone tells: what there is no telling without it
-    blocks: int = 12  # a record: long beside the correlation of what is left, many enough to scatter
-    careful: float = 0.5  # share of the widest that errors of a careful model have, where the records do not tell them
-    counts: float = 2.0  # errors of a group, that this belief weighs as much as
-    rounds: int = 20  # of the sizes, to where they come to rest
-    draws: int = 48  # of noise of the logged inputs: a standard deviation of 48 is known to a tenth
-    straight: float = 0.01  # of the extent: how far from a place readings are taken to change in proportion
-    secants: int = 4  # after the tangent: each halves, on a logarithmic scale at least, what the last was off by
+    alike: float = 1e-4  # of a parameter, or of the extent: difference between two numerical models of one structure
+    most_leverage: float = 0.5  # bound of the leverage of a block on a direction that no other block determines
+    blocks: int = 12  # of a record: longer than the correlation of the residual, and enough to estimate its scatter
+    careful: float = 0.5  # of the widest: size of a careful model's nominal errors where the records do not show it
+    counts: float = 2.0  # errors of a group that this prior size weighs as much as
+    rounds: int = 20  # updates of the prior sizes towards their fixed point
+    draws: int = 48  # of input noise: the standard error of a standard deviation from 48 draws is a tenth
+    straight: float = 0.01  # of the extent: distance over which readings are linear in a place
+    secants: int = 4  # after the tangent: each halves the error of the last, at least on a logarithmic scale
 
 
 SEARCH = SearchSettings()
