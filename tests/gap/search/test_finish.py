@@ -78,7 +78,7 @@ def test_a_fit_on_its_way_to_more_than_is_of_use_stays_where_it_is(rig, search, 
     on_whole_records(one, [wrong], 1)
     assert ended == [5, 25]
     ended.clear()
-    on_whole_records(one, [wrong], 1, to_cost=one.enough)
+    on_whole_records(one, [wrong], 1, to_cost=one.cost_limit)
     assert ended == [5]
 
 
@@ -122,7 +122,7 @@ def test_what_is_not_taken_to_its_end_is_still_there_and_all_are_there_once(rig,
     linear = replace(first, effects=(Effect(MODULUS, None, {"factor": 1.01}),), cost=first.cost + 0.1, falling=0.0)
     yields = Effect(BOUC_WEN, None, {"at": 0.62, "stiffness": 3.0, "yield_displacement": 3.0})
     stepped = replace(linear, effects=(yields,), cost=first.cost + 0.2)
-    found = attribute._ended(one, [first, linear, stepped])
+    found = attribute._finished_best(one, [first, linear, stepped])
     assert ended == [first, stepped]
     assert sorted(found, key=lambda f: f.cost) == [first, linear, stepped]
 
