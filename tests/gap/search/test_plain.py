@@ -80,7 +80,7 @@ def test_a_gain_beside_common_errors_is_known_no_better_than_calibrations(search
     gain = Effect(kind_named("actuator_gain"), "F", {"gain": 0.8})
     one = search((gain, MODULUS, DAMPING))
     found = uniform_as_nominal_errors(one, fit(one.rig, (gain, MODULUS, DAMPING), one.data))
-    wide = replace(found, effects=with_all_errors(one, found.effects))
+    wide = with_all_errors(one, found)
     np.testing.assert_allclose(*(one.data.residual(apply_all(one.rig, f.effects)) for f in (found, wide)), atol=1e-6)
     told = with_intervals(one.rig, wide, one.data).effects[0]
     of_gains = 0.01 * np.sqrt(2.0 / 5.0) * np.sqrt(1.0 + 1.0 / 4.0)  # and the mass is not known exactly either

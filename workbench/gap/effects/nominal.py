@@ -62,6 +62,7 @@ class NominalPrior:
         late, early: names of the sensors whose delay is positive, or at most zero: with held inputs, acceleration jumps
             at each sample, and no small step leads from one side to the other.
         interpolated: whether delays are linear interpolations between samples, which have no jumps.
+        points: named points of effects, where the mode shapes have errors as at the ports.
         waves: number of cosines of a smooth variation along the structure, the constant included.
         records, figure: names of the records between which a parameter varies, and its name.
         by_mode: whether errors are those of each mode.
@@ -81,6 +82,7 @@ class NominalPrior:
     late: tuple[str, ...] = ()
     early: tuple[str, ...] = ()
     interpolated: bool = False
+    points: tuple[str, ...] = ()
     waves: int = 9
     records: tuple[str, ...] = ()
     figure: str = STIFFNESS
@@ -205,6 +207,8 @@ def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
             yield from (
                 with_prior(n, prior.shape, PROFILE_UNIT, sensor=own) for n in _shape_names(port, rig.modes.n_modes)
             )
+        for point in prior.points:
+            yield from (with_prior(n, prior.shape, PROFILE_UNIT) for n in _shape_names(point, rig.modes.n_modes))
     if prior.record:
         yield from (with_prior(f"record_{name}", prior.record, PROFILE_UNIT) for name in prior.records)
 
@@ -322,11 +326,27 @@ def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[s
     rig = differing(rig, prior.figure, deviations_of(values))
     ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
     units = _shape_units(rig.modes, ports) if prior.shape else np.zeros((len(ports), 0))
+    if prior.shape and prior.points:
+        rig = replace(rig, modes=_modes_with_errors(rig.modes, ports, prior.points, values))
     off = [_port_with_errors(rig, port, unit, prior, values) for port, unit in zip(ports, units, strict=True)]
     if all(one is other for one, other in zip(ports, off, strict=True)):
         return rig
     n = len(rig.actuators)
     return replace(rig, actuators=tuple(off[:n]), sensors=tuple(off[n:]))
+
+
+def _modes_with_errors(
+    modes: Modes, ports: tuple[Actuator | Sensor, ...], points: tuple[str, ...], values: dict[str, float]
+) -> Modes:
+    """The modes with errors of their shapes at named points, in units of the rms of each mode at the ports."""
+    errors = np.array([[values.get(name, 0.0) for name in _shape_names(point, modes.n_modes)] for point in points])
+    if not errors.any():
+        return modes
+    assert isinstance(modes.domain, NamedPoints)
+    rows = np.zeros((len(modes.domain.names), modes.n_modes))
+    rows[modes.domain.locate(points)] = errors * _shape_units(modes, ports).max(axis=0)
+    shapes = modes.shapes
+    return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) + rows[located])
 
 
 def _port_with_errors(rig: Rig, port: Any, units: Floats, prior: NominalPrior, values: dict[str, float]) -> Any:
@@ -402,9 +422,10 @@ def _place_names(rig: Rig, port: Actuator | Sensor) -> list[str]:
 
 
 @lru_cache(maxsize=1024)
-def _shape_names(port: Actuator | Sensor, n_modes: int) -> tuple[str, ...]:
-    """Names of the errors of the mode shapes at a port."""
-    return tuple(f"shape_{_side(port)}_{port.name}_{r}" for r in range(1, n_modes + 1))
+def _shape_names(at: Actuator | Sensor | str, n_modes: int) -> tuple[str, ...]:
+    """Names of the errors of the mode shapes at a port, or at a named point."""
+    where = f"in_{at}" if isinstance(at, str) else f"{_side(at)}_{at.name}"
+    return tuple(f"shape_{where}_{r}" for r in range(1, n_modes + 1))
 
 
 def _side(port: Actuator | Sensor) -> str:

@@ -220,7 +220,7 @@ def attribute(
     if random is None:
         logged = logged or _input_noise_of(search, best, noise_of(search, best) if noise is None else noise)
         if outcome == "explained":
-            best = replace(best, effects=with_all_errors(final_search, best.effects))
+            best = with_all_errors(final_search, best)
         best = with_intervals(
             search.rig, best, final_search.data, workers, wide=identified_prior is not None, logged=logged
         )

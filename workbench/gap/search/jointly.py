@@ -21,6 +21,7 @@ from workbench.gap.search.fit import Chord, Fit, fit, parameters_of
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import INPUTS, JOINT, SELECTION
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Between, NamedPoints
 
 
 def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
@@ -333,19 +334,46 @@ def with_all_groups(search: Search, errors: Effect) -> Effect:
     return nominal_errors(search.rig, replace(errors.target, **closed), errors.values)
 
 
-def with_all_errors(search: Search, effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The effects, the nominal errors among them with all groups, so that intervals allow for every group.
+def with_all_errors(search: Search, found: Fit) -> Fit:
+    """The fit with nominal errors of every group, so that intervals allow for each.
 
-    Groups that were dropped get the smallest prior standard deviation.
+    Groups that were dropped get the smallest prior standard deviation. The mode shapes have errors at the named points
+    of the effects too: a factor common to all modes there scales an effect, which no record shows. Where the ports have
+    errors of their shapes, all are fitted again together.
     """
-    return tuple(_with_every_group(search, e) if isinstance(e.target, NominalPrior) else e for e in effects)
+    errors = next((e for e in found.effects if isinstance(e.target, NominalPrior)), None)
+    if errors is None:
+        return found
+    effects = tuple(_with_every_group(search, e, found.effects) if e is errors else e for e in found.effects)
+    if not errors.target.shape or not _points_of(search.rig, found.effects):
+        return replace(found, effects=effects)
+    data = search.data.finely(SELECTION.fine)
+    fitted = fit(
+        search.rig,
+        effects,
+        data.tempered(_residual_level(search.rig, effects, data)),
+        iterations=JOINT.last_iterations,
+        tolerance=JOINT.last_tolerance,
+        workers=search.workers,
+        chord=Chord(),
+    )
+    return evaluated(search, fitted, data.substeps).fit
 
 
-def _with_every_group(search: Search, errors: Effect) -> Effect:
-    """The nominal errors with values of every group."""
+def _with_every_group(search: Search, errors: Effect, effects: Sequence[Effect]) -> Effect:
+    """The nominal errors with values of every group, and of the mode shapes at the points of the effects."""
     groups = replace(search, by_mode=errors.target.by_mode).prior.groups
     closed = {g: JOINT.narrowest * size for g, size in JOINT.widest if g in set(groups) - set(errors.target.groups)}
-    return nominal_errors(search.rig, replace(errors.target, waves=JOINT.last_waves, **closed), errors.values)
+    target = replace(errors.target, waves=JOINT.last_waves, points=_points_of(search.rig, effects), **closed)
+    return nominal_errors(search.rig, target, errors.values)
+
+
+def _points_of(rig: Rig, effects: Sequence[Effect]) -> tuple[str, ...]:
+    """The named points at which effects act; none of a structure that is known all over."""
+    if not isinstance(rig.modes.domain, NamedPoints):
+        return ()
+    places = (e.at if isinstance(e.at, Between) else (e.at,) for e in effects if e.at is not None)
+    return tuple(dict.fromkeys(point for place in places for point in place))
 
 
 def surely_late(errors: Effect) -> Effect:
