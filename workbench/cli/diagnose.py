@@ -59,9 +59,7 @@ def diagnose(
     """
     from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose_case
-    from workbench.gap.effects.effect import COORDINATES
     from workbench.gap.report.record_checks import check_alive
-    from workbench.gap.report.verdict import place_in_words
     from workbench.gap.setup.corrections import without_faults
     from workbench.gap.setup.faults import setup_faults
     from workbench.gap.setup.repeats import check_disjoint
@@ -113,12 +111,8 @@ def diagnose(
         amplitude = {True: "; depends on amplitude", False: "; does not depend on amplitude", None: ""}
         say(f"  path       {where.path}{amplitude[where.amplitude_dependent]}")
         say(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
-    if verdict.shows_gap and where.path in ("structure", "environment"):
-        if verdict.is_located:
-            spread = dict.fromkeys(COORDINATES, where.at_std)
-            say(f"  place      {place_in_words(where.at, spread)}, of the unmodelled point force, no law assumed")
-        elif where.place.is_single_force is False:
-            say("  place      no single point force explains the gap")
+    if verdict.shows_gap and where.path in ("structure", "environment") and verdict.location_in_words:
+        say(f"  place      {verdict.location_in_words}")
     after, floor = shown["gap"]["after"], shown["gap"]["floor"]
     for name, before in shown["gap"]["before"].items():
         say(f"  {name:<10} gap {before:.4g} → {after[name]:.4g}, noise floor {floor[name]:.4g}")

@@ -142,8 +142,8 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
         ax.set_axis_off()
         ax.text(0.5, 0.5, "no place of a force can be identified", ha="center", va="center", transform=ax.transAxes)
         return
-    single = "place of one unmodelled force" if place.is_single_force else "no single point force: where one fits best"
-    ax.set(title=single)
+    several = "no single point force explains all: where one fits best"
+    ax.set(title="place of one unmodelled force" if place.is_single_force else several)
     domain = verdict.nominal.modes.domain
     if isinstance(domain, Rectangle):
         _map(ax, verdict, domain)

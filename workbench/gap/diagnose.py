@@ -15,7 +15,7 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior, deviations_of
 from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.where import Where, locate, locate_force
-from workbench.gap.prediction.noise import noise_guessed
+from workbench.gap.prediction.noise import LOGGED, noise_guessed
 from workbench.gap.prediction.residuals import lead_of
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.budget import (
@@ -187,14 +187,13 @@ def diagnose(
             errors=errors,
             records=validation or records,
             noise_found=attribution.noise,
-            logged=attribution.logged,
             settle=settle,
         )
-        budget = budget_for(effects)
+        budget = budget_for(effects, logged=_input_noise(attribution, outcome))
         power = _residual_power(rig, (), validation or records, settle) / len(validation or records)
         if outcome == "explained" and _leaves_unexplained(budget, power, tolerance):
             outcome, effects, attribution = "part", (), replace(attribution, outcome="part")
-            budget = budget_for(effects)
+            budget = budget_for(effects, logged=_input_noise(attribution, outcome))
         is_settled = outcome in ("none", "explained")
         in_records = () if is_settled else data_faults(rig, records, settle=settle)
         in_validation = () if is_settled else data_faults(rig, validation, settle=settle)
@@ -313,6 +312,14 @@ def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray
         return "unknown"
     fails = found.outcome == "explained" and _over_fits(found, shrinkage, beyond)
     return "part" if fails else found.outcome
+
+
+def _input_noise(found: Attribution, outcome: str) -> float:
+    """Noise of the logged inputs, as a share of their rms; 0 where it is at its bound and the gap is unexplained.
+
+    Whatever is missing then fills it.
+    """
+    return 0.0 if found.logged >= LOGGED.most and outcome in ("part", "unknown") else found.logged
 
 
 def _leaves_unexplained(budget: Budget, power: float, tolerance: float) -> bool:

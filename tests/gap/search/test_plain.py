@@ -22,6 +22,7 @@ from workbench.gap.search.plain import (
     is_plausible_error,
     other_delay_causes,
     uniform_as_nominal_errors,
+    with_common_delay,
 )
 from workbench.gap.search.search import Search
 from workbench.rig.actuators import Actuator
@@ -252,6 +253,19 @@ def test_sensors_that_are_all_late_alike_are_so_for_one_cause(hinged_rig, delays
     causes = [("sensor_lag", "all"), ("actuator_lag", "F"), ("actuator_delay", "F")] if has_one_cause else []
     assert [(effect.kind.name, effect.target) for effect in found] == causes
     assert all(list(effect.values.values()) == pytest.approx([0.002], rel=0.02) for effect in found)
+
+
+def test_a_delay_of_all_sensors_takes_what_their_own_have_in_common(search):
+    """A force late by 2 ms that is read 0.8 or 1.2 ms early is late by 1 ms, and read 0.2 ms late or early."""
+    one = search((MODULUS,))
+    late = Effect(kind_named("actuator_delay"), "F", {"delay": 0.002})
+    own = {"delay_d1": -0.12, "delay_d2": -0.08, "delay_d3": -0.12, "delay_d4": -0.08}  # in samples of 10 ms
+    errors = nominal_errors(one.rig, replace(one.prior, interpolated=True), own)
+    found = Fit((late, errors), 1.0, np.ones((1, 4)), 1)
+    delay, rest = with_common_delay(found).effects
+    assert delay.values["delay"] == pytest.approx(0.001)
+    assert [rest.values[name] for name in own] == pytest.approx([-0.02, 0.02, -0.02, 0.02])
+    assert with_common_delay(replace(found, effects=(DAMPER, errors))).effects[1] is errors
 
 
 @pytest.mark.parametrize("kind", ["sensor_lag", "actuator_delay"])

@@ -108,6 +108,17 @@ class Verdict:
         return any(domain.separation(effect.at, self.where.at) < near for effect in acting)
 
     @property
+    def location_in_words(self) -> str:
+        """Where the unmodelled point force acts, or that there is no single one; empty where that is not known."""
+        place = self.where.place
+        at = place_in_words(place.at, dict.fromkeys(COORDINATES, place.at_std))
+        if self.is_located:
+            return f"{at}, of the unmodelled point force, no law assumed"
+        if place.is_single_force is not False:
+            return ""
+        return f"no single point force explains all of the gap; the best, {at}, explains {_percent(place.share)} of it"
+
+    @property
     def nominal_errors(self) -> Effect | None:
         """Errors of the nominal model that were fitted beside the effects; None where none were."""
         return next((effect for effect in self.effects if effect.kind is NOMINAL_ERRORS), None)

@@ -277,6 +277,23 @@ def delay_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
     return _common_delays(rig, mean * sample_time)
 
 
+def with_common_delay(found: Fit) -> Fit:
+    """The fit, an effect that delays all sensors taking the mean of the delays among the nominal errors, the last.
+
+    Both delay alike, and the records determine only their sum.
+    """
+    *others, late, errors = found.effects
+    delays = {name: value for name, value in errors.values.items() if group_of(name) == "delay"}
+    mean = float(np.mean([*delays.values()])) if delays else 0.0
+    delay = delay_of(late) + mean * errors.target.sample_time
+    if late.kind not in DELAYS_OF_ALL or not mean or delay <= 0.0:
+        return found
+    (name,) = late.values
+    rest = {name: value - mean for name, value in delays.items()}
+    late = replace(late, values={name: delay})
+    return replace(found, effects=(*others, late, replace(errors, values={**errors.values, **rest})))
+
+
 def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None:
     """At most `most` effects that explain the records, added one by one to uniform stiffness and damping errors.
 

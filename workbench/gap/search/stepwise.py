@@ -49,6 +49,7 @@ from workbench.gap.search.plain import (
     is_plausible_delay,
     is_plausible_gain_or_place,
     other_delay_causes,
+    with_common_delay,
 )
 from workbench.gap.search.screening import fitted_ahead, one_more
 from workbench.gap.search.search import Decision, Search, apart, best_of_each_kind, most_informative
@@ -880,6 +881,7 @@ class Stepwise:
         without_delays = {n: 0.0 if group_of(n) == "delay" else v for n, v in step.errors.values.items()}
         errors = nominal_errors(search.rig, replace(target, late=(), early=(), interpolated=False), without_delays)
         each = search.workers.map(lambda e: fit_jointly(search, (*step.effects, e), errors, rounds=2), late)
+        each = [evaluated(search, with_common_delay(s.fit)) for s in each]
         best, *others = sorted(each, key=lambda s: s.fit.cost)
         effect = best.effects[-1]
         if self._is_likelier(step, best) or not effect.stands_out(search.rig):
