@@ -181,7 +181,7 @@ def test_design_has_observers_of_rigid_modes_and_says_what_is_on_the_axis(tmp_pa
     # two undamped laws, through exact modal coordinates: whatever rounding makes of poles on the axis
     assert [line.split()[-2:] for line in result.output.splitlines()[2:4]] == [["marginally", "stable"]] * 2
     by_ratio = run("design", free, "--control", 2, "--damping", 0.2)
-    assert by_ratio.exit_code == 0 and "what is rigid (mode 1, 2) has no damping ratio" in by_ratio.output, (
+    assert by_ratio.exit_code == 0 and "the rigid mode(s) 1, 2 have no damping ratio" in by_ratio.output, (
         by_ratio.output
     )
     free.write_text(free.read_text().replace("modes = 9", "modes = 2"))
@@ -385,7 +385,7 @@ def test_patches_on_a_plate_are_placed_and_designed(plate, tmp_path):
         (("--impulse-at", "3,0.1"), "--impulse-at: (x, y) = (3, 0.1) lies outside the structure, 0 to 1.2 by 0 to 0.8"),
         (("--impulse-at", "0.4"), "--impulse-at takes X,Y in m, such as 0.4,0.25; got '0.4'"),
         (("--forbid", "0.2:0.3"), "--forbid takes X,Y in m, such as 0.4,0.25; got '0.2'"),
-        (("--at", "0.2,0.3"), "2 actuators need as many places; the limits leave 1"),
+        (("--at", "0.2,0.3"), "2 actuators need as many places; the limits allow 1"),
         (("--control", 3), "there are 2 for 3 modes: describe 3 [[input]] of kind actuator"),
     ],
 )
@@ -412,7 +412,7 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         (("place", "{rig}", "--control", 4, "--json", "nowhere/found.json"), "there is no folder nowhere"),
         (
             ("place", "{rig}", "--control", 4, "--forbid", "0.5:10"),
-            "find room for 2 on the intervals left, 0 to 0.5 m:",
+            "only 2 find room on the allowed intervals, 0 to 0.5 m:",
         ),
         (("place", "{rig}", "--control", 9), "residual"),
         (("place", "{rig}", "--control", 1, "--effort", 0.01), "--effort counts in multiples of"),
