@@ -89,7 +89,7 @@ def test_a_pole_that_stays_costs_nothing():
         (lambda m: coupled_poles(m, 2, actuators(3.0), poles=[-1 + 1j, -1 + 1j]), "cannot assign 2 pairs"),
         (
             lambda m: coupled_poles(m, 2, actuators(3.0), poles=[-1e-300 + 1j * m.omega[1], -1 + 1j]),
-            "of mode 1 is that of mode 2 without control",
+            "of mode 1 is the open-loop pole of mode 2",
         ),
     ],
 )

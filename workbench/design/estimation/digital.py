@@ -181,7 +181,7 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
             " luenberger or filtered"
         )
     if not 0 < number(sample_time, "sample_time", "s") < np.inf:
-        raise ValueError(f"sample_time must be above 0 s; got {sample_time:g}")
+        raise ValueError(f"sample_time must be above 0; got {sample_time:g} s")
     n, n_sensors = controller.state.shape[0], len(controller.sensors)
     augmented = np.zeros((n + n_sensors, n + n_sensors))
     augmented[:n] = np.hstack([controller.state, controller.reads])
