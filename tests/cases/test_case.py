@@ -159,7 +159,7 @@ def test_a_record_shorter_than_a_period_is_refused(case, tmp_path):
 def test_what_is_not_a_case_folder_is_refused(tmp_path, folder):
     with pytest.raises(CaseError, match="not a folder"):
         read_case(tmp_path / "nowhere")
-    with pytest.raises(CaseError, match=r"holds no case\.toml"):
+    with pytest.raises(CaseError, match=r"has no case\.toml"):
         read_case(tmp_path)
     (folder / "records/one.npz").write_bytes(b"not an archive")
     with pytest.raises(CaseError, match="NPZ"):

@@ -269,7 +269,11 @@ def test_points_go_through_a_file_unchanged(tmp_path):
         (FRAME.replace('"a.x"', '"a.x"\ndirection = "z"'), POINTS, "point 'a.x' has no direction 'z'; it has x, y"),
         (FRAME.replace('"b.y"', '"b.y"\naxis = "z"'), POINTS, "'a1': a force or displacement.* has no axis"),
         (FRAME.replace('"acceleration"', '"slope"'), POINTS, "'b.y' is no rotation: give a point of direction rx"),
-        (PLATE.replace('"actuator"\nat', '"hammer"\npatch = [0.2, 0.1]\nat'), POINTS, "a patch is no hammer"),
+        (
+            PLATE.replace('"actuator"\nat', '"hammer"\npatch = [0.2, 0.1]\nat'),
+            POINTS,
+            "a patch is actuator, not hammer",
+        ),
         (FRAME.replace('"a.x"', '"a.x"\npatch = [0.2, 0.1]'), POINTS, "no key 'patch'"),
         (PLATE.replace("bottom =", "botom ="), POINTS, "did you mean 'bottom'"),
         (PLATE.replace('left = "simply', 'left = "hardly'), POINTS, "hardly supported"),

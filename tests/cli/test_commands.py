@@ -423,7 +423,7 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         (("study", "nothing_of_that_name"), "no study is called"),
         (("report", "nowhere.json"), "no such file"),
         (("bench", "nowhere.toml"), "no such file"),
-        (("bench", "{rig}", "--port", 1_000_000), "port 1000000 cannot be had"),
+        (("bench", "{rig}", "--port", 1_000_000), "port 1000000 is not available"),
         (("report", "{rig}"), "no study is called"),
         (("study", "ruler"), "needs --data"),
         (("study", "ruler", "--data", "nowhere.mat"), "no such file"),

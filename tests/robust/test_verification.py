@@ -29,7 +29,7 @@ def test_what_no_loop_can_be_made_of_is_refused(rig):
     for wrong, match in (
         ((rig, controller, test), "on an UncertainRig, or on rigs drawn from it; got Rig"),
         (((), controller, test), "on an UncertainRig"),
-        ((certain, law, test), "must be a sampled one; got Law"),
+        ((certain, law, test), "must be a DigitalController; got Law"),
         ((certain, controller, None), "the test must be a LoopTest; got NoneType: make one by LoopTest"),
     ):
         with pytest.raises(TypeError, match=match):

@@ -154,7 +154,7 @@ def test_what_cannot_be_attached_is_refused_with_the_remedy():
     ):
         with pytest.raises(ValueError, match=message):
             model.attached([part])
-    with pytest.raises(ValueError, match="from 1 to 3 modes"):
+    with pytest.raises(ValueError, match="have 1 to 3 modes; got 4"):
         model.modes(4)
 
 
