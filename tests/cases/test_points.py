@@ -281,7 +281,11 @@ def test_points_go_through_a_file_unchanged(tmp_path):
         (FRAME.replace("points.csv", "../points.csv"), POINTS, "outside the case folder"),
         (FRAME.replace("points.csv", "others.csv"), POINTS, "there is no such file"),
         (FRAME, POINTS.replace("mode_2", "mode_3"), "column 'mode_2' is missing"),
-        (FRAME, POINTS.replace("a.x,1,0", "a.x,1,"), "line 2, column 'x': .*; got ''; say where the point stands, m"),
+        (
+            FRAME,
+            POINTS.replace("a.x,1,0", "a.x,1,"),
+            "line 2, column 'x': .*; got ''; give the position of the point, m",
+        ),
         (FRAME, POINTS.replace("0.75", "wide"), "line 3, column 'mode_2': expected a finite number; got 'wide'"),
         (FRAME, POINTS.replace("b.y,2", "a.y,2"), "'a.y' twice"),
         (FRAME, POINTS.replace(",y,-0.5", ",north,-0.5"), "a direction is one of x, y, z"),

@@ -83,14 +83,14 @@ def test_the_damping_that_a_law_gives_is_told(run, rig, tmp_path, law, asked):
     rig.write_text(RIG.replace("damping_ratio = 0.01", "damping_ratio = 0.02"))
     options = ("--law", law, "--damping", asked, "--rate-hz", 1000, "--to", tmp_path / "one.py")
     result = run("export", rig, "--control", 1, *options)
-    assert f"every modal coordinate known: {given:.3g}\n" in result.output, result.output
+    assert f"with exact modal coordinates: {given:.3g}\n" in result.output, result.output
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         (["--rate-hz", "1"], "1 Hz is too slow for mode 1"),
-        (["--rate-hz", "-5"], "--rate-hz is the rate of the controller, above 0 Hz; got -5"),
+        (["--rate-hz", "-5"], "--rate-hz is the sample rate of the controller, above 0 Hz; got -5"),
         (["--rate-hz", "0"], "above 0 Hz; got 0"),
         (["--rate-hz", "100", "--law", "pid"], "no law is called 'pid'; the laws are imsc, coupled, poles, on-off"),
         (["--rate-hz", "100", "--law", "poles", "--weight", "2"], "give --damping for poles"),

@@ -424,7 +424,7 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
     elastic = rig.modes.omega[rig.modes.omega > 0]
     if elastic.size and n_samples * sample_time < 2.0 * np.pi / elastic[0]:
         raise CaseError(
-            f"{file} lasts {n_samples * sample_time:g} s, less than one period of the first mode"
+            f"{file} lasts {n_samples * sample_time:g} s, less than a period of the first mode"
             f" ({2.0 * np.pi / elastic[0]:g} s); take a longer record"
         )
     for sensor in rig.sensors:

@@ -94,7 +94,7 @@ def page_content_in(path: Path) -> PageContent:
     if isinstance(content, list):
         content = {path.stem: content}
     if not isinstance(content, dict):
-        raise StudyError(f"{path} contains a {type(content).__name__}; a report needs an object or a list of rows")
+        raise StudyError(f"{path} holds a {type(content).__name__}; a report needs an object or a list of rows")
     if "format" in content:
         if content["format"] != FORMAT:
             raise StudyError(f"{path} has the format {content['format']!r:.60}; this workbench reads {FORMAT!r}")
