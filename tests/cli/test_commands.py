@@ -376,7 +376,7 @@ def test_patches_on_a_plate_are_placed_and_designed(plate, tmp_path):
     assert result.exit_code == 0 and "effort [(N m/m)² s]  peak moment [N m/m]" in result.output, result.output
     plate.write_text(text.replace("patch = [0.2, 0.15]", "patch = [0.2, 0.1]", 1))
     result = run("place", plate, "--control", 2)
-    assert result.exit_code == 2 and "F2 is no patch like F1" in " ".join(result.output.split())
+    assert result.exit_code == 2 and "F2 is not a patch like F1" in " ".join(result.output.split())
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def test_the_damping_that_a_law_gives_is_told(run, rig, tmp_path, law, asked):
         (["--rate-hz", "0"], "above 0 Hz; got 0"),
         (["--rate-hz", "100", "--law", "pid"], "no law is called 'pid'; the laws are imsc, coupled, poles, on-off"),
         (["--rate-hz", "100", "--law", "poles", "--weight", "2"], "give --damping for poles"),
-        (["--rate-hz", "100", "--law", "on-off"], "`workbench redesign --to` writes it"),
+        (["--rate-hz", "100", "--law", "on-off"], "is exported by `workbench redesign --to`"),
         (["--rate-hz", "100", "--weight", "2", "--damping", "0.1"], "give one of them"),
         (["--rate-hz", "100", "--law", "on-off", "--damping", "0.1"], "on-off control gives no damping ratio"),
         (["--rate-hz", "100", "--estimator", "pid"], "--estimator is one of luenberger, kalman"),

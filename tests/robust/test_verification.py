@@ -45,7 +45,7 @@ def test_what_no_loop_can_be_made_of_is_refused(rig):
         ({"seed": "x"}, "seed is a whole number, 0 or more; got 'x'"),
         ({"controlled": 2}, r"controlled is a sequence of modes, counted from zero, such as \(0, 1\); got 2"),
         ({"controlled": ("a",)}, "a mode counted from zero, is a whole number"),
-        ({"margin_rig": controller}, "margin_rig is the rig whose small-gain margin is stated; got DigitalController"),
+        ({"margin_rig": controller}, "margin_rig must be a Rig, for the small-gain margin; got DigitalController"),
     ):
         with pytest.raises(TypeError, match=match):
             verify(certain, controller, test, **given)

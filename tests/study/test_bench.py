@@ -139,7 +139,7 @@ def test_sensors_close_the_loop_through_modal_filters():
         ({"actuators": ["a", 2.0, 6.0, 8.0]}, "a position x in m; got 'a'"),
         ({"impulse_at": 11.0}, "outside the structure"),
         ({"impulse_at": [1.0, 2.0]}, "a place is a position along the structure, m; got"),
-        ({"sensors": [[1.0, "b"]]}, "sensors is made of finite numbers; got 'b'"),
+        ({"sensors": [[1.0, "b"]]}, "sensors must be finite numbers; got 'b'"),
         ({"sensors": [3.0, 3.0]}, "increasing"),
         ({"law": "bang"}, "law is one of"),
         ({"final_time": 0}, "final_time must be positive"),

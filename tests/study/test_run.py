@@ -221,10 +221,10 @@ def test_a_table_says_what_it_cannot_do(tmp_path):
     with pytest.raises(StudyError, match=r"written as .csv, .parquet, .json; got .xls"):
         table().write(tmp_path / "t.xls")
     clash = study.run([{"at": 1}], lambda at: {"at": 2}, cache=None, **HERE)
-    with pytest.raises(StudyError, match="'at' is a parameter and a result of another value"):
+    with pytest.raises(StudyError, match="'at' is a parameter and a result with different values"):
         clash.rows()
     twice = study.run([{}], lambda: {"a.b": 1, "a": {"b": 2}}, cache=None, **HERE)
-    with pytest.raises(StudyError, match=r"in one column, 'a.b'"):
+    with pytest.raises(StudyError, match=r"the same column name 'a.b'"):
         twice.rows()
     for name in ("error", "seconds", "versions", "seed"):
         found = study.run([{}], lambda name=name: {name: 0.1}, cache=None, **HERE)

@@ -69,13 +69,11 @@ def design(
     say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {struck}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
-    units_of = map(units.named, (*command_headings(unit), "W_C [J]", "W_R [J]"))
-    show_table(("law", "cost", *units_of, "largest W_r", "loop"), shown)
+    headings = map(units.named, (*command_headings(unit), "W_C [J]", "W_R [J]"))
+    show_table(("law", "cost", *headings, "largest W_r", "loop"), shown)
     if {row.law.name for row in rows} >= {"IMSC", "coupled LQR"}:
-        say(
-            "  R weights FᵀF in the cost and coupled LQR, but fᵀf of modal forces in IMSC: the ranking depends on masses"
-        )
-        say("  and units; --damping compares the laws at equal poles")
+        say("  R weights FᵀF in the cost and coupled LQR, but fᵀf of modal forces in IMSC: the ranking depends on")
+        say("  masses and units; --damping compares the laws at equal poles")
     tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]

@@ -179,8 +179,8 @@ def _rank(ax: Axes, verdict: Verdict) -> None:
     ax.annotate("likeliest", (0.0, 0), (4, 0), textcoords="offset points", va="center", fontsize=8)
     unseen = [_short(at) for at in acting if all(separation(at, other) > 0 for other in shown)]
     if unseen:
-        told = f"{called}, not among these: {', '.join(unseen)}"
-        ax.text(1.0, 0, told, transform=ax.get_yaxis_transform(), ha="right", va="center", fontsize=8)
+        label = f"{called}, not among these: {', '.join(unseen)}"
+        ax.text(1.0, 0, label, transform=ax.get_yaxis_transform(), ha="right", va="center", fontsize=8)
 
 
 def _acting(verdict: Verdict) -> tuple[list[Any], str]:

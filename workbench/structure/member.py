@@ -134,7 +134,7 @@ class _Member(Printed):
     @one_blas_thread
     def _solve(self, n_modes: int, stiffness: Profile, continuity: int, tension: float, tolerance: float) -> Modes:
         if n_modes < 1:
-            raise ValueError(f"at least one mode must be asked for; got {n_modes}")
+            raise ValueError(f"the number of modes must be at least 1; got {n_modes}")
         extra = 0
         while True:
             segments = self._segments(n_modes, stiffness, continuity, extra)
@@ -182,7 +182,7 @@ class _Member(Printed):
             rigidity += spring * row.T @ row
         free = np.delete(np.arange(segments.n_functions), held)
         if n_modes > free.size:
-            raise ValueError(f"{n_modes} modes asked of {free.size} functions")
+            raise ValueError(f"{n_modes} modes requested of {free.size} functions")
         mass, rigidity = mass[np.ix_(free, free)], rigidity[np.ix_(free, free)]
         # The inverse problem M v = ν (K + σ M) v: its largest eigenvalues are the lowest modes, so that round-off is
         # relative to these and not to the highest frequency of the basis. σ keeps K + σ M definite with rigid-body

@@ -190,7 +190,7 @@ class Plate(_Surface):
             ValueError: the tolerance cannot be reached (with the accuracy that is reached), or buckling.
         """
         if n_modes < 1:
-            raise ValueError(f"at least one mode must be asked for; got {n_modes}")
+            raise ValueError(f"the number of modes must be at least 1; got {n_modes}")
         loaded = any(isinstance(part, PointMass | PointSpring) for part in self.attachments)
         if self.is_navier and not loaded and not isinstance(self.damping, ViscousDamping):
             return self._with_dampers(self._closed_form(n_modes + beyond))
@@ -369,7 +369,7 @@ class Membrane(_Surface):
             ValueError: the tolerance cannot be reached (with the accuracy that is reached).
         """
         if n_modes < 1:
-            raise ValueError(f"at least one mode must be asked for; got {n_modes}")
+            raise ValueError(f"the number of modes must be at least 1; got {n_modes}")
         a, b = self.length
         problem = SurfaceProblem(
             length=self.length,

@@ -142,7 +142,7 @@ def _ritz(
     stiffness = assemble(problem.squares, *axes) + edge_matrix(problem.edges, *axes) + problem.scale * mass
     n = mass.shape[0]
     if n_modes > n:
-        raise ValueError(f"{n_modes} modes asked of {n} functions")
+        raise ValueError(f"{n_modes} modes requested of {n} functions")
     if statics:
         mass, stiffness = _with_points(problem, axes, statics, mass, stiffness)
     # M v = ν (K + σ M) v: the largest ν are the lowest modes, so that round-off is relative to them

@@ -203,8 +203,8 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
     if unexplained.size:
         lines.append(
             f"modes {', '.join(str(r + 1) for r in unexplained)}: complex shapes (low phase collinearity); either"
-            " damping couples close modes, or data of roving sensors or hammers are inconsistent, and several of these modes"
-            " are the same"
+            " damping couples close modes, or data of roving sensors or hammers are inconsistent, and several of these"
+            " modes are the same"
         )
     band = found.frequencies_hz
     outputs, inputs = found.modes.n_outputs, len(measured.references)
