@@ -84,7 +84,12 @@ def test_what_the_format_cannot_say_is_refused(case, tmp_path):
     smooth = replace(case.rig.structure, mass_per_length=lambda x: 1.0 + x**2)
     loaded = replace(case.rig.structure, attachments=(PointMass(1.0, 0.1),))
     off = replace(case.rig.structure, frequency_errors=(0.01,))
-    faulty = ((smooth, "linear between"), (loaded, "attachments"), (off, "frequency_errors"), (None, "without its"))
+    faulty = (
+        (smooth, "not linear between"),
+        (loaded, "attachments"),
+        (off, "frequency_errors"),
+        (None, "no structure"),
+    )
     for structure, word in faulty:
         with pytest.raises(ValueError, match=word):
             write_case(replace(case, rig=replace(case.rig, structure=structure)), tmp_path / "out")
@@ -159,7 +164,7 @@ def test_a_record_shorter_than_a_period_is_refused(case, tmp_path):
 def test_what_is_not_a_case_folder_is_refused(tmp_path, folder):
     with pytest.raises(CaseError, match="not a folder"):
         read_case(tmp_path / "nowhere")
-    with pytest.raises(CaseError, match=r"holds no case\.toml"):
+    with pytest.raises(CaseError, match=r"has no case\.toml"):
         read_case(tmp_path)
     (folder / "records/one.npz").write_bytes(b"not an archive")
     with pytest.raises(CaseError, match="NPZ"):
@@ -277,7 +282,7 @@ def test_inputs_are_held_or_run_straight_as_the_case_says(case, tmp_path):
     (folder / "case.toml").write_text('input_hold = "first"\n' + text)
     assert read_case(folder).validation[0].input_hold == "first"
     (folder / "case.toml").write_text('input_hold = "second"\n' + text)
-    with pytest.raises(CaseError, match=r"zero \(held\), first"):
+    with pytest.raises(CaseError, match=r"zero \(constant between samples\), first"):
         read_case(folder)
 
 

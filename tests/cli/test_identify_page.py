@@ -28,7 +28,7 @@ def test_the_page_shows_shapes_mac_stabilisation_and_spectra(run, decay, tmp_pat
     assert found.exit_code == 0, found.output
     content = json.loads(page.with_suffix(".page.json").read_text())
     captions = " ".join(block["caption"] for block in content["blocks"])
-    for what in ("shapes identified", "Modal assurance criterion", "Stabilisation diagram", "spectral density"):
+    for what in ("identified shapes", "Modal assurance criterion", "Stabilisation diagram", "spectral density"):
         assert what in captions
     [(_, _, rows)] = content["tables"]
     # rounded to the second digit of the standard error, as the terminal shows it

@@ -27,7 +27,7 @@ def test_a_new_case_is_a_case_once_its_records_are_there(run, tmp_path, monkeypa
     assert [len(case.fit), len(case.validation)] == [2, 1]
     assert "diagnose 'your arm'" in run("new", "case", "your arm").output  # as a shell takes it
     again = run("new", "case", tmp_path / "arm")
-    assert again.exit_code == 2 and "is there already" in again.output
+    assert again.exit_code == 2 and "exists already" in again.output
 
 
 def test_a_new_study_runs_and_holds(run, tmp_path, monkeypatch):
@@ -36,5 +36,5 @@ def test_a_new_study_runs_and_holds(run, tmp_path, monkeypatch):
     ran = run("study", "tip")
     assert ran.exit_code == 0 and "1 of 1 checks hold" in ran.output, ran.output
     assert (tmp_path / "figures" / "tip-modes.png").is_file()
-    assert "is there already" in run("new", "study", "tip").output
-    assert "a study's name" in run("new", "study", "../tip").output
+    assert "exists already" in run("new", "study", "tip").output
+    assert "the name of a study" in run("new", "study", "../tip").output

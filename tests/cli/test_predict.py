@@ -104,7 +104,9 @@ def test_a_verdict_that_is_made_on_the_way_is_kept(run, case):
     assert done.exit_code == 0, done.output
     kept = json.loads((case / "out" / "late-verdict.json").read_text())
     assert [e["kind"] for e in kept["posterior"]["effects"]] == ["actuator_delay"]
-    assert "--verdict out/late-verdict.json the next command need not diagnose" in " ".join(done.stderr.split())
+    assert "give --verdict out/late-verdict.json to the next command to skip the diagnosis" in " ".join(
+        done.stderr.split()
+    )
     again = run("check", "late", "friday.csv", "--draws", 40, "--verdict", "out/late-verdict.json")
     assert again.exit_code == 0 and again.output.split(":")[0] == done.stdout.split(":")[0]
 

@@ -99,7 +99,7 @@ def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
         (lambda told: told["effects"][0].update(target="F9"), "acts on 'F9', which the rig does not have"),
         (lambda told: told.update(covariance=[[1.0, 2.0], [3.0]]), "covariance must be 1 by 1 finite numbers"),
         (lambda told: told.update(covariance=[[float("nan")]]), "covariance must be 1 by 1 finite numbers"),
-        (lambda told: told.update(unexplained=None), "it is damaged; diagnose it again"),
+        (lambda told: told.update(unexplained=None), "it is damaged; diagnose the case again"),
     ],
 )
 def test_a_damaged_verdict_is_named(run, case, tmp_path, change, said):

@@ -64,7 +64,7 @@ def test_a_frame_moves_each_node_in_its_directions_and_closes_its_loop():
     np.testing.assert_allclose(moves, SWAY * np.array([[0, 0], [0, 0], [1, 0.5], [1, 0]]), atol=1e-6)
     # two sets of modes move together, whatever the sign of each
     np.testing.assert_allclose(np.array(shown["tracks"][1]["moves"])[0], moves)
-    with pytest.raises(ValueError, match="positions are known"):
+    with pytest.raises(ValueError, match="cannot be drawn without positions"):
         mode_motion({"nominal": Modes([10.0], [0.01], PointShapes([[1.0], [2.0]]), NamedPoints(("p", "q")))})
 
 

@@ -58,7 +58,7 @@ def test_the_bands_of_a_plate_are_drawn_where_they_are_wide(plate):
         share = 100.0 * std[:, r].max() / np.abs(bands.phi[:, r]).max()
         assert ax.collections[0].get_array().max() <= 1.2 * share and ax.collections[0].levels[-1] >= share
     assert "of 3 eigenfunctions at" in str(bands)
-    with pytest.raises(ValueError, match="stand on one line: give a grid"):
+    with pytest.raises(ValueError, match="on one line: give a grid"):
         plot(Bands(at[:3], bands.phi[:3], std[:3], std[:3], np.full(3, 3.0), 0.95))
 
 

@@ -133,7 +133,7 @@ WAVE = np.array([1.0, -2.0, 3.0, -4.0, 5.0, 6.0])
         ("time;a\n0,5;999\n1,0;1.500\n", "'1.500' is not a number with the decimal mark"),
         ("time;a\n0,5;1.500\n1,0;999\n", "row 2 has points and commas"),
         ("time;a\n0;1.500\n1;999\n", "'1.500' stands beside numbers without '.'"),
-        ("time;a;time;b\n0;1;0,1;1\n1;2;1,1;2\n", "instants of their own, 'time' and 'time 2'"),
+        ("time;a;time;b\n0;1;0,1;1\n1;2;1,1;2\n", "different sample instants, 'time' and 'time 2'"),
         ("time,a\n0.5,2\n0,1\n1,3\n", "not uniformly sampled"),
         ("time,a\n0,1\n0,1\n0,1\n", "not uniformly sampled"),
         ("time,a\n1,1\n0.5,2\n0,3\n", "not uniformly sampled"),

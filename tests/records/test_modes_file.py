@@ -95,7 +95,7 @@ def test_only_displacements_of_a_universal_file_are_shapes(tmp_path):
          "its shapes are complex"),
         ({"shapes": np.where(SHAPES == 2.0, np.nan, SHAPES)}, "shapes must be finite; of mode 1 row 2 is nan"),
         ({"also": [{"type": 15, "node_nums": [9], "def_cs": [0], "disp_cs": [0], "color": [0], "x": [1.0], "y": [0.5],
-                    "z": [0.6]}]}, "node 9 stands at two places"),
+                    "z": [0.6]}]}, "node 9 has two positions"),
     ],
 )  # fmt: skip
 def test_what_a_universal_file_contradicts_is_refused(tmp_path, changed, message):

@@ -105,8 +105,8 @@ def test_a_misplaced_patch_keeps_its_size_and_stays_on_the_structure(on_plate):
             r"0.2 m by 0.12 m at \(x, y\) = \(1.15, 0.3\) does not lie on .* 0 to 1.2 by 0 to 0.8",
         ),
         (lambda: of("P", MIDDLE, direction="z"), "axis 'x' or 'y', or both"),
-        (lambda: points().edge_slopes([(*MIDDLE, *SIDES)]), "a patch has its place on a plate"),
-        (lambda: plate().modes(2).phi_at(Patch(*MIDDLE, *SIDES)), "no force or displacement"),
+        (lambda: points().edge_slopes([(*MIDDLE, *SIDES)]), "a patch is placed on a plate"),
+        (lambda: plate().modes(2).phi_at(Patch(*MIDDLE, *SIDES)), "not by a force or displacement"),
     ],
 )
 def test_what_is_no_patch_is_refused(ask, words):

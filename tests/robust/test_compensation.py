@@ -10,7 +10,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.rig.elements import CoulombFriction
 from workbench.robust.compensation import compensated
-from workbench.robust.on_rig import fitted
+from workbench.robust.on_rig import loop_on_rig
 
 
 @pytest.mark.parametrize(("sample_time", "left"), [(0.01, 0.1), (0.001, 0.012)])
@@ -19,7 +19,7 @@ def test_friction_is_opposed_so_that_the_controlled_modes_move_as_without_it(rig
     rig = replace(rig, modes=rig.modes.select(slice(2)), structure=None)
     test = LoopTest(round(6.0 / sample_time), sample_time, impulse_at=0.8)
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
-    loop = fitted(rig, kalman(rig.modes, law, rig.sensors[4:], disturbance=1.0, noise=1e-6), test)
+    loop = loop_on_rig(rig, kalman(rig.modes, law, rig.sensors[4:], disturbance=1.0, noise=1e-6), test)
     rough = replace(rig, elements=(CoulombFriction(0.9, 0.2, 0.05),))
 
     def moved(on, *steps):

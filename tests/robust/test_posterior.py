@@ -134,16 +134,16 @@ def test_errors_of_an_identified_rig_go_through_json():
         assert np.array_equal(one.modes.omega, other.modes.omega)
         assert np.array_equal(one.modes.phi("y"), other.modes.phi("y"))
     assert np.ptp([r.modes.omega[0] for r in again.draws(20)]) > 0
-    with pytest.raises(ValueError, match="modes know their covariance"):
+    with pytest.raises(ValueError, match="must have the covariance of its modes"):
         UncertainRig.from_json(identified_rig(), uncertain.to_json())
 
 
 def test_what_cannot_be_is_named(told):
     rig = told[0]
-    with pytest.raises(ValueError, match=r"one row a parameter of the effects, shape \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"one row per parameter of the effects, shape \(2, 2\)"):
         UncertainRig(rig, GAINS, np.eye(3))
     with pytest.raises(ValueError, match="no effect is called 'gremlin'"):
         UncertainRig.from_json(rig, {"effects": [{"kind": "gremlin"}], "covariance": [], "alternatives": []})
     buckled = Effect(kind_named("axial_load"), None, {"tension": -1e6})
-    with pytest.raises(ValueError, match="measure more of them"):
+    with pytest.raises(ValueError, match="measure more records"):
         UncertainRig(rig, (buckled,), np.array([[1e-6]])).draws(1)

@@ -212,7 +212,7 @@ def test_what_cannot_be_predicted_or_checked_is_named(plain):
     ):
         with pytest.raises(TypeError, match=match):
             predict(one, given, **options)
-    with pytest.raises(TypeError, match="must be a sampled one; got str"):
+    with pytest.raises(TypeError, match="must be a DigitalController; got str"):
         predict_loop(one, "controller", LoopTest(50, 0.01, 0.3))
     unknown = predict(replace(one, outcome="unknown", unexplained=0.2), new, draws=60)
     assert "leaves the gap unexplained: 20 %" in str(unknown)

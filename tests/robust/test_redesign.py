@@ -19,7 +19,7 @@ from workbench.gap.effects.effect import Effect
 from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
-from workbench.robust.on_rig import default_estimator, fitted, impulse_test, tuned
+from workbench.robust.on_rig import default_estimator, impulse_test, loop_on_rig, tuned
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.redesign import _losses, redesign
@@ -249,7 +249,7 @@ def test_the_gain_of_a_law_by_poles_is_tuned_as_that_of_a_weight(rig):
     """A weight k⁻² times as large raises the gain of a lightly damped mode k times."""
     modes = rig.modes
     law = imsc_poles(modes, 2, rig.actuators, poles=modes.omega[:2] * (-0.1 + 1.02j))
-    loop = fitted(rig, kalman(modes, law, rig.sensors, disturbance=1.0, noise=1e-6), LoopTest(100, DT, 0.8))
+    loop = loop_on_rig(rig, kalman(modes, law, rig.sensors, disturbance=1.0, noise=1e-6), LoopTest(100, DT, 0.8))
     np.testing.assert_allclose(tuned(loop, rig, weight=0.25).law.gain, 2.0 * law.gain, rtol=1e-9)
     with pytest.raises(DesignError, match="20 times the gain leaves a mode that does not oscillate"):
         tuned(loop, rig, weight=1.0 / 400.0)
@@ -299,11 +299,11 @@ def test_a_controller_for_other_places_does_not_fit_the_rig(rig, controller):
     reads = kalman(
         rig.modes, controller.law, stretched.sensors[:2] + stretched.sensors[-1:], disturbance=1.0, noise=1e-6
     )
-    loop = fitted(stretched, reads, LoopTest(100, DT, 0.8))
+    loop = loop_on_rig(stretched, reads, LoopTest(100, DT, 0.8))
     assert [s.name for s in loop.controller.sensors] == ["d1", "d2", "d9"]
     exchanged = [replace(a, name=b.name) for a, b in zip(rig.actuators, rig.actuators[::-1], strict=True)]
     turned = imsc(rig.modes, 2, exchanged, weight=0.02)
-    loop = fitted(rig, turned, LoopTest(100, DT, 0.8))
+    loop = loop_on_rig(rig, turned, LoopTest(100, DT, 0.8))
     assert [a.at for a in loop.law.actuators] == [a.at for a in rig.actuators], "the place decides"
 
 
@@ -461,12 +461,12 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
     with pytest.raises(DesignError, match="moves none of the controlled modes"):
         redesign(plain, controller, sample_time=DT, impulse_at=0.0)
     heard = replace(rig, sensors=(Sensor("a", 0.5, "acceleration"),))
-    with pytest.raises(DesignError, match="observers here do not read accelerations"):
+    with pytest.raises(DesignError, match="observers here do not use accelerations"):
         default_estimator(heard, controller.law, LoopTest(2, DT, 0.8))
     late = uncertain(rig, effect("actuator_delay", "all", delay=0.04))
     with pytest.raises(DesignError, match=r"delay of F1, 40 ms, is 40,000 samples .* sample at 1.25e\+04 Hz or slower"):
         redesign(late, controller, sample_time=1e-6, test=LoopTest(2, 1e-6, 0.8))
-    with pytest.raises(DesignError, match="how often"):
+    with pytest.raises(DesignError, match="sample time of the controller is not known"):
         redesign(plain, controller)
     by_hand = Law(controller.law.gain, controller.law.controlled, controller.law.actuators)
     with pytest.raises(DesignError, match="given by its gain"):

@@ -29,13 +29,13 @@ def test_what_no_loop_can_be_made_of_is_refused(rig):
     for wrong, match in (
         ((rig, controller, test), "on an UncertainRig, or on rigs drawn from it; got Rig"),
         (((), controller, test), "on an UncertainRig"),
-        ((certain, law, test), "must be a sampled one; got Law"),
+        ((certain, law, test), "must be a DigitalController; got Law"),
         ((certain, controller, None), "the test must be a LoopTest; got NoneType: make one by LoopTest"),
     ):
         with pytest.raises(TypeError, match=match):
             verify(*wrong)
     for draws in (2.5, 0, np.nan, np.inf):
-        with pytest.raises(ValueError, match="draws, by which the uncertainty is sampled, is a whole"):
+        with pytest.raises(ValueError, match="draws, the number of samples of the uncertain rig, is a whole"):
             verify(certain, controller, test, draws=draws)
     assert verify(certain, controller, test, draws=2.0).n_draws == 2
     for given, match in (
@@ -45,7 +45,7 @@ def test_what_no_loop_can_be_made_of_is_refused(rig):
         ({"seed": "x"}, "seed is a whole number, 0 or more; got 'x'"),
         ({"controlled": 2}, r"controlled is a sequence of modes, counted from zero, such as \(0, 1\); got 2"),
         ({"controlled": ("a",)}, "a mode counted from zero, is a whole number"),
-        ({"margin_rig": controller}, "margin_rig is the rig whose small-gain margin is stated; got DigitalController"),
+        ({"margin_rig": controller}, "margin_rig must be a Rig, for the small-gain margin; got DigitalController"),
     ):
         with pytest.raises(TypeError, match=match):
             verify(certain, controller, test, **given)

@@ -93,7 +93,7 @@ def test_a_mass_on_a_structure_with_dampers_is_one_in_its_matrices():
 
 def test_a_mass_between_two_points_is_refused():
     model = FiniteElements(np.eye(2), np.diag([1.0, 2.0]), nodes=NamedPoints(("p", "q")))
-    with pytest.raises(ValueError, match="a mass stands at one point; give it at each of the two"):
+    with pytest.raises(ValueError, match="a mass is attached to one point; give it at each of the two"):
         attach(model.modes(2), (PointMass(Between("p", "q"), 0.1),))
 
 
@@ -101,5 +101,5 @@ def test_parts_that_no_structure_has_are_refused():
     for part, figure in ((PointMass, "mass"), (PointSpring, "stiffness"), (PointDamper, "coefficient")):
         with pytest.raises(ValueError, match=f"the {figure} of a {part.__name__} must be finite; got nan"):
             part(0.5, np.nan)
-    with pytest.raises(ValueError, match="more mass is taken away than there is"):
+    with pytest.raises(ValueError, match="a negative mass is too large"):
         attach(beam().modes(4), (PointMass(2.0, -50.0),))

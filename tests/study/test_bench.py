@@ -28,7 +28,7 @@ from workbench.study.catalogue import describe, run_study
 from workbench.study.runs.cases import StudyError
 from workbench.study.runs.outcome import Outcome
 from workbench.study.saved_design import save
-from workbench.study.trying import asked, read_structure, shown, start, try_out
+from workbench.study.trying import design_from, read_structure, results_of, start, try_out
 from workbench.trials.plane_frame import Section, plane_frame
 
 RIG, TEXT = read_structure(None)
@@ -103,7 +103,7 @@ def request(port, method, path, content=None, **headers):
 def test_it_begins_with_the_design_of_section_5_8():
     design = start(RIG)
     assert design.actuators == (2.0, 4.0, 6.0, 8.0) and design.impulse_at == 6.3 and design.controlled == 4
-    found = shown(RIG, replace(design, final_time=3000.0))
+    found = results_of(RIG, replace(design, final_time=3000.0))
     expected = [0.0, 1.213865e-3, 5.203347e-5, 1.294254e-4, 1.037589e-4]
     np.testing.assert_allclose(found["by_mode"][4:], expected, rtol=1e-5, atol=1e-12)
     assert found["stable"] and len(found["poles"]) == 9 and found["residual"] == pytest.approx(1.499083e-3, rel=1e-5)
@@ -117,9 +117,9 @@ def test_effort_is_that_of_the_lyapunov_equation():
 
 def test_sensors_close_the_loop_through_modal_filters():
     design = start(RIG)
-    exact = shown(RIG, design)
-    many = shown(RIG, replace(design, sensors=tuple(np.linspace(0.5, 9.5, 15))))
-    few = shown(RIG, replace(design, sensors=(2.0, 3.5, 5.2, 8.1)))
+    exact = results_of(RIG, design)
+    many = results_of(RIG, replace(design, sensors=tuple(np.linspace(0.5, 9.5, 15))))
+    few = results_of(RIG, replace(design, sensors=(2.0, 3.5, 5.2, 8.1)))
     assert many["residual"] == pytest.approx(exact["residual"], rel=0.05)
     assert abs(few["residual"] / exact["residual"] - 1) > 0.2, "few sensors mistake residual modes for controlled ones"
 
@@ -129,7 +129,7 @@ def test_sensors_close_the_loop_through_modal_filters():
     [
         ({"controlled": 0}, "at least 1; got 0"),
         ({"controlled": True}, "at least 1"),
-        ({"controlled": 12, "weight": [1.0] * 12}, "12 modes controlled of 9"),
+        ({"controlled": 12, "weight": [1.0] * 12}, "12 controlled modes, but the rig has 9"),
         ({"controlled": 5, "weight": [1.0] * 5}, "5 controlled modes need as many actuators"),
         ({"weight": [1.0, 1.0, 1.0]}, "each of the 4 controlled modes"),
         ({"weight": [1.0, 1.0, 1.0, 0.0]}, "positive"),
@@ -139,7 +139,7 @@ def test_sensors_close_the_loop_through_modal_filters():
         ({"actuators": ["a", 2.0, 6.0, 8.0]}, "a position x in m; got 'a'"),
         ({"impulse_at": 11.0}, "outside the structure"),
         ({"impulse_at": [1.0, 2.0]}, "a place is a position along the structure, m; got"),
-        ({"sensors": [[1.0, "b"]]}, "sensors is made of finite numbers; got 'b'"),
+        ({"sensors": [[1.0, "b"]]}, "sensors must be finite numbers; got 'b'"),
         ({"sensors": [3.0, 3.0]}, "increasing"),
         ({"law": "bang"}, "law is one of"),
         ({"final_time": 0}, "final_time must be positive"),
@@ -149,7 +149,7 @@ def test_sensors_close_the_loop_through_modal_filters():
 )
 def test_what_makes_no_design_is_refused(change, words):
     with pytest.raises(ValueError, match=words):
-        shown(RIG, asked({**plain(start(RIG)), **change}))
+        results_of(RIG, design_from({**plain(start(RIG)), **change}))
 
 
 def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
@@ -157,7 +157,7 @@ def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
     design = start(rig)
     assert design.actuators == ((0.3, 0.24), (0.84, 0.52)) and design.impulse_at == (0.5, 0.46)
     moved = replace(design, actuators=((0.35, 0.3), (0.8, 0.5)))
-    found = shown(rig, asked(plain(moved)))
+    found = results_of(rig, design_from(plain(moved)))
     sizes = {"length": (0.2, 0.12)} if rig.actuators[0].kind == "moment" else None
     actuators = [piezo_patch("P", at, **sizes) if sizes else Actuator("F", at) for at in moved.actuators]
     law = imsc(rig.modes, 2, [replace(a, name=f"F{i}") for i, a in enumerate(actuators)], weight=design.weight)
@@ -165,7 +165,7 @@ def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
     exact = finite_spillover(close_loop(rig.modes, law), state, design.final_time).by_mode
     np.testing.assert_allclose(found["by_mode"], exact, rtol=1e-5, atol=1e-9)
     many = tuple((x, y) for x in np.linspace(0.1, 1.1, 9) for y in np.linspace(0.1, 0.7, 6))
-    assert shown(rig, replace(moved, sensors=many))["residual"] == pytest.approx(found["residual"], rel=0.05)
+    assert results_of(rig, replace(moved, sensors=many))["residual"] == pytest.approx(found["residual"], rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_what_makes_no_design_on_a_plate_is_refused(change, words, tmp_path):
     path.write_text(PLATE)
     rig, _ = read_structure(path)
     with pytest.raises(ValueError, match=words):
-        shown(rig, asked({**plain(start(rig)), **change}))
+        results_of(rig, design_from({**plain(start(rig)), **change}))
 
 
 @pytest.mark.slow
@@ -205,10 +205,10 @@ def test_a_saved_design_is_a_study_that_runs_and_agrees(tmp_path):
     outcome = Outcome("found", figures_folder=tmp_path / "figures")
     run_study(describe(path), None, outcome, tmp_path)
     assert outcome.holds and len(outcome.checks) == 3 and len(outcome.figures) == 2
-    with pytest.raises(StudyError, match="is there already"):
+    with pytest.raises(StudyError, match="exists already"):
         save(RIG, TEXT, design, "found", tmp_path / "studies")
     for name in ("../found", "Found", "", "a b", "a" * 50, "1a", "a\n"):
-        with pytest.raises(StudyError, match="a study's name"):
+        with pytest.raises(StudyError, match="the name of a study"):
             save(RIG, TEXT, design, name, tmp_path / "studies")
 
 
@@ -265,7 +265,7 @@ def test_it_can_be_played_on(bench, look, drawn, moves, until, width, tmp_path):
     ActionChains(browser).click_and_hold(second).move_by_offset(round(0.05 * length), 0).release().perform()
     at = float(second.get_attribute("aria-valuenow"))
     assert at == pytest.approx(4.5, abs=0.1)
-    moved = shown(RIG, replace(start(RIG), actuators=(2.0, at, 6.0, 8.0)))["residual"]
+    moved = results_of(RIG, replace(start(RIG), actuators=(2.0, at, 6.0, 8.0)))["residual"]
     until(lambda: float(card("residual").replace("−", "-")) == pytest.approx(moved, rel=1e-3))
 
     def control(count):
@@ -307,7 +307,7 @@ def test_actuators_are_dragged_over_a_plate(plate, opened, until, width, tmp_pat
         ActionChains(browser).send_keys(Keys.ARROW_UP).perform()
         x, y = (float(part) for part in second.get_attribute("aria-valuetext").split(","))
         assert (x, y) == pytest.approx((0.74, 0.32 + 0.008), abs=0.02)
-        moved = shown(rig, replace(start(rig), actuators=((0.3, 0.24), (x, y))))["residual"]
+        moved = results_of(rig, replace(start(rig), actuators=((0.3, 0.24), (x, y))))["residual"]
         residual = browser.find_element("id", "residual")
         until(lambda: float(residual.text.replace("−", "-")) == pytest.approx(moved, rel=0.02))
         ActionChains(browser).click_and_hold(grip).move_by_offset(0, round(-0.5 * scale)).release().perform()
@@ -353,25 +353,25 @@ def test_a_design_on_a_frame_is_what_the_library_makes_of_it(frame):
     rig, _ = frame
     design = start(rig)
     assert design.actuators == ("R.x", "l.x") and design.impulse_at == "m.y"
-    moved = asked({**plain(design), "actuators": ["L.x", "m.y"]})
+    moved = design_from({**plain(design), "actuators": ["L.x", "m.y"]})
     actuators = [Actuator("F1", "L.x"), Actuator("F2", "m.y")]
     law = imsc(rig.modes, 2, actuators, weight=design.weight)
     loop = close_loop(rig.modes, law)
     at_rest = impulse_state(rig.modes, "m.y")
     at_rest[rig.modes.n_modes + 2 :] = 0.0
     expected = finite_spillover(loop, at_rest, design.final_time).residual_total
-    assert shown(rig, moved)["residual"] == pytest.approx(expected, rel=1e-5)
+    assert results_of(rig, moved)["residual"] == pytest.approx(expected, rel=1e-5)
     sensors = ["l.x", "R.x", "m.y"]
     through = close_loop(rig.modes, law, point_filter(rig.modes, sensors, [0, 1]))
     expected = finite_spillover(through, at_rest, design.final_time).residual_total
-    seen = shown(rig, asked({**plain(moved), "sensors": sensors}))
+    seen = results_of(rig, design_from({**plain(moved), "sensors": sensors}))
     assert seen["residual"] == pytest.approx(expected, rel=1e-5)
     for change, words in (
         ({"actuators": ["L.x", "Q.x"]}, "there is no point 'Q.x'"),
         ({"sensors": ["r.x"]}, "a filter of 2 modes at named points needs at least as many sensors; got 1"),
     ):
         with pytest.raises(ValueError, match=words):
-            shown(rig, asked({**plain(design), **change}))
+            results_of(rig, design_from({**plain(design), **change}))
 
 
 @pytest.mark.parametrize("before", ["", "  "])
@@ -403,7 +403,7 @@ def test_actuators_are_dragged_from_point_to_point_of_a_frame(frame, opened, unt
         ActionChains(browser).click_and_hold(grip).move_by_offset(3, round(down) - 4).release().perform()
         until(lambda: first.get_attribute("aria-valuetext") == "r.x")
         residual = browser.find_element("id", "residual")
-        moved = shown(rig, replace(start(rig), actuators=("r.x", "l.x")))["residual"]
+        moved = results_of(rig, replace(start(rig), actuators=("r.x", "l.x")))["residual"]
         until(lambda: float(residual.text.replace("−", "-")) == pytest.approx(moved, rel=1e-3))
         ActionChains(browser).send_keys(Keys.ARROW_RIGHT).perform()
         until(lambda: first.get_attribute("aria-valuetext") == "r.y")
@@ -529,5 +529,5 @@ def test_a_client_that_sends_bytes_one_by_one_is_dropped_in_time(bench, monkeypa
 
 def test_undamped_residual_modes_are_not_called_stable_alone():
     design = start(RIG)
-    found = shown(RIG, design)
+    found = results_of(RIG, design)
     assert found["stable"] and found["undamped"] == RIG.modes.n_modes - design.controlled

@@ -127,10 +127,10 @@ def test_results_of_a_study_and_any_rows_become_tables(tmp_path):
     [
         ("{", "cannot be read as JSON"),
         ("[" * 100_000, "cannot be read as JSON"),
-        ('{"a": NaN}', "NaN is no number of JSON"),
-        ('{"a": 1e400}', "1e400 is no number of JSON"),
+        ('{"a": NaN}', "NaN is not a JSON number"),
+        ('{"a": 1e400}', "1e400 is not a JSON number"),
         ("3", "holds a int"),
-        ("{}", "no rows of named figures"),
+        ("{}", "no rows of named numbers"),
         ('{"format": "page 9"}', "has the format 'page 9'"),
         ('{"format": "workbench page 1"}', "its title is missing"),
         ('{"sentence": 3}', "looks like a verdict, but is damaged"),
@@ -164,7 +164,7 @@ def test_a_study_that_has_not_run_says_so(tmp_path, monkeypatch):
     (tmp_path / "studies").mkdir()
     (tmp_path / "studies/some.py").write_text('"""Why?"""\ndef study(outcome, data=None): ...\n')
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(StudyError, match="study some has left no page here; run it: workbench study some"):
+    with pytest.raises(StudyError, match="study some has no page here yet; run it: workbench study some"):
         page_content_about("some")
     with pytest.raises(StudyError, match="no study is called 'other'"):
         page_content_about("other")

@@ -221,15 +221,15 @@ def test_a_table_says_what_it_cannot_do(tmp_path):
     with pytest.raises(StudyError, match=r"written as .csv, .parquet, .json; got .xls"):
         table().write(tmp_path / "t.xls")
     clash = study.run([{"at": 1}], lambda at: {"at": 2}, cache=None, **HERE)
-    with pytest.raises(StudyError, match="'at' is a parameter and a result of another value"):
+    with pytest.raises(StudyError, match="'at' is a parameter and a result with different values"):
         clash.rows()
     twice = study.run([{}], lambda: {"a.b": 1, "a": {"b": 2}}, cache=None, **HERE)
-    with pytest.raises(StudyError, match=r"in one column, 'a.b'"):
+    with pytest.raises(StudyError, match=r"the same column name 'a.b'"):
         twice.rows()
     for name in ("error", "seconds", "versions", "seed"):
         found = study.run([{}], lambda name=name: {name: 0.1}, cache=None, **HERE)
         assert (
-            found[0].error == f"TypeError: a result cannot be called {name!r}: the table has a column of it; rename it"
+            found[0].error == f"TypeError: a result cannot be called {name!r}, a column of the results table; rename it"
         )
     assert not list(Path(tmp_path).iterdir())
 
@@ -237,6 +237,6 @@ def test_a_table_says_what_it_cannot_do(tmp_path):
 def test_results_that_cannot_be_kept_are_not_lost(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("a file stands where the folder of the cache should be")
-    with pytest.warns(UserWarning, match="3 of 3 results could not be kept in"):
+    with pytest.warns(UserWarning, match="3 of 3 results could not be written to"):
         found = study.run([{"at": at} for at in range(3)], third, cache=blocked, workers=1)
     assert [result["third"] for result in found] == [0.0, 1 / 3, 2 / 3] and not found.failed

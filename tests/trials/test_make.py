@@ -173,7 +173,7 @@ def test_of_sixty_forty_hide_one_ten_a_pair_five_none_five_something_else():
 
 @pytest.mark.slow
 def test_labels_lie_outside_the_cases(tmp_path):
-    with pytest.raises(ValueError, match="seal them elsewhere"):
+    with pytest.raises(ValueError, match="give another folder"):
         write_trials(tmp_path / "cases", tmp_path / "cases" / "labels.json", 1, 1)
     write_trials(tmp_path / "cases", tmp_path / "labels.json", 2, 7, kinds=[(), ("sensor_gain",)])
     labels = json.loads((tmp_path / "labels.json").read_text(encoding="utf-8"))

@@ -39,7 +39,7 @@ MOST_SAMPLES = 5_000_000
 LEAST_SAMPLES = 16
 MOST_MODES = 200
 
-# What each table may hold; a key beside these is a misspelt one.
+# The keys of each table; any other key is refused as a misspelling.
 TABLES = ("title", "input_hold", "units", "structure", "input", "output", "record")
 UNITS = ("length", "mass", "time", "force")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
@@ -49,7 +49,7 @@ PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio"
 EDGES = ("left", "right", "bottom", "top")
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
-# What an input and an output may have beside, where there are moments, patches, or more than one direction.
+# Further keys of an input and of an output, for moments, patches and directions, by the kind of structure.
 MORE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "beam": (("quantity", "patch"), ()),
     "rod": ((), ()),
@@ -57,20 +57,20 @@ MORE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "points": (("quantity", "axis", "direction"), ("axis", "direction")),
     "modal": ((), ()),
 }
-ACTING = ("force", "moment")  # what an input may be, the first where nothing is said
+ACTING = ("force", "moment")  # quantities of an input; the first is the default
 RECORD = ("name", "file", "sample_time", "use", "input_hold")
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What a user has in hand when a simulation and a test disagree.
+    """A nominal model and the records of a test with which it disagrees.
 
     Attributes:
-        name: of the folder.
-        rig: nominal.
-        fit: records that may be fitted.
-        validation: records only for measuring how far the gap shrank.
-        units: names of its units.
+        name: of the case folder.
+        rig: the nominal rig.
+        fit: records for fitting.
+        validation: records for validation only, on which the reduction of the gap is measured.
+        units: the units of the case.
     """
 
     name: str
@@ -91,7 +91,7 @@ def read_case(folder: str | Path) -> Case:
     if not folder.is_dir():
         raise CaseError(f"{folder} is not a folder; a case is a folder with case.toml and records")
     if not path.is_file():
-        raise CaseError(f"{folder} holds no case.toml, so it is not a case folder")
+        raise CaseError(f"{folder} has no case.toml, so it is not a case folder")
     table = table_of(path)
     rig = _rig(table, path)
     hold, units = _hold(table, str(path)), _units(table)
@@ -112,7 +112,7 @@ def read_case(folder: str | Path) -> Case:
 
 
 def _units(table: dict[str, Any]) -> Units:
-    """All of them or none: a force in newtons is no force of millimetres, kilograms and seconds."""
+    """Units of a case, SI unless given; all four must be given, as they need not be consistent (N with mm, kg, s)."""
     if "units" not in table:
         return SI
     units = table["units"]
@@ -123,12 +123,12 @@ def _units(table: dict[str, Any]) -> Units:
 
 
 def in_units(channels: Sequence[Channel], units: Units) -> tuple[Channel, ...]:
-    """Channels of a rig, whose units have SI names, by those of a case."""
+    """Channels of a rig, whose units are SI, with the unit names of a case."""
     return tuple(replace(channel, unit=units.named(channel.unit)) for channel in channels)
 
 
 def read_units(path: str | Path) -> Units:
-    """The units of a TOML file as a case has, by which results are told; SI where it names none.
+    """The units that a TOML file of the case format names, in which results are reported; SI if it names none.
 
     Raises:
         CaseError: naming the file, the key, the value, and what would be right.
@@ -137,7 +137,7 @@ def read_units(path: str | Path) -> Units:
 
 
 def read_rig(path: str | Path) -> Rig:
-    """A rig from a TOML file with [structure], [[input]] and [[output]], as a case has; records are not looked at.
+    """A rig from a TOML file with [structure], [[input]] and [[output]] of the case format; records are not read.
 
     Raises:
         CaseError: naming the file, the key, the value, and what would be right.
@@ -154,7 +154,9 @@ def _rig(table: dict[str, Any], path: Path) -> Rig:
     names = [entry["name"] for entry in (*inputs, *outputs)]
     for name in names:
         if name == "t" or names.count(name) > 1:
-            raise CaseError(f"{path}: an input or output is called {name!r}, as is another or the time; rename it")
+            raise CaseError(
+                f"{path}: the name {name!r} of an input or output is taken by another or by time; rename it"
+            )
     structure = table.get("structure")
     if not isinstance(structure, dict):
         raise CaseError(f"{path}: the table [structure] is missing")
@@ -174,7 +176,7 @@ def _rig(table: dict[str, Any], path: Path) -> Rig:
 
 
 def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
-    kind = "rod" if table.get("kind") == "bar" else table.get("kind")  # two words for one thing
+    kind = "rod" if table.get("kind") == "bar" else table.get("kind")  # synonyms
     if not isinstance(kind, str) or kind not in STRUCTURES:
         raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {shown(kind)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
@@ -220,7 +222,7 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
 
 
 def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
-    """Plain modal data, or a single degree of freedom with mass, damping and stiffness."""
+    """The rig of modal data in the case file, or of a single degree of freedom with mass, damping and stiffness."""
     single = "mass" in table
     check_keys(table, SINGLE if single else MODAL, "[structure]")
     _check_ports(inputs, outputs, "shape", "modal")
@@ -247,7 +249,7 @@ def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
 def _rig_at_points(
     table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], path: Path
 ) -> Rig:
-    """Modal data at named points, which a table beside the case file lists."""
+    """The rig of modal data at named points; the points and mode shapes are in a CSV table of the case folder."""
     check_keys(table, MODAL, "[structure]")
     _check_ports(inputs, outputs, "point", "points")
     omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
@@ -265,14 +267,14 @@ def _rig_of(
     place: Callable[[dict[str, Any], str], Place],
     structure: Structure | Plate | None = None,
 ) -> Rig:
-    """The rig of these inputs and outputs; `place` takes where an entry stands out of it."""
+    """The rig with these inputs and outputs; `place` returns the place of an entry."""
     actuators = tuple(_actuator(e, place(e, f"[[input]] {e['name']!r}"), modes) for e in inputs)
     sensors = tuple(_sensor(e, place(e, f"[[output]] {e['name']!r}"), modes) for e in outputs)
     return Rig(modes, actuators, sensors, structure=structure)
 
 
 def _modal_damping(table: dict[str, Any], omega: np.ndarray) -> np.ndarray:
-    """Coefficients c_rs (n_modes, n_modes), 1/s: 2 ζ_r ω_r, and for rigid modes what the table gives, or none."""
+    """Coefficients c_rs (n_modes, n_modes), 1/s: 2 ζ_r ω_r, and for rigid modes `rigid_damping`, or zero."""
     rates = 2.0 * numbers(table, "damping_ratios", "[structure]", omega.size) * omega
     if "rigid_damping" in table:
         rigid = omega == 0
@@ -289,8 +291,8 @@ def _check_ports(inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], pl
             check_keys(entry, (*keys, place), f"[[{key}]] {entry['name']!r}")
 
 
-def _check_stands(port: Actuator | Sensor, modes: Modes, where: str) -> None:
-    """Refuse a place that the structure does not have, or a direction or an axis that it does not have there."""
+def _check_place(port: Actuator | Sensor, modes: Modes, where: str) -> None:
+    """Refuse a place outside the structure, or a direction or axis that the structure does not have at this place."""
     try:
         modes.phi_at(port.at, derivative_of(port), direction=port.direction)
     except PlaceError as error:
@@ -326,16 +328,16 @@ def _actuator(entry: dict[str, Any], at: Place, modes: Modes) -> Actuator:
             raise CaseError(f"{where}: quantity is {' or '.join(ACTING)}; got {shown(quantity)}")
         turning = quantity == "moment"
         if turning and kind == "hammer":
-            raise CaseError(f"{where}: a hammer gives a force; the kind of what gives a moment is actuator")
+            raise CaseError(f"{where}: a hammer gives a force; for a moment the kind is actuator")
         direction = _direction(entry, turning, where)
         actuator = Actuator(entry["name"], at, quantity, direct=kind == "hammer", direction=direction)
-    _check_stands(actuator, modes, where)
+    _check_place(actuator, modes, where)
     return actuator
 
 
 def _patch(entry: dict[str, Any], at: Place, where: str) -> Actuator:
     if entry["kind"] == "hammer":
-        raise CaseError(f"{where}: a patch is no hammer; its kind is actuator")
+        raise CaseError(f"{where}: the kind of a patch is actuator, not hammer")
     if entry.get("quantity", "moment") != "moment":
         raise CaseError(f"{where}: a patch acts by moments along its edges; leave quantity out")
     length: float | tuple[float, float]
@@ -363,7 +365,7 @@ def _sensor(entry: dict[str, Any], at: Place, modes: Modes) -> Sensor:
         raise CaseError(f"{where}: noise_std must be positive; leave it out where it is not known")
     direction = _direction(entry, MEASURED[quantity][0] == 1, where)
     sensor = Sensor(entry["name"], at, quantity, noise_std=noise, direction=direction)
-    _check_stands(sensor, modes, where)
+    _check_place(sensor, modes, where)
     return sensor
 
 
@@ -371,12 +373,12 @@ def _sensor(entry: dict[str, Any], at: Place, modes: Modes) -> Sensor:
 
 
 def _hold(table: dict[str, Any], where: str) -> str:
-    """How inputs run between samples."""
+    """The hold of the inputs between samples."""
     hold = table.get("input_hold", "zero")
     if hold not in HOLDS:
         raise CaseError(
-            f"{where}: input_hold is zero (held), first (straight between samples) or band-limited (as behind an"
-            f" anti-alias filter); got {shown(hold)}"
+            f"{where}: input_hold is zero (constant between samples), first (linear between samples) or band-limited"
+            f" (after an anti-alias filter); got {shown(hold)}"
         )
     return str(hold)
 
@@ -400,7 +402,7 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
     names = {a.name for a in rig.actuators} | {s.name for s in rig.sensors}
     missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
     if missing:
-        raise CaseError(f"{file}: channel {missing[0]!r} of case.toml is missing; it holds {shown(sorted(arrays))}")
+        raise CaseError(f"{file}: channel {missing[0]!r} of case.toml is missing; the file has {shown(sorted(arrays))}")
     if extra:
         raise CaseError(f"{file}: channel {shown(extra[0])} is not named in case.toml; name it there or leave it out")
     if "t" not in arrays:
@@ -441,7 +443,7 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
 
 
 def signals_of(record: Record) -> dict[str, np.ndarray]:
-    """The time and the channels of a record of any format, by name."""
+    """The time t and the channels of a record, by name."""
     channels = (*zip(record.input_names, record.inputs), *zip(record.output_names, record.outputs))
     return {"t": record.time, **dict(channels)}
 

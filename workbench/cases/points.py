@@ -1,4 +1,4 @@
-"""The table of named points of a case: where each is, how it moves, and the shape of every mode there."""
+"""The table of named points of a case: the position and direction of each, and all mode shapes there."""
 
 import csv
 from pathlib import Path
@@ -17,8 +17,8 @@ COLUMNS = ("name", "node", "x", "y", "z", "direction")
 def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
     """Named points, and mode shapes (n_points, n_modes) there, from a CSV table.
 
-    Its columns are name, node, x, y, z (m; empty in every row where positions are not known), direction (x, y, z, rx,
-    ry or rz; empty where not known) and mode_1 to mode_n, mass-normalised.
+    The columns are name, node, x, y, z (m; empty in all rows if positions are not known), direction (x, y, z, rx, ry
+    or rz; empty if not known) and mode_1 to mode_n, mass-normalised.
 
     Raises:
         CaseError: naming the file, the line and the column, and what would be right.
@@ -33,7 +33,7 @@ def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
             reader = csv.DictReader(file, restkey="")
             missing = [column for column in columns if column not in (reader.fieldnames or ())]
             if missing:
-                raise CaseError(f"{path}: column {missing[0]!r} is missing; it has {shown(reader.fieldnames)}")
+                raise CaseError(f"{path}: column {missing[0]!r} is missing; the file has {shown(reader.fieldnames)}")
             rows = list(zip(range(MOST_POINTS + 1), reader, strict=False))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CaseError(f"{path} cannot be read as CSV: {error}") from error
@@ -74,7 +74,7 @@ def _number(path: Path, line: int, row: dict[str, Any], column: str) -> float:
     if not np.isfinite(value):
         remedy = ""
         if column in "xyz" and not row[column]:
-            remedy = "; say where the point stands, m, or leave x, y and z of every point empty"
+            remedy = "; give the position of the point, m, or leave x, y and z of every point empty"
         raise CaseError(
             f"{path}, line {line + 2}, column {column!r}: expected a finite number; got {shown(row[column])}{remedy}"
         )

@@ -1,4 +1,4 @@
-"""Values out of the tables of a case file, each checked as it is taken."""
+"""Checked values of the tables of a case file."""
 
 import re
 import tomllib
@@ -22,22 +22,22 @@ shown = _REPR.repr
 
 
 class CaseError(ValueError):
-    """A case folder that is not one, or holds what a diagnosis cannot use."""
+    """An invalid case folder, or contents that a diagnosis cannot use."""
 
 
 def table_of(path: Path) -> dict[str, Any]:
-    """The table that a TOML file holds.
+    """The table of a TOML file.
 
     Raises:
-        CaseError: no TOML, or more than `MOST_BYTES`.
+        CaseError: the file is not TOML, or has more than `MOST_BYTES`.
     """
     try:
         size = path.stat().st_size
         if size > MOST_BYTES:
             raise CaseError(f"{path} has {size} bytes; a case file has at most {MOST_BYTES}")
         text = path.read_text(encoding="utf-8")
-        if _DEEP_KEY.search(text):  # the reader's cost grows with the square of a key's parts
-            raise CaseError(f"{path} cannot be read as TOML: a key of it has a hundred parts or more")
+        if _DEEP_KEY.search(text):  # the cost of tomllib grows with the square of the number of parts of a key
+            raise CaseError(f"{path} cannot be read as TOML: a key has a hundred parts or more")
         return tomllib.loads(text)
     except CaseError:
         raise
@@ -48,10 +48,10 @@ def table_of(path: Path) -> dict[str, Any]:
 
 
 def check_keys(entry: dict[str, Any], allowed: Iterable[str], where: str) -> None:
-    """Refuse a key that nothing would read: a misspelt one would change the case unnoticed.
+    """Refuse an unknown key: a misspelt one would otherwise change the case unnoticed.
 
     Raises:
-        CaseError: naming the key, and the one that was meant.
+        CaseError: with the key, and the nearest allowed one.
     """
     allowed = list(allowed)
     for key in entry:
@@ -62,10 +62,10 @@ def check_keys(entry: dict[str, Any], allowed: Iterable[str], where: str) -> Non
 
 
 def tables(table: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
-    """The entries [[key]], each with a name of its own.
+    """The entries [[key]], whose names are unique.
 
     Raises:
-        CaseError: none, too many, or two of one name.
+        CaseError: no entries, too many, or two with the same name.
     """
     entries = table.get(key)
     if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
@@ -80,10 +80,10 @@ def tables(table: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
 
 
 def text(entry: dict[str, Any], key: str, where: str) -> str:
-    """A text of printable characters.
+    """The text of printable characters under `key`.
 
     Raises:
-        CaseError: anything else.
+        CaseError: the value is anything else.
     """
     value = entry.get(key)
     if not isinstance(value, str) or not value or not value.isprintable() or len(value) > 255:
@@ -92,14 +92,14 @@ def text(entry: dict[str, Any], key: str, where: str) -> str:
 
 
 def inside(folder: Path, file: str, where: str) -> Path:
-    """A file named in a case, which must lie in its folder.
+    """The path of a file named in a case, which must lie in the case folder.
 
     Raises:
-        CaseError: a name that leads elsewhere.
+        CaseError: the path leads outside the folder.
     """
     try:
         path = (folder / file).resolve()
-    except (OSError, RuntimeError) as error:  # links that go in a circle
+    except (OSError, RuntimeError) as error:  # symbolic links that form a loop
         raise CaseError(f"{where}: file {file!r} cannot be found: {error}") from error
     if not path.is_relative_to(folder.resolve()):
         raise CaseError(f"{where}: file {file!r} lies outside the case folder")
@@ -107,10 +107,10 @@ def inside(folder: Path, file: str, where: str) -> Path:
 
 
 def number(entry: dict[str, Any], key: str, where: str, *, low: float = -np.inf) -> float:
-    """A finite number, at least `low`.
+    """The finite number under `key`, at least `low`.
 
     Raises:
-        CaseError: anything else.
+        CaseError: the value is anything else.
     """
     value = entry.get(key)
     try:
@@ -124,10 +124,10 @@ def number(entry: dict[str, Any], key: str, where: str, *, low: float = -np.inf)
 
 
 def numbers(entry: dict[str, Any], key: str, where: str, length: int | None = None) -> np.ndarray:
-    """A list of finite numbers, `length` of them where given.
+    """The list of finite numbers under `key`, of this length if given.
 
     Raises:
-        CaseError: anything else.
+        CaseError: the value is anything else.
     """
     given = entry.get(key)
     plain = isinstance(given, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in given)
@@ -142,10 +142,10 @@ def numbers(entry: dict[str, Any], key: str, where: str, length: int | None = No
 
 
 def profile(entry: dict[str, Any], key: str) -> float | tuple[np.ndarray, np.ndarray]:
-    """A number, or points (x, value) with straight lines between.
+    """The profile under `key`: a number, or points (x, value) with linear interpolation between them.
 
     Raises:
-        CaseError: anything else.
+        CaseError: the value is anything else.
     """
     value = entry.get(key)
     if isinstance(value, dict):
@@ -155,10 +155,10 @@ def profile(entry: dict[str, Any], key: str) -> float | tuple[np.ndarray, np.nda
 
 
 def count(entry: dict[str, Any], key: str, most: int) -> int:
-    """A whole number from 1 to `most`.
+    """The whole number from 1 to `most` under `key`.
 
     Raises:
-        CaseError: anything else.
+        CaseError: the value is anything else.
     """
     value = entry.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:

@@ -30,12 +30,12 @@ Port = Actuator | Sensor
 def write_case(case: Case, folder: str | Path) -> Path:
     """Write a case as a folder, case.toml and records/NAME.npz, that `read_case` reads back.
 
-    A rig at named points is written with the table points.csv beside.
+    The named points of a rig are written to points.csv in the folder.
 
     Raises:
-        ValueError: what the format cannot say: profiles that are not linear between their breaks, a plate that varies,
-            attachments, ends or edges without a name, damping that differs from mode to mode of a structure or couples
-            modes, an input that is no ideal point force, moment or piezo patch, elements.
+        ValueError: the format has no key for: profiles that are not linear between their breaks, a plate with varying
+            properties, attachments, ends or edges without a name, damping that differs between the modes of a
+            structure or couples them, inputs other than ideal point forces, moments and piezo patches, elements.
     """
     folder = Path(folder)
     (folder / "records").mkdir(parents=True, exist_ok=True)
@@ -54,7 +54,7 @@ def write_case(case: Case, folder: str | Path) -> Path:
 
 
 def _rig(rig: Rig, folder: Path) -> list[str]:
-    """The tables [structure], [[input]] and [[output]]; a table of named points goes into the folder."""
+    """The tables [structure], [[input]] and [[output]]; named points are written to a table in the folder."""
     _check_ports(rig)
     structure, points = rig.structure, rig.modes.domain
     if isinstance(structure, Structure):
@@ -63,8 +63,8 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
         return [_plate(structure, rig.modes.n_modes), *_ports(rig, at=_over)]
     if not isinstance(points, NamedPoints):
         raise ValueError(
-            "a case folder describes a beam, a rod, a plate, or modes at named points; this is a membrane, or a rig"
-            " without its structure"
+            "a case folder describes a beam, a rod, a plate, or modes at named points; this rig is a membrane, or has"
+            " no structure"
         )
     write_points(folder / POINTS, points, rig.modes.phi(points.names))
     return [_modal(rig.modes, POINTS), *_ports(rig, at=lambda port: {"point": port.at})]
@@ -72,7 +72,7 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
 
 def _member(member: Structure, n_modes: int) -> str:
     if any(member.frequency_errors):
-        raise ValueError("the case format solves natural frequencies; it knows no frequency_errors of a structure")
+        raise ValueError("the case format has no frequency_errors of a structure: its frequencies are computed")
     beam = isinstance(member, Beam)
     stiffness = "bending_stiffness" if beam else "axial_stiffness"
     profiles = {"mass_per_length": member.mass_per_length, stiffness: getattr(member, stiffness)}
@@ -93,9 +93,9 @@ def _plate(plate: Plate, n_modes: int) -> str:
     constants = {"mass_per_area": plate.mass_per_area, "bending_stiffness": plate.bending_stiffness}
     for name, quantity in constants.items():
         if not quantity.is_constant:
-            raise ValueError(f"{name} varies over the plate; the case format holds one number")
+            raise ValueError(f"{name} varies over the plate; the case format has one number for the whole plate")
     if any(plate.tension):
-        raise ValueError(f"the case format knows no tension of a plate; got {plate.tension} N/m")
+        raise ValueError(f"the case format has no tension of a plate; got {plate.tension} N/m")
     return _table(
         "[structure]",
         kind="plate",
@@ -110,7 +110,7 @@ def _plate(plate: Plate, n_modes: int) -> str:
 
 def _modal(modes: Modes, points: str) -> str:
     if not modes.proportional:
-        raise ValueError("the case format knows no damping that couples modes; keep the diagonal of Modes.damping")
+        raise ValueError("the case format has no damping that couples modes; keep the diagonal of Modes.damping")
     rigid = modes.omega == 0
     rates = np.diag(modes.damping)[rigid].tolist()
     return _table(
@@ -126,10 +126,10 @@ def _modal(modes: Modes, points: str) -> str:
 def _damping_ratio(structure: Structure | Plate) -> float:
     if structure.attachments:
         part = structure.attachments[0]
-        raise ValueError(f"the case format knows no attachments; take {part} out of the nominal model")
+        raise ValueError(f"the case format has no attachments; take {part} out of the nominal model")
     ratio = np.unique(np.asarray(getattr(structure.damping, "zeta", np.nan)))
     if not isinstance(structure.damping, ModalDamping) or ratio.size != 1:
-        raise ValueError("the case format knows one damping ratio for all modes; use ModalDamping(ratio)")
+        raise ValueError("the case format has one damping ratio for all modes; use ModalDamping(ratio)")
     return float(ratio[0])
 
 
@@ -138,7 +138,7 @@ def _profile(profile: Profile, length: float, name: str) -> float | dict[str, li
     value = profile(x)
     fine = np.linspace(0.0, length, 1001)
     if np.abs(profile(fine) - np.interp(fine, x, value)).max() > 1e-9 * np.abs(value).max():
-        raise ValueError(f"{name} is not linear between its breaks; the case format holds points with straight lines")
+        raise ValueError(f"{name} is not linear between its breaks; the case format interpolates linearly")
     return float(value[0]) if np.ptp(value) == 0 else {"x": x.tolist(), "value": value.tolist()}
 
 
@@ -154,14 +154,14 @@ def _named(support: Support, names: tuple[str, ...], known: Mapping[str, Support
 
 
 def _check_ports(rig: Rig) -> None:
-    """Refuse what a case file would be silent about.
+    """Refuse properties of actuators, sensors and elements that a case file cannot describe.
 
     Raises:
-        ValueError: naming the part, and what the format has for it.
+        ValueError: with the name of the part, and what the format describes.
     """
     if rig.elements:
         raise ValueError(
-            f"the case format knows no elements of the nominal rig; take {type(rig.elements[0]).__name__} out"
+            f"the case format has no elements of the nominal rig; take {type(rig.elements[0]).__name__} out"
         )
     moments = isinstance(rig.structure, Beam | Plate) or isinstance(rig.modes.domain, NamedPoints)
     ports: tuple[Port, ...] = (*rig.actuators, *rig.sensors)
@@ -174,8 +174,8 @@ def _check_ports(rig: Rig) -> None:
         other += ["a moment"] * (isinstance(port, Actuator) and port.kind == "moment" and not moments)
         if other or (isinstance(port.at, Between) and not patch):
             raise ValueError(
-                f"{port.name!r} has {other[0] if other else 'two places'} beside what the case format holds: a point"
-                " force, a moment, a piezo patch or a reading at one place, with nothing lost on the way"
+                f"{port.name!r} has {other[0] if other else 'two places'}; the case format describes only ideal point"
+                " forces, moments, piezo patches and sensors at one place"
             )
 
 
@@ -185,25 +185,32 @@ def _is_patch(actuator: Actuator, rig: Rig) -> bool:
 
 
 def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
-    """Inputs and outputs; `at` gives the keys of a place and their values."""
+    """Tables of the inputs and outputs; `at` returns the keys and values of a place."""
     inputs = [
-        _table("[[input]]", name=a.name, kind="hammer" if a.direct else "actuator", **_acting(a), **at(a), **_way(a))
+        _table(
+            "[[input]]",
+            name=a.name,
+            kind="hammer" if a.direct else "actuator",
+            **_quantity(a),
+            **at(a),
+            **_direction(a),
+        )
         for a in rig.actuators
     ]
     outputs = [
-        _table("[[output]]", name=s.name, quantity=s.quantity, **at(s), **_way(s), noise_std=s.noise_std)
+        _table("[[output]]", name=s.name, quantity=s.quantity, **at(s), **_direction(s), noise_std=s.noise_std)
         for s in rig.sensors
     ]
     return [*inputs, *outputs]
 
 
-def _acting(actuator: Actuator) -> dict[str, str]:
+def _quantity(actuator: Actuator) -> dict[str, str]:
     at_point = not isinstance(actuator.at, Patch | Between)
     return {"quantity": "moment"} if actuator.kind == "moment" and at_point else {}
 
 
-def _way(port: Port) -> dict[str, str]:
-    """The direction of a force or a motion, or the axis of a moment or a rotation, where it has one."""
+def _direction(port: Port) -> dict[str, str]:
+    """The key of the direction of a force or motion, or of the axis of a moment or rotation; none if it has none."""
     turning = port.kind == "moment" if isinstance(port, Actuator) else MEASURED[port.quantity][0] == 1
     if port.direction is None or (not turning and not isinstance(port.at, str)):  # a plate moves along its normal
         return {}
@@ -211,14 +218,14 @@ def _way(port: Port) -> dict[str, str]:
 
 
 def _along(port: Port) -> dict[str, Any]:
-    """Its place along a member, and the length of a patch."""
+    """Keys of a place along a member, and of the length of a patch."""
     if isinstance(port.at, Between):
         return {"at": middle(port.at), "patch": position(port.at.first) - position(port.at.second)}
     return {"at": port.at}
 
 
 def _over(port: Port) -> dict[str, Any]:
-    """Its place on a plate, and the sides of a patch."""
+    """Keys of a place on a plate, and of the sides of a patch."""
     if isinstance(port.at, Patch):
         return {"at": list(port.at[:2]), "patch": [port.at.width, port.at.height]}
     return {"at": list(port.at)}  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The `workbench` command: its options, and the commands it has."""
+"""The `workbench` command: its options and subcommands."""
 
 from typing import Annotated
 
@@ -20,7 +20,7 @@ from workbench.cli.study import study
 from workbench.cli.terminal import errors
 from workbench.cli.trial import trial
 
-# Former names of options, which work for one version more.
+# Former names of options, accepted for one more version.
 RENAMED = {
     "mend": "correct",
     "as-wired": "uncorrected",
@@ -32,7 +32,7 @@ RENAMED = {
 
 
 def current_option(name: str) -> str:
-    """The name of an option now; a former one is said on standard error."""
+    """The present name of an option, with a notice on standard error if a former one is given."""
     if name not in RENAMED:
         return name
     errors.print(f"  --{name} is now --{RENAMED[name]}; the old name goes with the next version")

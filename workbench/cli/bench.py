@@ -1,4 +1,4 @@
-"""`workbench bench`: a page to try designs on."""
+"""`workbench bench`: an interactive page for designs."""
 
 from pathlib import Path
 from typing import Annotated

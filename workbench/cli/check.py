@@ -1,4 +1,4 @@
-"""`workbench check`: whether a new test of a case came out as its model predicts."""
+"""`workbench check`: whether a new test of a case agrees with the prediction of its model."""
 
 from pathlib import Path
 from typing import Annotated
@@ -37,13 +37,13 @@ def check(
 
     check_target(json_path, log)
     log = case / LOG if log is None else log
-    read_log(log)  # a file that is no log is refused before the work
+    read_log(log)  # an invalid log is refused before the computation
     found = read_case(case)
     measured = record_of(found, record, sample_rate_hz)
     check_length(measured)
     fitted = [one.name for one in found.fit if np.array_equal(one.outputs, measured.outputs)]
     if fitted:
-        raise ValueError(f"record {fitted[0]!r} was fitted, so it is no test of the model; check one that was not")
+        raise ValueError(f"record {fitted[0]!r} was fitted, so it is no test of the model; give another record")
     with reporting("reading") as report:
         prediction = predicted(found, measured, verdict, draws=draws, seed=seed, workers=workers, report=report)
     result = check_prediction(prediction, measured)
@@ -51,7 +51,7 @@ def check(
     for note in prediction.notes:
         say(note)
     log_test(log, result)
-    tests = {test["record"]: test for test in read_log(log)}  # of a record that was checked again, the last
+    tests = {test["record"]: test for test in read_log(log)}  # the last check of each record
     held = sum(test["holds"] == "yes" for test in tests.values())
     say(f"  log        {short(log)}: the model held on {held} of {len(tests)} tests")
     write_json(

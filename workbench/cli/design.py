@@ -1,4 +1,4 @@
-"""`workbench design`: control laws side by side."""
+"""`workbench design`: a comparison of control laws."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +12,7 @@ from workbench.structure.printed import command_headings
 if TYPE_CHECKING:
     from workbench.design.spillover.explain import Explanation
 
-PERIODS = 20  # of the first mode, over which the work is counted unless a time is given
+PERIODS = 20  # default final time of the work, in periods of the first mode
 
 
 @guarded
@@ -57,7 +57,7 @@ def design(
     laws, refused = laws_of(modes, n, actuators, weight=weight, damping=damping)
     elastic = modes.omega[modes.omega > 0]
     if final_time is None and not elastic.size:
-        raise ValueError("rigid modes alone set no time until which work is counted; give --final-time")
+        raise ValueError("without elastic modes the final time of the work has no default; give --final-time")
     end = PERIODS * 2.0 * np.pi / elastic[0] if final_time is None else final_time
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     shown = []
@@ -69,11 +69,11 @@ def design(
     say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {struck}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
-    told = map(units.named, (*command_headings(unit), "W_C [J]", "W_R [J]"))
-    show_table(("law", "cost", *told, "largest W_r", "loop"), shown)
+    headings = map(units.named, (*command_headings(unit), "W_C [J]", "W_R [J]"))
+    show_table(("law", "cost", *headings, "largest W_r", "loop"), shown)
     if {row.law.name for row in rows} >= {"IMSC", "coupled LQR"}:
-        say("  R weighs FᵀF in the cost and coupled LQR, but modal forces fᵀf in IMSC: their order depends on masses")
-        say("  and units; --damping compares the laws at equal poles")
+        say("  R weights FᵀF in the cost and coupled LQR, but fᵀf of modal forces in IMSC: the ranking depends on")
+        say("  masses and units; --damping compares the laws at equal poles")
     tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
@@ -129,7 +129,7 @@ def design(
 
 
 def _limit(explained: "Explanation") -> tuple[str, str]:
-    """The residual mode that limits the stability margin, and the path by which it does."""
+    """The residual mode that limits the stability margin, and the path through which it does, as text."""
     worst = explained.limiting if explained.loop.stable else explained.destabilising
     if worst is None and explained.loop.stable:
         return "none", ""

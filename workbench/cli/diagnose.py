@@ -70,9 +70,7 @@ def diagnose(
     if (case is None) == (nominal is None):
         raise ValueError("give a case folder, or --nominal and --records; not both")
     if case is not None and input_hold is not None:
-        raise ValueError(
-            "case.toml says how inputs run between samples: set its input_hold, and leave --input-hold out"
-        )
+        raise ValueError("--input-hold is for --nominal; for a case set input_hold in case.toml")
     if nominal is not None:
         if not records:
             raise ValueError("--nominal needs at least one record to diagnose: give --records")
@@ -93,9 +91,7 @@ def diagnose(
     for fault in faults:
         say(f"  {'corrected' if correct and fault.certain else 'set-up'}     {fault.sentence}")
     if any(fault.certain for fault in faults) and not (correct or uncorrected):
-        raise ValueError(
-            "diagnose again with --correct to correct this and go on, or with --uncorrected to go on as it is"
-        )
+        raise ValueError("diagnose again with --correct to correct these faults, or with --uncorrected to ignore them")
     if correct:
         rig, fit = without_faults(faults, found.rig, found.fit)
         found = replace(found, rig=rig, fit=fit, validation=without_faults(faults, found.rig, found.validation)[1])
@@ -107,7 +103,7 @@ def diagnose(
     say(verdict.sentence, bold=True)
     shown = verdict.to_json()
     where = verdict.where
-    if verdict.shows_gap:  # where there is no gap, noise is everywhere
+    if verdict.shows_gap:  # without a gap the residual is noise, and has no place
         amplitude = {True: "; depends on amplitude", False: "; does not depend on amplitude", None: ""}
         say(f"  path       {where.path}{amplitude[where.amplitude_dependent]}")
         say(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")

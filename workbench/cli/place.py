@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from workbench.records.units import Units
     from workbench.rig.rig import Rig
 
-LEAST_SPACING = 1 / 20  # of the size of the structure, unless one is given
+LEAST_SPACING = 1 / 20  # default least spacing, over the size of the structure
 WRITTEN = ("positions", "residual_work", "by_mode", "effort", "peak_force", "condition", "status")
 
 
@@ -37,7 +37,7 @@ def place(
         float | None,
         typer.Option(
             help="Least distance between middles of actuators, m; unless given 1/20 of the size, and of patches on a"
-            " beam their length. On a plate patches may overlap, which is told; their diagonal keeps them apart."
+            " beam their length. On a plate patches may overlap, which is headings; their diagonal keeps them apart."
         ),
     ] = None,
     peak_force: Annotated[
@@ -85,26 +85,26 @@ def place(
     found, units = read_structure_rig(rig), read_units(toml_of(rig))
     modes, struck = found.modes, impulse_place(found, impulse_at)
     if not modes.proportional:
-        say("damping couples the modes: places are compared without its coupling terms")
+        say("damping couples the modes: placements are compared without its coupling terms")
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
     domain = modes.domain
     candidates = _candidates(domain, at, grid)
     if certified_gap is not None and isinstance(domain, Rectangle) and candidates is None:
-        raise ValueError("--certify on a plate is among candidate places; give --grid M, so far apart, or --at PLACES")
+        raise ValueError("--certify on a plate needs candidate places; give their spacing by --grid M, or --at PLACES")
     with reporting("placing actuators") as report:
         task = placement_task(modes, control, impulse_at=struck, weight=weight, actuator=patch_of(found))
         if isinstance(domain, Interval):
-            usual = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
+            standard = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
         else:
-            usual = task.placed(_own(found, control), "of the rig")
-            if not math.isfinite(usual.effort):
+            standard = task.placed(_own(found, control), "of the rig")
+            if not math.isfinite(standard.effort):
                 raise ValueError(
-                    "the rig's own actuators cannot control these modes (B is singular), so their effort is no measure"
-                    " for --effort: move one off the nodal lines"
+                    "the rig's own actuators cannot control these modes (B is singular), so --effort has no reference:"
+                    " move one off the nodal lines"
                 )
         least = 0.0 if isinstance(domain, NamedPoints) else max(LEAST_SPACING * domain.size, extent(task.actuator))
         limits = Limits(
-            effort=effort * usual.effort,
+            effort=effort * standard.effort,
             spacing=least if spacing is None else spacing,
             peak_force=peak_force,
             condition=condition,
@@ -116,8 +116,8 @@ def place(
         except DesignError as error:
             if "effort" not in str(error):
                 raise
-            counted = f"--effort counts in multiples of {usual.effort:.4g}, that of actuators {usual.status}"
-            raise DesignError(f"{error}; {counted}") from error
+            reference = f"--effort is a multiple of {standard.effort:.4g}, that of actuators {standard.status}"
+            raise DesignError(f"{error}; {reference}") from error
         certificate = None
         if certified_gap is not None:
             wanted = 1.0 - certified_gap
@@ -127,7 +127,7 @@ def place(
                 report(f"proving: at least {share:.1%} of W_R, {cells:,} cells", 0.5 + 0.5 * min(share / wanted, 1.0))
 
             certificate = certify(task, limits, placement=best, gap=certified_gap, progress=proving)
-    rows = [best, usual]
+    rows = [best, standard]
     if isinstance(domain, Interval):
         nodes, (first, last) = nodes_of_mode(modes, control), task.reach
         if nodes.size == control and first <= nodes.min() and nodes.max() <= last:  # a patch may reach beyond the end
@@ -143,15 +143,15 @@ def place(
     )
     where = "points" if isinstance(domain, NamedPoints) else "places [m]"
     unit = command_unit([task.actuator])
-    told = map(units.named, (where, "W_R [J]", *command_headings(unit)))
-    show_table((*told, "condition number of B", ""), shown)
+    headings = map(units.named, (where, "W_R [J]", *command_headings(unit)))
+    show_table((*headings, "condition number of B", ""), shown)
     if best.overlapping:
         size = float(np.linalg.norm(2.0 * reach(domain, task.actuator.at)[0]))  # type: ignore[arg-type]
         say(f"  patches overlap; {SPREAD}: --spacing {size:.3g}")
     if certificate is not None:
         say(f"  {certificate}")
     if picture is not None:
-        _draw(picture, task, {"least work": best, usual.status: usual}, limits, struck, units)
+        _draw(picture, task, {"least work": best, standard.status: standard}, limits, struck, units)
     write_json(
         json_path,
         {
@@ -167,33 +167,33 @@ def place(
 
 
 def _own(rig: "Rig", control: int) -> list[Place]:
-    """Where the rig's own actuators stand; as many as there are controlled modes."""
+    """The places of the rig's own actuators; their number must be that of the controlled modes."""
     own = [middle(a.at) for a in rig.actuators if not a.direct]
     if len(own) != control:
         raise ValueError(
-            f"--effort counts from the rig's own actuators here, and there are {len(own)} for {control} modes:"
+            f"--effort is relative to the rig's own actuators here, and there are {len(own)} for {control} modes:"
             f" describe {control} [[input]] of kind actuator"
         )
     return own
 
 
 def _places(domain: Domain, text: str) -> tuple[Place, ...]:
-    """Candidate places as they are typed: between semicolons on a plate, else between commas."""
+    """Candidate places from text: separated by semicolons on a plate, else by commas."""
     parts = text.split(";" if isinstance(domain, Rectangle) else ",")
     if isinstance(domain, Interval) and not all(_is_number(part) for part in parts):
-        raise ValueError(f"--at takes places between commas, such as 0.1,0.25,0.4; got {text!r}")
+        raise ValueError(f"--at takes places separated by commas, such as 0.1,0.25,0.4; got {text!r}")
     return tuple(dict.fromkeys(place_in(domain, part, "--at") for part in parts))
 
 
 def _candidates(domain: Domain, at: str | None, grid: float | None) -> tuple[Place, ...] | None:
-    """The places of --at or --grid; None where neither is given."""
+    """The places of --at or --grid; None if neither is given."""
     if grid is None:
         return None if at is None else _places(domain, at)
     if at is not None or not isinstance(domain, Rectangle):
-        raise ValueError("--grid is for a plate, in place of --at; leave one of them out")
+        raise ValueError("--grid is for a plate, instead of --at; leave one of them out")
     widest = 0.5 * min(domain.length)
     if not 0.0 < grid <= widest:
-        raise ValueError(f"--grid lies between 0 and half the shorter side, {widest:g} m; got {grid:g}")
+        raise ValueError(f"--grid must be between 0 and half the shorter side, {widest:g} m; got {grid:g}")
     return domain.grid(round(max(domain.length) / grid))
 
 
@@ -221,7 +221,7 @@ def _draw(
     struck: Place,
     units: "Units",
 ) -> None:
-    """The placements as a picture: along a member, over a plate's nodal lines, at points the best's work by mode."""
+    """Draw the placements along a member or over the nodal lines of a plate; at points, the best one's work by mode."""
     from workbench.draw.design import plot_member_placement
     from workbench.draw.plot import plot
     from workbench.draw.surface import plot_surface_placement

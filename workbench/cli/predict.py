@@ -1,4 +1,4 @@
-"""`workbench predict`: what the next test of a case will show, with bands."""
+"""`workbench predict`: the readings of the next test of a case, with prediction bands."""
 
 from pathlib import Path
 

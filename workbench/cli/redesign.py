@@ -1,4 +1,4 @@
-"""`workbench redesign`: the controller that holds on the real structure."""
+"""`workbench redesign`: the controller for the real structure."""
 
 from pathlib import Path
 from typing import Annotated

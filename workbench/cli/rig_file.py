@@ -1,4 +1,4 @@
-"""The rig that `design`, `place` and `redesign` read, and what their options say about it."""
+"""The rig that `design`, `place` and `redesign` read, and the places in their options."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,15 +8,15 @@ from workbench.structure.domain import Between, Domain, Interval, NamedPoints, P
 
 
 def toml_of(path: Path) -> Path:
-    """The TOML file of a rig: itself, or that of a case folder."""
+    """The TOML file of a rig: the path itself, or case.toml of a case folder."""
     return path / "case.toml" if path.is_dir() else path
 
 
 def read_structure_rig(path: Path) -> Rig:
-    """The rig of a TOML file or a case folder; an actuator at a node stands at its point in the actuator's direction.
+    """The rig of a TOML file or a case folder; an actuator at a node is moved to the point of its direction.
 
     Raises:
-        ValueError: plain modal data without a file of points, where nothing is known but the shapes at the rig itself.
+        ValueError: modal data without a table of points, whose shapes are known only at the inputs and outputs.
     """
     from workbench.cases.case import read_rig
 
@@ -39,10 +39,10 @@ def read_structure_rig(path: Path) -> Rig:
 
 
 def typed_place(domain: Domain, text: str, option: str) -> Place:
-    """A place as it is typed: m along a beam, X,Y on a plate, or the name of a point.
+    """The place of a text: a position in m along a beam, X,Y on a plate, or the name of a point.
 
     Raises:
-        ValueError: what is not written so, with the option that it was typed for.
+        ValueError: another form; the message names the option.
     """
     if isinstance(domain, NamedPoints):
         return text.strip()
@@ -57,10 +57,10 @@ def typed_place(domain: Domain, text: str, option: str) -> Place:
 
 
 def place_in(domain: Domain, text: str, option: str) -> Place:
-    """The same, where the structure has it.
+    """The place of a text, which must be on the structure.
 
     Raises:
-        ValueError: what is no place of the structure.
+        ValueError: another form, or a place outside the structure.
     """
     at = typed_place(domain, text, option)
     try:
@@ -71,7 +71,7 @@ def place_in(domain: Domain, text: str, option: str) -> Place:
 
 
 def impulse_place(rig: Rig, at: str | None) -> Place:
-    """Where the impulse acts: as given, by place or by input, or at the rig's hammer."""
+    """The place of the impulse: as given, by place or by input, or that of the rig's hammer."""
     inputs = {a.name: a.at for a in rig.actuators if not isinstance(a.at, Between | Patch)}
     if at is not None and at.strip() in inputs:
         return inputs[at.strip()]

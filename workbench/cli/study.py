@@ -46,7 +46,7 @@ def study(
         chosen = [entry for entry in list_studies(here_first=True) if entry.defined and not entry.needs_data]
     else:
         chosen = [find_study(name)]
-    # of several, one that fails does not stop the others
+    # a failed study does not stop the others
     run = _run if len(chosen) == 1 else _run_one_of_several
     if not all([run(entry, data, scheduler) for entry in chosen]):
         raise typer.Exit(FAILURE)
@@ -61,7 +61,7 @@ def _run_one_of_several(found: "StudyFile", data: Path | None, scheduler: str | 
 
 
 def _run(found: "StudyFile", data: Path | None, scheduler: str | None) -> bool:
-    """Whether every case ran and every check holds."""
+    """Run a study; returns whether every case ran and every check holds."""
     from workbench.study.catalogue import output_root, run_study
     from workbench.study.runs.outcome import Outcome
 
@@ -80,7 +80,7 @@ def _run(found: "StudyFile", data: Path | None, scheduler: str | None) -> bool:
             name=found.name,
             title=found.question,
             figures_folder=root / "figures",
-            # on a terminal a line goes to stderr, where the progress bar makes room for it
+            # on a terminal a line goes to stderr, which the progress bar shares
             on_say=lambda text: (errors if console.is_terminal else console).print(f"  {text}"),
             on_track=track,
             on_report=lambda text, share: progress.update(cases, description=text, completed=share, visible=True),

@@ -1,4 +1,4 @@
-"""What every command shares: the terminal it writes to, its progress, its exit codes."""
+"""Output, progress bar and exit codes of the commands."""
 
 import json
 import re
@@ -18,10 +18,10 @@ from rich.table import Table
 
 FAILURE, BAD_INPUT = 1, 2
 OPTIONS = {"sample_rate_hz": "--sample-rate-hz", "n_modes": "--modes", "band_hz": "--band-hz"}  # by argument
-WIDE = 150  # columns of a table that goes to a file or a pipe
+WIDE = 150  # width of a table written to a file or a pipe
 
 
-# no text is markup: rich would take the unit in "acceleration [m/s^2]" for a style and drop it
+# without markup: rich would take the unit in "acceleration [m/s^2]" for a style and drop it
 console = Console(soft_wrap=True, highlight=False, markup=False)
 if not console.is_terminal:
     console.width = WIDE
@@ -29,7 +29,7 @@ errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
 
 
 def guarded(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with its exit codes: 2 for bad input, 1 for anything unforeseen, each with one line on stderr."""
+    """The command with exit codes: 2 for bad input, 1 for any other error, each with one line on stderr."""
 
     @wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -53,41 +53,41 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def with_notes(error: BaseException) -> str:
-    """What an error says, and in brackets what was noted of it, such as a line of the user's own script."""
+    """The message of an error, and in brackets its notes, such as a line of the user's own script."""
     notes = getattr(error, "__notes__", ())
     return f"{error} ({'; '.join(notes)})" if notes else str(error)
 
 
 def complain(fault: str) -> None:
-    """Print an error in one line, with options where the library names arguments."""
+    """Print an error in one line, with the names of arguments replaced by those of options."""
     for argument, option in OPTIONS.items():
         fault = re.sub(rf"\b{argument}\b", option, fault)
     errors.print(f"workbench: {_one_line(fault)}", style="red")
 
 
 def by_options(text: str) -> str:
-    """The text with options where the library names arguments, such as `seconds`."""
+    """The text with arguments in backquotes, such as `seconds`, replaced by options."""
     return re.sub(r"`(\w+)`", lambda named: "--" + named[1].replace("_", "-"), text)
 
 
 def say(text: str, *, bold: bool = False) -> None:
-    """Print a line as it stands."""
+    """Print a line without markup."""
     console.print(text, style="bold" if bold else None)
 
 
 def _one_line(text: str) -> str:
-    """The text in one line, without the control characters by which a file name could steer the terminal."""
+    """The text in one line, with control characters escaped, as those of a file name could control the terminal."""
     return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in " ".join(text.split()))
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    """Print a warning in one line; those of arithmetic are for developers, whose tests see them."""
+    """Print a warning in one line, except arithmetic warnings, which are for developers."""
     if not issubclass(category, RuntimeWarning):
         errors.print(f"workbench: {_one_line(str(message))}", style="yellow")
 
 
 def progress_bar() -> Progress:
-    """A progress bar on stderr, shown only where that is a terminal."""
+    """A progress bar on stderr, shown only on a terminal."""
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),
@@ -102,7 +102,7 @@ def progress_bar() -> Progress:
 
 @contextmanager
 def reporting(first: str) -> Iterator[Callable[[str, float], None]]:
-    """A `report(what, share)` that moves a progress bar, never backwards."""
+    """A context with a function `report(what, share)` that advances a progress bar, never backwards."""
     furthest = 0.0
     with progress_bar() as progress:
         task = progress.add_task(first, total=1.0)
@@ -124,7 +124,7 @@ def tell(result: object) -> None:
 
 
 def show_table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, right: Collection[str] = ()) -> None:
-    """Print a table; where the columns under some headings are flush right, no cell is broken into lines."""
+    """Print a table; with right-aligned columns, no cell is wrapped."""
     table = Table(box=None, pad_edge=False)
     for heading in headings:
         table.add_column(heading, justify="right" if heading in right else "left", no_wrap=bool(right))
@@ -134,10 +134,10 @@ def show_table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, right:
 
 
 def check_target(*paths: Path | None) -> None:
-    """Refuse a place where nothing can be written, before the work that is to be written there.
+    """Refuse paths that cannot be written, before the computation.
 
     Raises:
-        ValueError: a folder, or a file in a folder that is not there.
+        ValueError: a folder, or a file in a folder that does not exist.
     """
     for path in filter(None, paths):
         if path.is_dir():
@@ -147,7 +147,7 @@ def check_target(*paths: Path | None) -> None:
 
 
 def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
-    """Write results as JSON where a path is given, and say so."""
+    """Write results as JSON, if a path is given, and print the path."""
     from workbench.study.runs.outcome import plain
     from workbench.study.runs.whole_file import write_whole
 
@@ -157,7 +157,7 @@ def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
 
 
 def short(path: Path) -> str:
-    """The path as seen from the current folder, where it is below that."""
+    """The path relative to the current folder if inside it."""
     try:
         return str(path.resolve().relative_to(Path.cwd()))
     except ValueError:
@@ -165,10 +165,10 @@ def short(path: Path) -> str:
 
 
 def as_typed() -> str:
-    """The command that runs, with its options, for the foot of a page."""
+    """The present command line, for the foot of a page."""
     return shlex.join(["workbench", *sys.argv[1:]])
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """Names between commas."""
+    """The names of a text, separated by commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())

@@ -1,4 +1,4 @@
-"""What `predict`, `check` and `redesign` start from: the corrected rig with its uncertainty."""
+"""The corrected rig with its uncertainty, for `predict`, `check` and `redesign`."""
 
 import json
 from collections.abc import Callable
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 def uncertain_rig(
     case: "Case", verdict: Path | None, *, workers: int | None, report: Callable[[str, float], None]
 ) -> "tuple[UncertainRig, tuple[float, ...] | None]":
-    """The uncertain rig of a case, and the noise (n_outputs,) that its diagnosis found; from a verdict where given.
+    """The uncertain rig of a case, and the noise (n_outputs,) estimated by its diagnosis, which is run unless given.
 
-    A verdict that is made here is kept as out/NAME-verdict.json.
+    A new verdict is written to out/NAME-verdict.json.
 
     Raises:
-        ValueError: no verdict of this case, or channels that are certainly exchanged or turned.
+        ValueError: the verdict is of another case, or the set-up has certain faults, such as swapped channels.
     """
     from workbench.gap.diagnose import SECONDS, diagnose_case
     from workbench.gap.setup.faults import setup_faults
@@ -41,19 +41,19 @@ def uncertain_rig(
     for fault in setup_faults(case.rig, case.fit, case.validation):
         if fault.certain:
             raise ValueError(
-                f"{fault.sentence.rstrip('.')}; correct the case, or go on as it is by `workbench diagnose CASE"
-                f" --uncorrected --json {kept.name}`, and give that file as --verdict"
+                f"{fault.sentence.rstrip('.')}; correct the case, or ignore the fault by `workbench diagnose CASE"
+                f" --uncorrected --json {kept.name}` and give that file as --verdict"
             )
     errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
     found = diagnose_case(case, workers=workers, progress=report)
     write_verdict(found, kept)
     errors.print(f"  {found.sentence}")
-    errors.print(f"  verdict    {short(kept)}: with --verdict {short(kept)} the next command need not diagnose")
+    errors.print(f"  verdict    {short(kept)}: give --verdict {short(kept)} to the next command to skip the diagnosis")
     return UncertainRig.of(found), found.budget.noise_found or None
 
 
 def write_verdict(verdict: "Verdict", path: Path) -> None:
-    """Write a verdict with its uncertainty as JSON, as `read_verdict` reads it."""
+    """Write a verdict with its uncertainty as JSON for `read_verdict`."""
     from workbench.robust.posterior import UncertainRig
     from workbench.study.runs.whole_file import write_whole
 
@@ -72,7 +72,7 @@ def predicted(
     workers: int | None,
     report: Callable[[str, float], None],
 ) -> "Prediction":
-    """The prediction of a record by the corrected rig, with bands by its uncertainty."""
+    """The prediction of a record by the corrected rig, with bands from its uncertainty."""
     from workbench.cases.case import in_units
     from workbench.robust.prediction import check_draws, predict
 
@@ -86,10 +86,10 @@ def predicted(
 
 
 def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...] | None]":
-    """The uncertain rig of a verdict in JSON, and the noise that was found.
+    """The uncertain rig of a verdict in JSON, and the estimated noise (n_outputs,).
 
     Raises:
-        ValueError: a file that is no verdict of this case.
+        ValueError: the file is not a verdict of this case.
     """
     from workbench.robust.posterior import UncertainRig
 
@@ -98,14 +98,14 @@ def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...]
         posterior, noise = content["posterior"], content.get("noise", {}).get("found")
     except (OSError, json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
         raise ValueError(
-            f"{path} holds no verdict with its uncertainty: write one by `workbench diagnose CASE --json {path.name}`"
+            f"{path} is not a verdict with uncertainty: write one by `workbench diagnose CASE --json {path.name}`"
         ) from None
     try:
         return UncertainRig.from_json(rig, posterior), tuple(noise) if noise else None
     except KeyError as error:
-        raise ValueError(f"{path} is no verdict of this case: it has no {error}; diagnose it again") from None
+        raise ValueError(f"{path} is not a verdict of this case: it has no {error}; diagnose the case again") from None
     except (TypeError, IndexError, AttributeError):
-        raise ValueError(f"{path} is no verdict of this case: it is damaged; diagnose it again") from None
+        raise ValueError(f"{path} is not a verdict of this case: it is damaged; diagnose the case again") from None
 
 
 def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
@@ -122,7 +122,7 @@ def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
 
 
 def _with_inputs(read: Record, names: tuple[str, ...]) -> Record:
-    """The record with the channels of these names as inputs; where no others are there, as outputs too."""
+    """The record with the channels of these names as inputs; without other channels, they are also the outputs."""
     channels = (*read.input_channels, *read.output_channels)
     rows = (*read.inputs, *read.outputs)
     into = [i for i, channel in enumerate(channels) if channel.name in names]

@@ -1,4 +1,4 @@
-"""Pictures of how accurate an identification is: errors beside the bound, peers beside one another."""
+"""Figures of the accuracy of identification: errors of several methods beside the bound, confidence bands."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +15,12 @@ from workbench.structure.modes import Modes
 def peers_errors(
     every: Mapping[float, Mapping[str, Sequence[Mapping[str, Any]]]], efficient: Mapping[float, float]
 ) -> Figure:
-    """Worst-mode errors of every method on every structure, a panel a level; scores as `identification_peers`."""
+    """Worst-mode errors of every method on every structure, one panel per noise level.
+
+    Args:
+        every: level -> method -> scores of the study `identification_peers`.
+        efficient: level -> median of an efficient method.
+    """
     figure, axes = new_figure(1, len(every), width=12.5, height=5.2, sharex=True, sharey=True)
     rng = np.random.default_rng(0)
     for ax, (level, by_name) in zip(np.atleast_1d(axes), every.items()):
@@ -54,7 +59,7 @@ def peers_errors(
 
 
 def plot_bands(bands: Bands, exact: Modes | None = None, positions: Sequence[float] = ()) -> Figure:
-    """Each eigenfunction with its confidence band; below, the band about the curve and, where known, the error."""
+    """Each eigenfunction with its confidence band; below, the band and, if `exact` is given, the error of the curve."""
     n = bands.phi.shape[1]
     figure, axes = new_figure(
         2, n, width=max(5.0, 3.2 * n), height=4.8, sharex=True, squeeze=False, height_ratios=(2, 3)

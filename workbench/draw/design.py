@@ -17,11 +17,11 @@ from workbench.records.units import SI, Units
 from workbench.structure.printed import place_text
 
 SHOWN_SHARE = 1e-5
-MOST_INSTANTS = 700  # more than a picture has columns for
+MOST_INSTANTS = 700  # drawn over time, about the number of pixel columns
 
 
 def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
-    """Displacement over place and time as colour, one panel a response, all on one scale."""
+    """Displacement over place and time as colour, one panel per response, with a common scale."""
     figure, axes = new_figure(len(responses), 1, width=9, height=2.1 * len(responses), sharex=True, squeeze=False)
     steps = {name: -(-response.time.size // MOST_INSTANTS) for name, response in responses.items()}
     fields = {name: response.displacement(x)[:, :: steps[name]] for name, response in responses.items()}
@@ -52,7 +52,7 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
 
 
 def plot_work(spillovers: dict[str, Spillover]) -> Figure:
-    """Work in each residual mode, one group of bars per design, on a logarithmic scale; below zero what it loses."""
+    """Work in each residual mode, one colour of bars per design, on a logarithmic scale; negative if energy is lost."""
     first = next(iter(spillovers.values()))
     if not first.residual:
         return _without_residual_modes()
@@ -61,7 +61,7 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
     width = 0.8 / len(spillovers)
     total = max(float(np.abs(work.residual_work).sum()) for work in spillovers.values()) or 1.0
     least, lowest = SHOWN_SHARE * total, min(float(work.residual_work.min()) for work in spillovers.values())
-    signed = lowest <= -least  # a residual mode that moves already may lose energy
+    signed = lowest <= -least  # a residual mode in motion may lose energy
     for i, (name, work) in enumerate(spillovers.items()):
         at, small = modes + (i - 0.5 * (len(spillovers) - 1)) * width, np.abs(work.residual_work) < least
         values = np.where(small, 0.0 if signed else 0.1 * least, work.residual_work)
@@ -96,13 +96,13 @@ def plot_member_placement(
     impulse_at: float | None = None,
     units: Units = SI,
 ) -> Figure:
-    """Actuators along a structure over mode n + 1, the lowest residual one, and the work in each residual mode beside.
+    """Actuators along a structure with mode n + 1, the lowest residual one, and the work in each residual mode.
 
     Args:
-        placements: by name, drawn in its colour, each on a line of its own.
-        limits: of which the forbidden zones are hatched.
-        impulse_at: where the impulse acts, m, marked by a star.
-        units: by which the axes are told.
+        placements: by name, each in its own colour and row.
+        limits: forbidden zones are hatched.
+        impulse_at: place of the impulse, m, marked by a star.
+        units: of the axes.
     """
     n, modes = task.n_controlled, task.modes
     figure, (left, right) = new_figure(1, 2, width=11, height=3.8)
@@ -121,7 +121,7 @@ def plot_member_placement(
         right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
     if impulse_at is not None:
         left.plot(impulse_at, 1.2, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse")
-    left.set(xlabel=units.named("x [m]"), yticks=[], title="where the actuators stand")
+    left.set(xlabel=units.named("x [m]"), yticks=[], title="positions of the actuators")
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=9, ncols=2)
     most = max(float(placement.by_mode.max()) for placement in placements.values())
     right.set(xlabel="residual mode", ylabel=units.named("spillover work, W_r [J]"), xticks=few_ticks(numbers))
@@ -156,7 +156,7 @@ def plot_spillover_paths(explained: Explanation) -> Figure:
 
 
 def plot_controlled_mode_count(found: dict[str, ControlledModeCount], share: float | None = None) -> Figure:
-    """Energy left of each disturbance when the lowest n modes are controlled: in the others, and by spillover."""
+    """Remaining energy of each disturbance with n controlled modes: in the residual modes, and by spillover."""
     figure, axes = new_figure(1, len(found), width=11, height=4.5, sharey=True, squeeze=False)
     for ax, (name, result) in zip(axes[0], found.items(), strict=True):
         uncontrolled, spilled = result.uncontrolled / result.energy.sum(), result.spillover / result.energy.sum()

@@ -19,12 +19,12 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
 
-MOST_BARS, FEW_BARS = 16, 6  # of named points: the likeliest are shown; of sensors: few have their names level
-SHOWN = 0.005  # of the gap: a bar that is lower is not seen
+MOST_BARS, FEW_BARS = 16, 6  # named points that are shown; sensors whose names fit horizontally
+SHOWN = 0.005  # least share of the gap that is drawn
 
 
 def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record], *, time_unit: str = "s") -> Figure:
-    """Measured and simulated by each rig, at the sensor and in the segment where the first differs most, by record."""
+    """Measured and simulated responses by record, at the sensor and in the segment of the first rig's largest error."""
     records = list(records)[-3:]
     figure, axes = new_figure(len(records), 1, width=10, height=2.6 * len(records), squeeze=False)
     for ax, record in zip(axes[:, 0], records, strict=True):
@@ -47,7 +47,7 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record], *, time_u
 
 
 def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
-    """The gap of each record before and after, over the floor that no model of this kind gets below."""
+    """The gap of each record before and after, beside the noise floor, the least gap of any model."""
     records = list(gap["before"])
     figure, ax = new_figure(width=9, height=3.5)
     for i, (name, colour) in enumerate(zip(("before", "after", "floor"), (COLOURS[1], COLOURS[0], GREY))):
@@ -61,7 +61,7 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
 
 
 def plot_budget(budget: Budget) -> Figure:
-    """What causes the gap of each record: one bar per record, split by cause; beyond 100 % where they enlarge it."""
+    """The gap of each record, one bar split by cause; above 100 % if effects enlarge the gap."""
     causes = [label_in_words(label) for label in budget.effects]
     causes += ["errors of the nominal model", "unexplained", "noise"]
     colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], GREY]
@@ -83,7 +83,7 @@ def plot_budget(budget: Budget) -> Figure:
 
 
 def plot_where(verdict: Verdict) -> Figure:
-    """The gap taken apart: by mode, band, sensor, level and time, and the likelihood of a place."""
+    """The gap by mode, band, sensor, level and time, and the likelihood of each place of a force."""
     where = verdict.where
     figure, axes = new_figure(3, 2, width=10, height=9.2)
     _plot_modes(axes[0, 0], verdict)
@@ -117,7 +117,7 @@ def plot_where(verdict: Verdict) -> Figure:
 
 
 def _plot_modes(ax: Axes, verdict: Verdict) -> None:
-    """Shares of the gap by mode; rigid modes, which no frequency tells apart, have one bar."""
+    """Shares of the gap by mode; rigid modes, all of frequency zero, have one bar."""
     where, frequencies = verdict.where, verdict.nominal.modes.frequencies_hz
     rigid = int((frequencies == 0).sum())
     numbers = np.arange(rigid, frequencies.size) + 1
@@ -135,14 +135,14 @@ def _plot_modes(ax: Axes, verdict: Verdict) -> None:
 
 
 def _plot_places(ax: Axes, verdict: Verdict) -> None:
-    """How likely each place is for one unmodelled force: a curve along the structure, or bars at named places."""
+    """The log-likelihood of each place of one unmodelled force: a curve, a map, or bars at named points."""
     place = verdict.where.place
     profile = place.profile
     if place.is_single_force is None:
         ax.set_axis_off()
         ax.text(0.5, 0.5, "no place of a force can be identified", ha="center", va="center", transform=ax.transAxes)
         return
-    several = "no single point force explains all: where one fits best"
+    several = "no single point force explains all; best fit of one"
     ax.set(title="place of one unmodelled force" if place.is_single_force else several)
     domain = verdict.nominal.modes.domain
     if isinstance(domain, Rectangle):
@@ -162,7 +162,7 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
 
 
 def _rank(ax: Axes, verdict: Verdict) -> None:
-    """Named places, the likeliest first, by how much less likely each is; where effects act that are named is told."""
+    """The likeliest named points with their difference in log-likelihood; places of named effects are marked."""
     place, separation = verdict.where.place, verdict.nominal.modes.domain.separation
     shown = [place.places[i] for i in np.argsort(-place.profile, kind="stable")[:MOST_BARS]]
     below = place.profile.max() - np.sort(place.profile)[::-1][:MOST_BARS]
@@ -179,18 +179,18 @@ def _rank(ax: Axes, verdict: Verdict) -> None:
     ax.annotate("likeliest", (0.0, 0), (4, 0), textcoords="offset points", va="center", fontsize=8)
     unseen = [_short(at) for at in acting if all(separation(at, other) > 0 for other in shown)]
     if unseen:
-        told = f"{called}, not among these: {', '.join(unseen)}"
-        ax.text(1.0, 0, told, transform=ax.get_yaxis_transform(), ha="right", va="center", fontsize=8)
+        label = f"{called}, not among these: {', '.join(unseen)}"
+        ax.text(1.0, 0, label, transform=ax.get_yaxis_transform(), ha="right", va="center", fontsize=8)
 
 
 def _acting(verdict: Verdict) -> tuple[list[Any], str]:
-    """Where the effects act that the verdict names, and what it calls them."""
+    """The places of the verdict's effects, and whether they are "named" or "nearest"."""
     acting = [e.at for e in verdict.effects if e.at is not None and e.kind.path in ("structure", "environment")]
     return acting, "named" if verdict.outcome == "explained" else "nearest"
 
 
 def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
-    """The log-likelihood over a rectangle, its top, and the effects that were named."""
+    """The log-likelihood over a rectangle, its maximum, and the places of named effects."""
     place = verdict.where.place
     x, y = np.array(place.places).T
     ax.tricontourf(x, y, np.maximum(place.profile, _lowest(place.profile)), levels=12, cmap="Blues")
@@ -203,7 +203,7 @@ def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
 
 
 def _lowest(profile: Floats) -> float:
-    """The log-likelihood that is drawn lowest: what is far less likely than the three likeliest is cut off."""
+    """The least log-likelihood that is drawn, relative to that of the three likeliest places."""
     near = abs(np.sort(profile)[-min(3, profile.size)])
     return float(min(max(profile.min(), -50.0 * max(1.0, near)), -1.0))
 
@@ -213,7 +213,7 @@ def _short(where: Where) -> str:
 
 
 def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force: str | None = None) -> Figure:
-    """The force missing at its place beside other effects and freed figures, over displacement and velocity.
+    """The unmodelled force at its place, with all other effects in the model, over displacement and velocity.
 
     Args:
         verdict: of the diagnosis.
@@ -238,17 +238,17 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force:
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=3, alpha=0.6)
         ax.set_xlabel(f"{name} {there} [{unit}]")
         law = _law(chosen, series, name)
-        if law is not None:  # beneath the points, which it would hide where they follow it
+        if law is not None:  # beneath the points, which it would otherwise hide
             explains = verdict.outcome == "explained" or any_beyond(verdict.effects)
             label = "fitted law" if explains else "nearest law: it does not explain the gap"
             ax.plot(*law, color=COLOURS[1], linewidth=5.0, alpha=0.6, zorder=1, label=label)
             ax.legend()
-    axes[0].set(ylabel=f"unmodelled force [{force}]", title="unmodelled force, no law assumed")
+    axes[0].set(ylabel=f"unmodelled force [{force}]", title="unmodelled force, without an assumed law")
     return figure
 
 
 def _law(chosen: Sequence[Effect], series: Floats, name: str) -> tuple[Floats, Floats] | None:
-    """The fitted law as a line over one variable, where it depends on that variable alone."""
+    """The fitted law (values, forces) over one variable; None if it does not depend on that variable alone."""
     if not chosen:
         return None
     law = chosen[0].kind.force_laws.get(name)
@@ -257,7 +257,7 @@ def _law(chosen: Sequence[Effect], series: Floats, name: str) -> tuple[Floats, F
 
 
 def plot_single_effects(verdict: Verdict) -> Figure:
-    """What each effect alone would leave of the gap, and a law beyond the catalogue where one explains it."""
+    """The residual of each effect alone, and of a law beyond the catalogue if one explains the gap."""
     best = verdict.attribution.best
     beyond = [best] if any_beyond(best.effects) else []
     singles = [*beyond, *verdict.attribution.singles[:8]]

@@ -1,4 +1,4 @@
-"""A figure as plain numbers, for a page to draw: to zoom, to hover over, to read on a phone and in the dark."""
+"""A figure as plain numbers, from which a page draws an interactive one."""
 
 import base64
 from collections.abc import Callable
@@ -32,11 +32,11 @@ BARE = {"None", "none", "", " "}
 
 
 class Undescribed(TypeError):
-    """A figure that holds what only matplotlib can draw."""
+    """A figure with an artist that has no plain description."""
 
 
 def drawable(figure: Figure) -> dict[str, Any]:
-    """What a page draws of a figure: its description as "figure", or a "picture" (PNG in base64) where it has none."""
+    """The description of a figure as {"figure"}, or {"picture"} (PNG in base64) if it has none."""
     try:
         return {"figure": described(figure)}
     except Undescribed:
@@ -46,10 +46,10 @@ def drawable(figure: Figure) -> dict[str, Any]:
 
 
 def described(figure: Figure) -> dict[str, Any]:
-    """The panels of a figure, what is drawn in each, and how: lists, numbers and texts only.
+    """The panels of a figure and the marks in each, as lists, numbers and texts.
 
     Raises:
-        Undescribed: naming the artist that has no plain description.
+        Undescribed: an artist has no plain description.
     """
     figure.draw_without_rendering()
     axes = [ax for ax in figure.axes if ax.get_visible() and not hasattr(ax, "_colorbar")]
@@ -138,7 +138,7 @@ def _line(ax: Axes, line: Line2D) -> list[dict[str, Any]]:
 
 
 def _thinned(x: np.ndarray, y: np.ndarray) -> dict[str, Any]:
-    """At most MOST_POINTS points that look the same: along rising x, the least and the largest of each stretch."""
+    """At most MOST_POINTS points of a line: for rising x, the minimum and maximum of each segment."""
     if x.size > MOST_POINTS:
         keep = envelope(y) if (np.diff(x) >= 0).all() else np.arange(0, x.size, -(-x.size // MOST_POINTS))
         x, y = x[keep], y[keep]
@@ -196,7 +196,7 @@ def _mesh(ax: Axes, mesh: QuadMesh) -> list[dict[str, Any]]:
     corners = np.asarray(mesh.get_coordinates(), float)
     x, y = corners[0, :, 0], corners[:, 0, 1]
     if not (np.allclose(corners[..., 0], x) and np.allclose(corners[..., 1].T, y)):
-        raise Undescribed("a mesh that is no grid")
+        raise Undescribed("a mesh that is not a rectangular grid")
     values = np.ma.filled(np.ma.asarray(mesh.get_array()).astype(float), np.nan)
     return [_field(mesh, values.reshape(values.shape[-2:]), (x[0], x[-1]), (y[0], y[-1]))]
 
@@ -204,13 +204,13 @@ def _mesh(ax: Axes, mesh: QuadMesh) -> list[dict[str, Any]]:
 def _image(ax: Axes, image: AxesImage) -> list[dict[str, Any]]:
     values = np.ma.filled(np.ma.asarray(image.get_array()).astype(float), np.nan)
     if values.ndim != 2:
-        raise Undescribed("a picture of colours")
+        raise Undescribed("a colour image")
     left, right, bottom, top = image.get_extent()
     return [_field(image, values if image.origin == "lower" else values[::-1], (left, right), (bottom, top))]
 
 
 def _field(artist: QuadMesh | AxesImage, values: Floats, x: ArrayLike, y: ArrayLike) -> dict[str, Any]:
-    """Values over a grid, in 255 steps of its colours; 255 means none."""
+    """Values over a grid in 255 steps of the colour map; 255 means not finite."""
     every = [max(1, -(-n // most)) for n, most in zip(values.shape, MOST_CELLS)]
     values = values[:: every[0], :: every[1]]
     low, high = (float(v) for v in artist.get_clim())
@@ -240,7 +240,7 @@ def _words(ax: Axes, text: Text) -> list[dict[str, Any]]:
             shift = text.get_position()
             transform = text.xycoords
         elif text.anncoords != "data":
-            raise Undescribed("a note away from what it notes")
+            raise Undescribed("an annotation that is not placed relative to its point")
     x, y = float(ax.convert_xunits(at[0])), float(ax.convert_yunits(at[1]))
     if transform in ("axes fraction", ax.transAxes):
         frame = "axes"

@@ -1,4 +1,4 @@
-"""Motion as plain numbers, for a page to move: shapes along a structure, over a plate or of a frame, and over time."""
+"""Motion as plain numbers, from which a page draws an animation: mode shapes and responses of any structure."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from workbench.structure.modes import Modes, SampledModes
 N_PLACES = 161
 MOST_FRAMES = 600
 SHOWN_SECONDS = 12.0
-PER_SIDE = 19  # lines of a plate's net along the longer side
-MOST_NODES = 400  # of a frame, that are drawn
+PER_SIDE = 19  # grid lines of a plate along the longer side
+MOST_NODES = 400  # drawn of a frame
 ALONG = "x [m]"
-SWAY = 0.15  # of the structure's size: the largest motion as drawn
+SWAY = 0.15  # largest drawn motion, over the size of the structure
 
 
 def response_motion(
@@ -31,20 +31,20 @@ def response_motion(
     colours: Mapping[str, str] | None = None,
     length: str = "m",
 ) -> dict[str, Any]:
-    """Responses of one structure, moving on one picture: over each other along a beam, side by side as nets.
+    """An animation of responses of one structure, superposed along a beam, side by side for plates and frames.
 
     Args:
-        responses: by the name under which each is shown; all over the same times and of the same modes' number.
+        responses: by the displayed name; all with the same time axis and number of modes.
         actuators, sensors: marked at their places.
         colours: of responses by name; None for the first of several in grey.
         length: the unit of x.
 
     Raises:
-        ValueError: responses over different times, or at named points without positions.
+        ValueError: different time axes, or named points without positions.
     """
     first = next(iter(responses.values()))
     if any(r.time.shape != first.time.shape or (r.time != first.time).any() for r in responses.values()):
-        raise ValueError("responses that move together must be over the same times; simulate them on one time axis")
+        raise ValueError("responses in one animation must have the same time axis; simulate them with one")
     step = -(-first.time.size // MOST_FRAMES)
     tracks: list[dict[str, Any]] = [
         {
@@ -75,11 +75,10 @@ def response_motion(
 def mode_motion(
     modes: Mapping[str, Modes | SampledModes], *, actuators: Sequence[Actuator] = (), sensors: Sequence[Sensor] = ()
 ) -> dict[str, Any]:
-    """Mode shapes in motion, one mode at a time; several sets of modes over each other, each scaled to one.
+    """An animation of mode shapes, one mode at a time; several sets of modes are superposed, each scaled to one.
 
-    Sampled modes are shown at their sensors, with the phase that each sensor has; on a plate neighbours are joined. A
-    plate is a net of lines and a frame its nodes, neighbours joined, as both are seen from above the front; a plane
-    frame from the front.
+    Sampled modes are shown at their sensors, with phase. A plate is drawn as a grid of lines, a frame or the sensors on
+    a plate as nodes with lines between neighbours, in an oblique view; a plane frame is seen from the front.
 
     Raises:
         ValueError: modes at named points without positions.
@@ -99,7 +98,7 @@ def mode_motion(
             shapes = found.phi(x).astype(complex)
         order = np.argsort(x)
         shapes = shapes[order] / np.maximum(np.abs(shapes).max(axis=0), 1e-300)
-        # two sets of modes move together, whatever the sign of each
+        # align the signs of two sets of modes
         if tracks and isinstance(found, Modes) and tracks[0]["x"] == _numbers(x):
             n = min(shapes.shape[1], len(tracks[0]["real"][0]))
             aligned = np.sign(np.sum(shapes[:, :n].real * np.array(tracks[0]["real"])[:, :n], axis=0))
@@ -127,7 +126,7 @@ def _net_motion(
     for name, found in modes.items():
         moves = spots.moves(found)
         moves = moves * SWAY * size / np.maximum(np.abs(moves).max(axis=(0, 1)), 1e-300)
-        if tracks:  # two sets of modes move together, whatever the sign of each
+        if tracks:  # align the signs of two sets of modes
             n = min(moves.shape[2], len(tracks[0]["moves"]))
             other = np.moveaxis(np.array(tracks[0]["moves"])[:n], 0, 2)
             moves[:, :, :n] *= np.where((moves[:, :, :n].real * other).sum(axis=(0, 1)) < 0, -1.0, 1.0)
@@ -145,7 +144,7 @@ def _net_motion(
 
 
 def _on_net(spots: "Net", actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
-    """A net at rest, and the places marked on it."""
+    """A net at rest, and the places of actuators and sensors."""
     marked = {
         key: [
             {"name": part.name, "at": _numbers(spots.at(part.at))} for part in parts if not isinstance(part.at, Between)
@@ -157,13 +156,13 @@ def _on_net(spots: "Net", actuators: Sequence[Actuator], sensors: Sequence[Senso
 
 @dataclass(frozen=True, eq=False)
 class Net:
-    """Spots of a structure as a page shows them.
+    """Nodes of a structure in a plane projection.
 
     Attributes:
-        rest: (n_spots, 2) at rest, m, as they are seen.
-        lines: pairs of spots that are joined.
-        moves: modes -> (n_spots, 2, n_modes) displacements as they are seen, complex where sensors differ in phase.
-        at: place -> (2,) where it, or the middle of a patch, is seen.
+        rest: (n_spots, 2) projected positions at rest, m.
+        lines: pairs of nodes joined by a line.
+        moves: modes -> (n_spots, 2, n_modes) projected displacements, complex for sampled modes.
+        at: place -> (2,) projected position of a place, or of the centre of a patch.
     """
 
     rest: np.ndarray
@@ -172,13 +171,13 @@ class Net:
     at: Callable[[Any], np.ndarray]
 
 
-def _seen(at: np.ndarray) -> np.ndarray:
-    """(..., 3) as (..., 2): x to the right, z up, y away from the eye."""
+def _projected(at: np.ndarray) -> np.ndarray:
+    """Oblique projection of points (..., 3) to (..., 2): x to the right, z up, y away from the viewer."""
     return np.asarray(np.stack([at[..., 0] + 0.4 * at[..., 1], at[..., 2] + 0.45 * at[..., 1]], axis=-1))
 
 
 def _upwards(shapes: np.ndarray) -> np.ndarray:
-    """(n_spots, 2, n_modes) of displacements (n_spots, n_modes) that are seen as upwards."""
+    """Projected displacements (n_spots, 2, n_modes) of transverse ones (n_spots, n_modes), drawn upwards."""
     return np.stack([np.zeros_like(shapes), shapes], axis=1)
 
 
@@ -196,40 +195,45 @@ def _plate_net(domain: Rectangle) -> Net:
     flat = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
     return Net(
-        _seen(places @ flat),
+        _projected(places @ flat),
         lines,
         lambda modes: _upwards(modes.phi(places)),
-        lambda place: _seen(np.asarray(place)[:2] @ flat),
+        lambda place: _projected(np.asarray(place)[:2] @ flat),
     )
 
 
 def scattered_net(places: np.ndarray) -> Net:
-    """Sensors on a plate, at places (n_sensors, 2), neighbours joined; what they read moves up, each with its phase."""
+    """The net of sensors on a plate, at places (n_sensors, 2), neighbours joined; readings are drawn upwards."""
     at = np.column_stack([places, np.zeros(len(places))])
-    return Net(_seen(at), _neighbours(at), lambda modes: _upwards(modes.shapes), lambda place: _seen(np.r_[place, 0.0]))
+    return Net(
+        _projected(at),
+        _neighbours(at),
+        lambda modes: _upwards(modes.shapes),
+        lambda place: _projected(np.r_[place, 0.0]),
+    )
 
 
 def frame_net(domain: Domain) -> Net:
-    """A frame as its nodes, neighbours joined, seen from above the front; a plane one from the front.
+    """The net of a frame, neighbouring nodes joined, in an oblique view; a plane frame is seen from the front.
 
     Raises:
         ValueError: named points without positions.
     """
     if not isinstance(domain, NamedPoints) or domain.positions is None:
-        raise ValueError("shapes at named points are drawn where their positions are known; give positions")
+        raise ValueError("shapes at named points cannot be drawn without positions; give positions")
     names = list(dict.fromkeys(domain.nodes))
     names = names[:: -(-len(names) // MOST_NODES)]
     nodes = {node: i for i, node in enumerate(names)}
     first = {node: i for i, node in reversed(list(enumerate(domain.nodes)))}
     at = domain.positions[[first[node] for node in names]]
     planar = np.ptp(at[:, 2]) == 0 and "z" not in domain.directions
-    see = (lambda at: at[..., :2]) if planar else _seen
+    see = (lambda at: at[..., :2]) if planar else _projected
 
     def moves(modes: Modes) -> np.ndarray:
         shapes = modes.phi(list(domain.names))
         found = np.zeros((len(nodes), modes.n_modes, 3))
         for node, direction, shape in zip(domain.nodes, domain.directions, shapes, strict=True):
-            if node in nodes and direction not in ROTATIONS:  # of what moves in no known direction, up
+            if node in nodes and direction not in ROTATIONS:  # a motion of unknown direction is drawn upwards
                 found[nodes[node], :, TRANSLATIONS.index(direction) if direction else 1 if planar else 2] = shape
         return np.moveaxis(see(found), 2, 1)
 
@@ -241,9 +245,9 @@ def frame_net(domain: Domain) -> Net:
 
 
 def _neighbours(at: np.ndarray) -> list[list[int]]:
-    """Pairs of points that no other point is nearer to both of (the relative neighbourhood graph; Toussaint 1980).
+    """Pairs of neighbours: no third point is nearer to both (relative neighbourhood graph; Toussaint 1980).
 
-    None is twice as far apart as what joins all points takes: the feet of a portal are not joined.
+    Pairs at twice the longest edge of the minimum spanning tree or more are excluded, such as the feet of a portal.
     """
     distance = np.linalg.norm(at[:, None] - at, axis=2)
     longest = 2.0 * minimum_spanning_tree(distance).max()

@@ -173,7 +173,7 @@ def _(result: ModalFilter) -> Figure:
 
 
 def _point_motion(result: Response, names: Sequence[str]) -> Figure:
-    """Displacement over time of the points that move most, a panel a point, all in one scale."""
+    """Displacement over time of the points of largest motion, one panel per point, with a common scale."""
     moved = result.displacement(list(names))
     most = np.sort(np.argsort(-np.abs(moved).max(axis=1), kind="stable")[:MOST_PANELS])
     figure, axes = new_figure(

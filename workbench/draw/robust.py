@@ -1,4 +1,4 @@
-"""Figures of a corrected rig that is uncertain: the response predicted, and controllers on its draws."""
+"""Figures of an uncertain rig: predicted responses, and controllers on its draws."""
 
 from collections.abc import Mapping
 
@@ -14,16 +14,16 @@ from workbench.robust.verification import SETTLED, interval
 
 OLD, NEW = COLOURS[1], COLOURS[0]
 MOST_SENSORS = 8
-STRETCH = 400  # samples of a test that are drawn over time: more would be a solid area
+STRETCH = 400  # samples drawn over time; more would fill a solid area
 BAND, TEST = COLOURS[0], COLOURS[1]
 
 
 def plot_redesign(result: Redesign) -> Figure:
-    """Energy of the structure under test with its 95 % band over the draws, and the damping of each controlled mode."""
+    """Energy over the test with its 95 % band over the draws, and the damping of each controlled mode."""
     figure, (left, right) = new_figure(1, 2, width=10, height=4.2, width_ratios=(2, 1))
     time = result.test.time
     both = (("present", result.present_verification, OLD), ("redesigned", result.verification, NEW))
-    # after an impulse both begin at the same energy; one that diverges leaves the figure at its top
+    # after an impulse both start at the same energy; a diverging one is clipped at the top
     top = min(float(p.energy[0].max()) for _, p, _ in both)
     for name, verification, colour in both:
         middle, low, high = np.clip(verification.energy / max(top, 1e-300), 1e-9, 1e3)
@@ -50,7 +50,7 @@ def plot_redesign(result: Redesign) -> Figure:
 
 
 def plot_steps(result: Redesign) -> Figure:
-    """What each step leaves of the loss against perfect actuators and sensors."""
+    """The loss after each step, relative to perfect actuators and sensors."""
     figure, ax = new_figure(width=9, height=1.2 + 0.45 * len(result.steps))
     names = [step.name + ("" if step.kept else " (left out)") for step in result.steps]
     most = max((s.loss for s in result.steps if not s.diverges), default=1.0)
@@ -70,7 +70,7 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
 
     Args:
         prediction: with its bands.
-        measured: the test, drawn beneath them, in the stretch about the reading that lies farthest outside.
+        measured: the record of the test, drawn beneath the bands, around the reading farthest outside.
     """
     shown = min(len(prediction.channels), MOST_SENSORS)
     figure, axes = new_figure(shown, 2, width=11, height=0.9 + 1.9 * shown, sharex="col", squeeze=False)
@@ -102,7 +102,7 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
 
 
 def _around_worst(prediction: Prediction, rows: Mapping[str, Floats]) -> slice:
-    """The samples about the reading that lies farthest outside its band, in widths of that; all where none was read."""
+    """The samples around the reading farthest outside its band, over the band's width; all samples without readings."""
     worst = np.full(prediction.time.size, -np.inf)
     for channel, low, high in zip(prediction.channels, prediction.lower, prediction.upper):
         if channel.name in rows:

@@ -1,4 +1,4 @@
-"""Figures of sensors that are placed: where they stand, and what each mode adds to the error of their filter."""
+"""Figures of a sensor placement: positions, and the contribution of each mode to the error of the modal filter."""
 
 from typing import Any
 
@@ -15,11 +15,11 @@ from workbench.draw.surface import draw_moved, draw_nodal_lines
 from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.printed import counted
 
-SHOWN_ERROR = 1e-5  # of the largest error by one mode: what is less is not drawn
-FEW = 1e2  # between the errors on an axis that shows halves and fifths too
+SHOWN_ERROR = 1e-5  # least error that is drawn, over the largest error of a mode
+FEW = 1e2  # ratio of largest to least error below which the axis has ticks at 2 and 5 too
 N_PLACES = 401
 BELOW: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}
-OTHERS = tuple(colour for i, colour in enumerate(COLOURS) if i not in (1, 4))  # than of sensors and spillover
+OTHERS = tuple(colour for i, colour in enumerate(COLOURS) if i not in (1, 4))  # without those of sensors and spillover
 SENSOR: Any = {
     "color": "none",
     "marker": "o",
@@ -32,11 +32,10 @@ SENSOR: Any = {
 
 
 def plot_sensor_placement(placement: SensorPlacement) -> Figure:
-    """Sensors on the structure, and beside it the error of the filter's modal coordinates by mode.
+    """Sensors on the structure, and the error of the filter's modal coordinates by mode.
 
-    Along a structure they stand on the axis of the controlled modes' shapes, on a plate over the nodal lines of the
-    first mode left alone, at named points on the structure, moved in that mode. Points without positions have no such
-    picture.
+    A member is drawn with the shapes of the controlled modes, a plate with the nodal lines of the lowest residual mode,
+    and named points displaced in that mode. Points without positions are not drawn.
     """
     domain = placement.modes.domain
     if isinstance(domain, NamedPoints) and domain.positions is None:
@@ -46,10 +45,10 @@ def plot_sensor_placement(placement: SensorPlacement) -> Figure:
         if isinstance(domain, NamedPoints):
             _at_points(left, placement)
         elif isinstance(domain, Rectangle):
-            draw_nodal_lines(left, placement.modes, _first_left_alone(placement)[0])
+            draw_nodal_lines(left, placement.modes, _lowest_residual(placement)[0])
             left.plot(*placement.positions.T, **SENSOR)
             left.set(xticks=(0.0, domain.length[0]), yticks=(0.0, domain.length[1]), xlabel="x [m]", ylabel="y [m]")
-            left.set_title(f"nodal lines of {_first_left_alone(placement)[1]}", fontsize=10)
+            left.set_title(f"nodal lines of {_lowest_residual(placement)[1]}", fontsize=10)
             _legend(left, Line2D([], [], color="black", linewidth=1.4, label="nodal line: at rest"))
         else:
             _along(left, placement)
@@ -60,8 +59,8 @@ def plot_sensor_placement(placement: SensorPlacement) -> Figure:
     return plain_ticks(figure)
 
 
-def _first_left_alone(placement: SensorPlacement) -> tuple[int, str]:
-    """The first mode that is not controlled, the last where all are: its index, and what it is called."""
+def _lowest_residual(placement: SensorPlacement) -> tuple[int, str]:
+    """The index and title of the lowest residual mode, or of the last mode if all are controlled."""
     modes = placement.modes
     left = [r for r in range(modes.n_modes) if r not in placement.controlled]
     shown = left[0] if left else modes.n_modes - 1
@@ -82,7 +81,7 @@ def _along(ax: Axes, placement: SensorPlacement) -> None:
 
 
 def _at_points(ax: Axes, placement: SensorPlacement) -> None:
-    shown, called = _first_left_alone(placement)
+    shown, called = _lowest_residual(placement)
     net = frame_net(placement.modes.domain)
     draw_moved(ax, net, net.moves(placement.modes)[:, :, shown])
     names: dict[tuple[float, ...], list[str]] = {}

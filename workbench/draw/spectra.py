@@ -11,31 +11,31 @@ from workbench.identification.signal.distortion import Distortion
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
 
-LINES = 4096  # samples of a segment
-SHOWN = 1e-12  # least power shown, as a share of the largest
+SEGMENT_SAMPLES = 4096  # at most
+SHOWN = 1e-12  # least power that is drawn, over the largest
 OUTPUTS_SHOWN = 4  # of a record, in a figure of its distortion
-BEYOND = 4.0  # times the highest line excited, up to which distortion is shown
-TOGETHER = 256  # segments whose spectra are in memory at once
-SEGMENTS = 4  # of the record at least
+DISTORTION_LIMIT = 4.0  # highest frequency of a figure of distortion, over the highest excited line
+SEGMENTS_IN_MEMORY = 256  # at once
+SEGMENTS = 4  # of a record, at least
 MOST_PANELS = 12
 
 
 def power_spectrum(values: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies, Hz, and power spectral density, (n_lines,) each, of a signal about its mean, by Welch's method.
+    """Frequencies, Hz, and power spectral density, (n_lines,) each, of a signal without its mean, by Welch's method.
 
-    Segments of 4,096 samples, or a quarter of the signal, that overlap by half.
+    The segments have 4,096 samples, or a quarter of the signal, and overlap by half.
 
     Args:
         values: (n_samples,).
         rate_hz: sampling rate.
     """
-    segment = min(LINES, max(values.size // SEGMENTS, 1))
+    segment = min(SEGMENT_SAMPLES, max(values.size // SEGMENTS, 1))
     step = segment - segment // 2
     n_segments, mean = (values.size - segment // 2) // step, values.mean()
     power = np.zeros(segment // 2 + 1)
-    # so many segments at a time: all of a long record take several times its memory
-    for first in range(0, n_segments, TOGETHER):
-        count = min(TOGETHER, n_segments - first)
+    # in groups of segments: all segments of a long record take several times its memory
+    for first in range(0, n_segments, SEGMENTS_IN_MEMORY):
+        count = min(SEGMENTS_IN_MEMORY, n_segments - first)
         part = values[first * step : (first + count - 1) * step + segment] - mean
         lines, each = welch(part, rate_hz, nperseg=segment)
         power += count / n_segments * each
@@ -61,7 +61,7 @@ def plot_transfer(measured: TransferFunctions, fitted: TransferFunctions | None 
     """Magnitude and phase of each output's transfer functions, all inputs in one panel.
 
     Args:
-        fitted: the same of a model, dashed; at lines of its own.
+        fitted: transfer functions of a model, at any frequencies, drawn dashed.
     """
     channels = measured.output_channels[:MOST_PANELS]
     figure, axes = new_figure(len(channels), 2, width=10, height=0.8 + 1.6 * len(channels), sharex=True, squeeze=False)
@@ -87,14 +87,14 @@ def plot_transfer(measured: TransferFunctions, fitted: TransferFunctions | None 
 
 
 def plot_frf(record: Record) -> Figure:
-    """Frequency response of each output to the one input, H1 = S_uy / S_uu, over its coherence.
+    """Frequency response of each output to the single input, H1 = S_uy / S_uu, and its coherence.
 
     Raises:
         ValueError: a record with no input, or several.
     """
     if record.n_inputs != 1:
         raise ValueError(f"a frequency response by H1 needs one input; record {record.name!r} has {record.n_inputs}")
-    rate, segment = record.sample_rate_hz, min(LINES, max(record.n_samples // SEGMENTS, 1))
+    rate, segment = record.sample_rate_hz, min(SEGMENT_SAMPLES, max(record.n_samples // SEGMENTS, 1))
     u = record.inputs[0] - record.inputs[0].mean()
     lines, power = welch(u, rate, nperseg=segment)
     figure, axes = new_figure(2, 1, width=9, height=5.5, sharex=True, height_ratios=(3, 1))
@@ -111,13 +111,13 @@ def plot_frf(record: Record) -> Figure:
 
 
 def plot_distortion(distortions: Sequence[Distortion]) -> Figure:
-    """Excited lines, odd and even lines that are not, and noise, a column per record and a row per output."""
+    """Excited lines, odd and even lines that are not excited, and noise; a column per record, a row per output."""
     rows = distortions[0].channels[:OUTPUTS_SHOWN]
     figure, axes = new_figure(
         len(rows), len(distortions), width=10, height=1.0 + 2.3 * len(rows), sharex=True, sharey="row", squeeze=False
     )
     for column, found in zip(axes.T, distortions, strict=True):
-        shown = found.frequencies_hz < BEYOND * found.frequencies_hz[found.excited].max()
+        shown = found.frequencies_hz < DISTORTION_LIMIT * found.frequencies_hz[found.excited].max()
         lines = {"excited": found.excited, "odd, not excited": found.odd, "even, not excited": found.even}
         for j, ax in enumerate(column[: len(rows)]):
             for (label, kind), colour in zip(lines.items(), COLOURS, strict=False):

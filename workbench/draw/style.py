@@ -1,4 +1,4 @@
-"""The look of every figure: quiet axes, few colours that colour-blind readers can tell apart."""
+"""The style of all figures: plain axes, and colours that colour-blind readers can distinguish."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,10 +14,10 @@ matplotlib.use("Agg")
 # Okabe & Ito's palette, in the order of use
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GREY = "#8a8a8a"
-MOST_POINTS = 4000  # of a curve, of which a page or a screen shows no more
+MOST_POINTS = 4000  # of a drawn curve; a screen resolves no more
 PLAIN_LEAST, PLAIN_DECADES = 1e-4, 1e6  # least value and widest range of a logarithmic axis with plain numbers
 MOST_TICKS = 20  # numbers along an axis
-FEWER_NUMBERS = 2.9  # extent of one beyond which 1, 2, 3, 5 and 7 are numbers enough: two of them lie in any such range
+FEWER_NUMBERS = 2.9  # ratio of an axis's limits above which ticks at 1, 2, 3, 5 and 7 suffice: at least two are inside
 
 SETTINGS: Any = {
     "axes.grid": True,
@@ -41,7 +41,7 @@ matplotlib.rcParams.update(SETTINGS)
 def new_figure(
     rows: int = 1, cols: int = 1, *, width: float = 9.0, height: float = 4.5, **options: Any
 ) -> tuple[Figure, Any]:
-    """A figure in the house style and its axes, as `Figure.subplots` gives them: one, or an array."""
+    """A figure and the axes of `Figure.subplots`: one, or an array."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, cols, **options)
 
@@ -52,12 +52,12 @@ def in_units(name: str, unit: str) -> str:
 
 
 def few_ticks(numbers: Sequence[int] | np.ndarray) -> np.ndarray:
-    """Of the numbers of modes those that an axis has room for: all, or every so many."""
+    """The numbers of modes for the ticks of an axis: all, or every nth."""
     return np.asarray(numbers)[:: -(-len(numbers) // MOST_TICKS)]
 
 
 def plain_ticks(figure: Figure) -> Figure:
-    """The figure with plain numbers on its logarithmic axes, 0.1, 1, 20 rather than 2×10⁰, where they are few."""
+    """The figure with plain numbers, such as 0.1 and 20, on logarithmic axes of few decades."""
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):
             if axis.get_scale() != "log":
@@ -72,14 +72,14 @@ def plain_ticks(figure: Figure) -> Figure:
 
 
 def _plain_minor(extent: float) -> FuncFormatter:
-    """Numbers between the decades: as few as there is room for, but at least two with those of the decades."""
-    if extent <= FEWER_NUMBERS:  # 0.14, 0.16 and so on, where no decade is near
+    """The formatter of ticks between decades: few, but with those of the decades at least two."""
+    if extent <= FEWER_NUMBERS:  # such as 0.14 and 0.16
         return FuncFormatter(lambda value, _: f"{value:g}")
     return FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "2357" else "")
 
 
 def envelope(y: np.ndarray) -> np.ndarray:
-    """Which samples to draw of a signal (n_samples,): all, or the least and the largest of each of 2,000 stretches."""
+    """Indices of the samples of a signal (n_samples,) to draw: all, or the extrema of each of 2,000 segments."""
     if y.size <= MOST_POINTS:
         return np.arange(y.size)
     edges = np.linspace(0, y.size, MOST_POINTS // 2 + 1).astype(int)

@@ -22,25 +22,25 @@ from workbench.renamed import former_arguments
 from workbench.structure.domain import Patch, Rectangle
 from workbench.structure.modes import Modes, SampledModes
 
-PER_SIDE = 121  # of the longer one: points where a shape is drawn
-SHOWN_WORK = 1e-8  # of the largest work in one mode: what is less is not drawn
+PER_SIDE = 121  # grid points of a drawn shape along the longer side
+SHOWN_WORK = 1e-8  # least work that is drawn, over the largest in one mode
 LEVELS = 12  # of colour on each side of zero
 COLUMNS = 4
-HELD = 1e-6  # of a shape's largest value: less all along an edge is held
-CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a rectangle, one after another
-RED, BLUE = "#b2182b", "#2166ac"  # of the map of colours, up and down
+HELD = 1e-6  # of a shape's largest value: an edge with less is held
+CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a rectangle, anticlockwise
+RED, BLUE = "#b2182b", "#2166ac"  # ends of the colour map, up and down
 DOT: Any = {"color": "none", "marker": "o", "markeredgecolor": "black", "markerfacecolor": "none", "markersize": 7}
 
 
 def plot_surface_modes(
     modes: Modes, *, count: int | None = None, places: np.ndarray | None = None, values: np.ndarray | None = None
 ) -> Figure:
-    """Shapes over a rectangle, a panel per mode: red up, blue down, nodal lines black, edges that are held thick.
+    """Shapes over a rectangle, a panel per mode: red up, blue down, nodal lines black, held edges thick.
 
     Args:
-        count: of the lowest modes; all where not given.
+        count: number of modes, lowest first; all unless given.
         places: (n_places, 2) of sensors, m, drawn as circles.
-        values: (n_places, n_modes) found at the sensors, whose colour fills their circles.
+        values: (n_places, n_modes) identified at the sensors, the fill colours of the circles.
     """
     count = min(count or modes.n_modes, modes.n_modes)
     x, y, fields = _over(modes, np.eye(modes.n_modes)[:, :count])
@@ -75,14 +75,14 @@ def plot_surface_modes(
 
 
 def plot_surface_bands(bands: Bands) -> Figure:
-    """Each eigenfunction over a rectangle; below, its standard error as a share of its largest value.
+    """Each eigenfunction over a rectangle; below, its standard error relative to its largest value.
 
     Raises:
-        ValueError: places that all stand on one line.
+        ValueError: all places are on one line.
     """
     x, y = bands.x.T
     if np.linalg.matrix_rank(np.column_stack([x - x.mean(), y - y.mean()])) < 2:
-        raise ValueError("bands are drawn over a rectangle; their places all stand on one line: give a grid")
+        raise ValueError("bands over a rectangle need places that are not all on one line: give a grid")
     n = bands.phi.shape[1]
     wide, high = np.ptp(x), np.ptp(y)
     figure, grid = new_figure(
@@ -110,12 +110,12 @@ def plot_surface_motion(
     actuators: np.ndarray | None = None,
     impulse_at: tuple[float, float] | None = None,
 ) -> Figure:
-    """Displacement of a plate at some instants, a row a response, all in one scale of colour.
+    """Displacement of a plate at some instants, one row per response, with a common colour scale.
 
     Args:
         times: s; the nearest instants of each response are drawn.
         actuators: (n_actuators, 2) places, m, marked by crosses.
-        impulse_at: where the impulse acted, marked by a star.
+        impulse_at: place of the impulse, m, marked by a star.
     """
     first = next(iter(responses.values()))
     figure, grid = new_figure(
@@ -126,7 +126,7 @@ def plot_surface_motion(
         nearest = [int(np.argmin(np.abs(response.time - t))) for t in times]
         instants[name] = response.time[nearest]
         drawn[name] = _over(response.modes, response.modal[: response.modes.n_modes, nearest])
-    limit = max(float(np.abs(fields).max()) for _, _, fields in drawn.values()) or 1.0  # nothing may move at all
+    limit = max(float(np.abs(fields).max()) for _, _, fields in drawn.values()) or 1.0  # 1 if all are at rest
     for row, (name, (x, y, fields)) in zip(grid, drawn.items()):
         for ax, time, field in zip(row, instants[name], fields):
             image = _coloured(ax, x, y, field, limit)
@@ -156,14 +156,14 @@ def plot_surface_placement(
     limits: Limits | None = None,
     impulse_at: tuple[float, float] | None = None,
 ) -> Figure:
-    """Actuators on a plate over mode n + 1, whose nodal lines are black, and the work in each residual mode beside.
+    """Actuators on a plate with the nodal lines of mode n + 1, and the work in each residual mode.
 
-    Piezo patches are drawn in their size.
+    Piezo patches are drawn to scale.
 
     Args:
-        placements: by name, drawn in its colour.
-        limits: of which the forbidden zones are hatched.
-        impulse_at: where the impulse acts, marked by a star.
+        placements: by name, each in its own colour.
+        limits: forbidden zones are hatched.
+        impulse_at: place of the impulse, m, marked by a star.
     """
     n, modes = task.n_controlled, task.modes
     assert isinstance(modes.domain, Rectangle)
@@ -186,24 +186,24 @@ def plot_surface_placement(
         left.plot(*impulse_at, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
     (a, b), lines = modes.domain.length, f"nodal lines of mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz"
     left.set_title(f"{modes.domain}\n{lines}, the lowest residual mode", fontsize=10)
-    # at the top of its room: a layout that finds room inside it for the title gives it none above
+    # anchored at the top, else the layout leaves no room for the title above the axes
     left.set(anchor="N", xticks=(0.0, a), yticks=(0.0, b), xlabel="x [m]", ylabel="y [m]")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", fontsize=9, ncols=4)
     work = np.concatenate([placement.by_mode for placement in placements.values()])
     most, least = float(work.max()), float(work.min())
     right.set(xlabel="residual mode", ylabel="spillover work, W_r [J]", xticks=few_ticks(numbers), yscale="log")
-    # a mode at whose nodes they stand takes none but rounding
+    # a mode with all actuators at its nodes has no work but rounding
     right.set_ylim(max(SHOWN_WORK * most, 0.3 * least), 3.0 * most)
     return figure
 
 
 def plot_point_modes(modes: Modes, *, count: int | None = None) -> Figure:
-    """Shapes at named points, a panel per mode: the structure at rest grey, moved blue, neighbouring nodes joined.
+    """Shapes at named points, a panel per mode: the structure at rest grey, displaced blue, neighbouring nodes joined.
 
-    A plane structure is seen from the front, any other from above it: x to the right, z up, y away.
+    A plane structure is seen from the front, any other in an oblique view: x to the right, z up, y away.
 
     Args:
-        count: of the lowest modes; all where not given.
+        count: number of modes, lowest first; all unless given.
 
     Raises:
         ValueError: modes of another domain, or points without positions.
@@ -212,7 +212,7 @@ def plot_point_modes(modes: Modes, *, count: int | None = None) -> Figure:
 
 
 def plot_scattered_modes(modes: SampledModes, *, count: int) -> Figure:
-    """Shapes at sensors on a plate, a panel per mode, each sensor at the phase in which most of them are largest."""
+    """Shapes at sensors on a plate, a panel per mode, at the phase of largest motion."""
     phase = np.exp(-0.5j * np.angle(np.sum(modes.shapes**2, axis=0)))
     turned = replace(modes, shapes=modes.shapes * phase)
     return _net_panels(scattered_net(modes.positions), turned, min(count, modes.n_modes))
@@ -235,7 +235,7 @@ def _net_panels(net: Net, modes: Modes | SampledModes, count: int) -> Figure:
 
 
 def draw_nodal_lines(ax: Axes, modes: Modes, mode: int) -> None:
-    """A plate seen from above, in the grey of one mode's shape (an index), its nodal lines black."""
+    """Draw a plate from above, with the shape of one mode (an index) in grey and its nodal lines in black."""
     x, y, fields = _over(modes, np.eye(modes.n_modes)[:, mode : mode + 1])
     ax.contourf(x, y, fields[0].T, levels=2 * LEVELS, cmap="Greys", alpha=0.35)
     _nodal_lines(ax, x, y, fields[0], 1.4)
@@ -243,7 +243,7 @@ def draw_nodal_lines(ax: Axes, modes: Modes, mode: int) -> None:
 
 
 def draw_moved(ax: Axes, net: Net, moves: np.ndarray) -> None:
-    """A net at rest, grey, and moved by (n_spots, 2), blue, in a size that is seen."""
+    """Draw a net at rest in grey, and displaced by `moves` (n_spots, 2), scaled to be visible, in blue."""
     far = SWAY * np.ptp(net.rest, axis=0).max() / (np.abs(moves).max() or 1.0)
     for at, colour in ((net.rest, GREY), (net.rest + far * moves, COLOURS[0])):
         for ends in net.lines:
@@ -254,7 +254,7 @@ def draw_moved(ax: Axes, net: Net, moves: np.ndarray) -> None:
 
 
 def _nodal_lines(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, width: float) -> None:
-    """Where a field is zero; along edges that hold it, where it is so but for rounding, no line is drawn."""
+    """Draw the zero lines of a field, without held edges, along which it is zero but for rounding."""
     nothing = HELD * np.abs(field).max()
     i, j = (
         slice(int(np.abs(first).max() < nothing), -1 if np.abs(last).max() < nothing else None)
@@ -264,7 +264,7 @@ def _nodal_lines(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, widt
 
 
 def _held_edges(x: np.ndarray, y: np.ndarray, fields: np.ndarray) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """The edges along which no field moves, each as its ends: (x, x), (y, y)."""
+    """The edges along which all fields are zero, each by its ends: (x, x), (y, y)."""
     nothing, (a, b) = HELD * np.abs(fields).max(), (x[-1], y[-1])
     edges = (
         (fields[:, 0], ((0.0, 0.0), (0.0, b))),
@@ -278,7 +278,7 @@ def _held_edges(x: np.ndarray, y: np.ndarray, fields: np.ndarray) -> list[tuple[
 def _over(modes: Modes, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Coordinates x, y and fields (n_columns, n_x, n_y) of modal coordinates (n_modes, n_columns)."""
     if not isinstance(modes.domain, Rectangle):
-        raise ValueError("a surface is drawn over a rectangle; these modes have another domain")
+        raise ValueError("surface plots need modes of a rectangle; these have another domain")
     sides = modes.domain.length
     x, y = (np.linspace(0.0, side, max(round(PER_SIDE * side / max(sides)), 16)) for side in sides)
     places = np.column_stack([np.repeat(x, y.size), np.tile(y, x.size)])
@@ -305,7 +305,7 @@ def _panels(modes: Modes, count: int, columns: int) -> tuple[Figure, list[Axes]]
 
 
 def _bare(ax: Axes, modes: Modes) -> None:
-    """Equal axes with the rim as the only frame."""
+    """Axes of equal scale, with the edges of the plate as frame."""
     assert isinstance(modes.domain, Rectangle)
     a, b = modes.domain.length
     ax.set(aspect="equal", xlim=(0.0, a), ylim=(0.0, b), xticks=[], yticks=[])

@@ -1,4 +1,4 @@
-"""Figures of what the command wrote as JSON."""
+"""Figures of results that the command wrote as JSON."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,12 +12,12 @@ from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.free_decay.ibrahim import Stabilisation
 from workbench.structure.modes import SampledModes
 
-# the complex to real: seen on white and on black alike
+# from complex to real shapes; both ends are visible on white and on black
 REAL = LinearSegmentedColormap.from_list("real", ["#8f979f", COLOURS[0]])
 
 
 def plot_poles(poles: Mapping[str, np.ndarray]) -> Figure:
-    """Closed-loop poles (complex, rad/s) of each law, the upper half plane."""
+    """Closed-loop poles (complex, rad/s) of each law in the upper half plane."""
     figure, ax = new_figure(width=9, height=4.5)
     ax.axvline(0.0, color=GREY, linewidth=0.8)
     for (name, values), colour, marker in zip(poles.items(), COLOURS, "ox+s^v."):
@@ -29,7 +29,7 @@ def plot_poles(poles: Mapping[str, np.ndarray]) -> Figure:
 
 
 def plot_deviations(names: Sequence[str], values: Sequence[float], deviations: Sequence[float], label: str) -> Figure:
-    """Estimates, each with a bar of two standard errors either way."""
+    """Estimates with bars of ± 2 standard errors."""
     figure, ax = new_figure(width=9, height=3.5)
     at = np.arange(len(values))
     ax.vlines(at, np.subtract(values, 2 * np.asarray(deviations)), np.add(values, 2 * np.asarray(deviations)),
@@ -42,7 +42,7 @@ def plot_deviations(names: Sequence[str], values: Sequence[float], deviations: S
 
 
 def plot_mac(values: np.ndarray) -> Figure:
-    """Modal assurance criterion (n_modes, n_modes) of modes with one another, from 0 to 1."""
+    """A MAC matrix (n_modes, n_modes), with values from 0 to 1."""
     figure, ax = new_figure(width=5.5, height=4.8)
     modes = np.arange(1, len(values) + 1)
     image = ax.imshow(values, cmap="Blues", vmin=0.0, vmax=1.0, origin="lower")

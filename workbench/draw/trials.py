@@ -14,11 +14,11 @@ FAMILY = {
     "unknown": "outside the catalogue:",
 }
 BOTH, OTHER, ALWAYS_RIGHT = "both effects", "another two", "always right"
-MANY = 12  # kinds that are shown one by one; of more, those that were always named have one row together
+MANY = 12  # number of kinds above which those that were always named share one row
 
 
 def plot_confusion(tally: Tally) -> Figure:
-    """True against diagnosed effects, one square a case or more; on the diagonal, the correct answers."""
+    """The confusion matrix of true and diagnosed effects, with the number of cases in each square."""
     counts = _gathered(tally)
     rows = sorted({hidden for hidden, _ in counts}, key=_order)
     columns = rows + sorted({named for _, named in counts} - set(rows), key=_order)
@@ -41,7 +41,7 @@ def plot_confusion(tally: Tally) -> Figure:
 
 
 def _gathered(tally: Tally) -> dict[tuple[str, str], int]:
-    """Counts with all pairs in one row and two columns, and of many kinds those always named in one."""
+    """Counts with all pairs in one row and two columns, and with many kinds those that are always right in one row."""
     gathered: dict[tuple[str, str], int] = {}
 
     def add(hidden: str, named: str, count: int) -> None:

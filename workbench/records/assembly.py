@@ -1,6 +1,6 @@
-"""A record out of the signals, times and description that a file held.
+"""Assembly of a record from the signals, times and description in a file.
 
-What other programs write is brought to SI and to equal time steps, with a remark for each change.
+Files of other programs are converted to SI units and to equal time steps, with a remark for each change.
 """
 
 import json
@@ -18,13 +18,13 @@ from workbench.records.record import Channel, Record
 from workbench.records.units import SI, Unit, Units, split_unit, unit_named
 
 UNIFORM = 1e-3  # of the time step
-PART = 2**20  # steps looked at together
-# Steps between half and twice the median are resampled; a longer one is a gap, which nothing measured can fill.
+PART = 2**20  # steps checked together
+# Steps between half and twice the median are resampled; a longer one is a gap.
 SHORTEST, LONGEST = 0.5, 2.0
 FINEST_ROUNDING = 10  # decimals of a second
-FEWEST_ODD = 3  # steps that differ from the others, where instants were rounded
+FEWEST_ODD = 3  # least number of unequal steps if instants were rounded
 KINDS = ("input", "output")
-KEY = "crc32"  # of the checksum by which a file written here is known to be as it was written
+KEY = "crc32"  # of the checksum that detects changes of a file written here
 
 
 def checksum(description: Mapping[str, Any], signals: Iterable[np.ndarray]) -> int:
@@ -38,12 +38,12 @@ def checksum(description: Mapping[str, Any], signals: Iterable[np.ndarray]) -> i
 
 @dataclass(frozen=True, eq=False)
 class Sampling:
-    """When a record was sampled.
+    """The sampling of a record.
 
     Attributes:
-        start, step: of its equal steps, s.
-        times: (n_samples,) the instants, where they are unequal and the signals are to be resampled; else None.
-        remarks: what was taken for granted or will be changed.
+        start, step: of equal steps, s.
+        times: (n_samples,) unequal instants, from which the signals are to be resampled; else None.
+        remarks: on assumptions and changes.
     """
 
     start: float
@@ -54,12 +54,12 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Description:
-    """What a file says of its signals.
+    """The description of the signals in a file.
 
     Attributes:
         channels: by signal: kind, name, quantity, unit, at, noise_std, as far as given.
         name: of the record; None where only channels are described.
-        sampling: (start, step), s; None where there are times alone.
+        sampling: (start, step), s; None where the file has times alone.
         input_hold: "zero", "first" or "band-limited".
     """
 
@@ -79,7 +79,7 @@ def record_of(
     inputs: Sequence[str],
     into: Units = SI,
 ) -> Record:
-    """The record that a file held.
+    """The record of a file's contents.
 
     Args:
         path: of the file, for messages.
@@ -87,11 +87,11 @@ def record_of(
         signals: (n_samples,) each; a name may begin with its kind, `input:` or `output:`.
         header: the description as a JSON text.
         sample_rate_hz: where the file has no time.
-        inputs: names of signals that went in, where the file does not say.
-        into: the units that those which the file states become.
+        inputs: names of the input signals, where the file does not say.
+        into: the units into which stated units are converted.
 
     Raises:
-        RecordFileError: naming the file, channel and row, and what would be right.
+        RecordFileError: the message names the file, channel and row, and the remedy.
     """
     if not signals:
         raise RecordFileError(f"{path} holds no signals")
@@ -146,7 +146,7 @@ def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> 
         if "sample_time" not in table and KEY not in table:
             return Description(channels)
         sampling = (float(table["start_time"]), float(table["sample_time"]))
-        # files from before a description had a hold were all read as held
+        # descriptions of earlier versions have no hold; their inputs are held ("zero")
         described = Description(channels, str(table["name"]), sampling, table.get("input_hold", "zero"))
         whole = table[KEY] == checksum(table, [signals[key] for key in channels]) and len(signals) == len(channels)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
@@ -180,10 +180,10 @@ def _kind(key: str, described: Description) -> str:
 
 
 def legible(path: Path, name: str) -> str:
-    """The name of a channel, where a line of text can show it.
+    """The name of a channel, checked to be printable.
 
     Raises:
-        RecordFileError: control characters in it.
+        RecordFileError: control characters in the name.
     """
     if not name.isprintable():
         raise RecordFileError(f"{path}: the name {name!r} holds control characters; rename the channel")
@@ -205,31 +205,31 @@ def _channel(path: Path, name: str, facts: Mapping[str, Any], unit: Unit | None)
 
 
 def _units(path: Path, keys: Iterable[str], into: Units) -> dict[str, Unit]:
-    """The units that names of signals end in; none for names that would be alike without them."""
+    """The units at the end of signal names; none for names that would be equal without them."""
     split = {key: split_unit(_name(key)) for key in keys}
-    alike = Counter(base for base, _ in split.values())
-    found = {key: unit_named(text) for key, (base, text) in split.items() if text and alike[base] == 1}
+    counts = Counter(base for base, _ in split.values())
+    units = {key: unit_named(text) for key, (base, text) in split.items() if text and counts[base] == 1}
     try:
-        return {key: into.taken(unit) for key, unit in found.items() if unit is not None and unit.quantity != "time"}
+        return {key: into.taken(unit) for key, unit in units.items() if unit is not None and unit.quantity != "time"}
     except ValueError as error:
         raise RecordFileError(f"{path}: {error}") from None
 
 
 def unit_remark(name: str, written: str, unit: Unit) -> str:
-    """What to say of a signal that was brought to other units; nothing where it was in it."""
+    """The remark on a signal that was converted to another unit; empty where it was not."""
     if unit.si == "counts":
         return f"{name}: in counts of unstated sensitivity; modes have no scale"
     return "" if unit.factor == 1.0 else f"{name}: {written} taken as {unit.factor:g} {unit.si}"
 
 
 def _rows(signals: Sequence[np.ndarray], units: Sequence[Unit | None], sampling: Sampling) -> np.ndarray:
-    """The signals one below the other, in their units, at equal steps; read-only, for a record to take as they are."""
+    """The signals (n_signals, n_samples) in their units, at equal steps; read-only, so that `Record` does not copy."""
     rows = np.array(signals, float)
     for row, unit in zip(rows, units, strict=True):
         if unit is not None and unit.factor != 1.0:
             row *= unit.factor
         if sampling.times is not None:
-            # imported here: it is most of what a process that reads one file would wait for
+            # imported here, as the import takes longer than reading a file
             from scipy.interpolate import CubicSpline
 
             row[:] = CubicSpline(sampling.times, row)(sampling.start + sampling.step * np.arange(row.size))
@@ -253,18 +253,18 @@ def _sampling(
         raise RecordFileError(f"{path} is sampled at {1 / sampling.step:g} Hz, not at {sample_rate_hz:g} Hz")
     if described.sampling is None:
         return sampling
-    start, said = described.sampling
+    start, stated = described.sampling
     step = sampling.step
-    if not (abs(said - step) <= UNIFORM * step and abs(start - time[0]) <= UNIFORM * step):
+    if not (abs(stated - step) <= UNIFORM * step and abs(start - time[0]) <= UNIFORM * step):
         raise RecordFileError(
-            f"{path}: its description says a start at {start:g} s and steps of {said:g} s, its times {time[0]:g} s and"
-            f" {step:g} s; correct or remove the description"
+            f"{path}: its description states a start at {start:g} s and steps of {stated:g} s, its times {time[0]:g} s"
+            f" and {step:g} s; correct or remove the description"
         )
-    return replace(sampling, start=start, step=said)
+    return replace(sampling, start=start, step=stated)
 
 
 def _of_times(path: Path, time: np.ndarray, *, correct: bool) -> Sampling:
-    """Start and step of sample instants; unequal ones are rounded, or to be resampled, where they may be corrected."""
+    """Start and step of sample instants; if `correct`, rounded instants are recognised, and unequal ones resampled."""
     start, n_samples = float(time[0]), time.size
     with np.errstate(over="ignore", invalid="ignore"):
         mean = float((time[-1] - time[0]) / (n_samples - 1))
@@ -293,20 +293,20 @@ def _of_times(path: Path, time: np.ndarray, *, correct: bool) -> Sampling:
 
 
 def _is_steady(time: np.ndarray, step: float) -> bool:
-    """Whether all steps are so near one that they are near their median too; seen without a copy of a long record."""
+    """Whether all steps are near one value, and so near their median; checked in parts, without copying the record."""
     parts = (time[first : first + PART + 1] for first in range(0, time.size - 1, PART))
     return all((np.abs(np.diff(part) - step) <= 0.4 * UNIFORM * step).all() for part in parts)
 
 
 def _rounded(time: np.ndarray, steps: np.ndarray) -> Sampling | None:
-    """Equal steps whose instants were rounded to a power of ten when they were written; None where they were not."""
+    """The sampling of equal steps whose instants were rounded to a power of ten; None for other instants."""
     rounding = next((r for r in (10.0**-d for d in range(FINEST_ROUNDING)) if _are_multiples(time, r)), None)
     if rounding is None:
         return None
     wholes = np.round(steps / rounding)
     index = np.arange(time.size)
     step, start = np.polyfit(index, time, 1)
-    # one or two odd steps are samples that are missing, not rounding
+    # one or two unequal steps are missing samples, not rounding
     odd = wholes.size - Counter(wholes.tolist()).most_common(1)[0][1]
     if odd < FEWEST_ODD or np.abs(time - (start + step * index)).max() > 0.6 * rounding:
         return None

@@ -1,7 +1,7 @@
-"""Signals that hold nothing beyond half of their sample rate, as behind an anti-alias filter, between their samples.
+"""Band-limited interpolation of signals without content above the Nyquist frequency, as after an anti-alias filter.
 
-Samples determine such a signal (Shannon); it is the trigonometric polynomial through them over one period. A record is
-none: beyond its ends the signal is carried on by its reflection, each end into the other.
+Such a signal is determined by its samples (Shannon): over one period it is the trigonometric polynomial through them. A
+record is not periodic; it is continued from its end to its start by reflections of both ends, blended together.
 """
 
 import numpy as np
@@ -9,11 +9,11 @@ from scipy.fft import fft, ifft, next_fast_len
 
 from workbench.arrays import Complexes, Floats
 
-BEYOND = 256  # samples, at most, on which a record is carried on from its end to its start
+BEYOND = 256  # samples, at most, of the continuation from the end to the start
 
 
 def spectrum_of(signals: Floats) -> Complexes:
-    """Transform of each signal and what joins its end to its start, (n_signals, size), size odd.
+    """DFT (n_signals, size) of each signal with its continuation, size odd.
 
     Args:
         signals: (n_signals, n_samples).
@@ -22,7 +22,7 @@ def spectrum_of(signals: Floats) -> Complexes:
     if n == 1:
         return np.asarray(signals, complex)
     size = next_fast_len(n + min(BEYOND, n - 1))
-    while size % 2 == 0:  # no line at half of the sample rate, whose phase the samples do not tell
+    while size % 2 == 0:  # odd, to have no line at the Nyquist frequency, whose phase is not determined
         size = next_fast_len(size + 1)
     far = np.arange(1, size - n + 1)
     share = np.cos(0.5 * np.pi * far / (size - n + 1)) ** 2
@@ -32,19 +32,19 @@ def spectrum_of(signals: Floats) -> Complexes:
 
 
 def angles(size: int) -> Floats:
-    """Of the lines of a transform, rad a sample, (size,)."""
+    """Angular frequencies (size,) of the lines of a DFT, rad per sample."""
     return np.asarray(2.0 * np.pi * np.fft.fftfreq(size), float)
 
 
 def later(signals: Floats, delays: Floats) -> Floats:
-    """Each signal (n_signals, n_samples) delayed by so many samples (n_signals,), any fraction."""
+    """The signals (n_signals, n_samples), each delayed by a number of samples (n_signals,), fractions included."""
     spectrum = spectrum_of(signals)
-    turned = spectrum * np.exp(-1j * np.outer(delays, angles(spectrum.shape[1])))
-    return np.asarray(ifft(turned, axis=1).real[:, : signals.shape[1]])
+    shifted = spectrum * np.exp(-1j * np.outer(delays, angles(spectrum.shape[1])))
+    return np.asarray(ifft(shifted, axis=1).real[:, : signals.shape[1]])
 
 
 def finer(signals: Floats, times: int) -> Floats:
-    """So many times as many samples of each signal (n_signals, n_samples)."""
+    """The signals (n_signals, n_samples) interpolated to `times` as many samples."""
     spectrum = spectrum_of(signals)
     size = spectrum.shape[1]
     fine = np.zeros((len(signals), size * times), complex)
@@ -55,16 +55,17 @@ def finer(signals: Floats, times: int) -> Floats:
 
 
 def response_of_pole(spectrum: Complexes, pole: complex, n: int) -> tuple[Complexes, Complexes]:
-    """z of z' = λ z + u at n samples, zero at the first, and its derivative by λ, (n_signals, n) each.
+    """z of z' = λ z + u at n samples with z = 0 at the first, and its derivative by λ, (n_signals, n) each.
 
-    Line by line, U/(iω - λ) is the motion of the same period; what decays from the first sample takes z to zero there.
+    The periodic solution is U/(iω - λ) at each line; a free decay makes z zero at the first sample.
 
     Args:
-        spectrum: of `spectrum_of`.
+        spectrum: by `spectrum_of`.
         pole: λ times the sample time.
+        n: number of samples.
 
     Returns:
-        In units of the sample time, and of its square.
+        z in units of the sample time, and its derivative in units of the square.
     """
     denominator = 1j * angles(spectrum.shape[1]) - pole
     close = np.abs(denominator) < 1e-12  # undamped, on a line

@@ -1,7 +1,7 @@
-"""Readers of other people's formats, each run in a process of its own, within limits of time and memory.
+"""Readers of foreign formats, each run in a separate process with limits of time and memory.
 
-A compiled reader can crash, hang or ask for all memory on bytes that no program wrote, and nothing inside the same
-process can catch that. The arrays come back in a file, as an NPZ without pickles, so nothing that is sent can run here.
+A compiled reader can crash, hang or exhaust the memory on malformed bytes, which the same process cannot catch. The
+arrays are returned in a file, as an NPZ without pickles, so that no code from the file can run here.
 """
 
 import json
@@ -23,9 +23,9 @@ from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_arr
 NAMES = "names"
 REFUSED, NO_MEMORY = 3, 4
 LONGEST_REFUSAL = 10_000  # bytes
-PATIENCE = 5.0  # as many times as long by the clock as of processor time: a busy machine damages no file
-OVERHEAD = 2**29  # bytes of address space that the interpreter and its libraries take
-# -P keeps the working folder out of the path: a file there called numpy.py must not run
+PATIENCE = 5.0  # limit of elapsed time over that of processor time, for a busy machine
+OVERHEAD = 2**29  # bytes of address space of the interpreter and its libraries
+# -P keeps the working folder out of the path, so that a file called numpy.py there is not run
 CHILD = (
     "import sys; sys.path.append(sys.argv[1]); from workbench.records import confined; confined.serve(*sys.argv[2:])"
 )
@@ -33,7 +33,7 @@ ROOT = str(Path(__file__).resolve().parents[2])
 
 
 def load_confined(module: str, path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
-    """The arrays that `load(path, limits)` of a module finds in a file, by name and in its order.
+    """The arrays that `load(path, limits)` of a module reads from a file, by name, in order.
 
     Raises:
         RecordFileError: the reader refused the file, crashed on it, took too long, or needed too much memory.
@@ -78,7 +78,7 @@ def load_confined(module: str, path: Path, limits: Limits = DEFAULT) -> dict[str
 
 
 def serve(module: str, name: str, memory: str, seconds: str) -> None:
-    """Read in this process, write the arrays, or why there are none, to its output, and end it."""
+    """Read in this process, write the arrays, or the reason of a failure, to its output, and exit."""
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # some readers print
     limits, path = Limits(float(memory), float(seconds)), Path(name)
@@ -92,20 +92,20 @@ def serve(module: str, name: str, memory: str, seconds: str) -> None:
         code = 0
     except MemoryError:
         code = NO_MEMORY
-    except Exception as error:  # every reader of another's file has its own ways to fail
+    except Exception as error:  # readers raise exceptions of many kinds
         refusal = error if isinstance(error, RecordFileError) else unreadable(path, error)
         out.write(str(refusal).encode(errors="replace"))
         code = REFUSED
     out.close()
-    os._exit(code)  # without the clean-up of libraries that a damaged file may have upset
+    os._exit(code)  # without the clean-up of libraries, which a damaged file may have corrupted
 
 
 def _confine(limits: Limits) -> None:
     try:
         import resource
-    except ImportError:  # Windows knows no such limits; the limit by the clock holds there too
+    except ImportError:  # Windows has no such limits; the limit of elapsed time applies there too
         return
-    # the start of this process counts, and a second is left for the one that waits; a short limit is for the file alone
+    # includes the start of this process and leaves a second for the parent; a short limit applies to the file alone
     used = max(math.floor(limits.seconds) - 1, math.ceil(time.process_time()) + 1)
     for limit, value in (
         (resource.RLIMIT_AS, int(limits.memory) + OVERHEAD),

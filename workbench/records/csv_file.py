@@ -1,7 +1,7 @@
-"""Text tables: one row per sample, one column per signal; the first column is time where it is called so.
+"""Text tables: one row per sample, one column per signal; the first column is time where its name says so.
 
-Written here as CSV; read in whatever layout an instrument writes (`table_layout.py`). Numbers are parsed a block of
-lines at a time, so that a file of any length takes the memory of its numbers and of one block.
+Written as CSV; read in the layouts of many instruments (`table_layout.py`). Numbers are parsed in blocks of lines, so
+that a long file needs the memory of its numbers and of one block.
 """
 
 import csv
@@ -35,13 +35,13 @@ BLOCK = 2**21  # characters
 # a run of lines is one match without backtracking, so that 300 MB of them take seconds
 BLANK_LINES = re.compile(r"\n[ \t\n]+(?<=\n)")
 COMMENT_LINES = re.compile(r"^(?:#.*+\n?+)++", re.MULTILINE)
-SAME = 1e-9  # of the record's length: what two columns of the same instants differ by
+SAME = 1e-9  # of the record's length: tolerance of two equal columns of instants
 COUNTERS = ("sample", "samples", "index", "n", "no", "no.", "nr", "nr.", "#", "scan", "point", "row")  # before the time
 DATES = ("%d.%m.%Y", "%Y/%m/%d")  # beside ISO's, which numpy reads
 
 
 def read(path: Path, limits: Limits = DEFAULT) -> Signals:
-    """(time or None, signals by name, header text or None); units stand in brackets behind the names.
+    """(time or None, signals by name, header text or None), with units in brackets after the names.
 
     Raises:
         RecordFileError: rows that do not fit the names, or more than the limits allow.
@@ -71,17 +71,17 @@ def read(path: Path, limits: Limits = DEFAULT) -> Signals:
     time = signals.pop(first)
     time = time if factor == 1.0 else factor * time
     for name in [name for name in signals if time_base(name) == time_base(first)]:
-        # a time beside each channel, as some programs write it, is all right where all are one
+        # some programs write a time column for each channel, which must all be equal
         if not np.allclose((time_factor(name) or 1.0) * signals.pop(name), time, rtol=1e-9, atol=SAME * np.ptp(time)):
             raise RecordFileError(
-                f"{path}: channels have instants of their own, {first!r} and {name!r} differ; export them at one rate"
+                f"{path}: channels have different sample instants, {first!r} and {name!r}; export them with one rate"
                 " and start"
             )
     return time, signals, layout.header
 
 
 def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
-    """Write with all digits, so that reading gives the same numbers."""
+    """Write a record with all digits, so that reading gives the same numbers."""
     with path.open("w", newline="", encoding="utf-8") as file:
         file.write(MARK + json.dumps(header) + "\n")
         writer = csv.writer(file)
@@ -90,7 +90,7 @@ def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], heade
 
 
 def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> Iterator[np.ndarray]:
-    """The numbers of the table, (n_rows, n_columns) a block of lines, time stamps as seconds since the first."""
+    """The numbers of the table in blocks (n_rows, n_columns), time stamps as seconds since the first."""
     assert layout.first is not None
     deadline, clock = Deadline(path, limits), _Clock(path)
     number, rest = layout.first[0], layout.first[1] + "\n"
@@ -116,7 +116,7 @@ def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> 
 
 
 def _lines(path: Path, block: str) -> list[str]:
-    """The lines with numbers."""
+    """The lines of a block without comments and blank lines."""
     if "#" in block:
         if f"\n{MARK}" in f"\n{block}":
             raise RecordFileError(f"{path} is damaged: the description of its channels stands below its numbers")
@@ -141,7 +141,7 @@ def _numbers(path: Path, layout: Layout, number: int, block: str, lines: list[st
         numbers = np.loadtxt(commas, delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
         if numbers.shape != (len(lines), len(layout.names)):
             raise ValueError
-    except ValueError:  # which row and field is at fault is found line by line
+    except ValueError:  # line by line, to name the faulty row and field
         numbers = np.array([*_row_by_row(path, layout, number, block)])
     if not layout.stamped:
         return numbers
@@ -165,10 +165,10 @@ class _Clock:
         self._last: np.datetime64 | None = None
 
     def seconds(self, stamps: list[str]) -> np.ndarray:
-        """Of dates with times of day, or of times of day alone, which may pass midnight once.
+        """Seconds (n_stamps,) of dates with times of day, or of times of day alone, which may pass midnight.
 
         Raises:
-            RecordFileError: a stamp that is none.
+            RecordFileError: a text that is no time stamp.
         """
         try:
             times = np.array([_iso(stamp) for stamp in stamps], "datetime64[ns]")
@@ -184,7 +184,7 @@ class _Clock:
 
 
 def _iso(stamp: str) -> str:
-    """A time stamp as ISO 8601 writes it; a time of day is one of 1970-01-01."""
+    """A time stamp in ISO 8601; a time of day alone gets the date 1970-01-01."""
     stamp = stamp.strip(' "').replace(",", ".").removesuffix("Z")
     date, _, clock = stamp.replace("T", " ").partition(" ")
     if not clock:

@@ -1,9 +1,9 @@
-"""Records on disk: text tables, NPZ, MAT, HDF5, UFF 58, TDMS and WAV, through one door each way.
+"""Reading and writing of records: text tables, NPZ, MAT, HDF5, UFF 58, TDMS and WAV.
 
-What a format has no room for (places, noise, which signals are inputs, their hold) travels as a JSON text: in a
-comment of a CSV, an entry of an NPZ or MAT, an attribute of HDF5, the description lines of a UFF. A checksum in it
-detects a file that was changed since. Files of other programs have none of it: their signals are all outputs, by the
-file's names.
+Properties without a place in a format (places, noise, which signals are inputs, their hold) are stored as a JSON text:
+in a comment of a CSV, an entry of an NPZ or MAT, an attribute of HDF5, the description lines of a UFF. A checksum in it
+detects later changes of the file. Files of other programs have no such text: all their signals are outputs, with the
+names in the file.
 """
 
 from collections.abc import Iterator
@@ -48,33 +48,33 @@ def read_record(
     limits: Limits = DEFAULT,
     units: Units = SI,
 ) -> Record:
-    """A record from a file; the format goes by its ending.
+    """A record from a file, whose suffix selects the format.
 
-    Units that the file states, behind the names as in `Acc [g]` or beside the data, become SI or those of `units`, and
-    unequal time steps equal ones: `Record.remarks` says so.
+    Units that the file states, after the names as in `Acc [g]` or beside the data, are converted to SI or to `units`,
+    and unequal time steps are resampled; `Record.remarks` lists the changes.
 
     Args:
         path: of a .csv, .txt, .asc, .dat, .tsv, .npz, .mat, .h5, .hdf5, .uff, .unv, .tdms or .wav file.
         sample_rate_hz: where the file itself has no time.
-        inputs: names of the signals that went in, where the file does not say.
-        input_hold: "zero", "first" or "band-limited", how inputs run between samples; as the file says unless given,
-            "zero" where it does not, as those of other programs never do.
+        inputs: names of the input signals, where the file does not say.
+        input_hold: "zero", "first" or "band-limited", the course of inputs between samples; by default as the file
+            says, else "zero". Files of other programs do not say.
         limits: of memory and processor time.
-        units: in which the signals are wanted, those of a case say; numbers without a unit stay as they are.
+        units: of the signals, such as those of a case; numbers without a stated unit are not converted.
 
     Raises:
-        RecordFileError: naming file, channel and row, and what would be right; transfer functions; more than the
-            limits allow; a stated unit that cannot be told in `units`.
+        RecordFileError: a file that is no record; the message names file, channel and row, and the remedy. Transfer
+            functions; more than the limits allow; a stated unit that cannot be converted to `units`.
     """
-    found = read_measured(
+    measured = read_measured(
         path, sample_rate_hz=sample_rate_hz, inputs=inputs, input_hold=input_hold, limits=limits, units=units
     )
-    if isinstance(found, TransferFunctions):
+    if isinstance(measured, TransferFunctions):
         raise RecordFileError(
-            f"{path} is complex: it holds transfer functions, no record. Their modes are found by `workbench identify`,"
+            f"{path} is complex: it holds transfer functions, no record. Identify their modes by `workbench identify`,"
             " or by read_measured and identify_transfer"
         )
-    return found
+    return measured
 
 
 def read_measured(
@@ -86,19 +86,20 @@ def read_measured(
     limits: Limits = DEFAULT,
     units: Units = SI,
 ) -> Record | TransferFunctions:
-    """What a file holds: a record, or transfer functions where it is complex.
+    """The contents of a file: a record, or transfer functions where the data are complex.
 
     Transfer functions are complex arrays of MAT, NPZ or HDF5, shape ([n_outputs, [n_references,]] n_frequencies) with
-    the axes in any order, beside their lines (`frequency_hz`, `f`, ..., or `omega`) or a sample rate; data sets 58 of
-    UFF of the function type 4; tables that begin with a column `frequency`, then `NAME real`, `NAME imag`, or
+    the axes in any order, with their lines (`frequency_hz`, `f`, ..., or `omega`) or a sample rate; data sets 58 of
+    UFF of function type 4; tables that begin with a column `frequency`, then `NAME real`, `NAME imag`, or
     `NAME magnitude`, `NAME phase [deg]`.
 
     Args:
-        path, inputs, input_hold, limits, units: as `read_record`; transfer functions are always in SI.
-        sample_rate_hz: where the file itself has no time, or no lines: they then go from zero to half of it.
+        path, inputs, input_hold, limits, units: as for `read_record`; transfer functions are always in SI.
+        sample_rate_hz: where the file itself has no time, or no lines, which are then from zero to the Nyquist
+            frequency.
 
     Raises:
-        RecordFileError: naming file, channel and row, and what would be right.
+        RecordFileError: the message names file, channel and row, and the remedy.
     """
     path = Path(path)
     module = _format(path)
@@ -106,7 +107,7 @@ def read_measured(
     with reading(path):
         if module is csv_file:
             time, signals, header = csv_file.read(path, limits)
-            # beside sample instants, a column called F is a force
+            # in a table with sample instants, a column called F is a force
             arrays = complex_columns(path, signals) if time is None else {}
         else:
             arrays = module.arrays(path, limits)
@@ -124,12 +125,12 @@ def read_measured(
 
 
 def write_record(record: Record, path: str | Path) -> Path:
-    """Write a record; the format goes by the file's ending. Reading it back gives the same record, without remarks.
+    """Write a record to a file, whose suffix selects the format; reading it gives the same record, without remarks.
 
-    UFF 58 stores single channels with their own headers; the others hold all signals side by side.
+    UFF 58 stores each channel with its own header; the other formats store all signals together.
 
     Raises:
-        RecordFileError: an ending that names no format, or a name that a line of text cannot hold.
+        RecordFileError: an unknown suffix, or a channel name that is not printable.
     """
     path = Path(path)
     module = _format(path)

@@ -1,4 +1,4 @@
-"""HDF5: one dataset per signal at the top of the file, `t` or `time` for the instants."""
+"""HDF5: one dataset per signal in the root group, `t` or `time` for the instants."""
 
 import json
 import math
@@ -18,11 +18,11 @@ from workbench.records.units import unit_named
 
 UNIT = ("unit", "units")  # attributes
 
-arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
+arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
-    """The numbers and texts in the file itself, sizes known first, and its header; for a process of its own."""
+    """The numbers and texts in the file and its header, sizes checked first; to be called in a separate process."""
     with h5py.File(path, "r") as file:
         held = _held(file)
         found = {name: each for name, each in held.items() if isinstance(each, h5py.Dataset) and _is_read(each)}
@@ -45,8 +45,10 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
 
 
 def _in_units(name: str, dataset: Any) -> tuple[str, np.ndarray]:
-    """Name and values of a dataset; a unit among its attributes stands behind the name, but that of what is no signal,
-    or of its instants, is applied."""
+    """Name and values of a dataset, with the unit of its attributes after the name.
+
+    The unit of instants, lines, places and single values is applied instead.
+    """
     if _is_text(dataset):
         return name, np.array(dataset.asstr(errors="replace")[()], str)
     values = np.asarray(dataset[()])
@@ -62,12 +64,12 @@ def _in_units(name: str, dataset: Any) -> tuple[str, np.ndarray]:
 
 
 def is_hdf5(path: Path) -> bool:
-    """Whether the file is one of HDF5, whatever its ending."""
+    """Whether the file is HDF5, whatever its suffix."""
     return bool(h5py.is_hdf5(path))
 
 
 def _held(group: Any) -> dict[str, Any]:
-    """What a group itself holds, by name; no links to elsewhere."""
+    """The members of a group by name, without soft and external links."""
     return {name: group[name] for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)}
 
 
@@ -80,13 +82,13 @@ def _is_text(dataset: Any) -> bool:
 
 
 def _is_read(dataset: Any) -> bool:
-    """Texts, and numbers that are no text of MATLAB's."""
+    """Whether a dataset is text, or numbers that are not MATLAB text or cells."""
     numeric = dataset.dtype.base.kind in "fiubc"
     return _is_text(dataset) or (numeric and dataset.attrs.get("MATLAB_class") not in (b"char", b"cell"))
 
 
 def _numbers(dataset: Any) -> int:
-    """Numbers in a dataset, each of whose elements may be an array, or in a chunk, which is unpacked whole."""
+    """Size of a dataset, or of its chunk if that is larger, in numbers of eight bytes."""
     size = max(int(dataset.size or 0), math.prod(dataset.chunks or (0,)))
     return max(size, -(-size * int(dataset.dtype.itemsize) // (2 * BYTES_PER_NUMBER)))
 

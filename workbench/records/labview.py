@@ -1,4 +1,4 @@
-"""What the header of a LabVIEW measurement file says of the columns below it."""
+"""The header of a LabVIEW measurement file: units and sampling of its columns."""
 
 import re
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ END = "***End_of_Header***"
 
 @dataclass(frozen=True)
 class LabviewHeader:
-    """What the header says.
+    """Units and sampling in the header.
 
     Attributes:
-        units: one a channel, as written; empty where none are stated.
+        units: one per channel, as written; empty where none are stated.
         sampling: (start, step), s, where the instants are not written.
     """
 
@@ -25,17 +25,17 @@ class LabviewHeader:
     sampling: tuple[float, float] | None = None
 
     def of_columns(self, names: Sequence[str]) -> tuple[str, ...]:
-        """One unit a column, none for times."""
+        """One unit per column, empty for times."""
         channels = [name for name in names if time_factor(name) is None]
         by_name = dict(zip(channels, self.units))
         return tuple(by_name.get(name, "") for name in names) if self.units else ()
 
 
 def labview_header(path: Path, lines: Sequence[Sequence[str]]) -> LabviewHeader:
-    """The header in the lines above the numbers, by fields; an empty one of files of other programs.
+    """The header in the lines above the numbers (split into fields); empty for files of other programs.
 
     Raises:
-        RecordFileError: spectra, or channels that differ in start or rate and have no instants of their own.
+        RecordFileError: spectra, or channels without instants that differ in start or rate.
     """
     rows = {fields[0].strip(): [text.strip() for text in fields[1:]] for fields in lines if fields}
     if END not in rows:

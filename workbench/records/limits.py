@@ -1,4 +1,4 @@
-"""What a file may hold, how long it may take to read, and the error that every reader and writer raises."""
+"""Limits of the size of a file and of the time to read it, and the error of all readers and writers."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -12,9 +12,9 @@ COPIES = 4  # of a record, at most, in memory while it is read
 BYTES_PER_NUMBER = 8
 MOST_BYTES = 2**30
 MOST_CHANNELS = 10_000
-TELLING = 0.1  # of the time, from which on what is read tells how long the rest will take
-SPARE = 0.3  # by which what is read may mislead about all: rows grow longer with the digits of their times
-LONGEST = 200  # of a message that is passed on, characters
+TELLING = 0.1  # of the time limit, after which the remaining time is extrapolated
+SPARE = 0.3  # tolerance of extrapolations, as rows grow longer with the digits of their times
+LONGEST = 200  # characters of a reader's message that is passed on
 
 
 class RecordFileError(ValueError):
@@ -22,7 +22,7 @@ class RecordFileError(ValueError):
 
 
 def unreadable(path: Path, error: Exception) -> RecordFileError:
-    """What a reader's failure says of a file: its first line, shortened, and nothing that a terminal would obey."""
+    """The error for a reader's exception: the first line of its message, shortened, without control characters."""
     text = next(iter(str(error).splitlines()), "") or type(error).__name__
     shown = "".join(c if c.isprintable() else "?" for c in text[:LONGEST]) + ("..." if len(text) > LONGEST else "")
     return RecordFileError(f"{path} cannot be read as {path.suffix[1:].upper()}: {shown}")
@@ -30,21 +30,21 @@ def unreadable(path: Path, error: Exception) -> RecordFileError:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Read another's file inside this: whatever a reader fails by becomes a `RecordFileError`."""
+    """A context in which every exception of a reader becomes a `RecordFileError`."""
     try:
         yield
     except RecordFileError:
         raise
-    except Exception as error:  # every reader of another's file has its own ways to fail
+    except Exception as error:  # readers raise exceptions of many kinds
         raise unreadable(path, error) from error
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What reading a file may take.
+    """Limits of memory and time for reading a file.
 
     Attributes:
-        memory: bytes; the record itself may have a quarter of them.
+        memory: bytes; the record itself may have a quarter.
         seconds: of processor time.
     """
 
@@ -58,12 +58,12 @@ class Limits:
 
     @classmethod
     def of_gib(cls, memory: float) -> "Limits":
-        """Limits of memory in GiB, the time as ever."""
+        """Limits with a memory in GiB and the default time."""
         return cls(memory=memory * 2.0**30)
 
     @property
     def most_numbers(self) -> int:
-        """Numbers that a record may have."""
+        """Largest size of a record, in numbers."""
         return int(self.memory / (COPIES * BYTES_PER_NUMBER))
 
 
@@ -71,24 +71,24 @@ DEFAULT = Limits()
 
 
 class Deadline:
-    """The end of the time that a file may take, counted from the making of this."""
+    """The time limit of reading a file, from the creation of this object."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
         self._path, self._seconds = path, limits.seconds
         self._begun = time.process_time()
 
     def check(self, share: float = 1.0) -> None:
-        """Refuse to go on after the end, or where it will come before the file's, as what is read of it tells.
+        """Refuse to continue after the time limit, or where extrapolation predicts that it will be exceeded.
 
         Args:
-            share: of the file that is read.
+            share: of the file, read so far.
 
         Raises:
-            RecordFileError: the time is up, or will be.
+            RecordFileError: the time is or will be exceeded.
         """
         spent = time.process_time() - self._begun
-        telling = spent > TELLING * self._seconds
-        if spent > self._seconds or (telling and spent / share > self._seconds * _allowed(share)):
+        extrapolates = spent > TELLING * self._seconds
+        if spent > self._seconds or (extrapolates and spent / share > self._seconds * _allowed(share)):
             raise RecordFileError(
                 f"{self._path} takes more than {self._seconds:g} s to read: cut the record, take fewer channels, or"
                 " write it as HDF5 or NPZ"
@@ -96,12 +96,12 @@ class Deadline:
 
 
 def _allowed(share: float) -> float:
-    """Times a limit that a whole file may seem to take, of which a share is read."""
+    """Factor of a limit for values extrapolated from a share of a file."""
     return 1.0 + SPARE * (1.0 - share)
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file that is not there, is empty, or is too large to read.
+    """Refuse a file that does not exist, is empty, or is too large.
 
     Raises:
         RecordFileError: no file, no bytes, or more than `MOST_BYTES`.
@@ -129,14 +129,14 @@ def check_arrays(path: Path, arrays: Iterable[np.ndarray], limits: Limits = DEFA
 
 
 def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = DEFAULT, share: float = 1.0) -> None:
-    """Refuse what would hold too many channels or numbers, before it is read.
+    """Refuse too many channels or numbers, before they are read.
 
     Args:
         path: of the file.
-        n_channels: of all of it.
-        n_numbers: in the share of it that is read.
+        n_channels: in the whole file.
+        n_numbers: in a share of the file.
         limits: see `Limits`.
-        share: of the file; the rest is taken to be alike.
+        share: of the file; the rest is extrapolated.
 
     Raises:
         RecordFileError: more than `MOST_CHANNELS`, or more numbers than the memory allows.

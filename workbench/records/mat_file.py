@@ -1,4 +1,4 @@
-"""MAT files: one vector a signal, `t` or `time` for the instants, or one struct of these; version 7.3 is HDF5."""
+"""MAT files: one vector per signal, `t` or `time` for the instants, or one struct of these; version 7.3 is HDF5."""
 
 import json
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ from workbench.records.limits import Limits, check_counts
 from workbench.records.named_arrays import HEADER, check_struct, numbered
 
 NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
-arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
+arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
-    """The arrays of numbers and texts in the file, sizes known first; to be called in a process of its own."""
+    """The arrays of numbers and texts in the file, sizes checked first; to be called in a separate process."""
     if hdf5_file.is_hdf5(path):
         return hdf5_file.load(path, limits)
     held = whosmat(path, appendmat=False)

@@ -21,8 +21,8 @@ FORMATS = {
     ".h5": hdf5_file,
     ".hdf5": hdf5_file,
 }
-SCALES = ("mass_matrix", "modal_mass")  # arrays that say how large the shapes are
-ORTHOGONAL = 1e-3  # of unit modal mass: products of different modes beyond it are no rounding
+SCALES = ("mass_matrix", "modal_mass")  # arrays that determine the scale of the shapes
+ORTHOGONAL = 1e-3  # of unit modal mass: tolerated rounding of products of different modes
 NO_OP2 = (
     "Nastran's OP2 is not read: pyNastran 1.4 needs NumPy below 2. Export the modes as a universal file (data set"
     " 2414), or read the OP2 where pyNastran runs and save its arrays as an NPZ"
@@ -32,24 +32,24 @@ NO_OP2 = (
 def read_modes(
     path: str | Path, *, modal_mass: ArrayLike | None = None, damping_ratios: ArrayLike | None = None
 ) -> Modes:
-    """The mass-normalised modes that a file holds, at named points.
+    """The mass-normalised modes of a file, at named points.
 
     Universal files (.uff, .unv): displacements of data sets 55 or 2414 at nodes, with coordinates of 15 or 2411, in the
     units of 164; m, N and kg where it is missing. NPZ, MAT and HDF5:
     `shapes` (n_points, n_modes), `frequencies_hz` or `omega` (n_modes,), and where known `damping_ratios` (n_modes,),
     `modal_mass` (n_modes,), `names`, `nodes` and `directions` (n_points,), `positions` (n_points, 3) in m, and
-    `mass_matrix` (n_points, n_points), by which the shapes are then scaled and checked. Without it and `modal_mass`
-    they are taken as mass-normalised.
+    `mass_matrix` (n_points, n_points), by which the shapes are then scaled and checked. Without `mass_matrix` and
+    `modal_mass` the shapes count as mass-normalised.
 
     Args:
-        modal_mass: (n_modes,) or one number, kg, in place of what the file says: φᵀ M φ of its shapes.
-        damping_ratios: (n_modes,) or one number, in place of what the file says.
+        path: of the file.
+        modal_mass: (n_modes,) or one number, kg, φᵀ M φ of the file's shapes; overrides the file.
+        damping_ratios: (n_modes,) or one number; overrides the file.
 
     Raises:
-        RecordFileError: naming the file and what would be right: no modal mass, or another one than the mass matrix
-            gives, modes that are not orthogonal, shapes and frequencies that do not fit one another, complex shapes,
-            numbers that are not finite, damping in per cent, frequencies twice, an array that is named nearly like a
-            modal mass or a mass matrix.
+        RecordFileError: no modal mass, or another one than the mass matrix gives, modes that are not orthogonal, shapes
+            and frequencies of different numbers, complex shapes, numbers that are not finite, damping in per cent,
+            frequencies given twice, an array with a name similar to a modal mass or a mass matrix.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -67,12 +67,12 @@ def read_modes(
         return _modes_of(path, {**arrays, **{k: np.asarray(v, float) for k, v in given.items() if v is not None}})
     except RecordFileError:
         raise
-    except ValueError as error:  # what `Modes` and `NamedPoints` refuse, and text where numbers belong
+    except ValueError as error:  # refused by `Modes` or `NamedPoints`, or text instead of numbers
         raise RecordFileError(f"{path}: {error}") from error
 
 
 def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
-    for name in arrays:  # what else a file holds is left alone, but no scale of the shapes is passed over
+    for name in arrays:  # other arrays are ignored, but not a misspelt scale of the shapes
         if name not in SCALES and (name.lower() in ("m", "mass", "masses") or get_close_matches(name.lower(), SCALES)):
             likely = get_close_matches(name.lower(), SCALES, n=1) or SCALES
             raise RecordFileError(
@@ -166,20 +166,20 @@ def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) ->
     if not (masses > 0).all():
         r = int(np.argmin(masses > 0))
         raise RecordFileError(
-            f"{path} says no modal mass of mode {r + 1}, so its shape has no scale; give"
+            f"{path} states no modal mass of mode {r + 1}, so its shape has no scale; give"
             " read_modes(path, modal_mass=...), 1.0 where the shapes are mass-normalised"
         )
     return shapes / np.sqrt(masses)
 
 
 def _one_a_mode(path: Path, name: str, values: ArrayLike, n_modes: int) -> Floats:
-    """The same number of every mode, or one of each: (n_modes,)."""
-    found = np.ravel(np.asarray(values, float))
-    if found.size not in (1, n_modes):
+    """Values (n_modes,) from one number for all modes, or one per mode."""
+    given = np.ravel(np.asarray(values, float))
+    if given.size not in (1, n_modes):
         raise RecordFileError(
-            f"{path}: {name} is one number, or one per mode: {n_modes} modes need as many; got {found.size}"
+            f"{path}: {name} is one number, or one per mode: {n_modes} modes need as many; got {given.size}"
         )
-    return np.broadcast_to(found, (n_modes,))
+    return np.broadcast_to(given, (n_modes,))
 
 
 def _points(path: Path, n: int, arrays: Mapping[str, np.ndarray]) -> NamedPoints:

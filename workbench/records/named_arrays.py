@@ -1,4 +1,4 @@
-"""Signals out of named arrays, as NPZ, MAT and HDF5 hold them."""
+"""Signals from the named arrays of NPZ, MAT and HDF5 files."""
 
 import json
 from collections.abc import Collection, Mapping
@@ -17,37 +17,38 @@ Signals = tuple[np.ndarray | None, dict[str, np.ndarray], str | None]
 
 
 def numbered(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The signals under names that every format allows; their own travel in the header."""
+    """The signals under numbered names, which every format allows; the header has their own names."""
     return {f"{NUMBERED}{i}": np.asarray(values) for i, values in enumerate(signals.values())}
 
 
 def check_struct(path: Path, structs: Mapping[str, Collection[str]], read: Collection[str]) -> None:
-    """Refuse structs of MATLAB, and their fields, that stand where signals should, but for one with fields to read.
+    """Refuse MATLAB structs in place of signals, except a single one whose fields are signals.
 
     Args:
+        path: of the file.
         structs: fields, by struct.
-        read: fields of the one that hold signals.
+        read: fields of the single struct that are signals.
 
     Raises:
-        RecordFileError: naming them.
+        RecordFileError: several structs, or one without signals.
     """
     if len(structs) == 1 and read:
         return
-    told = "; ".join(f"{name} with {', '.join(fields) or 'no fields'}" for name, fields in structs.items())
+    listed = "; ".join(f"{name} with {', '.join(fields) or 'no fields'}" for name, fields in structs.items())
     raise RecordFileError(
-        f"{path} holds no signals but in structs: {told}. One struct is read, whose fields are signals: write it"
+        f"{path} holds no signals but in structs: {listed}. A single struct is read, whose fields are signals: write it"
         " alone, as by save('x.mat', '-struct', 'NAME')"
     )
 
 
 def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
-    """Time or None, signals by name, header or None: vectors as they are, single values and texts left out.
+    """Time or None, signals by name, header or None; single values and texts are left out.
 
-    An array of several rows, one axis as long as the other signals, is as many signals, `NAME 1` and so on. A single
-    value named `fs`, or another of `SURE_RATES`, gives the time where no array does.
+    An array of two axes, one as long as the other signals, becomes several signals, `NAME 1` and so on. A single value
+    named `fs`, or another of `SURE_RATES`, gives the time where no array does.
 
     Raises:
-        RecordFileError: an array that is no rows of samples, two of times, or numbered channels without their header.
+        RecordFileError: an array that is not rows of samples, two arrays of times, or numbered channels without header.
     """
     header = str(np.ravel(arrays[HEADER])[0]) if HEADER in arrays and np.size(arrays[HEADER]) else None
     time: np.ndarray | None = None
@@ -88,7 +89,7 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
 
 
 def _rows(path: Path, name: str, values: np.ndarray, lengths: set[int]) -> np.ndarray:
-    """The signals (n_signals, n_samples) of an array of two axes, the longer being time where no other signal says."""
+    """The signals (n_signals, n_samples) of an array of two axes; without other signals the longer axis is time."""
     along = [axis for axis, size in enumerate(values.shape) if size in (lengths or {max(values.shape)})]
     if values.ndim != 2 or len(along) != 1:
         raise RecordFileError(

@@ -17,7 +17,7 @@ LONGEST_TEXT = 2**22  # characters
 
 
 def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
-    """The arrays of an archive, once the headers of all of them have said how large they are.
+    """The arrays of an archive, read after a check of the sizes that their headers declare.
 
     Raises:
         RecordFileError: no archive, a damaged one, a pickle, or more than the limits allow.
@@ -51,7 +51,7 @@ def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], heade
 
 
 def _declared(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type that an array's header declares."""
+    """Shape and type declared by an array's header."""
     version = npy.read_magic(file)
     read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, _, dtype = read(file)
@@ -59,7 +59,7 @@ def _declared(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
 
 
 def _numbers(path: Path, member: zipfile.ZipInfo, shape: tuple[int, ...], dtype: np.dtype) -> int:
-    """How many numbers an array takes, of eight bytes each."""
+    """Size of an array in numbers of eight bytes."""
     size = 1
     for extent in shape:
         size *= int(extent)

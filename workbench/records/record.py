@@ -1,4 +1,4 @@
-"""A record: named, placed, uniformly sampled signals, going in and coming out."""
+"""A record: uniformly sampled input and output signals with names and places."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +14,7 @@ from workbench.structure.printed import Printed, counted, place_text
 if TYPE_CHECKING:
     import control  # takes seconds to import: most who read a record never need it
 
-# how an input runs between samples: held, straight from one to the next, or as an anti-alias filter lets it
+# course of an input between samples: zero-order hold, first-order hold, or band-limited
 HOLDS = ("zero", "first", "band-limited")
 QUANTITIES = {
     "displacement": "m",
@@ -35,9 +35,9 @@ class Channel:
 
     Attributes:
         name: unique among the inputs, and among the outputs, of a record.
-        quantity: what is measured, one of `QUANTITIES` or a word of the user's.
-        unit: as written on the axis; taken from the quantity where left empty.
-        at: its place on the structure: x (m), (x, y), or the name of a point; None where unknown or meaningless.
+        quantity: what is measured, one of `QUANTITIES` or another word.
+        unit: as written on the axis; by default that of the quantity.
+        at: place on the structure: x (m), (x, y), or the name of a point; None where unknown or meaningless.
         noise_std: standard deviation of the sensor's white noise, in `unit`; None where unknown.
     """
 
@@ -63,15 +63,15 @@ class Record(Printed):
     Attributes:
         sample_time: seconds between samples.
         outputs: (n_outputs, n_samples) measured signals.
-        output_channels: one `Channel` a row of `outputs`.
-        inputs: (n_inputs, n_samples) signals that went in; may have no rows.
-        input_channels: one `Channel` a row of `inputs`.
-        input_hold: "zero" where inputs are held over each sample interval, as a converter gives them, "band-limited"
-            where they hold nothing beyond half of the sample rate, as forces measured behind an anti-alias filter, or
-            "first" where they run straight from sample to sample, as forces slow against the sample rate nearly do.
+        output_channels: one `Channel` per row of `outputs`.
+        inputs: (n_inputs, n_samples) input signals; may have no rows.
+        input_channels: one `Channel` per row of `inputs`.
+        input_hold: "zero" where inputs are held over each sample interval, as by a D/A converter; "band-limited" where
+            they have no content above the Nyquist frequency, as forces measured after an anti-alias filter; "first"
+            where they are linear from sample to sample, as forces slow compared with the sample rate nearly are.
         start_time: time of the first sample, s.
-        name: how messages and plots call it.
-        remarks: what reading the file changed: units, time steps.
+        name: in messages and plots.
+        remarks: on changes made on reading the file: units, time steps.
 
     Raises:
         ValueError: shapes that do not fit, repeated names, empty or non-finite signals (channel and sample named).
@@ -99,8 +99,8 @@ class Record(Printed):
             raise ValueError(f"record {self.name!r}: the sample time must be positive; got {self.sample_time}")
         if self.input_hold not in HOLDS:
             raise ValueError(
-                f"record {self.name!r}: input_hold is zero (held), first (straight between samples) or band-limited"
-                f" (as behind an anti-alias filter); got {self.input_hold!r}"
+                f"record {self.name!r}: input_hold is zero (held), first (linear between samples) or band-limited"
+                f" (as after an anti-alias filter); got {self.input_hold!r}"
             )
         if outputs.shape[1] == 0:
             raise ValueError(f"record {self.name!r} is empty: it holds no samples")
@@ -182,7 +182,7 @@ class Record(Printed):
         """The samples with start <= time <= stop (s); the time axis is kept."""
         slack, ends = 1e-9 * self.sample_time, (self._instant(0), self._instant(self.n_samples - 1))
         first, last = 0, self.n_samples - 1
-        # Rounding may put the quotient on either side of a sample.
+        # The quotient may be rounded to either side of a sample.
         if start is not None and not start - slack <= ends[0]:
             first = int(max(min(self.n_samples, (start - self.start_time) / self.sample_time), 1)) - 1
             while first < self.n_samples and not self._instant(first) >= start - slack:
@@ -192,9 +192,9 @@ class Record(Printed):
             while last >= 0 and not self._instant(last) <= stop + slack:
                 last -= 1
         if first > last:
-            asked = [f"{word} {time:g} s" for word, time in (("from", start), ("to", stop)) if time is not None]
+            wanted = [f"{word} {time:g} s" for word, time in (("from", start), ("to", stop)) if time is not None]
             raise ValueError(
-                f"record {self.name!r} runs from {ends[0]:g} to {ends[1]:g} s: it has no sample {' '.join(asked)}"
+                f"record {self.name!r} runs from {ends[0]:g} to {ends[1]:g} s: it has no sample {' '.join(wanted)}"
             )
         if last - first == self.n_samples - 1:
             return self
@@ -267,5 +267,5 @@ class Record(Printed):
 
 
 def as_records(records: Record | Iterable[Record]) -> list[Record]:
-    """The records, or the one, as a list."""
+    """One record or several as a list."""
     return [records] if isinstance(records, Record) else list(records)

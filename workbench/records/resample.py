@@ -1,4 +1,4 @@
-"""Fewer samples per second, with what lies above the new band filtered out first."""
+"""Decimation of records, after a low-pass filter."""
 
 import numpy as np
 from scipy.signal import firwin, oaconvolve
@@ -11,8 +11,8 @@ HALF_WIDTH = 10
 def decimate(record: Record, factor: int) -> Record:
     """Every `factor`-th sample after a low-pass filter at 0.8 of the new Nyquist frequency.
 
-    The filter is causal, so a free decay stays one: only amplitudes and phases of its modes change, alike at every
-    sensor. The samples that the filter needs to fill are cut off at the start.
+    The filter is causal, so that a free decay remains one: amplitudes and phases of its modes change equally at all
+    sensors. The initial transient of the filter is cut off.
 
     Args:
         record: free decay or any other.

@@ -1,8 +1,8 @@
-"""How a text table is laid out: what stands before its numbers, and how these are separated.
+"""The layout of a text table: header lines, units, delimiter, time stamps and decimal mark.
 
 Instruments write comments, headers of several lines, a line of units; tabs, semicolons, commas or spaces between the
-fields; a date and a time of day in place of seconds. All of it shows in the lines down to the first that holds numbers
-only, but for the decimal mark: whole numbers have none, so that it is the first row with one that decides.
+fields; a date and a time of day instead of seconds. All of this is recognised from the lines down to the first row of
+numbers, except the decimal mark, which the first row with one determines.
 """
 
 import csv
@@ -23,7 +23,7 @@ LONGEST_LINE = 1_000_000  # characters
 LONGEST_HEADER = 1000, 4 * LONGEST_LINE  # lines, and characters in all
 SNIFFED = 2**20  # bytes, for the encoding
 DELIMITERS = "\t", ";", ",", " "
-# of a description that this program writes: a line with one of them is no header of another program
+# parts of a description written by this program: a line with one of them is not a header of another program
 OURS = (f'"{KEY}":', '"channels":', '"kind":', '"noise_std":')
 DATE = re.compile(r"\d{4}-\d\d-\d\d|\d{4}/\d\d/\d\d|\d{1,2}\.\d{1,2}\.\d{4}")
 CLOCK = re.compile(r"\d{1,2}:\d\d:\d\d(?:[.,]\d+)?")
@@ -33,26 +33,26 @@ SMALL = re.compile(r" *[-+]?[1-9]\d{0,2} *")  # a whole number that needs no tho
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(?:(?:,\d{3})+(?:\.\d*)?|(?:\.\d{3})+(?:,\d*)?)")
 ONE_MARK = "write numbers with one decimal mark and without thousands separators"
 MARKS = re.compile("[.,]")
-COMMENTS = re.compile(r'[\t;,] *"?comment"?\s*', re.IGNORECASE)  # the end of a line of names, as LabVIEW's
+COMMENTS = re.compile(r'[\t;,] *"?comment"?\s*', re.IGNORECASE)  # at the end of a line of names, as in LabVIEW files
 NO_UNIT = ("", "-", "–")
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How the rows of a table are to be read.
+    """The layout of a table.
 
     Attributes:
-        names: one a column, without those at the front.
-        units: one a column, as written; empty where none are.
+        names: one per column of numbers.
+        units: one per column of numbers, as written; empty where none are stated.
         delimiter: between fields; a blank for any run of white space.
-        n_front: columns at the front that are no numbers.
-        stamped: whether they hold a date, a time of day, or both in one; LabVIEW's of no instants are empty.
-        trailing: whether each row ends in a delimiter.
-        comments: whether texts may stand behind the numbers.
-        header: the description that this program wrote, as a JSON text.
-        first: the first row of numbers, and which row of the file it is; None where there is none.
-        sampling: (start, step), s, where the lines above say so.
-        decimal_comma: whether numbers have a comma for a point; None as long as none has either.
+        n_front: number of leading columns that are not numbers.
+        stamped: whether these are a date, a time of day, or both; else they are empty, as in LabVIEW files.
+        trailing: whether each row ends with a delimiter.
+        comments: whether texts may follow the numbers.
+        header: the description written by this program, as a JSON text.
+        first: (number of the row in the file, text) of the first row of numbers; None where there is none.
+        sampling: (start, step), s, where the header states them.
+        decimal_comma: whether the decimal mark is a comma; None until a number has a mark.
     """
 
     names: tuple[str, ...]
@@ -68,7 +68,7 @@ class Layout:
     decimal_comma: bool | None = None
 
     def fields(self, line: str) -> list[str]:
-        """The fields of a row that are to be numbers."""
+        """The fields of a row that should be numbers."""
         fields = _fields(line, self.delimiter, self.trailing)[self.n_front :]
         return fields[: len(self.names)] if self.comments else fields
 
@@ -82,12 +82,12 @@ class Layout:
 
 
 def decided(path: Path, layout: Layout, block: str, lines: Sequence[str]) -> Layout:
-    """The layout with the decimal mark of the first of these rows that has one; as it was where none has.
+    """The layout with the decimal mark of the first of these rows that has one; unchanged where none has.
 
     Raises:
-        RecordFileError: marks that may as well separate thousands, as in a column of 999 and 1,500.
+        RecordFileError: marks that may be thousands separators, as in a column of 999 and 1,500.
     """
-    signs = '."' if layout.delimiter == "," else ".,"  # whole numbers alone are seen without a look at each field
+    signs = '."' if layout.delimiter == "," else ".,"  # without these there are whole numbers alone
     if layout.decimal_comma is not None or not any(sign in block for sign in signs):
         return layout
     fields = (field.strip() for line in lines for field in layout.fields(line))
@@ -107,7 +107,7 @@ def decided(path: Path, layout: Layout, block: str, lines: Sequence[str]) -> Lay
 
 
 def encoding_of(path: Path) -> str:
-    """UTF-8 or UTF-16 by its first bytes; Latin-1 where they are neither."""
+    """The encoding of a file by its first bytes: UTF-8 or UTF-16, else Latin-1."""
     with path.open("rb") as file:
         start = file.read(SNIFFED)
     if start.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
@@ -120,10 +120,10 @@ def encoding_of(path: Path) -> str:
 
 
 def layout_of(path: Path, file: TextIOBase) -> Layout:
-    """The layout of a table, read from the file down to its first row of numbers.
+    """The layout of a table, recognised from the file down to its first row of numbers.
 
     Raises:
-        RecordFileError: no names before the numbers, a row below them that holds something else, or no table at all.
+        RecordFileError: no names before the numbers, a row below the names with something else, or no table.
     """
     lines: list[tuple[int, str]] = []  # of text, with their rows
     header, comment, characters = None, "", 0
@@ -164,10 +164,10 @@ def layout_of(path: Path, file: TextIOBase) -> Layout:
 
 
 def check_length(path: Path, number: int, line: str) -> None:
-    """Refuse a line that is none.
+    """Refuse a line of more than `LONGEST_LINE` characters.
 
     Raises:
-        RecordFileError: more than `LONGEST_LINE` characters.
+        RecordFileError: such a line.
     """
     if len(line) >= LONGEST_LINE:
         raise RecordFileError(f"{path}, row {number} has more than {LONGEST_LINE} characters: is it a table?")
@@ -177,7 +177,7 @@ def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]
     """The numbers of a row.
 
     Raises:
-        RecordFileError: too many or too few of them, or something else.
+        RecordFileError: too many or too few fields, or a field that is not a number.
     """
     fields = layout.fields(line)
     if len(fields) != len(layout.names):
@@ -195,7 +195,7 @@ def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]
 
 
 def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, found: Layout) -> Layout:
-    """The layout whose names stand in a line of as many fields as the first row of numbers has."""
+    """The layout with the names and units of the header lines with as many fields as the first row of numbers."""
     assert found.first is not None
     first, width = found.first[0], len(found.names)
     rows = []
@@ -239,7 +239,7 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
 
 
 def _names_and_units(titles: Sequence[list[str]]) -> tuple[int, int | None]:
-    """Which line of text is that of names, and which, if any, that of units: names are those with one of a time."""
+    """Indices of the header lines of names and of units (or None); for names a line that names a time is preferred."""
     timed = [{j for j, field in enumerate(fields) if time_factor(field) is not None} for fields in titles]
     units = None
     for i in reversed(range(len(titles))):
@@ -252,8 +252,11 @@ def _names_and_units(titles: Sequence[list[str]]) -> tuple[int, int | None]:
 
 
 def _are_units(fields: Sequence[str], timed: set[int]) -> bool:
-    """Whether fields are units: a time's is one of time; else all are known, in brackets, or empty, or more than half
-    are known."""
+    """Whether the fields of a header line are units.
+
+    The unit of a time must be one of time. Without times, all fields must be known units, in brackets or empty, or more
+    than half must be known.
+    """
     stated = {j: text for j, text in enumerate(fields) if text not in NO_UNIT}
     known = {j: unit for j, text in stated.items() if (unit := unit_named(_bare(text))) is not None}
     times = [j in known and known[j].quantity == "time" for j in timed & stated.keys()]
@@ -267,7 +270,7 @@ def _bare(unit: str) -> str:
 
 
 def _distinct_names(titles: Sequence[list[str]]) -> list[str]:
-    """The names of the last line of titles; where some are alike, behind what stands above them, a time numbered."""
+    """The names of the last line of titles; equal ones are preceded by the text above them, and times are numbered."""
     names, times = list(titles[-1]), 0
     for j, name in enumerate(names):
         if time_factor(name) is not None and name in names[:j]:
@@ -280,10 +283,10 @@ def _distinct_names(titles: Sequence[list[str]]) -> list[str]:
 
 
 def _row_of_numbers(path: Path, number: int, line: str, without_x: bool) -> Layout | None:
-    """How a row is laid out where all is numbers, or behind time stamps or LabVIEW's empty column; else None.
+    """The layout of a row of numbers, with leading time stamps or the empty column of LabVIEW; None for other rows.
 
     Raises:
-        RecordFileError: numbers with decimal points and others with decimal commas, or with thousands separators.
+        RecordFileError: numbers with both decimal points and decimal commas, or with thousands separators.
     """
     for delimiter in DELIMITERS:
         if delimiter not in line and delimiter != ",":
@@ -336,8 +339,8 @@ def _names(path: Path, fields: Sequence[str]) -> tuple[str, ...]:
 
 
 def _number(text: str, decimal_comma: bool | None) -> float:
-    """With a decimal point, a decimal comma, or, where it is not known, either."""
-    # an underscore is Python's, and nobody else's; a second mark would separate thousands
+    """A number with a decimal point, a decimal comma, or, where that is not known, either."""
+    # Python alone accepts an underscore; a second mark would be a thousands separator
     if "_" in text or (decimal_comma is not False and "." in text and (decimal_comma or "," in text)):
         raise ValueError
     return float(text if decimal_comma is False else text.replace(",", "."))

@@ -1,4 +1,4 @@
-"""TDMS, as LabVIEW writes it: one channel a signal, its unit and sample instants among its properties."""
+"""TDMS files of LabVIEW: one channel per signal, with unit and sampling among its properties."""
 
 from collections import Counter
 from functools import partial
@@ -9,14 +9,14 @@ import numpy as np
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError, check_counts
 
-TOGETHER = 0.01  # of a step: what starts of channels sampled together may differ by
-arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
+TOGETHER = 0.01  # of a step: tolerance of the start times of channels
+arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
-    """The channels of numbers, units in brackets behind their names, and `t` where the file has sample instants.
+    """The channels of numbers, with units in brackets after their names, and `t` where the file has sample instants.
 
-    Sizes are known first; to be called in a process of its own.
+    Sizes are checked first; to be called in a separate process.
     """
     from nptdms import TdmsFile
 
@@ -43,10 +43,10 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         raise RecordFileError(f"{path}: its channels have {len(sampling)} different sample instants; export one rate")
     if starts:
         first, last = min(starts, key=starts.__getitem__), max(starts, key=starts.__getitem__)
-        apart = (starts[last] - starts[first]) / np.timedelta64(1, "s")
-        if apart > TOGETHER * min(step for _, step in sampling):
+        difference = (starts[last] - starts[first]) / np.timedelta64(1, "s")
+        if difference > TOGETHER * min(step for _, step in sampling):
             raise RecordFileError(
-                f"{path}: channel {last!r} starts {apart:g} s after {first!r}; export channels that start together"
+                f"{path}: channel {last!r} starts {difference:g} s after {first!r}; export channels that start together"
             )
     lengths = {values.size for values in found.values()}
     if sampling and len(lengths) == 1:

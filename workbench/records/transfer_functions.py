@@ -1,4 +1,4 @@
-"""Transfer functions: named, placed spectra of outputs per unit input; read from arrays; their impulse responses."""
+"""Measured transfer functions (FRFs), their assembly from the arrays of a file, and their impulse responses."""
 
 import json
 import re
@@ -19,23 +19,23 @@ from workbench.renamed import Renamed
 from workbench.structure.modes import freeze
 from workbench.structure.printed import Printed, counted, place_text
 
-# Names, in small letters, under which programs keep the lines, the sample rate, and where the points are.
+# Names, in small letters, that programs use for the lines, the sample rate, and the places of the points.
 HERTZ = ("f", "freq", "freqs", "frequency", "frequencies", "hz", "f_hz", "freq_hz", "frequency_hz", "frequencies_hz",
          "frequency [hz]", "f [hz]")  # fmt: skip
 RADIANS = ("w", "omega", "w_rad_s", "omega_rad_s", "frequency_rad_s", "frequencies_rad_s",
            "frequency [rad/s]", "omega [rad/s]")  # fmt: skip
 SURE_RATES = ("fs", "sample_rate", "sample_rate_hz")
-LIKELY_RATES = ("freq", "frequency", "rate")  # where the number of samples stands beside it
+LIKELY_RATES = ("freq", "frequency", "rate")  # with a number of samples too
 SAMPLES = ("npts", "nfft", "n_samples")
 PLACES = ("positions", "at")
-# of a table: parts of complex numbers, behind the name of a channel or by themselves
+# names of columns with parts of complex numbers, with or without the name of a channel
 COLUMN = re.compile(
     r"(?:(.+?)[ ._]+)?(?:(re|real)|(im|imag|imaginary)|(mag|magnitude|amplitude)|(phase))", re.IGNORECASE
 )
 DECIBEL = re.compile(r"(.+?)\s*[\[(]\s*dB\s*[\])]", re.IGNORECASE)
 DESCRIPTION = "transfer_header"
-TURN = 2.0 * np.pi * (1.0 + 1e-6)  # rad: a phase beyond it is in degrees where no unit is told
-REAL = 1e-6  # relative imaginary part, at most, of a line that is real
+TURN = 2.0 * np.pi * (1.0 + 1e-6)  # rad: a larger phase without a unit is in degrees
+REAL = 1e-6  # largest relative imaginary part of a real line
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,10 +45,10 @@ class TransferFunctions(Printed):
     Attributes:
         values: (n_outputs, n_references, n_frequencies) complex, outputs per unit input.
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
-        output_channels: one `Channel` an output.
-        references: one name an input, whether it was struck or shaken.
-        name: how messages call it.
-        remarks: what reading the file changed: units.
+        output_channels: one `Channel` per output.
+        references: one name per input.
+        name: in messages.
+        remarks: on changes made on reading the file: units.
 
     Raises:
         ValueError: shapes that do not fit, repeated names, frequencies that do not increase.
@@ -94,10 +94,10 @@ class TransferFunctions(Printed):
     only = Renamed("select_outputs")
 
     def select_outputs(self, outputs: tuple[str, ...]) -> "TransferFunctions":
-        """These outputs alone, in this order.
+        """The transfer functions to some outputs, in that order.
 
         Raises:
-            ValueError: an output that is not there.
+            ValueError: an unknown output.
         """
         for name in outputs:
             if name not in self.output_names:
@@ -108,18 +108,18 @@ class TransferFunctions(Printed):
 
 
 def holds_transfer(arrays: Mapping[str, np.ndarray]) -> bool:
-    """Whether any array is complex, as no record is."""
+    """Whether an array is complex, so that the file has transfer functions and not a record."""
     return any(values.dtype.kind == "c" and values.size > 1 for values in arrays.values())
 
 
 def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The columns of a table that begins with frequencies, the parts of each complex number put together; else none.
+    """Lines and complex columns of a table that begins with frequencies; empty for other tables.
 
-    Parts are real and imaginary, or magnitude (which may be in dB) and phase (in rad or degrees). A unit that is known
-    stands behind the name or the part, as in `a [g/N] real`: values are brought to SI by it.
+    Columns are real and imaginary parts, or magnitude (also in dB) and phase (in rad or degrees). Values are converted
+    to SI by a known unit after the name or the part, as in `a [g/N] real`.
 
     Raises:
-        RecordFileError: frequencies, but a column beside them without its other part.
+        RecordFileError: a table of frequencies in which a column lacks its other part.
     """
     names = list(signals)
     base, text = split_unit(names[0]) if names else ("", "")
@@ -187,16 +187,16 @@ def _split_ratio(name: str) -> tuple[str, str, str]:
 def transfer_of(
     path: Path, arrays: Mapping[str, np.ndarray], *, sample_rate_hz: float | None = None
 ) -> TransferFunctions:
-    """The transfer functions that a file held.
+    """The transfer functions in the arrays of a file.
 
     Args:
         path: of the file, for messages.
-        arrays: complex ones, one axis of each as long as there are lines, the others its points (and references); the
-            lines under a name of `HERTZ` or `RADIANS`, or a sample rate.
-        sample_rate_hz: where the file has neither; its lines then go from zero to half of it.
+        arrays: complex ones, with an axis of lines, the others of points (and references); the lines under a name of
+            `HERTZ` or `RADIANS`, or a sample rate.
+        sample_rate_hz: where the file has neither; the lines are then from zero to the Nyquist frequency.
 
     Raises:
-        RecordFileError: naming the file and the array, and what would be right.
+        RecordFileError: the message names the file and the array, and the remedy.
     """
     found = {name: np.squeeze(v) for name, v in arrays.items() if v.dtype.kind == "c" and v.size > 1}
     lines, assumed = _lines(path, arrays, found, sample_rate_hz)
@@ -218,7 +218,7 @@ def transfer_of(
 def _lines(
     path: Path, arrays: Mapping[str, Any], found: Mapping[str, Any], sample_rate_hz: float | None
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Hz, and what was assumed of them."""
+    """The lines (n_frequencies,), Hz, and remarks on assumptions."""
     real = {
         name: np.ravel(v) for name, v in arrays.items() if v.dtype.kind in "fiu" and max(v.shape, default=1) == v.size
     }
@@ -237,13 +237,13 @@ def _lines(
     scalars = {name.lower(): float(values[0]) for name, values in real.items() if values.size == 1}
     longest = max(max(values.shape) for values in found.values())
     likely = (2 * longest - 2, 2 * longest - 1, 2 * longest)
-    told = next((scalars[name] for name in SAMPLES if scalars.get(name) in likely), None)
-    rates = [scalars[name] for name in (*SURE_RATES, *(LIKELY_RATES if told else ())) if name in scalars]
+    stated = next((scalars[name] for name in SAMPLES if scalars.get(name) in likely), None)
+    rates = [scalars[name] for name in (*SURE_RATES, *(LIKELY_RATES if stated else ())) if name in scalars]
     rate = sample_rate_hz if sample_rate_hz is not None else rates[0] if rates else None
     if rate is None:
         name = next(iter(found))
         raise RecordFileError(
-            f"{path}, {name!r} is complex: transfer functions? No lines stand beside it; add them as an array"
+            f"{path}, {name!r} is complex: transfer functions? The file has no lines; add them as an array"
             " 'frequency_hz', or give the sample rate if they go from zero to half of it"
         )
     if not 0 < rate < np.inf:
@@ -257,15 +257,15 @@ def _lines(
     ends = np.concatenate([np.moveaxis(v, v.shape.index(longest), -1)[..., [0, -1]].reshape(-1, 2)
                            for v in found.values() if longest in v.shape])  # fmt: skip
     is_real = (np.abs(ends.imag) <= REAL * np.abs(ends)).all(axis=0)
-    if is_real[1] and not is_real[0] and told in (None, 2 * longest):  # all lines of a transform but that at 0 Hz
+    if is_real[1] and not is_real[0] and stated in (None, 2 * longest):  # all lines of a DFT except that at 0 Hz
         lines = rate / (2 * longest) * np.arange(1, longest + 1)
         return lines, (
             f"no frequencies beside a sample rate of {rate:g} Hz: the {longest} lines taken from {lines[0]:g} to"
             f" {lines[-1]:g} Hz, as the last is real and the first is not; else add them as 'frequency_hz'",
         )
-    # half the samples of a transform that is a power of two long: all lines but that at half the rate, which is real
-    short = told is None and longest & (longest - 1) == 0 and not is_real[1]
-    n_samples = told if told is not None else 2 * longest if short else 2 * longest - 2
+    # a power of two, and the last line not real: all lines of a DFT except that at the Nyquist frequency
+    short = stated is None and longest & (longest - 1) == 0 and not is_real[1]
+    n_samples = stated if stated is not None else 2 * longest if short else 2 * longest - 2
     doubt = "" if is_real[0] else "; but the first is not real, as that at 0 Hz is"
     lines = rate / n_samples * np.arange(longest)
     return lines, (
@@ -288,7 +288,7 @@ def _frequency_last(path: Path, name: str, values: np.ndarray, n_lines: int) -> 
 def _points(
     path: Path, arrays: Mapping[str, Any], names: list[str], n_references: int
 ) -> tuple[tuple[Channel, ...], tuple[str, ...], tuple[str, ...]]:
-    """Channels and references, as the file names them, else numbered; and what reading changed."""
+    """Channels and references, named by the file or numbered, and the remarks of reading."""
     if DESCRIPTION in arrays:
         try:
             described = json.loads(str(arrays[DESCRIPTION]))
@@ -314,14 +314,14 @@ def _points(
 def read_transfer(
     path: str | Path, *, positions: Sequence[float], quantity: str, matrix: str = "yspec", sample_rate: str = "freq"
 ) -> Record:
-    """Impulse responses from the transfer functions of a MAT file, one column a point.
+    """Impulse responses from the transfer functions of a MAT file, one column per point.
 
     Args:
         path: of the file.
         positions: (n_points,) of the columns, m.
         quantity: measured, per N of force.
         matrix: name of the (n_frequencies, n_points) complex array, first row at 0 Hz, last at Nyquist.
-        sample_rate: name of the sample rate behind it, Hz.
+        sample_rate: name of the array with the sample rate, Hz.
 
     Raises:
         RecordFileError: a file that cannot be read, lacks an array, or has another number of columns.
@@ -353,8 +353,9 @@ def impulse_record(
 
     Args:
         transfer: (n_outputs, n_frequencies) complex, per unit input, first column at 0 Hz, last at Nyquist.
-        sample_rate_hz: of the time signals behind it.
+        sample_rate_hz: of the time signals.
         channels: one per output.
+        name: of the record.
 
     Raises:
         ValueError: shapes that do not fit, or non-finite values (channel and line named).

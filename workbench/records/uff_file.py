@@ -26,15 +26,15 @@ FUNCTIONS = {2: "auto spectrum", 3: "cross spectrum", 5: "transmissibility", 6: 
 OVER_TIME = (0, 1, 7, 8)  # general or unknown, time response, auto and cross correlation
 TIME = (0, 1, 17)  # abscissa_spec_data_type of the format: unknown, general, time
 TURNS = ("rpm", "cpm", "1/min")
-ALIKE = 1e-3  # relative, of factors of units as data sets 164 round them
+ALIKE = 1e-3  # relative tolerance of factors of units, which data sets 164 round
 MARK = b"    -1"
 BINARY = re.compile(rb"^ +58b ", re.MULTILINE)
 OURS = ('{"kind"', '"kind":', '"name":')
-arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
+arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
-    """The signals of all data sets 58, their instants and their header; to be called in a process of its own."""
+    """The signals of all data sets 58, their instants and their header; to be called in a separate process."""
     if not _whole(path.read_bytes()):
         raise RecordFileError(f"{path} is damaged: its last data set has no end")
     every = data_sets(path)
@@ -67,7 +67,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         if np.iscomplexobj(data):
             raise RecordFileError(f"{where} is complex, but not marked as a transfer function (function type 4)")
         if data.size != entry["num_pts"]:
-            raise RecordFileError(f"{where} holds {data.size} samples and says {entry['num_pts']}: it is damaged")
+            raise RecordFileError(f"{where} holds {data.size} samples and states {entry['num_pts']}: it is damaged")
         key, facts = _channel(where, entry, system)
         record = facts.pop("record", record)
         if key in arrays:
@@ -91,15 +91,14 @@ def data_sets(path: Path) -> list[dict[str, Any]]:
 
 
 def _whole(data: bytes) -> bool:
-    """Whether each data set has its end; that of a binary one (58b) stands behind its last number, on no line of its
-    own."""
+    """Whether each data set has its end mark; that of a binary one (58b) follows its last number on the same line."""
     if BINARY.search(data):
         return data.rstrip().endswith(MARK)
     return sum(line.rstrip() == MARK for line in data.splitlines()) % 2 == 0
 
 
 def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | None) -> dict[str, np.ndarray]:
-    """All pairs of response and reference as one array, in SI, with their lines and names."""
+    """The transfer functions of all pairs of response and reference as one array, in SI, with their lines and names."""
     lines = _abscissa(f"{path}, transfer function 1", sets[0], "frequency")
     found: dict[tuple[str, str], np.ndarray] = {}
     outputs: dict[str, dict[str, str]] = {}
@@ -147,13 +146,15 @@ def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | N
 
 
 def as_stored(values: np.ndarray) -> np.ndarray:
-    """Values as the format's twelve digits keep them."""
+    """Values rounded to the twelve digits of the format."""
     return np.array(("%.11e " * values.size % tuple(values)).split(), float)
 
 
 def _channel(where: str, entry: dict[str, Any], system: dict[str, Any] | None) -> tuple[str, dict[str, Any]]:
-    """Key and description: ours out of the five text lines, or what the data set itself says; none where a unit that is
-    known stands behind the name."""
+    """Key and description of a channel, from the text lines written by this program or from the data set itself.
+
+    The description is empty where a known unit follows the name.
+    """
     text = "".join(str(entry.get(f"id{i}", "")) for i in range(1, 6))
     if not any(sign in text for sign in OURS):
         name, (quantity, unit) = _node(entry, "rsp"), _measured(where, entry, "ordinate", system)
@@ -172,7 +173,7 @@ def _node(entry: dict[str, Any], which: str) -> str:
 
 
 def _label(entry: dict[str, Any], axis: str) -> str:
-    """The unit that stands at an axis, as written; empty where none does."""
+    """The unit of an axis, as written; empty where none is stated."""
     label = str(entry.get(f"{axis}_axis_units_lab", "")).strip()
     return "" if label.upper() == "NONE" else label
 
@@ -198,7 +199,7 @@ def _abscissa(where: str, entry: dict[str, Any], quantity: str) -> np.ndarray:
 
 
 def _measured(where: str, entry: dict[str, Any], axis: str, system: dict[str, Any] | None) -> tuple[str, str]:
-    """Quantity, by its code, and unit as written, or of the file's system of units where none is.
+    """Quantity, by its code, and unit, as written or else by the file's system of units.
 
     Raises:
         RecordFileError: a unit of another quantity, or a system whose unit is not known.
@@ -220,7 +221,7 @@ def _measured(where: str, entry: dict[str, Any], axis: str, system: dict[str, An
 
 
 def write(path: Path, time: np.ndarray, signals: dict[str, Any], header: dict[str, Any]) -> None:
-    """Write one data set a signal, in double precision.
+    """Write one data set per signal, in double precision.
 
     Raises:
         RecordFileError: a channel whose description does not fit the format's five lines of 80 characters.

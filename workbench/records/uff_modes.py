@@ -1,7 +1,7 @@
 """Normal modes at nodes in universal files: data sets 55 or 2414, with the nodes of 15 or 2411, by pyuff.
 
-Data set 164 says how many of its units a metre and a newton are. Shapes stay as they are, being ratios of
-displacements; coordinates become m, rotations rad a metre, and modal masses kg.
+Data set 164 states how many of the file's units a metre and a newton are. Shapes are ratios of displacements and are
+not converted; coordinates are converted to m, rotations to rad per metre, and modal masses to kg.
 """
 
 from functools import partial
@@ -18,13 +18,13 @@ NORMAL_MODE = 2  # analysis_type of both formats
 AT_NODES = 1  # dataset_location of 2414
 COMPLEX = (5, 6)  # data_type of both formats
 MOTIONS = (0, 1, 8)  # kinds of result that are shapes: unknown, general, displacement; others are forces, stresses, ...
-ALIKE = 1e-4  # of the coordinates: data set 15 writes six digits, 2411 sixteen
+ALIKE = 1e-4  # of the coordinates: tolerance, as data set 15 has six digits and 2411 sixteen
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
-arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
+arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
-    """Frequencies, damping, modal masses and shapes at nodes; to be called in a process of its own."""
+    """Frequencies, damping, modal masses and shapes at nodes; to be called in a separate process."""
     sets = data_sets(path)
     modes = [_of_55(s) if s["type"] == 55 else _of_2414(s) for s in sets if _is_mode(path, s)]
     if not modes:
@@ -39,7 +39,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
             raise RecordFileError(f"{path}, mode {number} is given at other nodes or directions than the first")
     shapes = np.stack([mode["shape"].reshape(-1) for mode in modes], axis=1)
     metre, newton = next(((s["length"], s["force"]) for s in sets if s["type"] == 164), (1.0, 1.0))
-    shapes[np.tile(np.arange(width) >= 3, nodes.size)] *= metre  # a rotation a metre
+    shapes[np.tile(np.arange(width) >= 3, nodes.size)] *= metre  # rotations to rad per metre
     moving = (shapes != 0).any(axis=1)  # three directions are written even where one was measured
     found = {
         "shapes": shapes[moving],
@@ -100,5 +100,5 @@ def _positions(path: Path, sets: list[dict[str, Any]]) -> dict[int, tuple[float,
             for node, x, y, z in zip(entry["node_nums"], entry["x"], entry["y"], entry["z"]):
                 place = found.setdefault(int(node), (float(x), float(y), float(z)))
                 if not np.allclose(place, (x, y, z), rtol=ALIKE, atol=ALIKE * max(map(abs, place))):
-                    raise RecordFileError(f"{path}: node {int(node)} stands at two places, {place} and {(x, y, z)}")
+                    raise RecordFileError(f"{path}: node {int(node)} has two positions, {place} and {(x, y, z)}")
     return found

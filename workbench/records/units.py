@@ -1,4 +1,4 @@
-"""Units as instruments write them, what they are in SI, and sets of units that go together."""
+"""Units of measurement: spellings, factors to SI, and consistent sets of units."""
 
 import re
 from dataclasses import dataclass, replace
@@ -10,9 +10,9 @@ class Unit:
     """A unit of measurement.
 
     Attributes:
-        factor: SI units in one of it.
-        si: the SI unit, as `Channel.unit` has it.
-        quantity: what it measures, one of `QUANTITIES` or a word beside them; empty where the unit leaves it open.
+        factor: to SI.
+        si: the SI unit, as in `Channel.unit`.
+        quantity: what it measures, one of `QUANTITIES` or another word; empty where the unit does not determine it.
     """
 
     factor: float
@@ -61,14 +61,14 @@ SPELLINGS = (
 SI_NAME = re.compile(r"\b(m|kg|s|N|Hz|J)(?![^\W²³])")
 POWERS = re.compile(r"(/?)\s*([A-Za-z]+)(?:\^(\d))?")
 BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*([^()]*(?:\(s\^2\))?[^()]*)\))")
-AFTER_SLASH = re.compile(r"(.*\S)\s+/\s+(\S.*)")  # as DIN and ISO label axes
+AFTER_SLASH = re.compile(r"(.*\S)\s+/\s+(\S.*)")  # axis labels of DIN and ISO
 TIME = {"t", "time", "zeit", "temps", "tiempo", "x_value", "timestamp", "time stamp", "elapsed time", "relative time"}
 TIME_UNDERSCORE = re.compile(r"(t|time)_(s|sec|ms|us)", re.IGNORECASE)
 NUMBERED = re.compile(r"(\S\D*?\S)\s+\d+\b.*")  # one time of several, as catman's `Time 1 - default sample rate`
 
 
 def unit_named(text: str) -> Unit | None:
-    """The unit that a text names, in any usual spelling; None where it names none."""
+    """The unit with a name, in any usual spelling; None for an unknown one."""
     for spelling, ours in SPELLINGS:
         text = text.replace(spelling, ours)
     return UNITS.get(" ".join(text.split()))
@@ -77,7 +77,7 @@ def unit_named(text: str) -> Unit | None:
 def split_unit(name: str) -> tuple[str, str]:
     """A column's name without its unit, and the unit as written: `Acc [g]`, `Acc (g)` and `Acc / g` give (Acc, g).
 
-    What stands in brackets and is no unit belongs to the name.
+    Text in brackets that is not a unit belongs to the name.
     """
     for pattern in (BRACKETED, AFTER_SLASH):
         found = pattern.fullmatch(name.strip())
@@ -89,7 +89,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def time_factor(name: str) -> float | None:
-    """Seconds in one unit of a column of sample instants; None where the name is not that of one."""
+    """Factor to seconds of a column of sample instants; None where the name is not that of a time."""
     underscore = TIME_UNDERSCORE.fullmatch(name)
     text = underscore[2].lower() if underscore else split_unit(name)[1]
     if not time_base(name):
@@ -99,7 +99,7 @@ def time_factor(name: str) -> float | None:
 
 
 def time_base(name: str) -> str:
-    """What a column of sample instants is called, without unit and number, in small letters; empty where it is none."""
+    """The name of a column of sample instants without unit and number, in small letters; empty for other columns."""
     underscore, base = TIME_UNDERSCORE.fullmatch(name), split_unit(name)[0].strip()
     numbered = NUMBERED.fullmatch(base)
     base = (underscore[1] if underscore else numbered[1] if numbered else base).lower()
@@ -108,7 +108,7 @@ def time_base(name: str) -> str:
 
 @dataclass(frozen=True)
 class Units:
-    """Names of a consistent set of units, by which numbers are read and results are told.
+    """Names of a consistent set of units, for input and results.
 
     Attributes:
         length, mass, time, force: such as "mm", "t", "s", "N"; force is that of mass · length / time².
@@ -120,15 +120,15 @@ class Units:
     force: str = "N"
 
     def named(self, unit: str) -> str:
-        """A unit by its SI names, such as N s^2/m^2, by those of this set."""
+        """A unit in SI names, such as N s^2/m^2, with the names of this set."""
         own = self._by_si()
         return SI_NAME.sub(lambda name: own[name[0]], unit)
 
     def taken(self, unit: Unit) -> Unit:
-        """A unit in terms of this set in place of SI: of mm/s^2 one, where length is in mm and time in s.
+        """A unit with its factor to this set instead of SI: of mm/s^2 the factor is 1 for lengths in mm and times in s.
 
         Raises:
-            ValueError: a name of this set of which nobody knows what it is in SI.
+            ValueError: a name of this set whose factor to SI is not known.
         """
         factor, own = unit.factor, self._by_si()
         for below, name, power in POWERS.findall(unit.si):

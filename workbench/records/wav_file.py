@@ -1,4 +1,4 @@
-"""WAV: one channel a signal, as a share of full scale where the samples are whole numbers."""
+"""WAV: one channel per signal, relative to full scale where the samples are integers."""
 
 import warnings
 from functools import partial
@@ -10,13 +10,13 @@ from scipy.io import wavfile
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError, check_counts
 
-arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
+arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
-    """Sample instants `t` and the channels, by name; to be called in a process of its own."""
+    """Sample instants `t` and the channels, by name; to be called in a separate process."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="Reached EOF prematurely")  # a file cut short is no shorter record
+        warnings.filterwarnings("error", message="Reached EOF prematurely")  # refuses a truncated file
         rate, samples = wavfile.read(path)
     samples = samples.reshape(samples.shape[0], -1)
     check_counts(path, samples.shape[1], samples.size + samples.shape[0], limits)

@@ -1,4 +1,4 @@
-"""Actuators: where a command becomes a force or a moment, and what it loses on the way."""
+"""Actuators: from a command to a force or a moment, with their imperfections."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,27 +10,28 @@ from workbench.structure.domain import Between, Patch, Place, PlaceError, Where,
 
 @dataclass(frozen=True)
 class Actuator:
-    """A point force or moment commanded through an actuator.
+    """An actuator that exerts a force or a moment.
 
-    On its way a command u passes hysteresis, gain, dead zone, saturation, rate limit, delay, lag, bias, in that order.
+    A command u passes hysteresis, gain, dead zone, saturation, rate limit, delay, lag and bias, in that order.
 
     Attributes:
         name: of the input.
-        at: its place on the structure: x (m), (x, y), the name of a point, `Between` two of these, where it acts on
-            the first and, opposite, on the second, or a `Patch` of a plate, where it acts along the edges.
+        at: place on the structure: x (m), (x, y), the name of a point; `Between` two of these, to act on the first and
+            in the opposite direction on the second; or a `Patch` of a plate, to act along its edges.
         kind: "force" (N) or "moment" (N m; of a patch, N m/m).
-        hysteresis_share: of u that goes through z: (1 - share) u + share z, z' = u' - (|u'| z + u' |z|) / (2 width).
-        hysteresis_width: the z that large commands come to.
+        hysteresis_share: part of u replaced by z: (1 - share) u + share z, z' = u' - (|u'| z + u' |z|) / (2 width).
+        hysteresis_width: limit of |z| for large commands.
         gain: force per command.
-        dead_zone: command (after the gain) below which nothing happens; sign(u) max(|u| - width, 0).
-        limit: the force cannot exceed ± this.
-        rate_limit: the force cannot change faster than ± this, N/s.
+        dead_zone: half width of the dead zone, N: force sign(f) max(|f| - dead_zone, 0), f the command times the gain.
+        limit: largest |force|.
+        rate_limit: largest rate of change of the force, N/s.
         delay: s.
         time_constant: of a first-order lag, s.
-        bias: constant force beside, N.
-        direct: a measured force applied without an actuator, such as a hammer; changes of the drive leave it alone.
+        bias: constant force that is added, N.
+        direct: a measured force applied without an actuator, such as of a hammer; effects on actuators leave it
+            unchanged.
         direction: of the force, or the axis of the moment, where the structure has more than one at a place.
-        shape_error: (n_modes,) what each mode shape, or its slope, is here beyond that of the modes; empty for nothing.
+        shape_error: (n_modes,) error of each mode shape, or of its slope, at this place; empty for none.
     """
 
     name: str
@@ -64,18 +65,18 @@ class Actuator:
 
     @property
     def linear(self) -> bool:
-        """Whether the force is a linear function of the command (a delay is not a finite state)."""
+        """Whether the force is a linear function of the command with finitely many states, so without a delay."""
         unbounded = np.isinf(self.limit) and np.isinf(self.rate_limit)
         return bool(unbounded and not (self.dead_zone or self.delay or self.hysteresis_share or self.bias))
 
 
 def force_unit(actuator: Actuator) -> str:
-    """Unit of what it does: N, N m, or N m/m of a patch on a plate."""
+    """Unit of an actuator's force: N, N m, or N m/m of a patch on a plate."""
     return "N" if actuator.kind == "force" else "N m/m" if isinstance(actuator.at, Patch) else "N m"
 
 
 def command_unit(actuators: Sequence[Actuator]) -> str:
-    """Unit of what all of them command: N, N m, or N m/m of patches on a plate; empty if they differ or have gains."""
+    """Common unit of the commands: N, N m, or N m/m of patches on a plate; empty if they differ or have gains."""
     units = {"" if a.gain != 1 else force_unit(a) for a in actuators}
     return units.pop() if len(units) == 1 else ""
 
@@ -83,21 +84,22 @@ def command_unit(actuators: Sequence[Actuator]) -> str:
 def piezo_patch(
     name: str, at: Place, *, length: float | tuple[float, float], gain: float = 1.0, direction: str | None = None
 ) -> Actuator:
-    """A piezo patch on a beam or a plate: moments along its ends or edges, opposite ones of opposite sign.
+    """A piezo patch on a beam or a plate: moments at its ends or along its edges, of opposite sign on opposite sides.
 
     On a beam ± gain u at x = at ± length/2, and the modal force is gain u (φ_r'(at + length/2) - φ_r'(at - length/2));
     Crawley & de Luis, AIAA J. 25 (1987) 1373. On a plate line moments gain u along its four edges, and the modal force
     is gain u ∮ ∂φ_r/∂n ds, n outward; Dimitriadis, Fuller & Rogers, J. Vib. Acoust. 113 (1991) 100.
 
     Args:
-        at: its middle: x, or (x, y) on a plate, m.
+        name: of the input.
+        at: the middle: x, or (x, y) on a plate, m.
         length: m; on a plate (width along x, height along y).
         gain: moment per command, N m/V where the command is a voltage; on a plate moment per length, N m/(m V).
-        direction: of a patch on a plate that acts one way only: "y", about which the moments on the two edges across x
-            act, or "x" for the other two.
+        direction: of a patch on a plate that acts along one pair of edges only: "y" is the axis of the moments on the
+            two edges across x, "x" of those on the other two.
 
     Raises:
-        ValueError: a length that is not positive, one length of a patch on a plate.
+        ValueError: a length that is not positive, or one length alone of a patch on a plate.
     """
     sides = np.atleast_1d(np.asarray(length, float))
     on_plate = np.ndim(at) == 1

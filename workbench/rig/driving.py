@@ -1,7 +1,7 @@
-"""Forces of actuators over the substeps of a sample: straight lines, and what delays and lags leave beside them.
+"""Forces of actuators over the substeps of a sample: linear in time, with exact corrections for delays and lags.
 
-A held force that is late, or fades into what it becomes, is not straight over a substep. The line of the same mean and
-first moment stands for it where laws are solved; what it does to each mode beyond that line is known in closed form.
+A delayed or lagged force is not linear over a substep. Where nonlinear laws are solved it is replaced by the linear
+force of the same mean and first moment; the difference in the motion of each mode is known in closed form.
 """
 
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
 from workbench.rig.linear import shifted, whole_samples
 
-DRIVES_KEPT, MOST_KEPT = 16, 2**18  # forces on substeps that are remembered, and the most values of one
+DRIVES_KEPT, MOST_KEPT = 16, 2**18  # size of the cache of forces, and the largest array in it
 ROUND_OFF = 1e-9  # of the largest force
-ALIKE = 1e-5  # over a substep: nearer, the two poles of a mode are taken for as far apart
+ALIKE = 1e-5  # least difference of a mode's two poles, times the substep, to avoid 0/0
 
 
 def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
-    """The force that an actuator heads for: hysteresis, gain, dead zone, saturation, before what takes its time."""
+    """The static force of an actuator: hysteresis, gain, dead zone, saturation, before rate limit, delay and lag."""
     if actuator.hysteresis_share:
         share = actuator.hysteresis_share
-        followed = stepping.hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[1:]
-        command = (1.0 - share) * command + share * followed
+        hysteretic = stepping.hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[1:]
+        command = (1.0 - share) * command + share * hysteretic
     force = command if actuator.gain == 1 else actuator.gain * command
     if actuator.dead_zone > 0:
         force = np.sign(force) * np.maximum(np.abs(force) - actuator.dead_zone, 0.0)
@@ -38,13 +38,13 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
 
 
 class Piece(NamedTuple):
-    """A force size t^power e^(-rate t) from a time t = 0 within a substep on.
+    """A force size t^power e^(-rate t), t the time from its beginning within a substep.
 
     Attributes:
         begins: s, after the start of the substep.
-        rate: 1/s; 0 for one that does not fade.
-        size: N, or N/s.
-        power: 0, or 1 for one that rises, which does not fade.
+        rate: of decay, 1/s.
+        size: N, or N/s for power 1.
+        power: 0, or 1 for a ramp, which has rate 0.
     """
 
     begins: float
@@ -53,11 +53,11 @@ class Piece(NamedTuple):
     power: int = 0
 
 
-Course = tuple[Piece, ...]  # of a force over a substep, the sum of these
+Course = tuple[Piece, ...]  # a force over a substep, as a sum
 
 
-def _straightened(course: Course, h: float) -> tuple[float, float]:
-    """Mean over a substep, and half the rise of the straight line of the same first moment."""
+def _linearised(course: Course, h: float) -> tuple[float, float]:
+    """Mean and half the rise over a substep of the linear force of the same mean and first moment."""
     mean = moment = 0.0
     for begins, rate, size, power in course:
         lasts = h - begins
@@ -71,26 +71,26 @@ def _straightened(course: Course, h: float) -> tuple[float, float]:
     return mean, 6.0 * moment
 
 
-def beyond_straight(course: Course, omega: Floats, damping: Floats, h: float) -> Floats:
-    """What a course does to q and q' of each mode by the end of a substep, (2, n_modes), beyond its straight line."""
-    straight = np.empty((2, 4, omega.size))
-    stepping.propagators(omega, damping, h, straight)
+def motion_correction(course: Course, omega: Floats, damping: Floats, h: float) -> Floats:
+    """Difference (2, n_modes) in q and q' at the end of a substep between a force and its linear replacement."""
+    linear = np.empty((2, 4, omega.size))
+    stepping.propagators(omega, damping, h, linear)
     root = np.sqrt((0.5 * damping) ** 2 - omega**2 + 0j)
     root[np.abs(root) * h < ALIKE] = ALIKE / h
     poles = -0.5 * damping + np.array([1.0, -1.0])[:, None] * root
-    mean, rise = _straightened(course, h)
+    mean, rise = _linearised(course, h)
     response = np.zeros_like(poles)
     for begins, rate, size, power in course:
         lasts = h - begins
-        response += size * lasts ** (power + 1) * _grown(poles * lasts, rate * lasts, power)
+        response += size * lasts ** (power + 1) * _convolution(poles * lasts, rate * lasts, power)
     both = np.array([response[0] - response[1], poles[0] * response[0] - poles[1] * response[1]]) / (2.0 * root)
-    return np.asarray(both.real - straight[:, 2] * (mean - rise) - straight[:, 3] * (mean + rise))
+    return np.asarray(both.real - linear[:, 2] * (mean - rise) - linear[:, 3] * (mean + rise))
 
 
-def _grown(pole: Complexes, rate: float, power: int) -> Complexes:
-    """∫ t^power e^(-rate t) e^(pole (1 - t)) dt from 0 to 1; of a power the rate is 0."""
+def _convolution(pole: Complexes, rate: float, power: int) -> Complexes:
+    """∫_0^1 t^power e^(-rate t) e^(pole (1 - t)) dt, with rate 0 for power 1."""
     x = pole + rate
-    near = np.abs(x) < 0.5  # where the difference of what is all but alike says nothing, by its series
+    near = np.abs(x) < 0.5  # by a series, as the difference would cancel
     series = np.exp(-rate) * sum(np.where(near, x, 0.0) ** k / factorial(k + power + 1) for k in range(16))
     x = np.where(near, 1.0, x)
     return np.where(near, series, (np.exp(pole) - 1.0 - pole) / x**2 if power else (np.exp(pole) - np.exp(-rate)) / x)
@@ -98,13 +98,13 @@ def _grown(pole: Complexes, rate: float, power: int) -> Complexes:
 
 @dataclass(frozen=True, eq=False)
 class Drives:
-    """Forces of the actuators on substeps.
+    """Forces of the actuators over the substeps.
 
     Attributes:
-        driven: (n_actuators,) which of them are ever at work.
-        starts, ends: (n_driven, n_samples * substeps) of what runs straight over each substep as their forces do.
-        at_samples: (n_actuators, n_samples) all forces.
-        courses: (actuator, course) of what is not straight in them, delayed or lagged.
+        driven: (n_actuators,) which actuators ever exert a force.
+        starts, ends: (n_driven, n_samples * substeps) linear forces at the start and the end of each substep.
+        at_samples: (n_actuators, n_samples) forces at the samples.
+        courses: (actuator, course) of unit delayed or lagged forces, which are not linear.
         sizes: (n_courses, n_samples * substeps) of these in each substep.
     """
 
@@ -117,7 +117,7 @@ class Drives:
 
 
 class _Signals:
-    """Signals that never change, as a key: the array itself, not its values."""
+    """A read-only array as a key of a cache, compared by identity."""
 
     def __init__(self, values: Floats) -> None:
         self.values = values
@@ -132,40 +132,46 @@ class _Signals:
 def drives(
     actuators: tuple[Actuator, ...], inputs: Floats, sample_time: float, substeps: int, input_hold: str
 ) -> Drives:
-    """Remembered for the inputs of a record, which nobody can write to: structure and sensors change more often."""
-    is_lasting = inputs.base is None and not inputs.flags.writeable
-    known = _known_drives if is_lasting and inputs.size * substeps <= MOST_KEPT else _known_drives.__wrapped__
-    return known(actuators, _Signals(inputs), sample_time, substeps, input_hold)
+    """The forces of the actuators over the substeps, for inputs (n_actuators, n_samples).
+
+    They are cached for the read-only inputs of a record, because structure and sensors of a rig change more often.
+    """
+    read_only = inputs.base is None and not inputs.flags.writeable
+    compute = _cached_drives if read_only and inputs.size * substeps <= MOST_KEPT else _cached_drives.__wrapped__
+    return compute(actuators, _Signals(inputs), sample_time, substeps, input_hold)
 
 
 @lru_cache(maxsize=DRIVES_KEPT)
-def _known_drives(
+def _cached_drives(
     actuators: tuple[Actuator, ...], inputs: _Signals, sample_time: float, substeps: int, input_hold: str
 ) -> Drives:
-    lines, at_samples, crooked = _forces_on_substeps(actuators, inputs.values, sample_time, substeps, input_hold)
+    lines, at_samples, nonlinear = _forces_on_substeps(actuators, inputs.values, sample_time, substeps, input_hold)
     (starts, ends), h = lines, sample_time / substeps
     driven = np.logical_or(starts.any(axis=1), ends.any(axis=1))
     least = ROUND_OFF * max(np.abs(starts).max(initial=0.0), np.abs(ends).max(initial=0.0))
-    crooked = [
-        (j, course, size) for j, course, size in crooked if np.abs(size).max(initial=0.0) * h ** course[0].power > least
+    nonlinear = [
+        (j, course, size)
+        for j, course, size in nonlinear
+        if np.abs(size).max(initial=0.0) * h ** course[0].power > least
     ]
-    sizes = np.array([size for *_, size in crooked]).reshape(len(crooked), starts.shape[1])
-    courses = tuple((j, course) for j, course, _ in crooked)
+    sizes = np.array([size for *_, size in nonlinear]).reshape(len(nonlinear), starts.shape[1])
+    courses = tuple((j, course) for j, course, _ in nonlinear)
     return Drives(driven, starts[driven], ends[driven], at_samples, courses, sizes)
 
 
 def _forces_on_substeps(
     actuators: tuple[Actuator, ...], inputs: Floats, sample_time: float, substeps: int, input_hold: str
 ) -> tuple[tuple[Floats, Floats], Floats, list[tuple[int, Course, Floats]]]:
-    """What runs straight over each substep as each actuator's force does, start and end, and the force at each sample.
+    """Linear forces over the substeps, forces at the samples, and the delayed or lagged forces that are not linear.
 
-    It has the mean and the first moment of the force over the substep. What a delayed or lagged force does beyond that
-    is the last: the actuator, what the force does per unit, and its size in each substep.
+    Returns:
+        (starts, ends) of the linear force of the same mean and first moment, (n_actuators, n_samples * substeps) each;
+        forces (n_actuators, n_samples) at the samples; and (actuator, unit course, size in each substep).
     """
     mean = np.empty((inputs.shape[0], inputs.shape[1] * substeps))
     rise = np.zeros_like(mean)  # half of it, over a substep
-    now = np.empty_like(inputs)
-    crooked = []
+    at_samples = np.empty_like(inputs)
+    nonlinear = []
     h = sample_time / substeps
     for j, actuator in enumerate(actuators):
         given = finer(inputs[j : j + 1], substeps)[0] if input_hold == "band-limited" else inputs[j]
@@ -178,7 +184,7 @@ def _forces_on_substeps(
                 change = np.diff(np.r_[start, 2.0 * mean[j, -1] - start[-1]])
                 share = np.minimum(np.abs(change) / most, 1.0)  # of the substep, until the ramp ends
                 rise[j] = change * share * (1.5 - share)
-        else:  # straight from sample to sample, or from substep to substep; after the last it stays
+        else:  # linear from sample to sample, or from substep to substep; held after the last
             every = mean.shape[1] // force.size
             edges = np.interp(np.arange(mean.shape[1] + 1), every * np.arange(force.size), force)
             if np.isfinite(actuator.rate_limit):
@@ -188,32 +194,34 @@ def _forces_on_substeps(
         if actuator.delay or actuator.time_constant:
             mean[j], rise[j], start, courses = _delayed_and_lagged(mean[j], rise[j], start, actuator, h)
             for course, size in courses:
-                straight, half = _straightened(course, h)
-                mean[j] += straight * size
-                rise[j] += half * size
-                crooked.append((j, course, size))
+                unit_mean, unit_rise = _linearised(course, h)
+                mean[j] += unit_mean * size
+                rise[j] += unit_rise * size
+                nonlinear.append((j, course, size))
         mean[j] += actuator.bias
-        now[j] = start[::substeps] + actuator.bias
-    return (mean - rise, mean + rise), now, crooked
+        at_samples[j] = start[::substeps] + actuator.bias
+    return (mean - rise, mean + rise), at_samples, nonlinear
 
 
 def _delayed_and_lagged(
     mean: Floats, rise: Floats, start: Floats, actuator: Actuator, h: float
 ) -> tuple[Floats, Floats, Floats, list[tuple[Course, Floats]]]:
-    """Forces that are straight over substeps, as delay and lag leave them.
+    """Forces that are linear over substeps, after delay and lag.
 
     Args:
         mean, rise: of each substep, half the rise.
-        start: force at the start of each, where a ramp that ends within it is not straight.
+        start: force at the start of each, which differs from mean - rise where a ramp ends within the substep.
+        actuator: has the delay and the lag.
+        h: substep, s.
 
     Returns:
-        Mean and half the rise of what is straight; the force at each start; and courses per unit beside it, with sizes.
+        Mean and half the rise of the linear part; the force at each start; and unit courses of the rest, with sizes.
     """
     shift, late = whole_samples(actuator.delay, h)
     old_mean, old_rise = (shifted(each, shift + 1) for each in (mean, rise))
     mean, rise, start = (shifted(each, shift) for each in (mean, rise, start))
     courses: list[tuple[Course, Floats]] = []
-    if late:  # the substep before goes on until then
+    if late:  # the force of the previous substep continues until the delay has passed
         before, until = old_mean + old_rise * (1.0 - 2.0 * late / h), old_mean + old_rise
         jump, bend = mean - rise - until, 2.0 * (rise - old_rise) / h
         courses = [((Piece(late, 0.0, 1.0),), jump), ((Piece(late, 0.0, 1.0, 1),), bend)]
@@ -221,13 +229,13 @@ def _delayed_and_lagged(
     lag = actuator.time_constant
     if lag == 0:
         return mean, rise, start, courses
-    # y + T y' = u: each part of u settles, and what it lags by fades
+    # y + T y' = u: the particular solution of each part of u, and an exponential
     slope = 2.0 * rise / h
     settled, fade = mean - rise - lag * slope, np.exp(-h / lag)
     new = settled * (1.0 - fade) + 2.0 * rise
     if late:
-        left, came = h - late, np.exp(-(h - late) / lag)
-        new = new + jump * (1.0 - came) + bend * (left - lag * (1.0 - came))
+        remaining, decay = h - late, np.exp(-(h - late) / lag)
+        new = new + jump * (1.0 - decay) + bend * (remaining - lag * (1.0 - decay))
         courses = [
             ((Piece(late, 0.0, 1.0), Piece(late, 1.0 / lag, -1.0)), jump),
             ((Piece(late, 0.0, 1.0, 1), Piece(late, 0.0, -lag), Piece(late, 1.0 / lag, lag)), bend),
@@ -240,7 +248,11 @@ def _delayed_and_lagged(
 def sinusoid_on_substeps(
     element: elements.PeriodicForce, n_samples: int, sample_time: float, substeps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Start and end of what runs straight over each substep, of the same mean and first moment, and at the samples."""
+    """A sinusoid's linear replacement over each substep, of the same mean and first moment, and its values at samples.
+
+    Returns:
+        Starts and ends (n_samples * substeps,), and values (n_samples,).
+    """
     omega, h = 2 * np.pi * element.frequency_hz, sample_time / substeps
     edges = omega * h * np.arange(n_samples * substeps + 1) + element.phase
     middle, half = 0.5 * (edges[:-1] + edges[1:]), 0.5 * omega * h

@@ -1,7 +1,7 @@
-"""What touches the structure, at a point or all along: springs, dampers, friction, stops, air, stretching.
+"""Elements attached to a structure, at a point or distributed: springs, dampers, friction, stops, drag, stretching.
 
-A force is positive in the direction of positive displacement w; v is the velocity there. An element stands at a place,
-or `Between` two: w is then the displacement of the first less that of the second, and the force on that is opposite.
+A force is positive in the direction of positive displacement w; v is the velocity. An element acts at a place, or
+`Between` two: w is then the displacement of the first minus that of the second, on which the opposite force acts.
 """
 
 from collections.abc import Callable
@@ -13,17 +13,17 @@ from workbench.structure.supports import AtPlace
 
 @dataclass(frozen=True)
 class PointElement(AtPlace):
-    """What acts by a law of the displacement and the velocity where it stands."""
+    """An element whose force is a function of the displacement and the velocity at its place."""
 
     @property
     def parameters(self) -> tuple[float, ...]:
-        """The numbers of its law, in the order of its fields."""
+        """The parameters of the force law, in the order of the fields."""
         return tuple(getattr(self, field.name) for field in fields(self)[1:])
 
 
 @dataclass(frozen=True)
 class LinearSpring(PointElement):
-    """-k w at x, k in N/m; in the rig rather than in the structure, so the modes stay what they are."""
+    """-k w at x, k in N/m; part of the rig, not of the structure, so that the modes do not change."""
 
     stiffness: float
 
@@ -56,7 +56,7 @@ class PowerSpring(_PowerLaw):
 
 @dataclass(frozen=True)
 class EvenSpring(_PowerLaw):
-    """-F |w / w_r|^p to one side, whichever way w points, at x: F (N) at the displacement w_r (m), p at least 1."""
+    """-F |w / w_r|^p for either sign of w, at x: F (N) at the displacement w_r (m), p at least 1."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class OneSidedStop(PointElement):
 class CoulombFriction(PointElement):
     """-F tanh(v / v_s) - F_0 at x: force F and offset F_0 in N, smoothing speed v_s in m/s.
 
-    Friction of two directions, F_+ forward and F_- backward, has F = (F_+ + F_-) / 2 and F_0 = (F_+ - F_-) / 2.
+    Asymmetric friction, F_+ forward and F_- backward, has F = (F_+ + F_-) / 2 and F_0 = (F_+ - F_-) / 2.
     """
 
     force: float
@@ -102,12 +102,12 @@ class BoucWen(PointElement):
 
 @dataclass(frozen=True)
 class UserLaw(PointElement):
-    """A force law of the user's own at x.
+    """A user-defined force law at x.
 
     Attributes:
         at: m.
-        law: force(w, v, parameters) -> N, in plain arithmetic and `math`: it is compiled by numba.
-        parameters: up to three numbers handed to it.
+        law: force(w, v, parameters) -> N, in plain arithmetic and `math`, since it is compiled by numba.
+        parameters: up to three numbers that are passed to the law.
     """
 
     law: Callable[[float, float, Any], float]
@@ -116,7 +116,7 @@ class UserLaw(PointElement):
 
 @dataclass(frozen=True)
 class AirDrag:
-    """-c |v| v per length all along, c in N s²/m³."""
+    """-c |v| v per length along the whole structure, c in N s²/m³."""
 
     coefficient: float
 
@@ -139,7 +139,7 @@ class PeriodicForce(AtPlace):
 
 @dataclass(frozen=True)
 class RandomForce(AtPlace):
-    """An unmeasured random force at x: rms in N. No prediction can hold it, only its statistics."""
+    """An unmeasured random force at x: rms in N. Only its statistics can be predicted."""
 
     rms: float
 

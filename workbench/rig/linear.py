@@ -9,8 +9,8 @@ from scipy.linalg import expm
 from workbench.arrays import Complexes, Floats
 from workbench.structure.modes import modal_state_matrix
 
-CLOSE = 1e-9  # of a lag's rate: nearer, a pole is as good as on it
-EVEN = 1e-9  # of a sample: a delay so near a whole number of samples is one
+CLOSE = 1e-9  # of a lag's rate: least distance of a pole from it, to avoid 0/0
+EVEN = 1e-9  # of a sample: a delay nearer to a whole number of samples is rounded to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,8 +20,8 @@ class ModalPoles:
     Attributes:
         poles: (n_poles,) complex λ, one of each conjugate pair.
         weights: (n_poles, n_modes) W, how the modal forces p drive each pole.
-        shapes: (n_modes, n_poles) Q, a conjugate pair counted in it.
-        uncoupled: whether each mode has a pole of its own: Q is twice the identity.
+        shapes: (n_modes, n_poles) Q, with a factor 2 for each conjugate pair.
+        uncoupled: whether each mode has its own pole pair; Q is then twice the identity.
     """
 
     poles: np.ndarray
@@ -33,8 +33,8 @@ class ModalPoles:
 def modal_poles(omega: np.ndarray, damping: np.ndarray) -> ModalPoles:
     """Poles of q'' + C q' + Ω² q = p, coupled or not.
 
-    A rigid-body mode without damping has a double pole at zero, which has no diagonal form: its frequency is taken as
-    a millionth of the lowest elastic one, an error below 1e-8 over ten of its periods.
+    An undamped rigid-body mode has a double pole at zero, without a diagonal form: its frequency is set to a millionth
+    of the lowest elastic one, with an error below 1e-8 over ten periods of that.
     """
     elastic = omega[omega > 0]
     tiny = 1e-6 * (elastic.min() if elastic.size else 1.0)
@@ -52,23 +52,23 @@ def modal_poles(omega: np.ndarray, damping: np.ndarray) -> ModalPoles:
 
 
 def integrated(a: Floats, q: Floats, time: float, halvings: int) -> tuple[Floats, Floats]:
-    """e^(A t) and ∫ e^(A s) Q e^(Aᵀ s) ds from 0 to t, by one exponential of a block, doubled up from t / 2^halvings.
+    """e^(A t) and ∫_0^t e^(A s) Q e^(Aᵀ s) ds, by one block exponential over t / 2^halvings and repeated doubling.
 
     Van Loan, IEEE Trans. Automatic Control 23 (1978) 395.
     """
     size = len(a)
     short = expm(np.block([[-a, q], [np.zeros_like(a), a.T]]) * time / 2**halvings)
     transition: Floats = short[size:, size:].T
-    whole: Floats = transition @ short[:size, size:]
+    integral: Floats = transition @ short[:size, size:]
     for _ in range(halvings):
-        whole = whole + transition @ whole @ transition.T
+        integral = integral + transition @ integral @ transition.T
         transition = transition @ transition
-    return transition, whole
+    return transition, integral
 
 
 @njit(cache=True, nogil=True)
 def _recursion(decay: Complexes, drive: Complexes, out: Complexes) -> None:
-    """out[i, k + 1] = decay[i] out[i, k] + drive[i, k], out[:, 0] given."""
+    """Fill out[i, k + 1] = decay[i] out[i, k] + drive[i, k] from a given out[:, 0]."""
     for i in range(drive.shape[0]):
         s = out[i, 0]
         d = decay[i]
@@ -81,7 +81,7 @@ def _recursion(decay: Complexes, drive: Complexes, out: Complexes) -> None:
 def _driven(
     decay: Complexes, newly: Complexes, newer: Floats, before: Complexes, older: Floats, out: Complexes
 ) -> None:
-    """The same, mode by mode, driven by newly[i] newer[i, k] + before[i] older[i, k]; `older` may have no samples."""
+    """Fill out[i, k + 1] = decay[i] out[i, k] + newly[i] newer[i, k] + before[i] older[i, k]; `older` may be empty."""
     for i in range(out.shape[0]):
         s = out[i, 0]
         d, a, b = decay[i], newly[i], before[i]
@@ -94,7 +94,7 @@ def _driven(
 
 @njit(cache=True, nogil=True)
 def _real_motion(poles: Complexes, response: Complexes, displacement: Floats, velocity: Floats) -> None:
-    """Twice the real parts of each pole's coordinate, and of its rate."""
+    """Fill displacements 2 Re s and velocities 2 Re λs from the coordinates s of uncoupled poles λ."""
     for i in range(response.shape[0]):
         sigma, omega = poles[i].real, poles[i].imag
         for k in range(response.shape[1]):
@@ -104,7 +104,7 @@ def _real_motion(poles: Complexes, response: Complexes, displacement: Floats, ve
 
 
 def whole_samples(delay: float, period: float) -> tuple[int, float]:
-    """Whole samples of a delay, and what is left of it, s."""
+    """The whole samples of a delay, and the remainder, s."""
     whole = int(delay / period + EVEN)
     rest = delay - whole * period
     return whole, rest if rest > EVEN * period else 0.0
@@ -119,7 +119,7 @@ def held_response(
     delay: float = 0.0,
     time_constant: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pole coordinates under inputs held over each sample, delayed and lagged as a drive does it.
+    """Pole coordinates under inputs held over each sample, delayed and lagged.
 
     Args:
         system: the poles.
@@ -140,15 +140,15 @@ def held_response(
     response = np.zeros((poles.size, n_samples), complex)
     decay = np.exp(poles * sample_time)
     if time_constant == 0:
-        whole, late = _growth(poles, sample_time), _growth(poles, sample_time - rest)
+        over_sample, over_newer = _growth(poles, sample_time), _growth(poles, sample_time - rest)
         if system.uncoupled:
             own = np.diag(system.weights)
             before = participation @ older if rest > 0 else np.zeros((poles.size, 0))
-            _driven(decay, own * late, participation @ newer, own * (whole - late), before, response)
+            _driven(decay, own * over_newer, participation @ newer, own * (over_sample - over_newer), before, response)
         else:
-            drive = late[:, None] * (weights @ newer)
+            drive = over_newer[:, None] * (weights @ newer)
             if rest > 0:
-                drive += (whole - late)[:, None] * (weights @ older)
+                drive += (over_sample - over_newer)[:, None] * (weights @ older)
             _recursion(decay, drive, response)
         return response, newer if rest == 0 else older
     rate = 1.0 / time_constant
@@ -156,7 +156,7 @@ def held_response(
     fade = np.exp(-rate * (sample_time - rest))
     command_drive = (1.0 - fade) * newer + fade * (1.0 - np.exp(-rate * rest)) * older
     _recursion(np.full(forces.shape[0], np.exp(-rate * sample_time)), command_drive, acting)
-    # over [0, rest) the command is `older`, then `newer`; in each the force decays exponentially towards it
+    # over [0, rest) the command is `older`, then `newer`; the force approaches each exponentially
     second = sample_time - rest
     middle = older + (acting - older) * np.exp(-rate * rest)
     drive = np.exp(poles * second)[:, None] * (
@@ -178,28 +178,29 @@ def straight_response(
     delay: float = 0.0,
     time_constant: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same under inputs that run straight from sample to sample, and are zero before the first.
+    """Pole coordinates under inputs that are linear between samples and zero before the first (first-order hold).
 
-    With the response R_λ of a pole to the inputs, that of a pole behind a lag T is (R_λ - R_{-1/T}) / (1 + λ T).
+    Arguments and results are those of `held_response`. With the response R_λ of a pole to the inputs, the response to
+    inputs with a lag T is (R_λ - R_{-1/T}) / (1 + λ T).
     """
     poles, weights = system.poles, system.weights @ participation
-    pieces = _StraightPieces.of(forces, sample_time, delay)
+    pieces = _LinearPieces.of(forces, sample_time, delay)
     response = pieces.response(poles, weights)
     if time_constant == 0:
         return response, pieces.first[0]
-    beside = 1.0 + poles * time_constant
-    beside = np.where(np.abs(beside) < CLOSE, CLOSE, beside)
+    denominator = 1.0 + poles * time_constant
+    denominator = np.where(np.abs(denominator) < CLOSE, CLOSE, denominator)
     n_inputs = forces.shape[0]
     lagging = pieces.response(np.full(n_inputs, -1.0 / time_constant), np.eye(n_inputs)).real
-    return (response - weights @ lagging) / beside[:, None], lagging / time_constant
+    return (response - weights @ lagging) / denominator[:, None], lagging / time_constant
 
 
 @dataclass(frozen=True, eq=False)
-class _StraightPieces:
-    """Inputs over each sample interval, straight up to the sample that arrives within it, if any, and after it.
+class _LinearPieces:
+    """Delayed inputs over each sample interval: two linear pieces, before and after the corner within it.
 
     Attributes:
-        first, second: (2, n_inputs, n_samples) values where each piece begins and where it ends.
+        first, second: (2, n_inputs, n_samples) values at the start and the end of each piece.
         spans: their durations, s.
     """
 
@@ -208,14 +209,14 @@ class _StraightPieces:
     spans: tuple[float, float]
 
     @classmethod
-    def of(cls, forces: np.ndarray, sample_time: float, delay: float) -> "_StraightPieces":
+    def of(cls, forces: np.ndarray, sample_time: float, delay: float) -> "_LinearPieces":
         late, rest = whole_samples(delay, sample_time)
         share = 1.0 - rest / sample_time
         ahead = np.c_[forces[:, 1:], forces[:, -1:]]
         old, middle, new = shifted(forces, late + 1), shifted(forces, late), shifted(ahead, late)
         if late < forces.shape[1]:
             middle_before = middle.copy()
-            middle_before[:, late] = 0.0  # nothing runs up to the first sample
+            middle_before[:, late] = 0.0  # zero before the first sample
         else:
             middle_before = middle
         first = np.stack([old + share * (middle_before - old), middle_before])
@@ -223,7 +224,7 @@ class _StraightPieces:
         return cls(first if rest else np.stack([middle, middle]), second, (rest, sample_time - rest))
 
     def response(self, poles: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Of poles that the inputs drive by weights (n_poles, n_inputs): (n_poles, n_samples)."""
+        """Coordinates (n_poles, n_samples) of poles that the inputs drive by weights (n_poles, n_inputs)."""
         before, after = self.spans
         drive = np.exp(poles * after)[:, None] * self._driven(poles, weights, self.first, before)
         drive = drive + self._driven(poles, weights, self.second, after)
@@ -233,7 +234,7 @@ class _StraightPieces:
 
     @staticmethod
     def _driven(poles: np.ndarray, weights: np.ndarray, ends: np.ndarray, span: float) -> np.ndarray:
-        """What a piece adds to each pole by its end."""
+        """Contribution (n_poles, n_samples) of a piece to each pole's coordinate at its end."""
         if span == 0:
             return np.zeros((poles.size, ends.shape[2]))
         level, rise = _growth(poles, span), _ramp_growth(poles, span)
@@ -245,14 +246,14 @@ def sinusoid_response(
 ) -> np.ndarray:
     """Pole coordinates (n_poles, n_samples) under the modal force participation · Im(phasor e^{iωt}), from rest."""
     weights = system.weights @ participation
-    turning = np.exp(1j * omega * sample_time * np.arange(n_samples))
-    ahead = weights * (phasor / 2j) / (1j * omega - system.poles)
-    back = weights * (-np.conj(phasor) / 2j) / (-1j * omega - system.poles)
-    # beside what goes on with the force, each pole goes free from what makes the whole start at rest
+    rotation = np.exp(1j * omega * sample_time * np.arange(n_samples))
+    positive = weights * (phasor / 2j) / (1j * omega - system.poles)
+    negative = weights * (-np.conj(phasor) / 2j) / (-1j * omega - system.poles)
+    # the steady response, plus a free motion for zero initial conditions
     response = np.empty((system.poles.size, n_samples), complex)
-    response[:, 0] = -(ahead + back)
+    response[:, 0] = -(positive + negative)
     _recursion(np.exp(system.poles * sample_time), np.zeros_like(response), response)
-    return response + np.outer(ahead, turning) + np.outer(back, turning.conj())
+    return response + np.outer(positive, rotation) + np.outer(negative, rotation.conj())
 
 
 def modal_motion(system: ModalPoles, response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -275,16 +276,16 @@ def _real_product(a: np.ndarray, b: np.ndarray) -> Floats:
 def _growth(poles: np.ndarray, span: float) -> np.ndarray:
     """∫_0^span e^{λ t} dt."""
     z = poles * span
-    still = z == 0  # of a rigid mode: too slow a pole for its product to show
-    return span * np.where(still, 1.0, np.expm1(z) / np.where(still, 1.0, z))
+    zero = z == 0  # of a rigid mode, also by underflow
+    return span * np.where(zero, 1.0, np.expm1(z) / np.where(zero, 1.0, z))
 
 
 def _ramp_growth(poles: np.ndarray, span: float) -> np.ndarray:
     """∫_0^span e^{λ (span - t)} t/span dt."""
     z = poles * span
     small = np.abs(z) < 0.1
-    few = np.where(small, z, 0.0)
-    series = 1.0 / 2 + few * (1.0 / 6 + few * (1.0 / 24 + few * (1.0 / 120 + few * (1.0 / 720 + few / 5040.0))))
+    x = np.where(small, z, 0.0)
+    series = 1.0 / 2 + x * (1.0 / 6 + x * (1.0 / 24 + x * (1.0 / 120 + x * (1.0 / 720 + x / 5040.0))))
     return span * np.where(small, series, (np.expm1(z) - z) / np.where(small, 1.0, z) ** 2)
 
 
@@ -298,7 +299,7 @@ def _faded_growth(poles: Complexes, rate: float, span: float) -> Complexes:
 
 
 def shifted(values: np.ndarray, samples: int) -> np.ndarray:
-    """Values (..., n_samples) so many samples later, zero before the first."""
+    """Values (..., n_samples) delayed by a number of samples, zero before the first."""
     if samples == 0:
         return values
     later = np.zeros_like(values)

@@ -1,4 +1,4 @@
-"""A rig: what stands in the laboratory."""
+"""A test rig: a structure with its actuators, sensors and attached elements."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from workbench.structure.printed import Printed, counted, place_text
 
 
 def derivative_of(port: Actuator | Sensor) -> int:
-    """0 where a port acts on or measures a displacement, 1 where it does a slope."""
+    """Order of the shapes' spatial derivative at a port: 0 for a force or a displacement, 1 for a moment or a slope."""
     return int(port.kind == "moment") if isinstance(port, Actuator) else MEASURED[port.quantity][0]
 
 
@@ -26,7 +26,7 @@ def shape_of(modes: Modes, port: Actuator | Sensor) -> Floats:
     """Mode shapes, or their slopes, at an actuator or a sensor: (n_modes,), without its gain, with its `shape_error`.
 
     Raises:
-        PlaceError: naming the actuator or sensor whose place or direction the structure does not have.
+        PlaceError: a place or direction that the structure does not have; the message names the actuator or sensor.
     """
     try:
         shape = modes.phi_at(port.at, derivative_of(port), direction=port.direction)
@@ -36,7 +36,7 @@ def shape_of(modes: Modes, port: Actuator | Sensor) -> Floats:
 
 
 def shape_error_of(port: Actuator | Sensor, n_modes: int) -> Floats:
-    """What the mode shapes at a port are off by (n_modes,): none of modes beyond those that its error is known of."""
+    """Errors (n_modes,) of the mode shapes at a port; zero for modes beyond those of its `shape_error`."""
     error = np.zeros(n_modes)
     known = port.shape_error[:n_modes]
     error[: len(known)] = known
@@ -53,17 +53,18 @@ class Rig(Printed):
     """A test rig: modes, with actuators, sensors, attached elements and disturbances.
 
     Attributes:
-        modes: of the structure; as many as the rig shows.
+        modes: of the structure; all that the model includes.
         actuators: one per input, in the order of the inputs.
         sensors: one per output, in the order of the outputs.
-        elements: forces at points or all along, linear or not.
-        stiffness_rate: the stiffness is 1 + rate t times itself, 1/s; t from the start of a record.
-        structure: the bar, beam, plate or membrane behind the modes, where it is known; changes of structure are solved
-            anew on it.
-        by_record: (name, change) of records in which the rig is another one; see `in_record`.
+        elements: at points or distributed, linear or nonlinear.
+        stiffness_rate: relative change of the stiffness per time, 1/s: a factor 1 + rate t, t from the start of a
+            record.
+        structure: the bar, beam, plate or membrane of the modes, where known; modes are recomputed from it when the
+            structure changes.
+        by_record: (name, change) of records for which the rig differs; see `in_record`.
 
     Raises:
-        ValueError: two actuators or two sensors of one name.
+        ValueError: two actuators or two sensors with the same name.
         PlaceError: an actuator, sensor or element at a place, or in a direction, that the structure does not have.
     """
 
@@ -93,7 +94,7 @@ class Rig(Printed):
             except PlaceError as error:
                 raise _misplaced(port, error) from None
         for element in self.elements:
-            where = getattr(element, "at", None)  # what acts all along has none
+            where = getattr(element, "at", None)  # None of a distributed element
             if where is not None:
                 try:
                     check_place(domain, where)
@@ -115,7 +116,7 @@ class Rig(Printed):
         )
 
     def in_record(self, name: str) -> "Rig":
-        """The rig as it is in a record of that name: itself, but for what differs from record to record."""
+        """The rig with the changes that apply to the record of that name."""
         if not self.by_record:
             return self
         rig = replace(self, by_record=())

@@ -1,4 +1,4 @@
-"""Sensors: what they measure, where, and what they lose on the way."""
+"""Sensors: quantity, place and imperfections."""
 
 from dataclasses import dataclass
 
@@ -18,25 +18,28 @@ MEASURED = {
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor at a point: cross-talk, delay, lag, gain, bias and drift, noise, clipping, rounding, in that order.
+    """A sensor at a point.
+
+    The measured quantity passes cross-talk, delay, lag, gain, bias and drift, noise, clipping and rounding, in that
+    order.
 
     Attributes:
         name: of the output.
-        at: its place on the structure: x (m), (x, y), or the name of a point.
+        at: place on the structure: x (m), (x, y), or the name of a point.
         quantity: "displacement", "slope", "velocity", "angular velocity" or "acceleration".
-        noise_std: standard deviation of its white noise.
-        gain: reading per truth.
+        noise_std: standard deviation of white noise.
+        gain: reading per measured quantity.
         bias: constant offset.
-        drift: offset gained over a record, from 0 at its first sample.
-        crosstalk: (name, share) of other sensors whose truth it reads too, delay and lag of its own.
-        delay: s; negative, by less than a sample, where its clock is ahead of that of the inputs.
-        interpolated: whether it is late by straight lines between its samples, as where a logger puts channels on one
-            clock, and not by reading the motion between them.
+        drift: offset gained linearly over a record, from 0 at its first sample.
+        crosstalk: (name, share) of other sensors whose quantities are added.
+        delay: s; negative, by less than a sample, where the sensor's clock is ahead of that of the inputs.
+        interpolated: whether the delay is by linear interpolation between samples, as where a logger resamples
+            channels to one clock; else the motion is read at the delayed time.
         time_constant: of a first-order lag, s.
-        limit: readings stop at ± this.
-        step: readings are multiples of this; 0 for none.
+        limit: largest |reading|.
+        step: readings are rounded to multiples of this; 0 for none.
         direction: of the displacement, or the axis of the slope, where the structure has more than one at a place.
-        shape_error: (n_modes,) what each mode shape, or its slope, is here beyond that of the modes; empty for nothing.
+        shape_error: (n_modes,) error of each mode shape, or of its slope, at this place; empty for none.
     """
 
     name: str
@@ -69,5 +72,5 @@ class Sensor:
 
     @property
     def linear(self) -> bool:
-        """Whether a reading is a linear function of the truth (a time constant adds a state)."""
+        """Whether the reading is a linear function of the measured quantity (a time constant adds a state)."""
         return bool(np.isinf(self.limit) and not (self.bias or self.drift or self.step or self.delay or self.crosstalk))

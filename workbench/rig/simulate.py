@@ -1,4 +1,4 @@
-"""Simulation of a rig from rest: exact where it is linear, stepped with exact modes where it is not."""
+"""Simulation of a rig from rest: in closed form where it is linear, by time stepping of exact modes elsewhere."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from workbench.records.band_limited import finer
 from workbench.records.record import Record
 from workbench.rig import elements, stepping
 from workbench.rig.between_samples import BetweenSamples, Step
-from workbench.rig.driving import actuator_force, beyond_straight, drives, sinusoid_on_substeps
+from workbench.rig.driving import actuator_force, drives, motion_correction, sinusoid_on_substeps
 from workbench.rig.linear import (
     ModalPoles,
     held_response,
@@ -42,8 +42,8 @@ LAWS: dict[type[elements.PointElement], int] = {
     elements.UserLaw: stepping.USER,
 }
 QUANTITIES = ("displacement", "velocity", "acceleration")  # by derivative in time
-BAND_STEPS = 32  # of each sample interval, over which a band-limited input runs straight: 0.05 % at 0.4 of the rate
-KEPT = 8  # rigs of which what all records share is remembered
+BAND_STEPS = 32  # linear steps of a band-limited input per sample interval: an error of 0.05 % at 0.4 of the rate
+KEPT = 8  # rigs in the cache of arrays that all records share
 NOTHING, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
 
 
@@ -53,12 +53,13 @@ class Motion:
 
     Attributes:
         displacement, velocity: (n_modes, n_samples) of the modal coordinates.
-        forces: (n_modes, n_samples) on them beside those of stiffness and damping.
+        forces: (n_modes, n_samples) modal forces without those of stiffness and damping.
         stiffness: (n_modes, 1) of each mode, or (n_modes, n_samples) where it changes.
         damping: (n_modes, n_modes).
-        steps: by which forces change within each interval.
-        held: (n_modes, n_samples) of the forces, what stays as it is from sample to sample but for these.
-        finer: what moves again, with so many times as many samples, where forces change within an interval otherwise.
+        steps: of the forces within each interval.
+        held: (n_modes, n_samples) the part of the forces that is constant over each interval but for the steps.
+        finer: (factor, function) that recomputes the motion with `factor` times as many samples, where forces change
+            within an interval in another way; None where not needed.
     """
 
     displacement: Floats
@@ -71,18 +72,18 @@ class Motion:
     finer: "tuple[int, Callable[[], Motion]] | None" = None
 
     def between_samples(self, sample_time: float) -> BetweenSamples:
-        """The motion at any time, s; computed once, since sensors of many delays may read one motion."""
+        """The motion at any time; cached, since sensors of many delays may read one motion."""
         if "_between_samples" not in self.__dict__:
             q, v, forces = self.displacement, self.velocity, self.forces
-            figures = self.stiffness, self.damping, sample_time
-            found = BetweenSamples.of(q, v, forces, *figures, steps=self.steps, held=self.held)
-            object.__setattr__(self, "_between_samples", found)
-        known: BetweenSamples = self.__dict__["_between_samples"]
-        return known
+            system = self.stiffness, self.damping, sample_time
+            computed = BetweenSamples.of(q, v, forces, *system, steps=self.steps, held=self.held)
+            object.__setattr__(self, "_between_samples", computed)
+        cached: BetweenSamples = self.__dict__["_between_samples"]
+        return cached
 
     @cached_property
     def acceleration(self) -> Floats:
-        """(n_modes, n_samples) of the modal coordinates."""
+        """Modal accelerations (n_modes, n_samples)."""
         return self.forces - self.stiffness * self.displacement - self.damping @ self.velocity
 
     def after(self, lead: int) -> "Motion":
@@ -100,14 +101,14 @@ class Motion:
         return replace(later, finer=(times, lambda: self.finely.after(times * lead)))
 
     def every(self, times: int) -> "Motion":
-        """One of so many samples of a motion under forces that run straight between its own."""
+        """Every `times`-th sample of a motion whose forces are linear between its own samples."""
         stiffness = self.stiffness[:, ::times] if self.stiffness.shape[1] > 1 else self.stiffness
         q, v, forces = (array[:, ::times] for array in (self.displacement, self.velocity, self.forces))
         return Motion(q, v, forces, stiffness, self.damping, finer=(times, lambda: self))
 
     @cached_property
     def finely(self) -> "Motion":
-        """The same motion with more samples, where there is one; of many sensors that are late, and asked for once."""
+        """The motion with more samples, by `finer`; itself where that is None. Cached for many delayed sensors."""
         return self if self.finer is None else self.finer[1]()
 
 
@@ -120,16 +121,17 @@ def simulate(
     name: str = "simulated",
     input_hold: str = "zero",
 ) -> Record:
-    """The record that the rig gives from rest, without noise.
+    """The simulated record of a rig, from rest, without noise.
 
     Args:
+        rig: the rig.
         inputs: (n_actuators, n_samples) commands.
         sample_time: s.
-        substeps: of each sample interval, where the rig is not linear.
+        substeps: per sample interval, where the rig is not linear.
         name: of the record.
-        input_hold: "zero" for inputs held over each sample interval, "first" for straight lines between the samples,
-            "band-limited" for inputs that hold nothing beyond half of the sample rate: these run straight over finer
-            steps, the substeps where the rig is not linear.
+        input_hold: "zero" for inputs held over each sample interval, "first" for linear interpolation between samples,
+            "band-limited" for inputs without content above the Nyquist frequency: these are interpolated to finer
+            steps (the substeps where the rig is not linear) and linear over those.
 
     Raises:
         ValueError: inputs that do not fit the actuators.
@@ -145,12 +147,12 @@ def simulate(
 
 
 def predict(rig: Rig, record: Record, *, substeps: int = 8) -> np.ndarray:
-    """What a rig's sensors read (n_sensors, n_samples) under the inputs of a record, noise apart; see `simulate`."""
+    """Noise-free readings (n_sensors, n_samples) of a rig under the inputs of a record; see `simulate`."""
     rig = rig.in_record(record.name)
-    found = simulate(
+    simulated = simulate(
         rig, record.inputs, sample_time=record.sample_time, substeps=substeps, input_hold=record.input_hold
     )
-    return found.outputs
+    return simulated.outputs
 
 
 def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8, input_hold: str = "zero") -> Motion:
@@ -164,7 +166,7 @@ def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8,
 
 
 def is_stepped(rig: Rig) -> bool:
-    """Whether the motion has no closed form and is stepped through time."""
+    """Whether the motion has no closed form and needs time stepping."""
     if rig.stiffness_rate != 0 or _is_rate_limited(rig):
         return True
     return any(not isinstance(e, elements.PeriodicForce | elements.RandomForce) for e in rig.elements)
@@ -175,50 +177,50 @@ def _is_rate_limited(rig: Rig) -> bool:
 
 
 def steps_exactly(rig: Rig) -> bool:
-    """Whether steps of a whole sample are exact: no law, delay, lag or sinusoid, and no damping between the modes."""
+    """Whether steps of a whole sample are exact: no element, delay or lag, and proportional damping."""
     late = any(actuator.delay or actuator.time_constant for actuator in rig.actuators)
     return rig.modes.proportional and not (late or rig.elements or rig.stiffness_rate)
 
 
 def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
-    """What the sensors read of a motion, noise apart: (n_sensors, n_samples); clipped and rounded in the mean."""
+    """Noise-free readings (n_sensors, n_samples) of a motion, clipped, and with the mean effect of rounding."""
     outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
     for order, here, shapes in _shapes_at_sensors(rig):
         delays = np.array([0.0 if rig.sensors[j].interpolated else rig.sensors[j].delay for j in here])
         if not delays.all():
             outputs[here] = shapes @ getattr(motion, QUANTITIES[order])
         if delays.any():
-            behind = np.flatnonzero(delays)
-            every, moved = 1, motion
+            delayed = np.flatnonzero(delays)
+            factor, fine = 1, motion
             if motion.finer is not None and (order == 2 or _is_rate_limited(rig)):
-                every, moved = motion.finer[0], motion.finely
-            late = moved.between_samples(sample_time / every)
-            outputs[np.array(here)[behind]] = late.earlier(order, shapes[behind], delays[behind])[:, ::every]
+                factor, fine = motion.finer[0], motion.finely
+            between = fine.between_samples(sample_time / factor)
+            outputs[np.array(here)[delayed]] = between.delayed(order, shapes[delayed], delays[delayed])[:, ::factor]
     for j, sensor in enumerate(rig.sensors):
         if sensor.delay and sensor.interpolated:
             samples = np.arange(outputs.shape[1])
             outputs[j] = np.interp(samples - sensor.delay / sample_time, samples, outputs[j])
-    for row, leak in _leaks(rig, outputs):
-        outputs[row] += leak
+    for row, added in _crosstalk(rig, outputs):
+        outputs[row] += added
     for j, sensor in enumerate(rig.sensors):
         outputs[j] = sensor_reading(sensor, outputs[j], sample_time)
     return outputs
 
 
-def _leaks(rig: Rig, truths: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    """What each sensor reads of others' truths (n_sensors, n_samples): its row, and that series."""
+def _crosstalk(rig: Rig, truths: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """Cross-talk: (row of the sensor, added series (n_samples,)) for measured quantities (n_sensors, n_samples)."""
     rows = {sensor.name: j for j, sensor in enumerate(rig.sensors)}
-    leaks = []
+    crosstalk = []
     for sensor in rig.sensors:
         for name, share in sensor.crosstalk:
             if name not in rows:
                 raise ValueError(f"sensor {sensor.name} reads a share of {name!r}, which is no sensor of the rig")
-            leaks.append((rows[sensor.name], share * truths[rows[name]]))
-    return leaks
+            crosstalk.append((rows[sensor.name], share * truths[rows[name]]))
+    return crosstalk
 
 
 def sensor_reading(sensor: Sensor, truth: np.ndarray, sample_time: float) -> np.ndarray:
-    """A sensor's mean reading (n_samples,) of the truth: lag, gain, bias and drift, clipping, rounding."""
+    """A sensor's mean reading (n_samples,) of a measured quantity: lag, gain, bias and drift, clipping, rounding."""
     y = truth
     if sensor.time_constant > 0:
         y = _lagged(y, sensor.time_constant, sample_time)
@@ -235,23 +237,23 @@ def sensor_reading(sensor: Sensor, truth: np.ndarray, sample_time: float) -> np.
 
 @lru_cache(maxsize=KEPT)
 def participation_of(rig: Rig) -> np.ndarray:
-    """(n_modes, n_actuators), the actuators' gains left out: those belong to the path before the structure.
+    """Participation factors (n_modes, n_actuators) without the actuators' gains, which belong to the drive.
 
-    Remembered: not to be written to.
+    The array is cached and must not be changed.
     """
     shapes = np.empty((rig.modes.n_modes, len(rig.actuators)))
     kinds = [(a.kind, a.direction, isinstance(a.at, Between | Patch)) for a in rig.actuators]
-    for kind, direction, apart in set(kinds):
-        group = [j for j, other in enumerate(kinds) if other == (kind, direction, apart)]
+    for kind, direction, extended in set(kinds):
+        group = [j for j, other in enumerate(kinds) if other == (kind, direction, extended)]
         at, derivative = [rig.actuators[j].at for j in group], 1 if kind == "moment" else 0
         try:
-            if apart:
+            if extended:
                 each = [rig.modes.phi_at(where, derivative, direction=direction) for where in at]
                 shapes[:, group] = np.array(each).T
             else:
                 shapes[:, group] = rig.modes.phi(at, derivative, direction=direction).T
         except PlaceError:
-            _ = [shape_of(rig.modes, rig.actuators[j]) for j in group]  # says which actuator it is
+            _ = [shape_of(rig.modes, rig.actuators[j]) for j in group]  # raises with the name of the actuator
             raise
     for j, actuator in enumerate(rig.actuators):
         if actuator.shape_error:
@@ -304,7 +306,7 @@ def _poles(modes: Modes) -> ModalPoles:
 def _steps_within(
     rig: Rig, inputs: Floats, acting: Floats, participation: Floats, sample_time: float
 ) -> tuple[Step, ...]:
-    """How held inputs that are delayed or lagged change the forces on the modes within each sample interval.
+    """Steps of the modal forces within each sample interval, of held inputs that are delayed or lagged.
 
     Args:
         acting: (n_actuators, n_samples) forces at the samples, without bias.
@@ -329,21 +331,21 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
     participation, at_samples = _step(rig, inputs, *unmeasured, sample_time, substeps, input_hold, motion, NOTHING)
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(inputs.shape[1])
     stiffness = modes.omega[:, None] ** 2 * (scale if rig.stiffness_rate else 1.0)
-    # the forces on the modes hold what couples them; only each mode's own damping is left
+    # coupling by damping is among the forces on the modes, so that the diagonal alone remains
     bias = np.array([[actuator.bias] for actuator in rig.actuators])
     acting = at_samples[: len(rig.actuators)] - bias
     steps = _steps_within(rig, inputs, acting, participation, sample_time) if input_hold == "zero" else ()
     n_inputs = len(rig.actuators)
     held = participation[:, :n_inputs] @ at_samples[:n_inputs] if input_hold == "zero" else 0.0
     damping = np.diag(np.diag(modes.damping))
-    found = Motion(q, v, participation @ at_samples + f, stiffness, damping, steps, held)
+    stepped = Motion(q, v, participation @ at_samples + f, stiffness, damping, steps, held)
     if substeps == 1 or not (rig.elements or input_hold == "band-limited" or _is_rate_limited(rig)):
-        return found
-    return replace(found, finer=(substeps, lambda: _move_finely(rig, inputs, sample_time, substeps, input_hold)))
+        return stepped
+    return replace(stepped, finer=(substeps, lambda: _move_finely(rig, inputs, sample_time, substeps, input_hold)))
 
 
 def _move_finely(rig: Rig, inputs: Floats, sample_time: float, substeps: int, input_hold: str) -> Motion:
-    """The same motion with every substep a sample."""
+    """The motion of `_move_in_steps` with every substep as a sample."""
     if input_hold == "zero":
         finely = np.repeat(inputs, substeps, axis=1)
     elif input_hold == "band-limited":
@@ -364,18 +366,18 @@ def prediction_errors(
     substeps: int = 8,
     input_hold: str = "zero",
 ) -> np.ndarray:
-    """Errors (n_sensors, n_samples) of predictions one sample ahead, by a rig that every sample corrects.
+    """Innovations (n_sensors, n_samples): errors of one-step-ahead predictions by an observer of the rig.
 
-    A motion that runs away from the measured one within a few periods, as that of a stiff contact a little out of place
-    does, is kept near it: the errors then go smoothly with every number of the rig.
+    The observer keeps the motion near the measured one, from which that of a stiff contact, say, diverges within a few
+    periods. The innovations are therefore smooth functions of the parameters of the rig.
 
     Args:
-        rig: its sensors may have gain, bias and drift; lag, clipping and rounding are not seen.
+        rig: its sensors may have gain, bias and drift; lag, clipping and rounding are not included.
         inputs: (n_actuators, n_samples) commands.
         outputs: (n_sensors, n_samples) measured.
-        gain: (2, n_modes, n_sensors) by which an error moves the displacements and velocities of the modes.
+        gain: (2, n_modes, n_sensors) of the observer, from innovations to displacements and velocities of the modes.
         sample_time: s.
-        substeps: of each sample interval.
+        substeps: per sample interval.
         input_hold: as of `simulate`.
     """
     errors = np.empty_like(outputs)
@@ -385,9 +387,9 @@ def prediction_errors(
 
 @lru_cache(maxsize=KEPT)
 def reading_of(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """What the sensors read of the modes (n_sensors, n_modes), of which derivative in time (n_sensors,).
+    """Output matrix (n_sensors, n_modes) of the sensors, and the order (n_sensors,) of their time derivative.
 
-    Remembered: not to be written to.
+    The arrays are cached and must not be changed.
     """
     rows, orders = np.zeros((len(rig.sensors), rig.modes.n_modes)), np.zeros(len(rig.sensors), np.int64)
     for order, here, shapes in _shapes_at_sensors(rig):
@@ -397,19 +399,19 @@ def reading_of(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=KEPT)
 def _shapes_at_sensors(rig: Rig) -> list[tuple[int, list[int], np.ndarray]]:
-    """Order in time, sensors and shapes (n_here, n_modes), of sensors of a kind at a time."""
-    found, measured = [], [(*MEASURED[sensor.quantity], sensor.direction) for sensor in rig.sensors]
+    """Sensors grouped by quantity and direction: order of the time derivative, sensors, shapes (n_here, n_modes)."""
+    groups, measured = [], [(*MEASURED[sensor.quantity], sensor.direction) for sensor in rig.sensors]
     for derivative, order, direction in set(measured):
         here = [j for j, kind in enumerate(measured) if kind == (derivative, order, direction)]
         try:
             shapes = rig.modes.phi([rig.sensors[j].at for j in here], derivative, direction=direction)
         except PlaceError:
-            _ = [shape_of(rig.modes, rig.sensors[j]) for j in here]  # says which sensor it is
+            _ = [shape_of(rig.modes, rig.sensors[j]) for j in here]  # raises with the name of the sensor
             raise
         if any(rig.sensors[j].shape_error for j in here):
             shapes = shapes + [shape_error_of(rig.sensors[j], rig.modes.n_modes) for j in here]
-        found.append((order, here, shapes))
-    return found
+        groups.append((order, here, shapes))
+    return groups
 
 
 def _step(
@@ -423,29 +425,30 @@ def _step(
     motion: tuple[np.ndarray, ...],
     errors: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fill displacements and velocities of the modes and the forces of what touches them, or the outputs' errors.
+    """Step a rig through a record: fill modal displacements, velocities and element forces, or the innovations.
 
     Returns:
-        Participations (n_modes, n_forces) of all other forces, and these at the sample instants (n_forces, n_samples).
+        Participation (n_modes, n_forces) of the forces of actuators and sinusoids, and these forces at the samples
+        (n_forces, n_samples).
     """
     modes = rig.modes
     n_samples = inputs.shape[1]
     driving = drives(rig.actuators, inputs, sample_time, substeps, input_hold)
     driven, starts, ends, at_samples = driving.driven, driving.starts, driving.ends, driving.at_samples
-    participation, (damping, coupling, spread) = participation_of(rig), structure_arrays(rig)
+    participation, (damping, coupling, distributed) = participation_of(rig), structure_arrays(rig)
     h = sample_time / substeps
-    beyond = {c: beyond_straight(c, modes.omega, damping, h) for c in {course for _, course in driving.courses}}
-    added = [beyond[course] * participation[:, j] for j, course in driving.courses]
+    corrections = {c: motion_correction(c, modes.omega, damping, h) for c in {course for _, course in driving.courses}}
+    added = [corrections[course] * participation[:, j] for j, course in driving.courses]
     for element in rig.elements:
         if isinstance(element, elements.PeriodicForce):
             start, end, now = sinusoid_on_substeps(element, n_samples, sample_time, substeps)
             driven, starts, ends = np.append(driven, True), np.vstack([starts, start]), np.vstack([ends, end])
             at_samples = np.vstack([at_samples, now])
             participation = np.column_stack([participation, modes.phi_at(element.at)])
-    known, reading, orders = outputs, NOTHING, NO_ORDERS
+    measured, reading, orders = outputs, NOTHING, NO_ORDERS
     if outputs.size:
         reading, orders = reading_of(rig)
-        known = _left_to_motion(rig, outputs, reading, orders, participation, at_samples)
+        measured = _without_feedthrough(rig, outputs, reading, orders, participation, at_samples)
     step: Callable[..., None] = stepping.step_record
     step(
         modes.omega,
@@ -459,9 +462,9 @@ def _step(
         np.ascontiguousarray(participation[:, driven]),
         driving.sizes,
         np.array(added).reshape(len(added), 2, modes.n_modes),
-        *spread,
+        *distributed,
         *_laws(rig),
-        known,
+        measured,
         orders,
         reading,
         gain,
@@ -471,30 +474,30 @@ def _step(
     return participation, at_samples
 
 
-def _left_to_motion(
+def _without_feedthrough(
     rig: Rig, outputs: Floats, reading: Floats, orders: Integers, participation: Floats, at_samples: Floats
 ) -> Floats:
-    """Outputs (n_sensors, n_samples) without biases, drifts, and the accelerations under the actuators' own forces."""
-    known = outputs.copy()
+    """Outputs (n_sensors, n_samples) without biases, drifts, and the feedthrough of forces to accelerations."""
+    measured = outputs.copy()
     for j, sensor in enumerate(rig.sensors):
         if sensor.bias or sensor.drift:
-            known[j] -= sensor.bias + sensor.drift * np.linspace(0.0, 1.0, outputs.shape[1])
+            measured[j] -= sensor.bias + sensor.drift * np.linspace(0.0, 1.0, outputs.shape[1])
     here = np.flatnonzero(orders == 2)
     if here.size and at_samples.size:
-        known[here] -= reading[here] @ (participation @ at_samples)
-    return known
+        measured[here] -= reading[here] @ (participation @ at_samples)
+    return measured
 
 
 @lru_cache(maxsize=KEPT)
 def structure_arrays(rig: Rig) -> tuple[Floats, Floats, tuple[float, Floats, Floats, Floats]]:
-    """What acts all along, or couples the modes, as a stepper takes it: nothing is an array of no numbers.
+    """Damping and distributed elements as arrays for the compiled steppers.
 
-    One type and one layout of every argument: a stepper is compiled anew for any other. Remembered: not to be written
-    to.
+    All have one type and memory layout, since numba compiles a stepper again for any other; absent parts are empty
+    arrays. The arrays are cached and must not be changed.
 
     Returns:
-        Damping (n_modes,) and its coupling of modes; and of what acts all along, the coefficient of stretching and
-        ∫ φ_r' φ_s' dx, shapes (n_modes, n_points) where the air drags, and the coefficient times each point's weight.
+        Damping (n_modes,), its coupling (n_modes, n_modes), and of the distributed elements: coefficient of stretching,
+        ∫ φ_r' φ_s' dx, shapes (n_modes, n_points) at quadrature points for drag, and its coefficient times the weights.
     """
     damping = np.diag(rig.modes.damping).copy()
     coupling = rig.modes.damping - np.diag(damping)
@@ -512,9 +515,9 @@ def _laws(rig: Rig) -> tuple[Integers, Floats, Floats]:
 
 
 def law_arrays(rig: Rig, points: Sequence[elements.PointElement]) -> tuple[Integers, Floats, Floats]:
-    """Kinds (n_elements,), shapes (n_elements, n_modes) and parameters of elements at points, a row each."""
-    of_the_users_own = any(isinstance(e, elements.UserLaw) for e in points)
-    parameters = np.zeros((len(points), stepping.N_PARAMETERS + of_the_users_own))
+    """Kinds (n_elements,), shapes (n_elements, n_modes) and parameters (n_elements, n_parameters) of point elements."""
+    user_defined = any(isinstance(e, elements.UserLaw) for e in points)
+    parameters = np.zeros((len(points), stepping.N_PARAMETERS + user_defined))
     for row, element in zip(parameters, points, strict=True):
         row[: len(element.parameters)] = element.parameters
         if isinstance(element, elements.UserLaw):
@@ -524,7 +527,7 @@ def law_arrays(rig: Rig, points: Sequence[elements.PointElement]) -> tuple[Integ
 
 
 def along(rig: Rig, derivative: int) -> tuple[Floats, Floats]:
-    """Shapes and weights at Gauss points along the structure, fine enough for products of four of its shapes."""
+    """Shapes and quadrature weights at Gauss points along the structure, for products of up to four shapes."""
     points, weights = rig.modes.domain.quadrature(max(3 * rig.modes.n_modes + 12, 30))
     return rig.modes.phi(points, derivative), weights
 
@@ -536,7 +539,7 @@ def stretching_of(rig: Rig) -> Floats:
 
 
 def _lagged(truth: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
-    """A first-order lag of a signal that is linear between samples, settled at its first value."""
+    """A first-order lag of a signal that is linear between samples, in steady state at its first value."""
     ratio = sample_time / time_constant
     fade = np.exp(-ratio)
     new = 1.0 - (1.0 - fade) / ratio
@@ -546,12 +549,12 @@ def _lagged(truth: np.ndarray, time_constant: float, sample_time: float) -> np.n
 
 def _mean_rounded(y: np.ndarray, step: float, noise_std: float) -> np.ndarray:
     """The mean of a rounded noisy reading, by the Fourier series of the rounding error."""
-    spread = noise_std / step
-    if spread < 0.05:
+    sigma = noise_std / step
+    if sigma < 0.05:
         return step * np.round(y / step)
     error = np.zeros_like(y)
     for m in range(1, 12):
-        weight = np.exp(-2.0 * (np.pi * m * spread) ** 2)
+        weight = np.exp(-2.0 * (np.pi * m * sigma) ** 2)
         if weight < 1e-12:
             break
         error += (-1.0) ** m / (np.pi * m) * weight * np.sin(2.0 * np.pi * m * y / step)

@@ -11,14 +11,14 @@ from workbench.rig.rig import shape_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
 
-DELAY_ORDER = 0.7  # of the delay line, per radian of the fastest mode that passes meanwhile
+DELAY_ORDER = 0.7  # order of a delay line per radian of the fastest mode within the delay
 
 
 def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
-    """Modal forces per unit command, B_rj = φ_r at its place, or the slope there for a moment: (n_modes, n_actuators).
+    """Modal forces per unit command (n_modes, n_actuators): gain times φ_r at the place, or its slope for a moment.
 
     Raises:
-        ValueError: an actuator on a support, where it can do no work.
+        ValueError: an actuator on a support, where it does no work.
     """
     columns = []
     for actuator in actuators:
@@ -41,9 +41,8 @@ def output_matrix(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
 def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> control.StateSpace:
     """The linear model from commands to sensor outputs, states (q_1..q_n, q_1'..q_n'), named signals.
 
-    x' = [0 I; -Ω² -C] x + [0; B] u, and y a displacement, slope, velocity, angular velocity or acceleration; an
-    acceleration feels the force directly, so D is then not zero. A lag of an actuator or a sensor adds a state each,
-    after the modal ones (actuators first).
+    x' = [0 I; -Ω² -C] x + [0; B] u, and y a displacement, slope, velocity, angular velocity or acceleration. For an
+    acceleration D is not zero. Lags of actuators, then of sensors, add one state each after the modal ones.
 
     Raises:
         ValueError: an actuator or sensor that is not linear (delay, dead zone, limit, bias, rounding).
@@ -68,10 +67,10 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
 def modal_plant(
     modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[Sensor]
 ) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
-    """A, B, C, D and the names of the states, from commands to readings, then to what the commands have become.
+    """A, B, C, D and the names of the states, from commands to readings and to the delayed and lagged commands.
 
-    Lags and delays count, a delay as of `delay_line`; what is not linear does not. The last n_actuators rows of C and D
-    are the commands where they act, before the gains.
+    Lags and delays are included, a delay as of `delay_line`; nonlinear imperfections are not. The last n_actuators rows
+    of C and D give the delayed and lagged commands, before the gains.
     """
     n, m = modes.n_modes, len(actuators)
     force = input_matrix(modes, actuators)
@@ -114,18 +113,18 @@ Late = tuple[Floats, Floats, Floats]
 
 
 def lateness(part: Actuator | Sensor, modes: Modes) -> list[tuple[str, Late]]:
-    """The delay and the lag of an actuator or a sensor, where it has them: what each is, and its (A, b, c)."""
-    found: list[tuple[str, Late]] = []
+    """The delay and the lag of an actuator or a sensor as linear systems: ("delay" or "lag", (A, b, c)) of each."""
+    systems: list[tuple[str, Late]] = []
     if part.delay > 0:
-        found.append(("delay", delay_line(part.delay, float(modes.omega.max()))))
+        systems.append(("delay", delay_line(part.delay, float(modes.omega.max()))))
     if part.time_constant > 0:
         rate = np.array([1.0 / part.time_constant])
-        found.append(("lag", (-rate[:, None], rate, np.ones(1))))
-    return found
+        systems.append(("lag", (-rate[:, None], rate, np.ones(1))))
+    return systems
 
 
 def delay_line(delay: float, fastest: float) -> Late:
-    """A delay as a linear system (A, b, c), to a millionth up to the fastest frequency, rad/s.
+    """A delay as a linear system (A, b, c), accurate to a millionth up to the fastest frequency, rad/s.
 
     The Padé approximation of order [N-1/N] in Legendre polynomials, which stay well conditioned (Voelker, Kajić &
     Eliasmith, NeurIPS 32 (2019)).
@@ -138,5 +137,5 @@ def delay_line(delay: float, fastest: float) -> Late:
 
 
 def signal_names(names: Iterable[str]) -> list[str]:
-    """Names of signals as python-control allows them: a point, which it keeps for subsystems, becomes a line below."""
+    """Names of signals as python-control allows them: a full stop, reserved for subsystems, becomes an underscore."""
     return [name.replace(".", "_") for name in names]

@@ -1,9 +1,9 @@
-"""Stepping of a rig with nonlinear elements: exact modes, forces linear over each substep, laws solved implicitly.
+"""Time stepping of a rig with nonlinear elements: exact modes, forces linear over a substep, implicit force laws.
 
-Each mode is propagated exactly under a force that varies linearly over the substep, so the only error is that of this
-interpolation, of second order in the substep, and stiff modes cost nothing. The law of a point element is solved at
-the end of the substep (Newton, safeguarded by bisection), so stiff contacts and friction stay stable. A substep in
-which friction turns is taken in finer ones.
+Each mode is propagated exactly under a force that is linear over the substep. The only error is that of this
+interpolation, of second order in the substep, and stiff modes do not limit the substep. The law of a point element is
+solved at the end of the substep (Newton, safeguarded by bisection), so that stiff contacts and friction are stable. A
+substep in which friction reverses is divided.
 """
 
 import math
@@ -21,13 +21,13 @@ from workbench.arrays import Floats, Integers
 LINEAR_SPRING, LINEAR_DAMPER, CUBIC, POWER_SPRING, EVEN_SPRING, POWER_DAMPER = range(6)
 CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, USER = range(6, 11)
 N_PARAMETERS = 3  # of a law, at most
-SETTLED = 1e-10  # of a force: what is left between it and its law
+SETTLED = 1e-10  # relative tolerance of a force
 FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
-# finer substeps of one in which friction turns: a force that all but jumps is far from straight over one. On a frame,
-# at four substeps a sample, they leave a thirteenth of the power of the error. Stops, whose force has a corner only,
-# gain nothing: errors at the corner and in contact all but cancel, as long as the substeps are even
+# Parts of a substep in which friction reverses, since its force is far from linear there. On a frame, at four substeps
+# per sample, this reduces the power of the error to a thirteenth. Stops, whose force has a corner only, do not gain:
+# errors at the corner and in contact nearly cancel as long as the substeps are equal.
 PARTS = 8
-# What `advance` takes, as it describes them.
+# Arguments of `advance`, described there.
 Linear = tuple[Floats, Floats, Floats]
 Drives = tuple[Floats, Floats, Floats, Floats]
 Elements = tuple[Integers, Floats, Floats]
@@ -36,7 +36,7 @@ Moving = tuple[Floats, Floats, Floats]
 Points = tuple[Floats, Floats, Floats, Floats]
 Work = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
 Kept = tuple[Floats, Floats, Floats, Floats]
-LANES = 8  # modes that are worked on at once; a number of them that is no multiple is rounded up, with modes at rest
+LANES = 8  # modes per SIMD operation; the number of modes is padded to a multiple, with modes at rest
 
 
 @intrinsic
@@ -53,7 +53,7 @@ def _call(typing: Any, address: Any, w: Any, v: Any, p: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def user_law(w: float, v: float, p: Floats) -> float:
-    """A law of the user's own, whose address stands behind its parameters."""
+    """The force of a user-defined law, whose address follows its parameters in `p`."""
     force: float = _call(int(p[p.size - 1]), w, v, p)  # type: ignore[call-arg]
     return force
 
@@ -120,7 +120,7 @@ def hysteresis(path: Floats, limit: float) -> Floats:
 
 @njit(cache=True, nogil=True)
 def ramped(targets: Floats, most: float) -> tuple[Floats, Floats]:
-    """Mean over each step, and value at its start, of what heads for targets (n_steps,) by at most `most` a step."""
+    """Mean over each step, and value at its start, of a signal that follows targets by at most `most` per step."""
     mean, start = np.empty_like(targets), np.empty_like(targets)
     value = 0.0
     for k in range(targets.size):
@@ -137,7 +137,7 @@ def ramped(targets: Floats, most: float) -> tuple[Floats, Floats]:
 
 @njit(cache=True, nogil=True)
 def _power(w: float, p: Floats) -> tuple[float, float]:
-    """-F |w / w_r|^e against w, with (F, w_r, e) = p, and its slope."""
+    """-F |w / w_r|^e in the direction of w, with (F, w_r, e) = p, and its derivative."""
     level = abs(w) / p[1]
     less = p[0] * level ** (p[2] - 1.0) / p[1]
     return -less * w, -p[2] * less
@@ -235,7 +235,7 @@ def solve_pair(
     f: float,
     g: float,
 ) -> tuple[float, float, bool]:
-    """The forces f and g of two elements that obey their laws, by Newton from f and g, and whether it settled."""
+    """The forces of two elements by Newton's method from f and g, and whether it converged."""
     for _ in range(6):
         w, v = w_free[0] + aw[0, 0] * f + aw[0, 1] * g, v_free[0] + av[0, 0] * f + av[0, 1] * g
         law_f, f_w, f_v = element_force(kinds[0], parameters, 0, w, v, z[0], w_old[0])
@@ -247,7 +247,7 @@ def solve_pair(
         ff, fg = 1.0 - f_w * aw[0, 0] - f_v * av[0, 0], -f_w * aw[0, 1] - f_v * av[0, 1]
         gf, gg = -g_w * aw[1, 0] - g_v * av[1, 0], 1.0 - g_w * aw[1, 1] - g_v * av[1, 1]
         determinant = ff * gg - fg * gf
-        # laws that resist the motion make ff and gg at least 1; others may have several answers
+        # ff and gg are at least 1 for laws that resist the motion; others may have several solutions
         if not (ff > 0.1 and gg > 0.1 and determinant > 0.01):
             break
         f += (gg * off_f - fg * off_g) / determinant
@@ -272,7 +272,7 @@ def solve_in_turn(
     w_old: Floats,
     force: Floats,
 ) -> None:
-    """Fill the forces of all elements from what they are, one after the other until none moves."""
+    """Solve the forces of all elements in place, one after the other until none changes (Gauss-Seidel)."""
     for _ in range(12):
         largest = 0.0
         for i in range(kinds.size):
@@ -300,7 +300,7 @@ def spread_forces(
     coupling: Floats,
     out: Floats,
 ) -> None:
-    """Fill the modal forces (n_modes,) of what acts all along, or couples the modes; push is a work array."""
+    """Fill the modal forces (n_modes,) of stretching, drag and damping that couples modes; push is a work array."""
     n = q.size
     out[:] = 0.0
     if stretch != 0.0:
@@ -328,11 +328,11 @@ def spread_forces(
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _reactions(omega: Floats, c: Floats, h: float, shapes: Floats, linear: Linear) -> None:
-    """Fill propagators (2, 4, n_modes) over a substep, and the reactions of the elements to them.
+def _compliances(omega: Floats, c: Floats, h: float, shapes: Floats, linear: Linear) -> None:
+    """Fill the propagators (2, 4, n_modes) over a substep, and the compliances between elements.
 
-    The reactions, two of (n_elements, n_elements), are displacement and velocity of element i after a substep by a
-    force of element j that has risen to one at its end.
+    The compliances, two of (n_elements, n_elements), are displacement and velocity of element i at the end of a substep
+    due to a force of element j that rises from zero to one over it.
     """
     e, aw, av = linear
     propagators(omega, c, h, e)
@@ -346,8 +346,8 @@ def _reactions(omega: Floats, c: Floats, h: float, shapes: Floats, linear: Linea
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
-def _rubs(kinds: Integers) -> bool:
-    """Whether there is friction."""
+def _has_friction(kinds: Integers) -> bool:
+    """Whether an element is Coulomb friction."""
     for i in range(kinds.size):
         if kinds[i] == FRICTION:
             return True
@@ -358,20 +358,20 @@ def _rubs(kinds: Integers) -> bool:
 def drifted_propagators(
     omega: Floats, c: Floats, h: float, factor: float, elements: Elements, linear: Linear, finely: Linear
 ) -> None:
-    """Fill `linear` of a substep at `factor` times the stiffness, and `finely` where friction may turn."""
+    """Fill `linear` for a substep at `factor` times the stiffness, and `finely` for its parts if there is friction."""
     kinds, shapes, _ = elements
     drifted = omega * math.sqrt(max(factor, 1e-6))
-    _reactions(drifted, c, h, shapes, linear)
-    if _rubs(kinds):
-        _reactions(drifted, c, h / PARTS, shapes, finely)
+    _compliances(drifted, c, h, shapes, linear)
+    if _has_friction(kinds):
+        _compliances(drifted, c, h / PARTS, shapes, finely)
 
 
-# Neither called nor counting references to its arrays: either would cost as much as the work of a substep.
+# Inlined and without reference counting, since either would cost as much as the work of a substep.
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
 def _advance_once(
     linear: Linear, drives: Drives, elements: Elements, along: Along, motion: Moving, points: Points, work: Work
 ) -> None:
-    """As `advance`, whether friction turns or not."""
+    """Advance by one substep, or by a part of one; arguments as of `advance`."""
     e, aw, av = linear
     drive, drive_end, more_q, more_v = drives
     kinds, shapes, parameters = elements
@@ -422,7 +422,7 @@ def _advance_once(
             q[r] = base_q[r] + e[0, 3, r] * new[r]
             v[r] = base_v[r] + e[1, 3, r] * new[r]
         if distributed and sweep == 0:
-            # the forces that depend on the whole shape, from the motion just predicted
+            # distributed forces, from the predicted motion
             spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, spread)
     for r in range(n):
         old[r] = new[r]
@@ -437,7 +437,7 @@ def _advance_once(
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
 def _rate(shapes: Floats, i: int, v: Floats) -> float:
-    """Of element i."""
+    """Velocity at element i."""
     rate = 0.0
     for r in range(shapes.shape[1]):
         rate += shapes[i, r] * v[r]
@@ -445,8 +445,8 @@ def _rate(shapes: Floats, i: int, v: Floats) -> float:
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
-def _turns(kinds: Integers, parameters: Floats, rates: Floats) -> bool:
-    """Whether the friction of an element turns between two rates (2, n_elements): they pass its smoothing speed."""
+def _friction_reverses(kinds: Integers, parameters: Floats, rates: Floats) -> bool:
+    """Whether a friction force reverses between two rates (2, n_elements): they pass its smoothing speed."""
     for i in range(kinds.size):
         if kinds[i] == FRICTION:
             smooth, before, after = parameters[i, 1], rates[0, i], rates[1, i]
@@ -457,14 +457,14 @@ def _turns(kinds: Integers, parameters: Floats, rates: Floats) -> bool:
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
 def _keep(kept: Floats, a: Floats, b: Floats, c: Floats, d: Floats) -> None:
-    """Four arrays (n,) as they are, into `kept` (4, n)."""
+    """Copy four arrays (n,) into `kept` (4, n)."""
     for i in range(a.size):
         kept[0, i], kept[1, i], kept[2, i], kept[3, i] = a[i], b[i], c[i], d[i]
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
 def _put_back(kept: Floats, a: Floats, b: Floats, c: Floats, d: Floats) -> None:
-    """Four arrays as `_keep` has kept them."""
+    """Restore four arrays (n,) from `kept` (4, n)."""
     for i in range(a.size):
         a[i], b[i], c[i], d[i] = kept[0, i], kept[1, i], kept[2, i], kept[3, i]
 
@@ -481,20 +481,20 @@ def advance(
     work: Work,
     kept: Kept,
 ) -> None:
-    """Advance the modes, a whole number of LANES, and the elements of a rig by a substep.
+    """Advance the modes, a multiple of LANES, and the elements of a rig by a substep, in place.
 
     Args:
-        linear, finely: propagators and reactions, as `drifted_propagators` fills them; those of a substep PARTS times
-            finer are taken where friction turns.
-        drives: modal forces (n_modes,) at the start and the end, straight between; and what they do beyond that to q
-            and q' by the end.
-        elements: kinds (n_elements,), shapes (n_elements, n_modes) and parameters (n_elements, 3) of those at points.
-        along: of what acts all along, as `spread_forces` takes it.
+        linear, finely: propagators and compliances of a substep, and of one of PARTS parts for where friction reverses,
+            see `drifted_propagators`.
+        drives: modal forces (n_modes,) at the start and the end of the substep; and corrections of q and q' at the end
+            for forces that are not linear.
+        elements: kinds (n_elements,), shapes (n_elements, n_modes) and parameters (n_elements, 3) of point elements.
+        along: distributed elements, see `spread_forces`.
         motion: q, q' and the modal forces of all elements, (n_modes,): updated.
-        points: forces, forces a substep before, displacements and hysteretic displacements, (n_elements,): updated.
-        work: free displacements and rates (n_elements,); q, q' and forces (n_modes,), the forces of what acts all
-            along last. Those are kept from one substep to the next.
-        kept: the motion, the points and the rates before the substep, and drives of its parts.
+        points: forces, previous forces, displacements and hysteretic displacements, (n_elements,): updated.
+        work: free displacements and rates (n_elements,); q, q' and forces (n_modes,); distributed forces (n_modes,),
+            which carry over to the next substep.
+        kept: copies of motion, points and rates before the substep, and the drives of its parts.
     """
     kinds, shapes, parameters = elements
     start, end, more_q, more_v = drives
@@ -502,15 +502,15 @@ def advance(
     point, earlier, w, z = points
     spread = work[5]
     modes_kept, points_kept, rates, parts_of = kept
-    rubs = _rubs(kinds)
-    if rubs:
+    friction = _has_friction(kinds)
+    if friction:
         _keep(modes_kept, q, v, old, spread)
         _keep(points_kept, point, earlier, w, z)
         for i in range(kinds.size):
             rates[0, i] = _rate(shapes, i, v)
     parts, part = 1, 0
     while part < parts:
-        # called in one place alone, as it is compiled anew wherever it is called
+        # one call for both cases, because every inlined call is compiled again
         whole = parts == 1
         _advance_once(
             linear if whole else finely,
@@ -522,10 +522,10 @@ def advance(
             work,
         )
         part += 1
-        if rubs and whole:
+        if friction and whole:
             for i in range(kinds.size):
                 rates[1, i] = _rate(shapes, i, v)
-            if _turns(kinds, parameters, rates):
+            if _friction_reverses(kinds, parameters, rates):
                 _put_back(modes_kept, q, v, old, spread)
                 _put_back(points_kept, point, earlier, w, z)
                 parts, part = PARTS, 0
@@ -540,7 +540,7 @@ def advance(
 
 @njit(cache=True, nogil=True)
 def at_rest(n: int, n_elements: int) -> tuple[Linear, Linear, Drives, Moving, Points, Work, Kept]:
-    """Arrays that `advance` takes: linear, finely, drives, motion, points, work, kept."""
+    """Arguments of `advance` for a motion at rest: linear, finely, drives, motion, points, work, kept."""
     linear = np.empty((2, 4, n)), np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
     finely = np.empty((2, 4, n)), np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
     motion = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -555,7 +555,7 @@ def at_rest(n: int, n_elements: int) -> tuple[Linear, Linear, Drives, Moving, Po
 def whole_lanes(
     omega: Floats, c: Floats, coupling: Floats, stretching: Floats, drag_shapes: Floats, shapes: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """The same with modes at rest added, to a whole number of LANES."""
+    """The arrays padded with modes at rest to a multiple of LANES modes."""
     n = LANES * ((omega.size + LANES - 1) // LANES)
     wide, damping, elements = np.ones(n), np.zeros(n), np.zeros((shapes.shape[0], n))
     for r in range(omega.size):
@@ -610,23 +610,27 @@ def step_record(
     f_out: Floats,
     error_out: Floats,
 ) -> None:
-    """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest; or error_out.
+    """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest; or innovations error_out.
 
-    starts, ends (n_inputs, n_samples * n_sub) of forces that run straight over each substep; participation
-    (n_modes, n_inputs). What true forces do beyond these has sizes (n_added, n_samples * n_sub), each of which adds
-    `added` (n_added, 2, n_modes) to q and q' by the end of a substep. stretching (n_modes, n_modes); drag_shapes
-    (n_modes, n_points); shapes (n_elements, n_modes).
-
-    Where something is measured, (n_sensors, n_samples), its error against reading (n_sensors, n_modes) of displacement,
-    velocity or acceleration, by orders (n_sensors,) 0, 1 or 2, fills error_out in place of the motion, which it sets
-    right by gain (2, n_modes, n_sensors).
+    Args:
+        omega, c, coupling: frequencies and damping (n_modes,), and coupling by damping (n_modes, n_modes).
+        dt, n_sub, rate: sample time, s; substeps; relative change of stiffness per time, 1/s.
+        starts, ends: (n_inputs, n_samples * n_sub) forces at the start and the end of each substep.
+        participation: (n_modes, n_inputs).
+        sizes, added: forces that are not linear: sizes (n_added, n_samples * n_sub), and the correction (n_added, 2,
+            n_modes) of q and q' at the end of a substep per unit size.
+        stretch, stretching, drag_shapes, drag_weights: distributed elements, see `structure_arrays` of `simulate`.
+        kinds, shapes, parameters: point elements.
+        measured: (n_sensors, n_samples); if given, the innovations are computed instead of the motion, and correct it.
+        orders, reading: order of the time derivative (n_sensors,) and output matrix (n_sensors, n_modes).
+        gain: (2, n_modes, n_sensors) of the observer.
     """
     n_modes, n_elements, n_inputs = omega.size, kinds.size, starts.shape[0]
     n_samples = measured.shape[1] if measured.size > 0 else q_out.shape[1]
     omega, c, coupling, stretching, drag_shapes, shapes = whole_lanes(
         omega, c, coupling, stretching, drag_shapes, shapes
     )
-    n = LANES * (omega.size // LANES)  # so the compiler sees it
+    n = LANES * (omega.size // LANES)  # tells the compiler that n is a multiple of LANES
     into, n_sensors = np.zeros((n_inputs, n)), measured.shape[0]
     more = np.zeros((added.shape[0], 2, n))
     seen, held = np.zeros((n_sensors, n)), np.zeros((2, n_sensors, n))
@@ -698,7 +702,7 @@ def step_record(
 
 @cache
 def address_of(law: Callable[[float, float, Floats], float]) -> float:
-    """Where force(w, v, parameters) = `law` stands in the memory of this process, compiled."""
+    """Address of the compiled force(w, v, parameters) = `law` in the memory of this process."""
     compiled = njit(nogil=True)(law)
 
     def call(w: float, v: float, parameters: Any) -> float:
@@ -707,7 +711,7 @@ def address_of(law: Callable[[float, float, Floats], float]) -> float:
 
     signature = types.float64(types.float64, types.float64, types.CPointer(types.float64))  # type: ignore[no-untyped-call]
     _KEPT.append(cfunc(signature)(call))
-    return float(_KEPT[-1].address)  # below 2**53: a number holds it exactly
+    return float(_KEPT[-1].address)  # exact, as addresses are below 2**53
 
 
-_KEPT: list[Any] = []  # laws of the user's own live as long as this process
+_KEPT: list[Any] = []  # user-defined laws, kept alive as long as this process

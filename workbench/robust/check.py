@@ -1,4 +1,4 @@
-"""Whether a test came out as predicted, and the log of tests that a model has passed."""
+"""Validation of a model by a new record: the coverage of its prediction bands, and a log of such tests."""
 
 import csv
 import os
@@ -15,25 +15,25 @@ from workbench.robust.prediction import LEVEL, Prediction
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed
 
-UNLIKELY = 0.01  # share of tests of a true model that come out worse, below which the model does not hold
-LEAST_SAMPLES = 40  # of a record: of fewer readings a sensor hardly two lie outside the bands of a true model
+UNLIKELY = 0.01  # significance level: the model is rejected if fewer tests of a true model come out as badly
+LEAST_SAMPLES = 40  # of a record: of fewer samples, less than two of a sensor lie outside the bands of a true model
 COLUMNS = ("checked", "record", "readings", "coverage", "expected_least", "worst_sensor", "worst_coverage", "holds")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PredictionCheck(Printed):
-    """How much of a new record lies inside the bands that were predicted.
+    """The coverage of prediction bands by a new record, beside that expected of a true model.
 
     Attributes:
         name: of the record.
         sensors: (n_outputs,) names.
-        readings: how many were checked.
+        readings: number of readings checked.
         coverage: (n_outputs,) share of readings inside the bands over time.
-        band_coverage: (n_outputs, n_bands) share of Fourier amplitudes inside theirs, by frequency band.
+        band_coverage: (n_outputs, n_bands) share of Fourier amplitudes inside their bands, by frequency band.
         bands_hz: (n_bands, 2) Hz.
-        expected: (n_draws, n_outputs, 1 + n_bands) the same shares of readings that the model itself gives.
-        allowed: rms of what the model leaves unexplained, over that of the readings: of 1 or more, bands about no
-            model at all would be as good.
+        expected: (n_draws, n_outputs, 1 + n_bands) the same shares of readings simulated by the model.
+        allowed: rms of the model's unexplained residual over that of the readings; bands with 1 or more are no test
+            of the model.
     """
 
     name: str
@@ -56,29 +56,29 @@ class PredictionCheck(Printed):
 
     @property
     def expected_least(self) -> float:
-        """Share of the worst sensor, over time, that a test of a true model falls below only once in a hundred."""
+        """The one per cent quantile of the worst sensor's coverage over time, for a true model."""
         worst = np.sort(self.expected[:, :, 0].min(axis=1))
         return float(worst[int(UNLIKELY * worst.size)])
 
     @property
     def probability(self) -> float:
-        """Share of tests of a true model whose worst sensor, over time or in a band, comes out no better."""
+        """p-value: the lesser of those over time and in the frequency bands."""
         return min(self._probabilities)
 
     @property
     def _probabilities(self) -> tuple[float, float]:
-        """The same over time alone, and in the bands alone."""
-        found = np.column_stack([self.coverage, self.band_coverage])
-        over_time = np.mean(self.expected[:, :, 0].min(axis=1) <= found[:, 0].min())
-        if found.shape[1] == 1:
+        """p-values over time (worst sensor) and in the frequency bands (worst band, mean of the sensors)."""
+        coverage = np.column_stack([self.coverage, self.band_coverage])
+        over_time = np.mean(self.expected[:, :, 0].min(axis=1) <= coverage[:, 0].min())
+        if coverage.shape[1] == 1:
             return float(over_time), 1.0
-        # bands hold few frequencies: the mean over sensors of each tells more than the least of all
-        in_bands = np.mean(self.expected[:, :, 1:].mean(axis=1).min(axis=1) <= found[:, 1:].mean(axis=0).min())
+        # a band holds few lines, so that the mean over sensors has more power than the worst sensor
+        in_bands = np.mean(self.expected[:, :, 1:].mean(axis=1).min(axis=1) <= coverage[:, 1:].mean(axis=0).min())
         return float(over_time), float(in_bands)
 
     @property
     def holds(self) -> bool:
-        """Whether the record is one that the model, with its uncertainty, gives; not where that allows for any."""
+        """Whether the record agrees with the model and its uncertainty, where the bands are a test of the model."""
         return self.probability > UNLIKELY and self.allowed < 1.0
 
     @property
@@ -92,8 +92,8 @@ class PredictionCheck(Printed):
         )
         if self.allowed >= 1.0:
             return (
-                f"This is no test of the model: {100 * self.allowed:.3g} % of the readings are allowed for, no less"
-                f" than without any model; {text}."
+                f"This is no test of the model: its bands allow for an error of {100 * self.allowed:.3g} % of the"
+                f" readings, as much as without any model; {text}."
             )
         if self.holds:
             return f"The model holds: {text}."
@@ -101,7 +101,7 @@ class PredictionCheck(Printed):
 
     @property
     def _worst(self) -> list[str]:
-        """What comes out worse than a true model gives, in words: a sensor over time, a frequency band, or both."""
+        """The sensor, the frequency band, or both, whose coverage is too low, in words."""
         over_time, in_bands = self._probabilities
         words = []
         if over_time <= UNLIKELY:
@@ -130,7 +130,7 @@ def check_length(record: Record) -> None:
     """Refuse a record too short to be a test.
 
     Raises:
-        ValueError: saying how long it must be.
+        ValueError: fewer than LEAST_SAMPLES samples.
     """
     if record.n_samples < LEAST_SAMPLES:
         raise ValueError(
@@ -140,22 +140,22 @@ def check_length(record: Record) -> None:
 
 
 def check_prediction(prediction: Prediction, record: Record) -> PredictionCheck:
-    """How much of a record lies inside the bands that were predicted for its inputs.
+    """The coverage of the prediction bands by a measured record.
 
     Args:
-        prediction: of this test.
-        record: what was measured, its sensors named as the rig's.
+        prediction: for the inputs of the record.
+        record: measured, its sensors named as the rig's.
 
     Raises:
-        ValueError: sensors that are missing, a record too short, or another length or sampling rate.
+        ValueError: missing sensors, a record too short, or another length or sampling rate.
     """
     check_length(record)
-    there = {channel.name: row for channel, row in zip(record.output_channels, record.outputs)}
+    measured = {channel.name: row for channel, row in zip(record.output_channels, record.outputs)}
     names = [channel.name for channel in prediction.channels]
-    missing = [name for name in names if name not in there]
+    missing = [name for name in names if name not in measured]
     if missing:
         raise ValueError(
-            f"record {record.name!r} has no output {missing[0]!r}: it has {', '.join(there)}; the prediction is of"
+            f"record {record.name!r} has no output {missing[0]!r}: it has {', '.join(measured)}; the prediction is of"
             f" {', '.join(names)}"
         )
     expected = (prediction.time.size, prediction.sample_time)
@@ -164,7 +164,7 @@ def check_prediction(prediction: Prediction, record: Record) -> PredictionCheck:
             f"record {record.name!r} has {record.n_samples} samples of {record.sample_time:g} s; the prediction"
             f" {expected[0]} of {expected[1]:g} s. Predict with this record's own inputs"
         )
-    outputs = np.array([there[name] for name in names])
+    outputs = np.array([measured[name] for name in names])
     shares = prediction.coverage(outputs)
     return PredictionCheck(
         record.name,
@@ -179,10 +179,10 @@ def check_prediction(prediction: Prediction, record: Record) -> PredictionCheck:
 
 
 def log_test(path: str | Path, check: PredictionCheck) -> Path:
-    """Append a check to a log of tests (CSV), whole or not at all: one write, safe beside other writers.
+    """Append a check to a log of tests (CSV), by one write, so that concurrent writers do not mix lines.
 
     Raises:
-        ValueError: a file that is no such log.
+        ValueError: a file that is no log of tests.
     """
     path = Path(path)
     _check_log(path)
@@ -207,10 +207,10 @@ def log_test(path: str | Path, check: PredictionCheck) -> Path:
 
 
 def read_log(path: str | Path) -> list[dict[str, str]]:
-    """The tests of a log, first to last: what each column holds; none where there is no such file.
+    """The rows of a log of tests, {column: text}, oldest first; empty where the file does not exist.
 
     Raises:
-        ValueError: a file that is no such log.
+        ValueError: a file that is no log of tests.
     """
     path = Path(path)
     if not path.exists():
@@ -224,10 +224,12 @@ def _check_log(path: Path) -> None:
     if path.exists():
         with path.open(encoding="utf-8", errors="replace", newline="") as file:
             if tuple(next(csv.reader(file), ())) != COLUMNS:
-                raise ValueError(f"{path} is no log of tests: its first line must be {','.join(COLUMNS)}; move it away")
+                raise ValueError(
+                    f"{path} is no log of tests: its first line must be {','.join(COLUMNS)}; choose another file"
+                )
 
 
 def _line(values: Sequence[object]) -> str:
-    """A line of CSV; a quoted text keeps commas, and no text begins a formula."""
+    """A line of CSV; texts with commas or quotes are quoted."""
     texts = [" ".join(str(value).split()) for value in values]
     return ",".join(f'"{t.replace(chr(34), chr(34) * 2)}"' if any(c in t for c in ',"') else t for t in texts) + "\n"

@@ -1,4 +1,4 @@
-"""A design on a rig: its law and estimator by the rig's own actuators and sensors, and designed anew for another."""
+"""A design on a rig: its law and estimator on the rig's actuators and sensors, and their redesign for another rig."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,8 +21,8 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
-from workbench.robust.compensation import Loop, check_rate, without
-from workbench.robust.plain_law import struck_by
+from workbench.robust.compensation import Loop, check_rate, without_faults
+from workbench.robust.plain_law import unit_participation
 from workbench.robust.small_motion import loop_poles
 from workbench.structure.domain import Between, Domain, NamedPoints, Patch, Where
 from workbench.structure.modes import Modes, mac
@@ -31,14 +31,14 @@ Design = Law | OnOffLaw | Controller | PlacementTask
 
 PERIODS = 25  # of the lowest controlled mode: the length of a test
 MOST_SAMPLES = 6000
-UNMOVED, GRID = 1e-9, 33  # of the largest displacement of a mode: what does not move; points where it is looked for
-SAME_PLACE = 0.01  # of the size of the structure: farther apart, two places are not the same
-SPEEDS = tuple(10.0**k for k in np.arange(8.0, -2.1, -0.5))  # of the default Kalman filter: noise over what is stated
-ENOUGH, BETTER = 0.8, 1.02  # of the damping designed for; a faster filter must give so much more
+UNMOVED, GRID = 1e-9, 33  # a place does not move below this share of the largest displacement; points to find that
+SAME_PLACE = 0.01  # of the size of the structure: largest distance of two places that count as the same
+SPEEDS = tuple(10.0**k for k in np.arange(8.0, -2.1, -0.5))  # of the default Kalman filter: noise over the stated
+ENOUGH, BETTER = 0.8, 1.02  # sufficient share of the designed damping; least factor by which a faster filter is better
 
 
 def law_of(design: Law | OnOffLaw | Controller) -> Law | OnOffLaw:
-    """The law of a design, on-off control among them."""
+    """The law of a design, linear or on-off."""
     return design.law if isinstance(design, Controller) else design
 
 
@@ -46,7 +46,7 @@ def controlled_by(design: Design) -> tuple[int, ...]:
     """The controlled modes of a design, zero-based.
 
     Raises:
-        TypeError: no design.
+        TypeError: neither a law, a controller nor a placement task.
     """
     if not isinstance(design, Design):
         raise TypeError(
@@ -65,27 +65,27 @@ def impulse_test(
     level: np.ndarray | None = None,
     seed: int | None = 0,
 ) -> LoopTest:
-    """An impulse, and the free motion after it for 25 periods of the lowest controlled mode.
+    """A test by an impulse, with the free motion after it for 25 periods of the lowest controlled mode.
 
     Args:
         rig: nominal.
         controlled: zero-based modes.
         sample_time: s.
-        impulse_at: the place; unless given, that of a hammer or of the first actuator, or where that moves none of the
-            controlled modes, as at a clamp that a motor turns, the place that moves all of them most.
-        level: (n_outputs,) readings that the nominal rig without control then peaks at, in the median of the sensors;
-            None for a unit impulse.
+        impulse_at: the place; by default that of a hammer or of the first actuator. If that moves none of the
+            controlled modes, as at a clamp turned by a motor, the place where all of them move most.
+        level: (n_outputs,) peak readings of the nominal rig without control, to which the impulse is scaled (by the
+            median of the sensors); None for a unit impulse.
         seed: of the noise.
 
     Raises:
         DesignError: rigid modes alone, a sample time too long for the modes, or a place where none of them moves.
-        ValueError: a place that the structure does not have.
+        ValueError: a place outside the structure.
     """
     check_rate(rig.modes, controlled, sample_time)
     omega = rig.modes.omega[list(controlled)]
     omega = omega[omega > 0]
     if not omega.size:
-        raise DesignError("the controlled modes are all rigid, so they have no period: give a test of your own")
+        raise DesignError("the controlled modes are all rigid, so they have no period: give the test")
     impulse_at = _impulse_place(rig, controlled, impulse_at)
     shape = rig.modes.phi_at(impulse_at)
     n_samples = int(min(max(PERIODS * 2.0 * np.pi / omega.min() / sample_time, 64), MOST_SAMPLES))
@@ -108,19 +108,19 @@ def impulse_test(
 
 
 def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> Where:
-    """Where an impulse moves the controlled modes: the place given, or one that suits."""
+    """A place where an impulse moves the controlled modes: the given one, or by default that of `impulse_test`."""
     places = rig.modes.domain.grid(GRID)
     shapes = np.abs(rig.modes.phi(places))
     at = given
     if at is None:
         at = _place_of(rig.modes.domain, next((a for a in rig.actuators if a.direct), rig.actuators[0]))
-    turns = isinstance(at, Patch)  # it has moments along its edges, and no displacement
-    if not turns and np.abs(rig.modes.phi_at(at)[list(controlled)]).max() > UNMOVED * shapes.max():
+    patch = isinstance(at, Patch)  # acts by moments along its edges, so that an impulse there is not defined
+    if not patch and np.abs(rig.modes.phi_at(at)[list(controlled)]).max() > UNMOVED * shapes.max():
         return at
     if given is not None:
         raise DesignError(
             f"an impulse at {rig.modes.domain.text(at)} moves none of the controlled modes, so it tests no"
-            " controller; strike elsewhere"
+            " controller; choose another place"
         )
     moved = shapes[:, list(controlled)]
     most: Where = places[int((moved / np.maximum(moved.max(axis=0), 1e-300)).min(axis=1).argmax())]
@@ -128,7 +128,7 @@ def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> 
 
 
 def _place_of(domain: Domain, port: Actuator) -> Where:
-    """Its place; of a node and a direction the point that moves so."""
+    """The place of an actuator; of a node with a direction, the point that moves in that direction."""
     if not isinstance(domain, NamedPoints) or port.direction is None:
         return port.at
     places = port.at if isinstance(port.at, Between) else (port.at,)
@@ -136,8 +136,8 @@ def _place_of(domain: Domain, port: Actuator) -> Where:
     return Between(*names) if isinstance(port.at, Between) else names[0]
 
 
-def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
-    """A design on the sensors and actuators of a rig, by their places and names; a law alone reads a Kalman filter.
+def loop_on_rig(rig: Rig, design: Design, test: LoopTest) -> Loop:
+    """A design on the sensors and actuators of a rig, matched by places and names; a law alone gets a Kalman filter.
 
     Raises:
         DesignError: a sensor or an actuator that the rig does not have, or a gain given by hand.
@@ -148,8 +148,8 @@ def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
     law = law_of(design)
     if law.designed_by is None:
         raise DesignError(
-            f"{law.name} was given by its gain, which no other structure can be designed from: make it by imsc,"
-            " imsc_poles, coupled_lqr, coupled_poles or on_off"
+            f"{law.name} was given by its gain, so its design cannot be repeated for another structure: make it by"
+            " imsc, imsc_poles, coupled_lqr, coupled_poles or on_off"
         )
     law = replace(law, actuators=tuple(_same_actuator(rig, a) for a in law.actuators))
     linear = law if isinstance(law, Law) else _without_gain(law)
@@ -164,28 +164,29 @@ def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
 
 
 def _without_gain(law: OnOffLaw) -> Law:
+    """A linear law of zero gain with the modes and actuators of an on-off law."""
     return Law(np.zeros((len(law.actuators), 2 * len(law.controlled))), law.controlled, law.actuators, law.name)
 
 
 def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
-    """A Kalman filter on all sensors of motion and rate, as fast as the loop of all modes bears.
+    """A Kalman filter on all sensors of displacement and velocity, as fast as the loop of all modes permits.
 
-    The intensity of the readings' noise is σ² T, and the modal forces are those that excite each mode within the test
-    to the speed that the impulse gives it, by a factor that leaves the loop of the nominal rig with the most damping of
-    its controlled modes, residual ones stable.
+    The intensity of the readings' noise is σ² T times a factor. The intensity of the modal forces excites each mode
+    within the test to the speed that the impulse gives it. The factor is chosen for the most damping of the controlled
+    modes in the loop of the nominal rig, with stable residual modes.
     """
-    sensors = without([s for s in rig.sensors if MEASURED[s.quantity][1] < 2])
+    sensors = without_faults([s for s in rig.sensors if MEASURED[s.quantity][1] < 2])
     if not sensors:
         raise DesignError(
-            "no sensor of the rig reads displacement or velocity, and the observers here do not read accelerations; add"
-            " one that does"
+            "no sensor of the rig reads displacement or velocity, and observers here do not use accelerations; add such"
+            " a sensor"
         )
     index = list(law.controlled)
     at = test.impulse_at
-    shape = struck_by(rig.modes, rig.actuators[0]) if at is None else rig.modes.phi_at(at)
+    shape = unit_participation(rig.modes, rig.actuators[0]) if at is None else rig.modes.phi_at(at)
     speed = np.abs(test.impulse * shape[index])
     speed = np.maximum(speed, 0.1 * speed.max())
-    push = speed**2 / (test.n_samples * test.sample_time)
+    disturbance = speed**2 / (test.n_samples * test.sample_time)
     shapes = np.abs(output_matrix(rig.modes, sensors)[:, index])
     rates = np.array([MEASURED[s.quantity][1] for s in sensors])[:, None]
     signal = (shapes * speed / np.maximum(rig.modes.omega[index], 1e-9) ** (1 - rates)).max(axis=1)
@@ -194,14 +195,14 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
     best, least = None, -np.inf
     for factor in SPEEDS:
         try:
-            controller = kalman(rig.modes, law, sensors, disturbance=push, noise=factor * noise)
+            controller = kalman(rig.modes, law, sensors, disturbance=disturbance, noise=factor * noise)
         except DesignError:
             continue
-        found = loop_poles(rig, sampled(controller, test.sample_time))
-        # fast enough for the damping that the law was designed for is enough; the slower one is the more robust
-        reached = float(np.minimum(found.damping[index] / damping, ENOUGH).mean())
-        if found.spectral_radius < 1.0 and reached > least * BETTER:
-            best, least = controller, reached
+        loop = loop_poles(rig, sampled(controller, test.sample_time))
+        # beyond a sufficient share of the designed damping the slower filter is preferred, as the more robust one
+        achieved = float(np.minimum(loop.damping[index] / damping, ENOUGH).mean())
+        if loop.spectral_radius < 1.0 and achieved > least * BETTER:
+            best, least = controller, achieved
     if best is None:
         raise DesignError(
             f"no Kalman filter on {', '.join(s.name for s in sensors)} leaves the loop of all modes stable; pass"
@@ -211,7 +212,7 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
 
 
 def _design_damping(modes: Modes, law: Law) -> np.ndarray:
-    """Damping ratios (n_controlled,) with exact modal coordinates fed back; those without control for a law of none."""
+    """Damping ratios (n_controlled,) of a law on exact modal coordinates; open-loop ratios for zero gain."""
     a, b = controlled_plant(modes, law.controlled, law.actuators)
     poles = np.linalg.eigvals(a - b @ law.gain)
     poles = poles[poles.imag >= 0]
@@ -221,11 +222,12 @@ def _design_damping(modes: Modes, law: Law) -> np.ndarray:
 
 
 def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
-    there = [a for a in rig.actuators if a.kind == wanted.kind and separation(rig.modes, a, wanted) < SAME_PLACE]
-    # the name alone says nothing where the place is another: gains for one place mean another law at the other
-    found = next((a for a in there if a.name == wanted.name), next((a for a in there if not a.direct), None))
-    if found is not None:
-        return replace(found)
+    """The rig's actuator of the same kind at the same place, by preference of the same name."""
+    near = [a for a in rig.actuators if a.kind == wanted.kind and separation(rig.modes, a, wanted) < SAME_PLACE]
+    # an actuator of the same name at another place does not do: the gains are for their places
+    match = next((a for a in near if a.name == wanted.name), next((a for a in near if not a.direct), None))
+    if match is not None:
+        return replace(match)
     names = ", ".join(f"{a.name} ({a.kind}) at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
     raise DesignError(
         f"the law drives {wanted.name} ({wanted.kind}) at {rig.modes.domain.text(wanted.at)}, where the rig has no"
@@ -234,59 +236,60 @@ def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
 
 
 def _same_sensors(rig: Rig, wanted: Sequence[Sensor]) -> tuple[Sensor, ...]:
-    found = []
+    """The rig's sensors of the same quantities at the same places, by preference of the same names."""
+    matches = []
     for one in wanted:
-        alike = [s for s in rig.sensors if s.quantity == one.quantity and separation(rig.modes, s, one) < SAME_PLACE]
-        if not alike:
+        near = [s for s in rig.sensors if s.quantity == one.quantity and separation(rig.modes, s, one) < SAME_PLACE]
+        if not near:
             names = ", ".join(f"{s.name} ({s.quantity} at {rig.modes.domain.text(s.at)})" for s in rig.sensors)
             raise DesignError(
                 f"the controller reads {one.quantity} at {rig.modes.domain.text(one.at)}, where the rig has no such"
                 f" sensor: it has {names}; design the estimator for these"
             )
-        found.append(next((s for s in alike if s.name == one.name), alike[0]))
-    return tuple(found)
+        matches.append(next((s for s in near if s.name == one.name), near[0]))
+    return tuple(matches)
 
 
-def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = ()) -> Loop:
-    """The same law and estimator, designed with their settings for the modes of another rig.
+def redesigned_for(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = ()) -> Loop:
+    """The loop with its law and estimator redesigned, with the same settings, for the modes of another rig.
 
-    Poles of a law move with the natural frequencies, p ω / ω_old: they ask for damping, and holding a mode at the
-    frequency that another rig had would take far more force than damping it.
+    Poles of a law scale with the natural frequencies, p ω / ω_old: they are given for damping, and to keep a mode at
+    the frequency of the other rig would take far more force.
 
     Args:
-        loop: as it is.
-        rig: whose actuators and sensors are taken, by name.
-        modes: of the rig in its motion.
-        removed: sensors that are not to be read.
+        loop: designed before.
+        rig: has the actuators and sensors of the loop, by name.
+        modes: of the rig, linearised about its motion.
+        removed: names of sensors not to be read.
 
     Raises:
-        DesignError: modes that cannot be controlled or seen on that rig.
+        DesignError: modes that cannot be controlled or observed on that rig.
     """
     controlled = paired(loop.modes, modes, loop.law.controlled)
     actuators = [named(rig.actuators, old.name) for old in loop.law.actuators]
     assert loop.law.designed_by is not None and loop.controller.designed_by is not None
     if isinstance(loop.law, OnOffLaw):
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
-    law = _moved_along(loop, modes, controlled)(modes, controlled=controlled, actuators=actuators)
+    law = _scaled_design(loop, modes, controlled)(modes, controlled=controlled, actuators=actuators)
     linear = law if isinstance(law, Law) else _without_gain(law)
     sensors = [named(rig.sensors, old.name) for old in loop.controller.sensors]
-    controller = _estimated(loop.controller, modes, linear, without(sensors), removed)
+    controller = _redesigned_estimator(loop.controller, modes, linear, without_faults(sensors), removed)
     return Loop(modes, law, controller)
 
 
 def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> Loop | None:
-    """The loop designed for multiples of its settings; None where its design has no such setting.
+    """The loop redesigned with multiples of its settings; None where its design has no such setting.
 
-    A law by poles has no weight: it feeds back 1/√weight times as much, as a regulator of light damping does.
+    For a law by poles, which has no weight, the gain changes by 1/√weight, as for a lightly damped regulator.
 
     Args:
-        loop: as it is.
-        rig: whose actuators and sensors are taken, by name.
-        weight: of the law's forces, over its own.
-        noise: of the readings of a Kalman filter, over its own.
+        loop: designed before.
+        rig: has the actuators and sensors of the loop, by name.
+        weight: factor of the law's control weight.
+        noise: factor of the noise intensity of a Kalman filter.
 
     Raises:
-        DesignError: nothing can be designed with them.
+        DesignError: settings without a design.
     """
     parts: dict[str, Any] = {}
     for name, setting, factor in (("law", "weight", weight), ("controller", "noise", noise)):
@@ -297,15 +300,15 @@ def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> L
         if setting in keywords:
             changed = {setting: factor * np.asarray(keywords[setting])}
         elif name == "law" and "poles" in keywords:
-            changed = {"poles": _moved(np.asarray(keywords["poles"]), loop, 1.0 / np.sqrt(factor))}
+            changed = {"poles": _poles_of_gain(np.asarray(keywords["poles"]), loop, 1.0 / np.sqrt(factor))}
         else:
             return None
         parts[name] = replace(part, designed_by=partial(part.designed_by.func, **{**keywords, **changed}))
-    return designed_anew(loop._replace(**parts), rig, loop.modes)
+    return redesigned_for(loop._replace(**parts), rig, loop.modes)
 
 
-def _moved_along(loop: Loop, modes: Modes, controlled: Sequence[int]) -> Any:
-    """The design of the loop's law, its poles, where it has some, over the natural frequencies of other modes."""
+def _scaled_design(loop: Loop, modes: Modes, controlled: Sequence[int]) -> Any:
+    """The design function of the loop's law, with given poles scaled by the natural frequencies of other modes."""
     design: Any = loop.law.designed_by
     poles = getattr(design, "keywords", {}).get("poles")
     if poles is None:
@@ -315,10 +318,10 @@ def _moved_along(loop: Loop, modes: Modes, controlled: Sequence[int]) -> Any:
     return partial(design.func, **{**design.keywords, "poles": scale * np.asarray(poles)})
 
 
-def _moved(poles: np.ndarray, loop: Loop, gain: float) -> np.ndarray:
-    """The poles (n_controlled,) where each mode is fed back `gain` times what puts them at `poles`.
+def _poles_of_gain(poles: np.ndarray, loop: Loop, gain: float) -> np.ndarray:
+    """The poles (n_controlled,) for `gain` times the modal gains that assign `poles`.
 
-    s² + (c + gain g2) s + ω² + gain g1, with g1 and g2 of `pole_gains`.
+    They are the roots of s² + (c + gain g2) s + ω² + gain g1, with g1 and g2 of `pole_gains`.
     """
     index = list(loop.law.controlled)
     omega, c = loop.modes.omega[index], np.diag(loop.modes.damping)[index]
@@ -329,32 +332,33 @@ def _moved(poles: np.ndarray, loop: Loop, gain: float) -> np.ndarray:
     return -half + 1j * np.sqrt(square - half**2)
 
 
-def _estimated(
+def _redesigned_estimator(
     old: Controller, modes: Modes, law: Law, sensors: Sequence[Sensor], removed: Sequence[str]
 ) -> Controller:
+    """The controller with its estimator redesigned for other modes, a law and sensors without the removed ones."""
     assert old.designed_by is not None
     kept = [i for i, s in enumerate(sensors) if s.name not in removed]
     design: Any = old.designed_by
-    anew: Controller
+    new: Controller
     if removed and np.ndim(noise := getattr(design, "keywords", {}).get("noise", 0.0)):
         chosen = np.asarray(noise)[kept] if np.ndim(noise) == 1 else np.asarray(noise)[np.ix_(kept, kept)]
-        anew = design.func(modes, law, [sensors[i] for i in kept], **{**design.keywords, "noise": chosen})
+        new = design.func(modes, law, [sensors[i] for i in kept], **{**design.keywords, "noise": chosen})
     else:
-        anew = design(modes, law, [sensors[i] for i in kept])
-    if anew.state.size == 0:  # a filter's own sensors stand where the rig's do
-        anew = replace(anew, sensors=tuple(sensors))
-    return anew
+        new = design(modes, law, [sensors[i] for i in kept])
+    if new.state.size == 0:  # a modal filter places its own sensors; those of the rig are at the same places
+        new = replace(new, sensors=tuple(sensors))
+    return new
 
 
 def paired(nominal: Modes, modes: Modes, controlled: Sequence[int]) -> tuple[int, ...]:
-    """Which modes of a changed structure are the controlled ones, by their shapes; increasing.
+    """Indices of the modes of a changed structure that pair with the controlled ones, by MAC; increasing.
 
     Raises:
-        DesignError: more modes controlled than there are.
+        DesignError: more controlled modes than the changed structure has.
     """
     if len(controlled) > modes.n_modes:
-        raise DesignError(f"{len(controlled)} modes are controlled; the corrected rig shows {modes.n_modes}")
+        raise DesignError(f"{len(controlled)} modes are controlled; the corrected rig has {modes.n_modes}")
     grid = nominal.domain.grid(8 * nominal.n_modes + 9)
-    alike = mac(nominal.phi(grid)[:, list(controlled)], modes.phi(grid))
-    _, found = linear_sum_assignment(-alike)
-    return tuple(sorted(int(r) for r in found))
+    assurance = mac(nominal.phi(grid)[:, list(controlled)], modes.phi(grid))
+    _, pairs = linear_sum_assignment(-assurance)
+    return tuple(sorted(int(r) for r in pairs))

@@ -1,4 +1,4 @@
-"""A law from one number: the damping that its controlled modes should have."""
+"""A law by a rule of thumb, from the damping wanted of its controlled modes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -15,8 +15,8 @@ from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Where
 from workbench.structure.modes import Modes
 
-PERIODS = 5.0  # in which on-off control stops each mode
-BAND = 0.02  # of the first speed: the dead band of on-off control
+PERIODS = 5.0  # within which on-off control stops each mode
+BAND = 0.02  # dead band of on-off control over the initial modal speed
 
 
 def plain_law(
@@ -30,16 +30,16 @@ def plain_law(
 ) -> Law | OnOffLaw:
     """A law of a kind with settings by a rule of thumb.
 
-    IMSC: R = 1 / (2 ζ² ω²) a mode; coupled LQR the mean of that times b_r b_rᵀ; poles: -ζ ω ± i ω √(1 - ζ²); on-off:
-    forces that stop each mode within five periods after the impulse, and a dead band of a fiftieth of its first speed.
+    IMSC: R = 1 / (2 ζ² ω²) per mode; coupled LQR the mean of that times b_r b_rᵀ; poles: -ζ ω ± i ω √(1 - ζ²); on-off:
+    forces that stop each mode within five periods after the impulse, and a dead band of 2 % of its initial speed.
 
     Args:
         kind: "imsc", "coupled", "poles" or "on-off".
-        rig: whose actuators drive it, hammers left out.
-        controlled: how many of the lowest modes, or which; as many as actuators unless given.
-        damping: ζ wanted of controlled modes: poles give it, the weights of IMSC and coupled LQR come near it where it
-            is small; on-off control takes none.
-        impulse_at, impulse: for which on-off forces are sized, N s; by the first actuator itself unless given.
+        rig: its actuators, without hammers, are those of the law.
+        controlled: number of the lowest modes, or their indices (zero-based); by default as many as actuators.
+        damping: ζ wanted of controlled modes: exact for poles, approximate for small ζ for IMSC and coupled LQR, not
+            used for on-off control.
+        impulse_at, impulse: impulse (N s) for which on-off forces are sized; by default by the first actuator.
 
     Raises:
         DesignError: an unknown kind, no actuator, or a damping ratio out of range.
@@ -54,15 +54,15 @@ def plain_law(
     modes = rig.modes
     index = controlled_indices(modes, len(actuators) if controlled is None else controlled)
     if (modes.omega[list(index)] == 0).any():
-        raise DesignError("a rigid mode has no damping ratio; design its law with a weight or poles of your own")
+        raise DesignError("a rigid mode has no damping ratio; design its law with a given weight or poles")
     if kind == "on-off":
-        shape = struck_by(modes, actuators[0]) if impulse_at is None else modes.phi_at(impulse_at)
+        shape = unit_participation(modes, actuators[0]) if impulse_at is None else modes.phi_at(impulse_at)
         return _on_off(modes, index, actuators, np.abs(impulse * shape[list(index)]))
     return LINEAR[kind](modes, index, actuators, damping)
 
 
-def struck_by(modes: Modes, actuator: Actuator) -> np.ndarray:
-    """Modal forces (n_modes,) of a unit force, or moment, by an actuator without losses and a gain of 1."""
+def unit_participation(modes: Modes, actuator: Actuator) -> np.ndarray:
+    """Modal forces (n_modes,) of a unit force or moment at an actuator's place."""
     return input_matrix(modes, [replace(actuator, gain=1.0)])[:, 0]
 
 
@@ -74,9 +74,9 @@ def _imsc(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio
 
 
 def _coupled(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float) -> Law:
-    reach = (input_matrix(modes, actuators)[list(index)] ** 2).sum(axis=1)
+    squared = (input_matrix(modes, actuators)[list(index)] ** 2).sum(axis=1)
     return coupled_lqr(
-        modes, index, actuators, weight=float(np.mean(0.5 * reach / (ratio * modes.omega[list(index)]) ** 2))
+        modes, index, actuators, weight=float(np.mean(0.5 * squared / (ratio * modes.omega[list(index)]) ** 2))
     )
 
 
@@ -87,7 +87,7 @@ def _poles(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], rati
 
 def _on_off(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], speed: np.ndarray) -> OnOffLaw:
     speed = np.maximum(speed, 0.1 * speed.max())
-    # each period takes 4 k / ω² from the amplitude q'/ω
+    # a relay reduces the amplitude q'/ω by 4 k / ω² per period
     force = speed * modes.omega[list(index)] / (4.0 * PERIODS)
     return on_off(modes, index, actuators, force=force, dead_band=BAND * speed)
 

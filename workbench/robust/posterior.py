@@ -1,4 +1,4 @@
-"""A corrected rig with its uncertainty: rigs drawn from what a diagnosis leaves uncertain."""
+"""A corrected rig with its uncertainty, and rigs drawn from it: the posterior of a diagnosis."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,14 +21,14 @@ from workbench.structure.domain import Between
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
 
-# Free coordinates within which a fit is taken for linear: a factor e, a tenth of the extent. A number that the records
-# hardly tell has a wider deviation, which says no more than that.
+# Largest standard deviations in free coordinates for which a fit counts as linear: a factor e, a tenth of the extent.
+# A parameter that the records hardly determine has a larger one, which is clipped.
 WIDEST, WIDEST_PLACE = 1.0, 10.0
-LIKELY = 0.01  # probability from which on an alternative set is drawn too
-MOST_TRIES = 20  # draws for each rig that can be
-SAYABLE = ("none", "explained")
+LIKELY = 0.01  # probability above which an alternative set is drawn too
+MOST_TRIES = 20  # draws until one is a feasible rig
+EXPLAINED = ("none", "explained")  # outcomes without an unexplained gap
 LATER = ("places_of_inputs", "places_of_outputs", "quantities_of_outputs", "damping_rates")  # not in early verdicts
-WHAT_DRAWS = "draws, by which the uncertainty is sampled,"
+WHAT_DRAWS = "draws, the number of samples of the uncertain rig,"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +39,10 @@ class UncertainRig:
         nominal: the rig without any effect.
         effects: the central estimate.
         covariance: (n_parameters, n_parameters) of the free coordinates of all parameters, effect by effect.
-        unexplained: root mean square of what the effects leave unexplained, noise apart, over that of the readings: a
-            relative error |Δ| of the model's output, y_real = (1 + Δ) y.
+        unexplained: root mean square of the residual without noise, over that of the readings: a relative error |Δ| of
+            the model's output, y_real = (1 + Δ) y.
         outcome: of the diagnosis.
-        alternatives: other sets that the records do not exclude, each with its probability.
+        alternatives: other sets of effects that the records do not exclude, each with its probability.
     """
 
     nominal: Rig
@@ -60,7 +60,7 @@ class UncertainRig:
         n = len(self._parameters)
         if self.covariance.shape != (n, n):
             raise ValueError(
-                f"UncertainRig.covariance must have one row a parameter of the effects, shape ({n}, {n}); got"
+                f"UncertainRig.covariance must have one row per parameter of the effects, shape ({n}, {n}); got"
                 f" {self.covariance.shape}"
             )
         if not (np.isfinite(self.unexplained) and self.unexplained >= 0):
@@ -68,10 +68,10 @@ class UncertainRig:
 
     @classmethod
     def of(cls, verdict: Verdict) -> "UncertainRig":
-        """The corrected rig of a verdict, with the covariance of its effects and alternatives that are not excluded.
+        """The corrected rig of a verdict, with the covariance of its effects and the alternatives not excluded.
 
         Raises:
-            TypeError: no verdict.
+            TypeError: not a verdict.
         """
         if not isinstance(verdict, Verdict):
             raise TypeError(
@@ -92,31 +92,31 @@ class UncertainRig:
 
     @cached_property
     def rig(self) -> Rig:
-        """The corrected rig: the central estimate."""
+        """The corrected rig at the central estimate."""
         return apply_all(self.nominal, self.effects)
 
     @property
     def explained(self) -> bool:
-        """Whether the effects account for the gap, so that draws of them hold the real structure."""
-        return self.outcome in SAYABLE
+        """Whether the effects explain the gap, so that the draws cover the real structure."""
+        return self.outcome in EXPLAINED
 
     @cached_property
     def _parameters(self) -> list[tuple[int, Parameter]]:
         return parameters_of(self.nominal, self.effects)
 
     def draws(self, n: int, seed: int | np.random.Generator = 0) -> tuple[Rig, ...]:
-        """Rigs (n,) drawn from the uncertainty of the diagnosis, alternatives in proportion to their probability.
+        """Rigs (n,) drawn from the posterior, alternative sets in proportion to their probability.
 
-        Normal in the free coordinates of the fit, inside the bounds of each parameter; a rig that cannot be, such as a
-        buckled beam, is drawn again.
+        Draws are normal in the free coordinates of the fit, within the bounds of each parameter. An infeasible rig,
+        such as a buckled beam, is drawn again.
 
         Args:
-            n: how many.
+            n: number of rigs.
             seed: of the draws, or a generator.
 
         Raises:
-            TypeError: no number of them.
-            ValueError: fewer than one, no whole number of them, or hardly any draw is a rig that can be.
+            TypeError: n is no number.
+            ValueError: n is not a whole number of 1 or more, or hardly any draw is feasible.
         """
         return tuple(rig for rig, _ in self.draws_with_effects(n, seed))
 
@@ -124,7 +124,7 @@ class UncertainRig:
     def draws_with_effects(
         self, n: int, seed: int | np.random.Generator = 0
     ) -> tuple[tuple[Rig, tuple[Effect, ...]], ...]:
-        """The same, each with the effects that make it."""
+        """Rigs drawn as by `draws`, each with its effects."""
         n = whole(n, WHAT_DRAWS, least=1)
         rng = np.random.default_rng(seed)
         sets = [self, *(alternative for alternative, _ in self.alternatives)]
@@ -134,6 +134,7 @@ class UncertainRig:
         return tuple(sets[i]._drawn(rng) for i in chosen)
 
     def _drawn(self, rng: np.random.Generator) -> tuple[Rig, tuple[Effect, ...]]:
+        """One feasible rig drawn from this set of effects, with its effects."""
         for _ in range(MOST_TRIES):
             effects = self._at(self._root @ rng.standard_normal(self._root.shape[1]))
             try:
@@ -141,13 +142,13 @@ class UncertainRig:
             except (ValueError, np.linalg.LinAlgError):
                 continue
         raise ValueError(
-            f"of {MOST_TRIES} draws of {' and '.join(e.label for e in self.effects)} none is a rig that can be: the"
-            " records hardly determine their sizes; measure more of them before a redesign"
+            f"none of {MOST_TRIES} draws of {' and '.join(e.label for e in self.effects)} is a feasible rig: the"
+            " records hardly determine the sizes of these effects; measure more records before a redesign"
         )
 
     @cached_property
     def _root(self) -> np.ndarray:
-        """R with R Rᵀ the covariance, no deviation wider than a fit can state."""
+        """R with R Rᵀ the covariance, rows scaled down to the largest deviations, `WIDEST`."""
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         deviations = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
@@ -163,7 +164,7 @@ class UncertainRig:
         return tuple(replace(effect, values=v) for effect, v in zip(self.effects, values, strict=True))
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers, from which `from_json` makes the same beside the same nominal rig."""
+        """A JSON object from which `from_json` restores the uncertain rig, given its nominal rig."""
         return {
             "nominal": _nominal_json(self.nominal),
             "effects": [_effect_json(effect) for effect in self.effects],
@@ -177,26 +178,26 @@ class UncertainRig:
     def from_json(
         cls, nominal: Rig, written: Mapping[str, Any], *, catalogue: Sequence[Kind] = CATALOGUE
     ) -> "UncertainRig":
-        """What `to_json` wrote, beside the nominal rig that it belongs to.
+        """The uncertain rig that `to_json` wrote, for its nominal rig.
 
         Args:
             nominal: of the case.
-            written: as written.
-            catalogue: kinds by which effects are known, where kinds of your own are among them.
+            written: by `to_json`.
+            catalogue: kinds of the effects, with any user-defined ones.
 
         Raises:
-            ValueError: another rig, an effect of a kind that the catalogue does not hold, of a channel that the rig
-                does not have or without its numbers, or a covariance of another size.
+            ValueError: another nominal rig, an effect of an unknown kind, of a channel that the rig does not have or
+                without its numbers, or a covariance of another size.
         """
         kinds = {kind.name: kind for kind in (*catalogue, *BEYOND, NOMINAL_ERRORS)}
         unknown = [entry["kind"] for entry in written["effects"] if entry["kind"] not in kinds]
         if unknown:
-            raise ValueError(f"no effect is called {unknown[0]!r}; hand a catalogue that holds it")
+            raise ValueError(f"no effect is called {unknown[0]!r}; give a catalogue that contains it")
         for what, own in _nominal_json(nominal).items():
             if what in LATER and what not in written["nominal"]:
                 continue
             stated = written["nominal"][what]
-            if not _alike(stated, own):
+            if not _equal(stated, own):
                 raise ValueError(
                     f"the verdict is of another rig: its {what.replace('_', ' ')} are {_listed(stated)}, and here"
                     f" {_listed(own)}; diagnose this case again"
@@ -210,7 +211,7 @@ class UncertainRig:
 
 
 def _nominal_json(rig: Rig) -> dict[str, list[Any]]:
-    """By what a rig is known again."""
+    """The properties by which a nominal rig is recognised."""
     text = rig.modes.domain.text
     return {
         "inputs": [a.name for a in rig.actuators],
@@ -223,7 +224,7 @@ def _nominal_json(rig: Rig) -> dict[str, list[Any]]:
     }
 
 
-def _alike(stated: Sequence[Any], own: Sequence[Any]) -> bool:
+def _equal(stated: Sequence[Any], own: Sequence[Any]) -> bool:
     if own and isinstance(own[0], float):
         return len(stated) == len(own) and bool(np.allclose(stated, own, rtol=1e-6))
     return list(stated) == list(own)
@@ -234,13 +235,14 @@ def _listed(values: Sequence[Any]) -> str:
 
 
 def _widest(parameter: Parameter) -> float:
+    """The largest standard deviation of a parameter's free coordinate."""
     if parameter.name in COORDINATES:
         return WIDEST_PLACE
     return WIDEST if parameter.logarithmic else np.inf
 
 
 def _covariance(nominal: Rig, fit: Fit) -> np.ndarray:
-    """The joint covariance of a fit's free coordinates; of each alone where only deviations are known."""
+    """The joint covariance of a fit's free coordinates; diagonal where only standard deviations are known."""
     parameters = parameters_of(nominal, fit.effects)
     if fit.covariance is not None and fit.covariance.shape == (len(parameters),) * 2:
         return fit.covariance
@@ -256,15 +258,15 @@ def _variances(effects: Sequence[Effect], parameters: Sequence[tuple[int, Parame
 
 
 def _unexplained(verdict: Verdict) -> float:
-    """What is left and is not noise, relative to the readings; see `UncertainRig`."""
+    """RMS of the residual without noise over that of the readings; see `UncertainRig.unexplained`."""
     shrinkage, budget = verdict.shrinkage, verdict.budget
-    if verdict.outcome in SAYABLE:
+    if verdict.outcome in EXPLAINED:
         gaps = verdict.where.record_gaps if shrinkage is None else list(shrinkage.before.values())
         return float(np.sqrt(budget.unexplained * np.mean(np.square(gaps))))
     if shrinkage is not None:
         noise = max(budget.noise_ratio, 1.0)
-        left = [shrinkage.after[name] ** 2 - (noise * floor) ** 2 for name, floor in shrinkage.floor.items()]
-        return float(np.sqrt(max(float(np.mean(left)), 0.0)))
+        excess = [shrinkage.after[name] ** 2 - (noise * floor) ** 2 for name, floor in shrinkage.floor.items()]
+        return float(np.sqrt(max(float(np.mean(excess)), 0.0)))
     data, best = verdict.attribution.search.data, verdict.attribution.best
     scales = np.array([record.outputs.std(axis=1) for record in data.counted])
     beyond = np.maximum(best.cost_by_channel - (verdict.attribution.noise / data.noise) ** 2, 0.0)
@@ -297,11 +299,11 @@ def _effect(nominal: Rig, kind: Kind, written: Mapping[str, Any]) -> Effect:
 
 
 def _check_effect(nominal: Rig, effect: Effect) -> None:
-    """Refuse an effect that acts on what the rig does not have, or that lacks a number."""
+    """Refuse an effect on a target that the rig does not have, or without a value of a parameter."""
     known = {"all", *(name for target in effect.kind.targets(nominal) for name in names_in(target))}
-    strange = [name for name in names_in(effect.target) if name not in known]
-    if strange:
-        raise ValueError(f"{effect.kind.name} acts on {strange[0]!r}, which the rig does not have; diagnose it again")
+    unknown = [name for name in names_in(effect.target) if name not in known]
+    if unknown:
+        raise ValueError(f"{effect.kind.name} acts on {unknown[0]!r}, which the rig does not have; diagnose it again")
     for parameter in effect.parameters(nominal):
         value = effect.values.get(parameter.name)
         if not isinstance(value, int | float) or not np.isfinite(value):
@@ -309,22 +311,22 @@ def _check_effect(nominal: Rig, effect: Effect) -> None:
 
 
 def _covariance_read(written: Any, n: int) -> np.ndarray:
-    """(n, n), finite."""
+    """The covariance (n, n) of a written verdict, checked to be finite."""
     try:
         covariance = np.array(written, float) if n else np.zeros((0, 0))
     except ValueError:
         covariance = np.array(np.nan)
     if covariance.shape != (n, n) or not np.isfinite(covariance).all():
-        raise ValueError(f"the covariance must be {n} by {n} finite numbers, one row a parameter; diagnose it again")
+        raise ValueError(f"the covariance must be {n} by {n} finite numbers, one row per parameter; diagnose it again")
     return covariance
 
 
 def _identified(nominal: Rig, root: Floats) -> IdentifiedPrior:
-    """Errors of identified modes, with the root of their covariance as it was written."""
+    """The prior of errors of identified modes, with the root of their covariance from a written verdict."""
     prior = IdentifiedPrior.of_modes(nominal)
     if prior is None or prior.root.shape[0] != root.shape[0]:
         raise ValueError(
-            "errors of an identified rig are read beside that rig alone: give one whose modes know their covariance, as"
-            " rig_from makes it"
+            "the verdict has errors of identified modes, so its rig must have the covariance of its modes; give the rig"
+            " as rig_from makes it"
         )
     return replace(prior, root=root)

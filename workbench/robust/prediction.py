@@ -1,4 +1,4 @@
-"""What the next test will show, with bands: readings of rigs drawn from what a diagnosis leaves uncertain."""
+"""Prediction of the readings of a test, with bands, from rigs drawn from the uncertainty of a diagnosis."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,29 +25,29 @@ from workbench.threads import one_blas_thread
 
 LEVEL = 0.95
 DRAWS, LEAST_DRAWS = 200, 40
-NOISES = 4  # readings of each draw, each with noise of its own, from which the bands over time are read
+NOISES = 4  # realisations of noise per draw, for the bands over time
 MOST_BANDS = 8
-MOST_NUMBERS = 25_000_000  # readings of all draws that are held at a time
-RUN_AWAY = 1e30  # of any unit: a draw that does not come back
+MOST_NUMBERS = 25_000_000  # readings of all draws in memory
+RUN_AWAY = 1e30  # readings, in any unit, above which a draw has diverged
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prediction(Printed):
-    """Readings of a test to come, each with the band that holds it with the probability LEVEL.
+    """Predicted readings of a test, each with a band that contains it with the probability LEVEL.
 
     Attributes:
         time: (n_samples,) s.
         channels: (n_outputs,) of the sensors.
-        median, lower, upper: (n_outputs, n_samples) of the readings, noise among it.
+        median, lower, upper: (n_outputs, n_samples) of the readings with noise.
         frequencies_hz: (n_frequencies,) Hz.
         spectrum_median, spectrum_lower, spectrum_upper: (n_outputs, n_frequencies) of the amplitude |Y| of a reading's
             discrete Fourier transform, in the unit of the reading.
-        bands_hz: (n_bands, 2) frequency bands, one around each mode or several.
+        bands_hz: (n_bands, 2) frequency bands, each around one mode or several.
         expected: (n_draws, n_outputs, 1 + n_bands) share of each draw's own readings inside the bands: over time,
-            then in each frequency band. A test of a true model gives such shares.
-        name: of what is predicted.
-        notes: what else a reader should know.
-        allowed: rms of what the rig leaves unexplained, over that of the readings, which the bands allow for.
+            then in each frequency band. They sample the coverage of a true model.
+        name: of the test or controller.
+        notes: warnings and remarks.
+        allowed: rms of the unexplained residual over that of the readings; the bands include it.
     """
 
     time: Floats
@@ -76,7 +76,7 @@ class Prediction(Printed):
 
     @property
     def relative_width(self) -> Floats:
-        """Half width of the bands over the root mean square of the median (n_outputs,), both in the mean over time."""
+        """RMS half width of the bands over the RMS of the median (n_outputs,), over time."""
         half = 0.5 * np.sqrt(np.mean((self.upper - self.lower) ** 2, axis=1))
         size = np.sqrt(np.mean(self.median**2, axis=1))
         return np.asarray(half / np.where(size > 0, size, np.nan))
@@ -85,8 +85,8 @@ class Prediction(Printed):
         """Share of readings (n_outputs, n_samples) inside the bands (n_outputs, 1 + n_bands): see `expected`."""
         inside = ((outputs >= self.lower) & (outputs <= self.upper)).mean(axis=1)
         size = amplitudes(outputs)
-        held = (size >= self.spectrum_lower) & (size <= self.spectrum_upper)
-        of_band = [held[:, band].mean(axis=1) for band in _members(self.frequencies_hz, self.bands_hz)]
+        lines_inside = (size >= self.spectrum_lower) & (size <= self.spectrum_upper)
+        of_band = [lines_inside[:, band].mean(axis=1) for band in _members(self.frequencies_hz, self.bands_hz)]
         return np.column_stack([inside, *of_band])
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
@@ -116,30 +116,30 @@ def predict(
 ) -> Prediction:
     """Predicted sensor outputs of a test, from rest, with 95 % bands over time and frequency.
 
-    Each draw of the rig is simulated under the inputs; a relative error Δ of the size that is left unexplained changes
-    amplitude and phase of each sensor in each frequency band, y_real = (1 + Δ) y; noise comes last. A band runs between
-    the quantiles of all draws' readings.
+    Each draw of the rig is simulated under the inputs. A random relative error Δ, of the size of the unexplained
+    residual, changes amplitude and phase of each sensor in each frequency band, y_real = (1 + Δ) y. Noise is added. The
+    bands are quantiles of the readings of all draws.
 
     Args:
-        rig: a verdict, or the uncertain rig that it leaves.
-        inputs: (n_actuators, n_samples) commands, or a record that has these as inputs; its outputs are not looked at.
+        rig: a verdict, or its uncertain rig.
+        inputs: (n_actuators, n_samples) commands, or a record with these inputs; its outputs are not used.
         sample_time: of an array of inputs, s.
-        noise_std: (n_outputs,) of the readings; as the verdict found it, or as the sensors state it.
+        noise_std: (n_outputs,) of the readings; by default that of the verdict, else that of the sensors.
         draws: of the rig.
         seed: of the draws and of the noise.
-        progress: called with what is done and the share done.
+        progress: called with (text, share done).
 
     Raises:
-        TypeError: no verdict, inputs that are neither numbers nor a record, or no number where one is asked for.
-        ValueError: inputs that do not fit the rig, too few draws, or hardly any draw with a bounded motion.
+        TypeError: no verdict, inputs that are neither numbers nor a record, or an argument that is no number.
+        ValueError: inputs that do not fit the rig, too few draws, or a motion that diverges in many of them.
     """
     seed = whole(seed, "seed")
-    found, spread = _found(rig, noise_std)
-    sent, period, hold, start = _inputs(found.nominal, inputs, sample_time)
-    n_outputs, n_samples = spread.size, sent.shape[1]
+    uncertain, noise = _uncertain(rig, noise_std)
+    sent, period, hold, start = _inputs(uncertain.nominal, inputs, sample_time)
+    n_outputs, n_samples = noise.size, sent.shape[1]
     rng = np.random.default_rng(seed)
     truths = []
-    rigs = found.draws(_draws(draws, n_outputs, n_samples), rng)
+    rigs = uncertain.draws(_draws(draws, n_outputs, n_samples), rng)
     for i, drawn in enumerate(rigs):
         if progress is not None:
             progress("predicting", i / len(rigs))
@@ -147,23 +147,23 @@ def predict(
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 truth = simulate(quiet, forces, sample_time=period, input_hold=hold).outputs
-            except ValueError:  # a record holds no infinite readings
+            except ValueError:  # infinite readings are refused by `Record`
                 truth = np.full((n_outputs, n_samples), np.inf)
         truths.append(truth)
     time = np.asarray(start + period * np.arange(n_samples), float)
     name = inputs.name if isinstance(inputs, Record) else "prediction"
-    banded = _banded(found, found.rig, truths, time, spread, rng, name)
-    return replace(banded, notes=(*banded.notes, *_too_fast(found.rig.modes, period)))
+    banded = _banded(uncertain, uncertain.rig, truths, time, noise, rng, name)
+    return replace(banded, notes=(*banded.notes, *_above_nyquist(uncertain.rig.modes, period)))
 
 
-def _too_fast(modes: Modes, period: float) -> tuple[str, ...]:
-    """Which modes move between the samples, in words."""
+def _above_nyquist(modes: Modes, period: float) -> tuple[str, ...]:
+    """A note on the modes above the Nyquist frequency."""
     fast = [f"{f:.4g}" for f in modes.frequencies_hz if f > 0.5 / period]
     if not fast:
         return ()
     return (
-        f"Modes at {', '.join(fast)} Hz lie above the Nyquist frequency of {0.5 / period:.4g} Hz: what drives them"
-        " between samples is not in the inputs, unless these were held as input_hold says; sample faster.",
+        f"Modes at {', '.join(fast)} Hz lie above the Nyquist frequency of {0.5 / period:.4g} Hz: the inputs do not"
+        " contain their excitation between samples, unless they were held as input_hold says; sample faster.",
     )
 
 
@@ -177,44 +177,45 @@ def predict_loop(
     draws: int = DRAWS,
     seed: int = 0,
 ) -> Prediction:
-    """What the sensors of a controller will read in a controlled test to come, with 95 % bands over time and frequency.
+    """Predicted readings of a controller's sensors in a closed-loop test, with 95 % bands over time and frequency.
 
-    Each draw of the rig is simulated in the loop, its sensors' noise fed back; what is left unexplained is an error of
-    the gains that the loop feels, and one of the readings as in `predict`.
+    Each draw of the rig is simulated in the loop, with the noise of its sensors. The unexplained residual is an error
+    of the sensors' gains in the loop, and of the readings as in `predict`.
 
     Args:
-        rig: a verdict, or the uncertain rig that it leaves.
+        rig: a verdict, or its uncertain rig.
         controller: of the test's sample time.
-        test: what the loop is put through.
-        noise_std: (n_outputs,) of all the rig's sensors; as the verdict found it, or as they state it.
+        test: the excitation.
+        noise_std: (n_outputs,) of all the rig's sensors; by default that of the verdict, else that of the sensors.
         draws: of the rig.
         seed: of the draws and of the noise.
 
     Raises:
-        TypeError: no verdict, no sampled controller, no test, or no number where one is asked for.
-        ValueError: a controller or a test that does not fit the rig, too few draws, or hardly any with a bounded
-            motion.
+        TypeError: no verdict, no sampled controller, no test, or an argument that is no number.
+        ValueError: a controller or a test that does not fit the rig, too few draws, or a motion that diverges in many
+            of them.
     """
     check_loop_kinds(controller, test)
     seed = whole(seed, "seed")
-    found, noise = _found(rig, noise_std)
+    uncertain, noise = _uncertain(rig, noise_std)
     n_outputs, n_samples = len(controller.sensors), test.n_samples
-    rigs = [_with_noise(drawn, noise) for drawn in drawn_with_errors(found, _draws(draws, n_outputs, n_samples), seed)]
+    n_draws = _draws(draws, n_outputs, n_samples)
+    rigs = [_with_noise(drawn, noise) for drawn in drawn_with_errors(uncertain, n_draws, seed)]
     runs = run_loops(rigs, controller, replace(test, seed=seed))
     truths = [_loop_truth(drawn, run, controller, test.sample_time) for drawn, run in zip(rigs, runs, strict=True)]
-    sensors = _with_noise(found.rig, noise).sensors
-    read_by = replace(found.rig, sensors=tuple(named(sensors, name) for name in controller.sensors))
-    spread = np.array([s.noise_std for s in read_by.sensors])
+    sensors = _with_noise(uncertain.rig, noise).sensors
+    read_by = replace(uncertain.rig, sensors=tuple(named(sensors, name) for name in controller.sensors))
+    of_sensors = np.array([s.noise_std for s in read_by.sensors])
     rng = np.random.default_rng([seed, 1])
-    return _banded(found, read_by, truths, test.time, spread, rng, controller.name)
+    return _banded(uncertain, read_by, truths, test.time, of_sensors, rng, controller.name)
 
 
-def _found(rig: Verdict | UncertainRig, noise_std: Sequence[float] | Floats | None) -> tuple[UncertainRig, Floats]:
-    """The uncertain rig, and the noise of its sensors: as given, as the verdict found it, or as they state it."""
-    found = rig if isinstance(rig, UncertainRig) else UncertainRig.of(rig)
+def _uncertain(rig: Verdict | UncertainRig, noise_std: Sequence[float] | Floats | None) -> tuple[UncertainRig, Floats]:
+    """The uncertain rig, and the noise of its sensors (n_outputs,): as given, else of the verdict, else as stated."""
+    uncertain = rig if isinstance(rig, UncertainRig) else UncertainRig.of(rig)
     if noise_std is None and isinstance(rig, Verdict) and rig.budget.noise_found:
         noise_std = rig.budget.noise_found
-    return found, _noise(found.nominal, noise_std)
+    return uncertain, _noise(uncertain.nominal, noise_std)
 
 
 def _with_noise(rig: Rig, noise: Floats) -> Rig:
@@ -223,18 +224,18 @@ def _with_noise(rig: Rig, noise: Floats) -> Rig:
 
 
 def check_draws(wanted: int) -> None:
-    """Refuse too few draws for the ends of a band.
+    """Refuse too few draws for the quantiles of a band.
 
     Raises:
-        TypeError: no number.
-        ValueError: saying how many it takes.
+        TypeError: not a number.
+        ValueError: fewer than LEAST_DRAWS.
     """
     if whole(wanted, WHAT_DRAWS, least=1) < LEAST_DRAWS:
         raise ValueError(f"bands of {100 * LEVEL:g} % need {LEAST_DRAWS} draws or more; got {wanted}")
 
 
 def _draws(wanted: int, n_outputs: int, n_samples: int) -> int:
-    """How many draws: as wanted, or as many as can be held at a time."""
+    """The number of draws: as wanted, or as many as fit in memory."""
     check_draws(wanted)
     most = MOST_NUMBERS // (n_outputs * n_samples)
     if most < LEAST_DRAWS:
@@ -246,7 +247,7 @@ def _draws(wanted: int, n_outputs: int, n_samples: int) -> int:
 
 
 def _loop_truth(rig: Rig, run: LoopRun, controller: DigitalController, sample_time: float) -> Floats:
-    """What the controller's sensors (n_outputs, n_samples) read of a run, noise, clipping and rounding apart."""
+    """Readings (n_outputs, n_samples) of the controller's sensors in a run, without noise, clipping and rounding."""
     rows = [[s.name for s in rig.sensors].index(name) for name in controller.sensors]
     if not run.bounded:
         return np.full((len(rows), run.commands.shape[1]), np.inf)
@@ -259,56 +260,56 @@ def _loop_truth(rig: Rig, run: LoopRun, controller: DigitalController, sample_ti
 
 
 def _banded(
-    found: UncertainRig,
+    uncertain: UncertainRig,
     rig: Rig,
-    possible: Sequence[Floats],
+    drawn: Sequence[Floats],
     time: Floats,
-    spread: Floats,
+    noise: Floats,
     rng: np.random.Generator,
     name: str,
 ) -> Prediction:
-    """The bands of what the sensors of a rig read in each draw, (n_outputs, n_samples); draws that run away left out.
+    """The prediction with its bands, from the noise-free readings of each draw; diverging draws are left out.
 
     Args:
-        found: whose unexplained share is allowed for.
-        rig: whose sensors read.
-        possible: noise apart, a draw each.
+        uncertain: gives the unexplained share that the bands allow for.
+        rig: gives the sensors.
+        drawn: (n_outputs, n_samples) noise-free readings of each draw.
         time: (n_samples,) s.
-        spread: (n_outputs,) of the noise.
+        noise: (n_outputs,) standard deviation.
         rng: of the noise.
-        name: of what is predicted.
+        name: of the prediction.
     """
     period = float(time[1] - time[0])
     frequencies = np.asarray(np.fft.rfftfreq(time.size, period), float)
     bands = _bands(rig.modes, frequencies)
     truths = [
-        truth + _unexplained(truth, found.unexplained, frequencies, bands, rng)
-        for truth in possible
+        truth + _unexplained(truth, uncertain.unexplained, frequencies, bands, rng)
+        for truth in drawn
         if np.abs(truth).max() < RUN_AWAY
     ]
-    notes, away = [], len(possible) - len(truths)
-    if away > len(possible) // 10:
+    notes, diverging = [], len(drawn) - len(truths)
+    if diverging > len(drawn) // 10:
         raise ValueError(
-            f"{away} of {len(possible)} samples of the uncertain rig diverge in this test; predict a weaker one, or"
-            " measure more first"
+            f"{diverging} of {len(drawn)} samples of the uncertain rig diverge in this test; predict a test of less"
+            " excitation, or measure more first"
         )
-    if away:
-        notes.append(f"{away} of {len(possible)} samples diverge and are left out.")
-    if not found.explained:
+    if diverging:
+        notes.append(f"{diverging} of {len(drawn)} samples diverge and are left out.")
+    if not uncertain.explained:
         notes.append(
-            "The diagnosis leaves the gap unexplained:"
-            f" {100 * found.unexplained:.3g} % of the readings are allowed for, of any phase and in any band."
+            "The diagnosis leaves the gap unexplained: the bands allow for an error of"
+            f" {100 * uncertain.unexplained:.3g} % of the readings, of any phase and in any frequency band."
         )
     readings = np.array(truths)
-    low, middle, high = _over_time(readings, rig, spread, rng)
+    low, median, high = _over_time(readings, rig, noise, rng)
     for i, truth in enumerate(readings):
-        readings[i] = _read(truth, rig, spread, rng)
+        readings[i] = _read(truth, rig, noise, rng)
     sizes = np.array([amplitudes(reading) for reading in readings])
     spectrum = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
     prediction = Prediction(
         time,
-        tuple(Channel(s.name, s.quantity, at=s.at, noise_std=n) for s, n in zip(rig.sensors, spread)),
-        middle,
+        tuple(Channel(s.name, s.quantity, at=s.at, noise_std=n) for s, n in zip(rig.sensors, noise)),
+        median,
         low,
         high,
         frequencies,
@@ -319,7 +320,7 @@ def _banded(
         np.zeros((0, len(rig.sensors), 1 + len(bands))),
         name,
         tuple(notes),
-        found.unexplained,
+        uncertain.unexplained,
     )
     return replace(prediction, expected=np.array([prediction.coverage(reading) for reading in readings]))
 
@@ -333,18 +334,18 @@ def amplitudes(outputs: Floats) -> Floats:
 
 
 def _inputs(rig: Rig, inputs: Record | Floats, sample_time: float | None) -> tuple[Floats, float, str, float]:
-    """Commands (n_actuators, n_samples), their sample time, how they are held, and the time of the first, s."""
+    """Commands (n_actuators, n_samples), their sample time (s), their hold, and the time of the first (s)."""
     names = [actuator.name for actuator in rig.actuators]
     if isinstance(inputs, Record):
-        there = {channel.name: row for channel, row in zip(inputs.input_channels, inputs.inputs)}
-        missing = [name for name in names if name not in there]
+        given = {channel.name: row for channel, row in zip(inputs.input_channels, inputs.inputs)}
+        missing = [name for name in names if name not in given]
         if missing:
             raise ValueError(
-                f"record {inputs.name!r} has no input {missing[0]!r}: it has {', '.join(there) or 'none'}; the rig's"
+                f"record {inputs.name!r} has no input {missing[0]!r}: it has {', '.join(given) or 'none'}; the rig's"
                 f" are {', '.join(names)}"
             )
         sent, period, hold, start = (
-            np.array([there[name] for name in names]), inputs.sample_time, inputs.input_hold, inputs.start_time,
+            np.array([given[name] for name in names]), inputs.sample_time, inputs.input_hold, inputs.start_time,
         )  # fmt: skip
     else:
         if inputs is None or isinstance(inputs, str | Path):
@@ -370,7 +371,7 @@ def _noise(rig: Rig, given: Sequence[float] | Floats | None) -> Floats:
 
 
 def _bands(modes: Modes, frequencies: Floats) -> Floats:
-    """Frequency bands (n_bands, 2), Hz, from half-way to half-way between modes, on a logarithmic scale."""
+    """Frequency bands (n_bands, 2), Hz, around groups of modes; edges are geometric means of neighbouring modes."""
     top = float(frequencies[-1])
     own = np.sort(modes.frequencies_hz[(modes.frequencies_hz > frequencies[1]) & (modes.frequencies_hz < top)])
     groups = [group for group in np.array_split(own, min(MOST_BANDS, max(own.size, 1))) if group.size]
@@ -381,24 +382,24 @@ def _bands(modes: Modes, frequencies: Floats) -> Floats:
 
 
 def _members(frequencies: Floats, bands: Floats) -> list[Floats]:
-    """Of each band, which frequencies it holds; the lower edge belongs to it, the last band's upper one too."""
+    """Masks (n_frequencies,) of the lines in each band; a band includes its lower edge, the last also its upper one."""
     last = bands[-1, 1]
     return [(frequencies >= low) & ((frequencies < high) | (high == last)) for low, high in bands]
 
 
 def _with_disturbances(rig: Rig, sent: Floats, rng: np.random.Generator) -> tuple[Rig, Floats]:
-    """The rig without noise, clipping and rounding, its random forces as inputs of their own, drawn anew."""
+    """The rig without noise, clipping and rounding and with its random forces as inputs, and all inputs' samples."""
     sensors = [replace(sensor, limit=np.inf, step=0.0) for sensor in rig.sensors]
     random = [element for element in rig.elements if isinstance(element, RandomForce)]
     others = [element for element in rig.elements if not isinstance(element, RandomForce)]
     ports = [Actuator(f"random force {i + 1}", element.at, direct=True) for i, element in enumerate(random)]
     forces = [element.rms * rng.standard_normal(sent.shape[1]) for element in random]
-    whole = replace(rig, sensors=tuple(sensors), elements=tuple(others), actuators=(*rig.actuators, *ports))
-    return whole, np.vstack([sent, *forces])
+    with_ports = replace(rig, sensors=tuple(sensors), elements=tuple(others), actuators=(*rig.actuators, *ports))
+    return with_ports, np.vstack([sent, *forces])
 
 
 def _unexplained(truth: Floats, share: float, frequencies: Floats, bands: Floats, rng: np.random.Generator) -> Floats:
-    """Δ y of a relative error Δ with E|Δ|² = share², of its own for each sensor and frequency band."""
+    """Δ y of a random relative error Δ with E|Δ|² = share², independent for each sensor and frequency band."""
     if share == 0:
         return np.zeros_like(truth)
     error = np.zeros((truth.shape[0], frequencies.size), complex)
@@ -408,7 +409,7 @@ def _unexplained(truth: Floats, share: float, frequencies: Floats, bands: Floats
 
 
 def _read(truth: Floats, rig: Rig, noise: Floats, rng: np.random.Generator) -> Floats:
-    """Readings of the truth (..., n_outputs, n_samples): noise, then clipping, then rounding."""
+    """Readings of noise-free signals `truth` (..., n_outputs, n_samples): with noise, then clipping, then rounding."""
     reading = truth + noise[:, None] * rng.standard_normal(truth.shape)
     for j, sensor in enumerate(rig.sensors):
         reading[..., j, :] = np.clip(reading[..., j, :], -sensor.limit, sensor.limit)

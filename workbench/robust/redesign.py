@@ -1,4 +1,4 @@
-"""A controller redesigned for what a diagnosis found, step by step, and proved on what remains unknown."""
+"""Redesign of a controller for a diagnosed structure, step by step, with Monte Carlo verification."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,8 +21,8 @@ from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
-from workbench.robust.compensation import STEPS, Loop, check_rate, compensated, without
-from workbench.robust.on_rig import Design, controlled_by, designed_anew, fitted, impulse_test, tuned
+from workbench.robust.compensation import STEPS, Loop, check_rate, compensated, without_faults
+from workbench.robust.on_rig import Design, controlled_by, impulse_test, loop_on_rig, redesigned_for, tuned
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.relocation import Relocation, relocated
 from workbench.robust.small_motion import loop_poles, modes_in_motion
@@ -32,17 +32,18 @@ from workbench.threads import one_blas_thread
 
 Report = Callable[[str, float], None]
 
-AWAY = 1e3  # a loss from which on the motion is said to diverge
-LEAST_SHOWN = 1e-4  # a loss below which its size says nothing
-GAINED = 0.005  # of the loss: what a step must take away; of the cost: less is no reason to change the controller
-WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
-SLOWER = (1.0, 2.0, 5.0, 10.0)  # of the readings of its Kalman filter: noise over its own
-SOFTER = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the forces of a law that is unstable as it is designed: weight over its own
-SLOWEST = tuple(10.0**k for k in np.arange(0.0, 9.1, 0.5))  # of the readings of its Kalman filter: noise over its own
-SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # of the readings of a Kalman filter: noise over its own
-MORE_COST = 0.01  # of the present one's: what counts as no more
+AWAY = 1e3  # loss above which the motion is called divergent
+LEAST_SHOWN = 1e-4  # loss below which its size is not stated
+GAINED = 0.005  # least reduction of the loss by a step; least change of the cost for a change of the controller
+# factors of the control weight, and of the noise of the Kalman filter, that are tried
+WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # weight, where actuators saturate
+SLOWER = (1.0, 2.0, 5.0, 10.0)  # noise, with these
+SOFTER = (1.0, 3.0, 10.0, 30.0, 100.0)  # weight, where the law is unstable as designed
+SLOWEST = tuple(10.0**k for k in np.arange(0.0, 9.1, 0.5))  # noise, with these
+SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # noise, for the law as designed
+MORE_COST = 0.01  # of the present cost: default of `more_cost`
 AS_MUCH = "as much"
-CRITERIA = ("cost", "settling")  # what a law can be for
+CRITERIA = ("cost", "settling")
 
 
 @dataclass(frozen=True)
@@ -51,15 +52,15 @@ class Step:
 
     Attributes:
         name: such as "delay".
-        what: in words, with the numbers that it takes out.
+        what: in words, with the compensated values.
         vibration, effort, work: ∫ of the energy of all modes, ∫ FᵀF dt and W = Σ_r |W_r|, on the corrected rig under
-            test.
-        excess: what it takes more than the redesigned law with perfect actuators and sensors, with this step and those
-            kept before: of the vibration of controlled modes, of that of residual modes (over that of all modes), and
-            of the effort, as shares; none is below zero, so that a gain in one makes up for no loss in another.
-        loss: their sum.
-        cost: J / J₀ - 1, J₀ that of the same perfect loop; see `Redesign.criterion`. Below zero the loop does better.
-        kept: whether it paid.
+            test, with this step and those kept before.
+        excess: relative excess over the redesigned law with perfect actuators and sensors: of the vibration of
+            controlled modes, of that of residual modes (over that of all modes), and of the effort. Each is 0 or more,
+            so that a gain in one cannot offset a loss in another.
+        loss: sum of the three.
+        cost: J / J₀ - 1, J₀ of the same perfect loop; see `Redesign.criterion`. Below zero the loop is better.
+        kept: whether the step reduces the loss or the cost enough to be kept.
     """
 
     name: str
@@ -74,7 +75,7 @@ class Step:
 
     @property
     def diverges(self) -> bool:
-        """Whether the motion grows so far that a loss in per cent says nothing."""
+        """Whether the motion grows so far that the loss is not stated in per cent."""
         return not self.loss < AWAY
 
     @property
@@ -91,22 +92,22 @@ class Redesign:
 
     Attributes:
         uncertain_rig: the corrected rig with its uncertainty.
-        present, redesigned: the controllers, once a sample.
-        loop: law and estimator of the redesigned one, on the corrected rig in the motion under test.
+        present, redesigned: the digital controllers.
+        loop: law and estimator of the redesigned one, on the corrected rig linearised about the motion under test.
         controlled: zero-based modes of the corrected rig.
-        steps: from one to the other.
-        test: what the loops were put through.
-        before, after: the present and the redesigned controller on the corrected rig under test.
-        present_verification, verification: both on the same draws.
+        steps: from the present controller to the redesigned one.
+        test: the excitation.
+        before, after: response of the corrected rig under test with the present and with the redesigned controller.
+        present_verification, verification: of both, on the same draws.
         weight: ρ of the cost J; 0 for on-off control.
-        criterion: what the law is for. "cost": J = 2 ∫ energy dt + ρ ∫ FᵀF dt, with ρ such that both terms are equal
-            over the controlled modes where actuators and sensors are perfect; "settling": J = t + ρ ∫ FᵀF dt with t the
-            settling time of the controlled modes, at most that of the test, and ρ such that both are equal there.
-        more_cost, more_work: shares by which the redesigned controller may cost more, J, and do more work, W, than the
-            present one.
-        relocation: where the actuators should stand for the corrected structure; None where that is not known.
-        notes: what else a reader should know.
-        units: by which numbers are told, and signals in a file of the controller.
+        criterion: "cost": J = 2 ∫ energy dt + ρ ∫ FᵀF dt, with ρ such that both terms are equal over the controlled
+            modes where actuators and sensors are perfect; "settling": J = t + ρ ∫ FᵀF dt with t the settling time of
+            the controlled modes, at most that of the test, and ρ such that both terms are equal there.
+        more_cost, more_work: relative increase of the cost J and of the work W that the redesigned controller is
+            allowed over the present one.
+        relocation: better places of the actuators on the corrected structure; None where not known.
+        notes: warnings and remarks.
+        units: of results, and of signals in a file of the controller.
     """
 
     uncertain_rig: UncertainRig
@@ -135,10 +136,10 @@ class Redesign:
 
     @cached_property
     def improves(self) -> bool:
-        """Whether the redesigned controller does better than the present one, draw by draw.
+        """Whether the redesigned controller is better than the present one, on the same draws.
 
-        It is stable on more of the draws; or on as many, and on those that both keep stable it costs less or settles
-        sooner, and neither costs nor works more than is allowed: by the means of log J and log W, W = Σ_r |W_r|.
+        It is if it is stable on more draws. On as many, it must cost less or settle sooner, and exceed neither the
+        allowed cost nor the allowed work: by the means of log J and log W, W = Σ_r |W_r|, over draws stable with both.
         """
         old, new = self.present_verification, self.verification
         if new.stable.sum() != old.stable.sum():
@@ -147,18 +148,19 @@ class Redesign:
 
     @property
     def _better(self) -> bool:
-        """Whether it costs less than the present controller, or settles sooner."""
+        """Whether the redesigned controller costs less than the present one, or settles sooner."""
         return self._over[0] < 1.0 or self._sooner
 
     @property
     def _better_on(self) -> int:
-        """Draws that both keep stable on which it does better, by what `_better` finds in the mean."""
+        """Number of draws on which the redesigned controller is better, by cost if it costs less in the mean."""
         of_draw = self._cost if self._over[0] < 1.0 else self._settling
         new, old = (of_draw(p)[self._both] for p in (self.verification, self.present_verification))
         return int((new < old).sum())
 
     @property
     def _sooner(self) -> bool:
+        """Whether the redesigned controller settles sooner, in the median of the draws."""
         return interval(self._settling(self.verification))[0] < interval(self._settling(self.present_verification))[0]
 
     @property
@@ -172,15 +174,15 @@ class Redesign:
         return 1.0 - new / old if old else 0.0
 
     def _settling(self, verification: Verification) -> np.ndarray:
-        """Settling time of each draw (n_draws,), s: of the controlled modes where the law is for it."""
+        """Settling time of each draw (n_draws,), s: of the controlled modes with criterion "settling", else of all."""
         return verification.settling if self.criterion == "cost" else verification.controlled_settling
 
     @property
     def _more(self) -> str:
-        """What it takes more than is allowed, in words; empty for nothing."""
-        together = f"costs {{}} more, {'vibration' if self.criterion == 'cost' else 'time'} and effort taken together"
-        said = together, "takes {} more work"
-        over = zip(said, np.array(self._over) - 1.0, ("cost", "work"), (self.more_cost, self.more_work))
+        """Cost and work above what is allowed, in words; empty for none."""
+        cost = f"costs {{}} more, {'vibration' if self.criterion == 'cost' else 'time'} and effort taken together"
+        texts = cost, "takes {} more work"
+        over = zip(texts, np.array(self._over) - 1.0, ("cost", "work"), (self.more_cost, self.more_work))
         return ", and ".join(
             f"{what.format(_percent(more))}: more_{name} = {np.ceil(100.0 * more) / 100.0:g} allows it"
             for what, more, name, allowed in over
@@ -189,13 +191,13 @@ class Redesign:
 
     @cached_property
     def _over(self) -> tuple[float, float]:
-        """J and W over those of the present controller: means of the draws that both keep stable; inf for none."""
+        """J and W over those of the present controller: geometric means over draws stable with both; inf for none."""
         old, new, both = self.present_verification, self.verification, self._both
         if not both.any():
             return np.inf, np.inf
         costs = (self._cost(p)[both] for p in (new, old))
         works = (p.all_work[both] for p in (new, old))
-        with np.errstate(divide="ignore", invalid="ignore"):  # a controller that does nothing does no work
+        with np.errstate(divide="ignore", invalid="ignore"):  # the work may be zero
             cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
         return cost, work
 
@@ -203,17 +205,18 @@ class Redesign:
         """J of each draw (n_draws,); inf where it is not stable."""
         settles = np.minimum(verification.controlled_settling, self.test.time[-1])
         cost = 2.0 * verification.vibration if self.criterion == "cost" else np.array(settles)
-        if self.weight:  # relays have none, and an effort may be infinite
+        if self.weight:  # with weight 0, of relays, an infinite effort would give nan
             cost = cost + self.weight * verification.effort
         return np.asarray(np.where(verification.stable, cost, np.inf))
 
     @property
     def _both(self) -> np.ndarray:
+        """Draws (n_draws,) that are stable with both controllers."""
         return np.asarray(self.present_verification.stable & self.verification.stable)
 
     @property
     def controller(self) -> DigitalController:
-        """The one to use: the redesigned where it helps, else the present one."""
+        """The controller to use: the redesigned one where it is better, else the present one."""
         return self.redesigned if self.improves else self.present
 
     @property
@@ -232,22 +235,22 @@ class Redesign:
     @property
     def sentence(self) -> str:
         """The redesign in one sentence."""
-        kept = "" if self.improves and not self._neither else self._kept
+        kept = "" if self.improves and not self._no_controller else self._reason_to_keep
         return " ".join(part for part in (self.comparison, kept, self.guarantee) if part)
 
     @property
     def comparison(self) -> str:
-        """What both controllers do on the real structure, in one sentence."""
+        """Damping or settling time, effort and stability of both controllers, in one sentence."""
         old, new = self.present_verification, self.verification
         unstable = old.n_draws - int(old.stable.sum())
         effort, work = _times(new.effort, old.effort), _times(new.all_work, old.all_work)
         if old.share_stable < 0.5:
             text = f"the present controller is unstable on {_of(unstable, old.n_draws)} samples; redesigned, it "
-            text += self._does(new, "95 %: ")
+            text += self._behaviour(new, "95 %: ")
         else:
-            text = f"the present controller {self._does(old, '95 %: ')}"
+            text = f"the present controller {self._behaviour(old, '95 %: ')}"
             text += f", unstable on {unstable} samples" if unstable else ""
-            text += f"; redesigned: {self._does(new, '', named=False)}, {effort} effort"
+            text += f"; redesigned: {self._behaviour(new, '', named=False)}, {effort} effort"
             text += "" if work == AS_MUCH else f" and {work} work"
         text = (
             f"On the corrected model {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} Monte Carlo samples."
@@ -255,11 +258,11 @@ class Redesign:
         return f"{text} {self.left_undamped}".rstrip()
 
     @property
-    def _kept(self) -> str:
-        """Why the present controller stays."""
+    def _reason_to_keep(self) -> str:
+        """Why to keep the present controller."""
         old, new = self.present_verification, self.verification
-        if self._neither:
-            return self._neither
+        if self._no_controller:
+            return self._no_controller
         if new.stable.sum() < old.stable.sum():
             why = "it is stable on more samples of the model"
         elif self._better and np.isfinite(self._over).all():
@@ -269,8 +272,8 @@ class Redesign:
         return f"Keep the present controller: {why}."
 
     @property
-    def _neither(self) -> str:
-        """That no controller is to be used, and what can be done; empty where one is stable on most of the draws."""
+    def _no_controller(self) -> str:
+        """The advice to use neither controller; empty where one is stable on half of the draws or more."""
         old, new = self.present_verification, self.verification
         if max(old.share_stable, new.share_stable) >= 0.5:
             return ""
@@ -280,8 +283,8 @@ class Redesign:
             " fewer modes, or read more sensors."
         )
 
-    def _does(self, verification: Verification, lead: str, *, named: bool = True) -> str:
-        """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
+    def _behaviour(self, verification: Verification, lead: str, *, named: bool = True) -> str:
+        """Damping of the mode that is changed most; of on-off control, which has no poles, the settling time."""
         if self.redesigned.relays is not None:
             middle, low, high = interval(self._settling(verification))
             if not np.isfinite(high):
@@ -293,9 +296,9 @@ class Redesign:
 
     @property
     def advice(self) -> str:
-        """Which controller to use, and what it does after the test."""
-        if not self.improves or self._neither:
-            return self._kept
+        """The advice which controller to use, and why."""
+        if not self.improves or self._no_controller:
+            return self._reason_to_keep
         difference = self._difference
         if self.present_verification.stable.sum() != self.verification.stable.sum():
             return f"Use the redesigned controller: it {difference}."
@@ -311,7 +314,7 @@ class Redesign:
 
     @property
     def _difference(self) -> str:
-        """What the redesigned controller does better than the present one, in words."""
+        """The difference of the redesigned controller from the present one, in words."""
         old, new = self.present_verification, self.verification
         if new.stable.sum() != old.stable.sum():
             stable = _of(int(new.stable.sum()), new.n_draws)
@@ -321,13 +324,13 @@ class Redesign:
             settles += f" where the present one {self._settles(old, ' them')}"
             return f"{settles}, for {effort}" if self._sooner else f"takes {effort} and {settles}"
         less = 1.0 - self._over[0]
-        if self._sooner and self._sooner_by >= less:  # of the two gains the larger one is the reason
+        if self._sooner and self._sooner_by >= less:  # state the larger of the two gains
             return f"{self._settles(new)} where the present one {self._settles(old)}"
         parts = (_times(getattr(new, part), getattr(old, part)) + f" {part}" for part in ("vibration", "effort"))
         return f"{'lowers' if less > 0 else 'raises'} the cost J by {_percent(abs(less))}, with {' and '.join(parts)}"
 
     def _settles(self, verification: Verification, what: str = "") -> str:
-        """How soon it settles, in the median of the draws, in words."""
+        """The settling time in the median of the draws, in words."""
         time = interval(self._settling(verification))[0]
         if not np.isfinite(time):
             return f"does not settle{what} within the test"
@@ -335,7 +338,7 @@ class Redesign:
 
     @property
     def left_undamped(self) -> str:
-        """Which residual mode the controller to use leaves with less than half of its own damping; empty for none."""
+        """A warning of the residual mode that keeps less than half of its open-loop damping; empty for none."""
         ratios = np.median(self._used.damping, axis=0)
         own = self.loop.modes.zeta[: ratios.size]
         r = int(np.argmin(ratios))
@@ -348,14 +351,14 @@ class Redesign:
 
     @property
     def safe(self) -> bool:
-        """Whether the controller to use is stable on every draw, and bears an error as large as is unexplained."""
+        """Whether the controller to use is stable on every draw, with a small-gain margin above what is unexplained."""
         margin = self._used.small_gain_margin
         holds = margin > self.uncertain_rig.unexplained or np.isnan(margin)
         return bool(self._used.stable.all() and (self.uncertain_rig.explained or holds))
 
     @property
     def guarantee(self) -> str:
-        """What stability is guaranteed where the gap is not explained; empty where it is."""
+        """The stability guarantee by the small-gain margin where the gap is unexplained; empty otherwise."""
         if self.uncertain_rig.explained:
             return ""
         share, margin = self.uncertain_rig.unexplained, self._used.small_gain_margin
@@ -363,7 +366,7 @@ class Redesign:
         if np.isnan(margin):
             return f"No stability guarantee: {error}, and on-off control has no small-gain margin."
         bears = f"the small-gain margin is {_percent(min(margin, 9.99))}"
-        # the share is a mean over frequencies, and the bound is of each of them
+        # the share is a mean over frequencies, and the bound must hold at each
         sure = "guaranteed if the share exceeds that at no frequency" if margin > share else "not guaranteed"
         return f"No effect explains the gap: {error}; {bears}, so stability is {sure}."
 
@@ -371,13 +374,13 @@ class Redesign:
         return f"<Redesign: {self.sentence}>"
 
     def export(self, path: str | Path) -> tuple[Path, ...]:
-        """The files written of the controller to use: NAME.c and NAME.h, NAME.py or NAME.mat.
+        """Write the controller to use to NAME.c and NAME.h, NAME.py or NAME.mat, and return the paths.
 
         Args:
-            path: its ending names the kind; its name that of the functions in C.
+            path: the suffix selects the format; NAME is also the name of the functions in C.
 
         Raises:
-            ValueError: an ending of another kind, or a name that C or Python cannot have.
+            ValueError: another suffix, or a name that is no identifier in C or Python.
         """
         rig, used, units = self.uncertain_rig.rig, self.controller, self.units
         return write_controller(
@@ -423,40 +426,42 @@ def redesign(
     units: Units | None = None,
     progress: Report = lambda text, share: None,
 ) -> Redesign:
-    """A controller of the same kind, redesigned for the corrected rig, and both verified on the same samples of it.
+    """A controller of the same kind, redesigned for the corrected rig; both are verified on the same draws.
 
-    The law and the estimator are designed with the settings that they have, on the modes of the corrected rig, with
-    each element at a point as the spring and damper that it is worth in the motion under test. Then every loss on the
-    way is made up for by a step of its own, which is kept where it lowers the vibration.
+    Law and estimator are redesigned with the same settings for the modes of the corrected rig, in which each nonlinear
+    element at a point is replaced by its equivalent spring and damper in the motion under test. Delays, dead zones,
+    saturation, sensor faults and friction are then compensated one by one; a step is kept where it reduces the loss.
 
     Args:
         verdict: of the diagnosis, or the corrected rig with its uncertainty.
-        design: in use: a `Controller` from `luenberger`, `kalman` or a modal filter; a law, which then reads a Kalman
-            filter on the rig's sensors; or a `PlacementTask`, whose IMSC law the rig's actuators then take.
-        sample_time: s, of the controller; that of the records unless given.
-        impulse_at: where the test strikes; at the hammer, or the first actuator, unless given.
-        test: in place of the impulse.
+        design: in use: a `Controller` from `luenberger`, `kalman` or a modal filter; a law, which gets a Kalman filter
+            on the rig's sensors; or a `PlacementTask`, whose IMSC law gets the rig's actuators.
+        sample_time: of the controller, s; by default that of the records.
+        impulse_at: place of the test's impulse; by default that of the hammer, or of the first actuator.
+        test: instead of the impulse.
         draws: samples of the uncertain rig on which both are verified.
         seed: of the draws and of the sensors' noise.
-        placement: whether to look where the actuators should stand instead.
-        criterion: what it is judged by, "cost" or "settling", see `Redesign`; unless given "cost" for a law that
-            minimises it, and "settling" for one by poles or on-off.
-        more_cost: share by which the redesigned controller may cost more than the present one where it settles sooner.
-        more_work: share by which it may do more work, W = Σ_r |W_r|: as much as it takes, unless given.
-        units: by which results are told; those of the verdict unless given.
-        progress: called with (what, share done).
+        placement: whether to optimise the places of the actuators too.
+        criterion: "cost" or "settling", see `Redesign`; by default "cost" for a law that minimises a cost, and
+            "settling" for a law by poles or on-off control.
+        more_cost: relative increase of the cost that is allowed where the redesigned controller settles sooner.
+        more_work: relative increase of the work W = Σ_r |W_r| that is allowed; by default any.
+        units: of the results; by default those of the verdict.
+        progress: called with (text, share done).
 
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
             of them, or modes that cannot be controlled on the corrected rig.
-        TypeError: no verdict, no design, no test, or no number where one is asked for.
+        TypeError: no verdict, no design, no test, or an argument that is no number.
         ValueError: an impulse outside the structure, no draws, an unknown criterion, or a share below zero.
     """
     if criterion not in (None, *CRITERIA):
-        raise ValueError(f"a controller is judged by {' or '.join(CRITERIA)}; got {criterion!r}")
+        raise ValueError(f"the criterion is {' or '.join(CRITERIA)}; got {criterion!r}")
     for name, share in (("more_cost", more_cost), ("more_work", more_work)):
         if not number(share, name) >= 0:
-            raise ValueError(f"{name} is a share of that of the present controller, 0 or more; got {share:g}")
+            raise ValueError(
+                f"{name} is the relative increase allowed over the present controller, 0 or more; got {share:g}"
+            )
     draws, seed = whole(draws, WHAT_DRAWS, least=1), whole(seed, "seed")
     if test is not None:
         check_test(test)
@@ -469,38 +474,38 @@ def redesign(
         sample_time = number(sample_time, "sample_time", "s")
     else:
         if isinstance(verdict, UncertainRig):
-            raise DesignError("how often does the controller run? give sample_time, in s")
+            raise DesignError("the sample time of the controller is not known; give sample_time, in s")
         sample_time = verdict.attribution.search.data.records[0].sample_time
     check_rate(nominal.modes, controlled_by(design), sample_time)
     progress("the present controller", 0.05)
     level = _level(verdict)
     test = test or impulse_test(nominal, controlled_by(design), sample_time, impulse_at, level=level, seed=seed)
-    loop = fitted(nominal, design, test)
+    loop = loop_on_rig(nominal, design, test)
     present = _present(nominal, loop, sample_time)
     before = run_loop(corrected, present, test)
     progress("designing for the corrected rig", 0.15)
     quiet = _silent(present)
     modes = modes_in_motion(corrected, run_loop(corrected, quiet, test))
     steps: tuple[Step, ...]
-    for _ in range(2):  # elements are worth another stiffness in the smaller motion of the redesigned loop
-        anew = designed_anew(loop, corrected, modes)
-        wanted = criterion or ("cost" if _weighted(anew) else "settling")
-        redesigned, steps, anew, weight, judged = _compensated(corrected, anew, test, present, wanted, units)
+    for _ in range(2):  # again, as the equivalent stiffness of elements changes in the smaller motion
+        new_loop = redesigned_for(loop, corrected, modes)
+        wanted = criterion or ("cost" if _weighted(new_loop) else "settling")
+        redesigned, steps, new_loop, weight, judged = _compensated(corrected, new_loop, test, present, wanted, units)
         after = run_loop(corrected, redesigned, test)
         if not corrected.elements or not after.bounded:
             break
         modes = modes_in_motion(corrected, after)
     progress("verification on the samples", 0.4)
     rigs = drawn_with_errors(uncertain, draws, seed)
-    old = verify(rigs, present, test, controlled=anew.law.controlled, margin_rig=corrected)
+    old = verify(rigs, present, test, controlled=new_loop.law.controlled, margin_rig=corrected)
     progress("verification on the samples", 0.65)
-    new = verify(rigs, redesigned, test, controlled=anew.law.controlled, margin_rig=corrected)
-    progress("where actuators should stand", 0.9)
-    moved = relocated(anew, test, units) if placement else None
+    new = verify(rigs, redesigned, test, controlled=new_loop.law.controlled, margin_rig=corrected)
+    progress("placement of actuators", 0.9)
+    moved = relocated(new_loop, test, units) if placement else None
     progress("done", 1.0)
     return Redesign(
-        uncertain, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight,
-        judged, more_cost, more_work, moved, _notes(uncertain, corrected, judged == wanted), units,
+        uncertain, present, redesigned, new_loop, new_loop.law.controlled, steps, test, before, after, old, new,
+        weight, judged, more_cost, more_work, moved, _notes(uncertain, corrected, judged == wanted), units,
     )  # fmt: skip
 
 
@@ -513,41 +518,45 @@ def _level(verdict: Verdict | UncertainRig) -> np.ndarray | None:
 
 
 def _present(rig: Rig, loop: Loop, sample_time: float) -> DigitalController:
-    """The controller in use, as it is: designed for the nominal rig, and nothing made up for."""
+    """The controller in use, designed for the nominal rig, without compensation."""
     if isinstance(loop.law, OnOffLaw):
         return compensated(rig, loop, sample_time, ())
     return sampled(loop.controller, sample_time)
 
 
 def _silent(controller: DigitalController) -> DigitalController:
-    """A controller that commands nothing."""
-    nothing: dict[str, Any] = {"c": np.zeros_like(controller.c), "d": np.zeros_like(controller.d), "friction": None}
+    """The controller with its commands set to zero."""
+    zero: dict[str, Any] = {"c": np.zeros_like(controller.c), "d": np.zeros_like(controller.d), "friction": None}
     n_u = len(controller.actuators)
     if controller.relays is not None:
-        nothing |= {
+        zero |= {
             "c": np.zeros((n_u, controller.a.shape[0])),
             "d": np.zeros((n_u, len(controller.sensors))),
             "relays": None,
         }
-    return replace(controller, **nothing, dead_zone=np.zeros(n_u), bias=np.zeros(n_u))
+    return replace(controller, **zero, dead_zone=np.zeros(n_u), bias=np.zeros(n_u))
 
 
 def _compensated(
     rig: Rig, loop: Loop, test: LoopTest, present: DigitalController, criterion: str, units: Units
 ) -> tuple[DigitalController, tuple[Step, ...], Loop, float, str]:
-    """The redesigned controller: compensations one after the other, each kept where it helps; then sensors left out.
+    """The redesigned controller: compensations, tuning and removal of faulty sensors, each kept where it helps.
 
-    The last that are returned are ρ of the cost and what the law is judged by, see `Redesign`.
+    Returns:
+        The controller, the steps, its loop, ρ of the cost, and the criterion, see `Redesign`.
     """
     perfect = replace(
-        rig, actuators=tuple(_perfect(a) for a in rig.actuators), sensors=without(rig.sensors), elements=rig.elements
+        rig,
+        actuators=tuple(_perfect(a) for a in rig.actuators),
+        sensors=without_faults(rig.sensors),
+        elements=rig.elements,
     )
     loop, softened = _stabilised(perfect, loop, test)
     ideal = run_loop(perfect, compensated(perfect, loop, test.sample_time, ()), test)
     settles, controlled = _settling(ideal, loop.law.controlled), loop.law.controlled
-    if settles >= test.time[-1]:  # a test too short to show how soon it settles judges by vibration
+    if settles >= test.time[-1]:  # the test is too short for a settling time
         criterion = "cost"
-    # relays have forces of a given size, which nothing is traded for: they are judged by what they gain alone
+    # the forces of relays are given, so that their effort does not count
     weight = settles / max(ideal.effort, 1e-300) if criterion == "settling" else force_weight(ideal, controlled)
     weight = 0.0 if isinstance(loop.law, OnOffLaw) else weight
 
@@ -569,7 +578,7 @@ def _compensated(
     kept: list[str] = []
     best = compensated(rig, loop, test.sample_time, ())
     steps = [
-        tried("present", f"{present.name}, as it is", present),
+        tried("present", f"{present.name}, unchanged", present),
         tried("law and estimator", f"{loop.controller.name}, designed for the corrected rig{softened}", best),
     ]
     now, chosen = steps[-1], loop
@@ -584,24 +593,24 @@ def _compensated(
         if helps:
             kept.append(name)
             best, now = trial, step
-    # a limit holds the effort down: more gain wins vibration back for it, and a slower filter keeps residual modes,
-    # which the readings carry and a limited force cannot follow, out of the commands
+    # with limited forces the effort is low: more gain reduces vibration, and a slower filter keeps residual modes,
+    # which a limited force cannot follow, out of the commands
     bounded = any(np.isfinite(named(rig.actuators, a.name).limit) for a in loop.law.actuators)
     gains = [("gain", weight, noise) for noise in SLOWER for weight in WEIGHTS] if bounded else []
     for name, weight_by, noise_by in (*gains, *(("estimator", 1.0, noise) for noise in SPEEDS)):
         try:
             other = tuned(chosen if name == "estimator" else loop, rig, weight=weight_by, noise=noise_by)
         except DesignError:
-            continue  # none is that fast
+            continue  # no design with these settings
         if other is None:
             continue
         trial = compensated(rig, other, test.sample_time, kept)
         step = tried(name, _tuning(loop, weight_by, noise_by), trial)
         if name == "gain":
             helps = step.loss < now.loss - GAINED
-        else:  # no trade: no part may be worse than under the present controller and before
-            bearable = np.maximum(now.excess, steps[0].excess)
-            helps = step.cost < now.cost - GAINED and step.loss <= now.loss and bool((step.excess <= bearable).all())
+        else:  # no part of the excess may be larger than both before this step and with the present controller
+            allowed = np.maximum(now.excess, steps[0].excess)
+            helps = step.cost < now.cost - GAINED and step.loss <= now.loss and bool((step.excess <= allowed).all())
         if helps and loop_poles(rig, trial, loop.modes).spectral_radius < 1.0:
             steps = [*(s for s in steps if s.name != name), step]
             best, now, chosen = trial, step, other
@@ -609,24 +618,25 @@ def _compensated(
     removed: list[str] = []
     for name in _faulty(rig, loop):
         try:
-            fewer = designed_anew(loop, rig, loop.modes, (*removed, name))
+            fewer = redesigned_for(loop, rig, loop.modes, (*removed, name))
             trial = compensated(rig, fewer, test.sample_time, kept)
         except DesignError:
-            continue  # the others cannot do without it
+            continue  # the modes are unobservable without this sensor
         step = tried(f"without {name}", f"{name} is not read", trial)
         helps = step.loss < now.loss - GAINED
         steps.append(replace(step, kept=helps))
         if helps:
             removed.append(name)
             best, now = trial, step
-    last = designed_anew(loop, rig, loop.modes, removed) if removed else loop
+    last = redesigned_for(loop, rig, loop.modes, removed) if removed else loop
     return best, tuple(steps), last, weight, criterion
 
 
 def _stabilised(rig: Rig, loop: Loop, test: LoopTest) -> tuple[Loop, str]:
-    """The loop, and in words by what it is slower or softer than designed where only so it is stable on a rig.
+    """The loop, detuned if it is unstable on a rig as designed, and the detuning in words.
 
-    Of the tunings that are, the one under which all modes vibrate least; the loop as it is where none is.
+    The first weight with a stable loop is taken, with the noise of least vibration; the loop as designed where none is
+    stable.
     """
 
     def vibration(one: Loop | None) -> float:
@@ -640,7 +650,7 @@ def _stabilised(rig: Rig, loop: Loop, test: LoopTest) -> tuple[Loop, str]:
         try:
             return tuned(loop, rig, weight=weight, noise=noise)
         except DesignError:
-            return None  # none is that slow
+            return None  # no design with these settings
 
     if np.isfinite(vibration(loop)):
         return loop, ""
@@ -658,47 +668,47 @@ def _weighted(loop: Loop) -> bool:
 
 
 def _tuning(loop: Loop, weight: float, noise: float) -> str:
-    """By what a law and its filter were tuned, in words."""
+    """The changed settings of a law and its Kalman filter, in words."""
     of_law = ("weight", weight) if _weighted(loop) else ("gain", 1.0 / np.sqrt(weight))
     return " and ".join(f"{what} × {by:.3g}" for what, by in (of_law, ("measurement noise", noise)) if by != 1)
 
 
 def _faulty(rig: Rig, loop: Loop) -> list[str]:
-    """Sensors with a fault, which an observer may do without; a filter needs them all."""
+    """Names of faulty sensors that an observer may leave out; none for a modal filter, which needs all its sensors."""
     if loop.controller.state.size == 0 or len(loop.controller.sensors) < 2:
         return []
     read = [named(rig.sensors, one.name) for one in loop.controller.sensors]
-    return [s.name for s, clean in zip(read, without(read), strict=True) if s != clean]
+    return [s.name for s, faultless in zip(read, without_faults(read), strict=True) if s != faultless]
 
 
 def _perfect(actuator: Actuator) -> Actuator:
-    """The actuator with its gain and nothing lost on the way."""
+    """The actuator with its gain, without delay, lag, limits and other imperfections."""
     at = {"kind": actuator.kind, "direction": actuator.direction, "direct": actuator.direct}
     return Actuator(actuator.name, actuator.at, gain=actuator.gain, **at)  # type: ignore[arg-type]
 
 
 def force_weight(run: LoopRun, controlled: Sequence[int]) -> float:
-    """ρ of the cost 2 ∫ energy dt + ρ ∫ FᵀF dt whose terms are equal over the controlled modes, as in the optimum.
+    """ρ of the cost 2 ∫ energy dt + ρ ∫ FᵀF dt for which both terms are equal over the controlled modes.
 
     Args:
-        run: of the loop that is taken for the optimum.
+        run: of the reference loop, with perfect actuators and sensors.
         controlled: zero-based modes.
     """
     return 2.0 * _vibration(run, controlled) / max(run.effort, 1e-300)
 
 
 def _excess(run: LoopRun, ideal: LoopRun, controlled: Sequence[int]) -> tuple[float, float, float]:
-    """What a loop takes more than an ideal one, see `Step`."""
+    """Relative excess of a loop over an ideal one, see `Step.excess`."""
     if not run.bounded:
         return np.inf, np.inf, np.inf
-    (found, part), (wanted, ideal_part) = ((_vibration(r), _vibration(r, controlled)) for r in (run, ideal))
-    controls = part / max(ideal_part, 1e-300) - 1.0
-    spills = ((found - part) - (wanted - ideal_part)) / max(wanted, 1e-300)
-    return max(controls, 0.0), max(spills, 0.0), max(run.effort / max(ideal.effort, 1e-300) - 1.0, 0.0)
+    (total, part), (ideal_total, ideal_part) = ((_vibration(r), _vibration(r, controlled)) for r in (run, ideal))
+    of_controlled = part / max(ideal_part, 1e-300) - 1.0
+    of_residual = ((total - part) - (ideal_total - ideal_part)) / max(ideal_total, 1e-300)
+    return max(of_controlled, 0.0), max(of_residual, 0.0), max(run.effort / max(ideal.effort, 1e-300) - 1.0, 0.0)
 
 
 def _vibration(run: LoopRun, modes: Sequence[int] | None = None) -> float:
-    """∫ of the energy of some modes, or of all, over time; inf where the motion runs away."""
+    """∫ of the energy of some modes, by default of all, over time; inf where the motion diverges."""
     if not run.bounded:
         return np.inf
     time, energy = run.response.time, run.response.energy
@@ -706,7 +716,7 @@ def _vibration(run: LoopRun, modes: Sequence[int] | None = None) -> float:
 
 
 def _settling(run: LoopRun, controlled: Sequence[int]) -> float:
-    """Settling time of the controlled modes, at most that of the test, s; inf where the motion runs away."""
+    """Settling time of the controlled modes, at most that of the test, s; inf where the motion diverges."""
     if not run.bounded:
         return np.inf
     time, energy = run.response.time, run.response.energy[list(controlled)].sum(axis=0)
@@ -714,8 +724,8 @@ def _settling(run: LoopRun, controlled: Sequence[int]) -> float:
 
 
 def _losses(rig: Rig, loop: Loop, step: str, units: Units) -> str:
-    """What a step takes out, in words; empty where there is nothing."""
-    words, newton = [], units.force
+    """What a step compensates, in words; empty where there is nothing."""
+    words, force = [], units.force
     for a in (named(rig.actuators, one.name) for one in loop.law.actuators):
         lost = []
         if step == "delay":
@@ -723,9 +733,9 @@ def _losses(rig: Rig, loop: Loop, step: str, units: Units) -> str:
             lost = [f"{what} {_short(value, units)}" for what, value in parts if value]
         elif step == "dead zone":
             parts = ("dead zone", a.dead_zone), ("bias", a.bias)
-            lost = [f"{what} {value:.3g} {newton}" for what, value in parts if value]
+            lost = [f"{what} {value:.3g} {force}" for what, value in parts if value]
         elif step == "saturation":
-            limits = ("limit", a.limit, newton), ("rate", a.rate_limit, f"{newton}/{units.time}")
+            limits = ("limit", a.limit, force), ("rate", a.rate_limit, f"{force}/{units.time}")
             lost = [f"{what} {value:.3g} {unit}" for what, value, unit in limits if np.isfinite(value)]
         if lost:
             words.append(f"{a.name}: {', '.join(lost)}")
@@ -741,7 +751,7 @@ def _losses(rig: Rig, loop: Loop, step: str, units: Units) -> str:
                 words.append(f"{s.name}: {', '.join(faults)}")
     if step == "friction":
         words += [
-            f"{e.force:.3g} {newton} at {rig.modes.domain.text(e.at)}"
+            f"{e.force:.3g} {force} at {rig.modes.domain.text(e.at)}"
             for e in rig.elements
             if isinstance(e, CoulombFriction)
         ]
@@ -749,18 +759,19 @@ def _losses(rig: Rig, loop: Loop, step: str, units: Units) -> str:
 
 
 def _short(time: float, units: Units) -> str:
-    """A short time in words."""
+    """A short time as text: in ms, or in a time unit other than s."""
     return f"{1e3 * time:.3g} ms" if units.time == "s" else f"{time:.3g} {units.time}"
 
 
 def _gain(gain: float) -> str:
-    """A gain in words, one near 1 by what it is off."""
+    """A gain as text; one near 1 by its error."""
     return f"gain {gain:.3g}" if abs(gain - 1.0) >= 0.005 else f"gain off by {_percent(abs(gain - 1.0))}"
 
 
-def _notes(uncertain: UncertainRig, rig: Rig, aimed: bool) -> tuple[str, ...]:
+def _notes(uncertain: UncertainRig, rig: Rig, as_wanted: bool) -> tuple[str, ...]:
+    """Remarks on the criterion, where it is not the wanted one, on hysteresis, and on alternative sets of effects."""
     notes = []
-    if not aimed:
+    if not as_wanted:
         notes.append(
             "Even with perfect actuators and sensors the controlled modes do not settle within the test, so the"
             " controllers are judged by vibration and effort; give a longer test to judge them by settling."
@@ -769,12 +780,12 @@ def _notes(uncertain: UncertainRig, rig: Rig, aimed: bool) -> tuple[str, ...]:
         notes.append("The hysteresis of an actuator is in the verification, but is not compensated.")
     if uncertain.alternatives:
         share = sum(p for _, p in uncertain.alternatives)
-        notes.append(f"{100 * share:.0f} % of the draws are other sets of effects that the records do not exclude.")
+        notes.append(f"{100 * share:.0f} % of the draws are of other sets of effects that the records do not exclude.")
     return tuple(notes)
 
 
 def _times(after: np.ndarray, before: np.ndarray) -> str:
-    """Median of draws (n_draws,) over another, in words that go before what is meant."""
+    """Ratio of two medians of draws (n_draws,), as text before a noun: "as much", or "1.2 times the"."""
     new, old = interval(after)[0], interval(before)[0]
     if old == 0.0:
         return AS_MUCH if new == 0.0 else "nonzero instead of zero"
@@ -791,7 +802,7 @@ def _percent(share: float) -> str:
 
 
 def _ratios(values: np.ndarray, lead: str = "") -> str:
-    """Median and 95 % interval in per cent; digits until its ends differ, two to four."""
+    """Median and 95 % interval in per cent as text, with two to four digits until the ends differ."""
     middle, low, high = (100.0 * v for v in interval(values))
     digits = next((n for n in (2, 3, 4) if _rounded(low, n) != _rounded(high, n)), 0)
     if not digits:

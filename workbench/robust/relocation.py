@@ -1,4 +1,4 @@
-"""Where actuators should stand for a corrected structure, and what moving them is worth."""
+"""Optimal places of the actuators on a corrected structure, compared with the present ones."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,11 +20,11 @@ SPACING, STARTS = 0.05, 4  # of the length; random starts of the search
 
 @dataclass(frozen=True, eq=False)
 class Relocation:
-    """Actuators as they stand and as they should, on the corrected structure, for no more effort than now.
+    """The present and the optimal placement of the actuators on the corrected structure, for no more effort.
 
     Attributes:
-        present, moved: W_R, effort and peak force of each.
-        units: by which the places are told.
+        present, moved: both placements.
+        units: of the places in `sentence`.
     """
 
     present: Placement
@@ -33,7 +33,7 @@ class Relocation:
 
     @property
     def gain(self) -> float:
-        """Share of W_R that moving takes away."""
+        """Relative reduction of W_R by the optimal placement."""
         return 1.0 - self.moved.residual_work / self.present.residual_work
 
     @property
@@ -41,8 +41,8 @@ class Relocation:
         old, new = (", ".join(f"{x:.4g}" for x in p.positions) for p in (self.present, self.moved))
         m = self.units.length
         return (
-            f"Actuators at x = {new} {m} instead of {old} {m} would spill {100 * self.gain:.0f} % less work into"
-            " residual modes, for no more effort."
+            f"Actuators at x = {new} {m} instead of {old} {m} would do {100 * self.gain:.0f} % less work in residual"
+            " modes (spillover), for no more effort."
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -55,9 +55,9 @@ class Relocation:
 
 
 def relocated(loop: Loop, test: LoopTest, units: Units = SI) -> Relocation | None:
-    """The best places for the law's actuators on its modes; None where they are better where they are, or not known.
+    """The optimal placement of the law's actuators; None where it is no better than the present one, or not known.
 
-    Known for IMSC of the lowest modes along an interval, by point forces of one kind, after an impulse.
+    It is known for IMSC of the lowest modes along an interval, by point forces, after an impulse.
     """
     law, modes = loop.law, loop.modes
     n = len(law.controlled)
@@ -72,7 +72,7 @@ def relocated(loop: Loop, test: LoopTest, units: Units = SI) -> Relocation | Non
         task = placement_task(
             modes, n, impulse_at=position(test.impulse_at), weight=settings["weight"], impulse=test.impulse
         )
-        present = task.placed(np.array([position(a.at) for a in law.actuators]), "as they stand")
+        present = task.placed(np.array([position(a.at) for a in law.actuators]), "present places")
         limits = Limits(effort=present.effort, spacing=SPACING * modes.length)
         moved = place_actuators(task, limits, starts=STARTS)
     except DesignError:

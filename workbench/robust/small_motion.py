@@ -1,4 +1,4 @@
-"""The loop of small motion about that under test: its poles, and the error of the readings that it bears for sure."""
+"""The loop linearised about the motion under test: its poles, and its small-gain margin."""
 
 from dataclasses import dataclass
 
@@ -16,15 +16,14 @@ from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
 from workbench.structure.supports import PointDamper, PointSpring
 
-FREQUENCIES = 240
+FREQUENCIES = 240  # logarithmic grid for the small-gain margin
 
 
 def modes_in_motion(rig: Rig, run: LoopRun) -> Modes:
-    """The modes with each element at a point as the spring and damper that do the same in the motion of a run.
+    """The modes with each nonlinear element at a point replaced by its equivalent spring and damper in a run.
 
-    (k, c) by least squares of f = -k w - c v over the run: equivalent linearisation (Caughey, J. Acoust. Soc. Am. 35
-    (1963) 1706). Either may be negative: a spring that softens, a damper that feeds the motion. Springs that soften are
-    left out where the structure would have no frequency with them.
+    Equivalent linearisation (Caughey, J. Acoust. Soc. Am. 35 (1963) 1706): (k, c) by least squares of f = -k w - c v
+    over the run. Either may be negative. Negative springs are left out where they would make the structure unstable.
     """
     points = [e for e in rig.elements if isinstance(e, PointElement)]
     springs, dampers = [], []
@@ -43,11 +42,12 @@ def modes_in_motion(rig: Rig, run: LoopRun) -> Modes:
 
 @dataclass(frozen=True, eq=False)
 class LoopPoles:
-    """Poles of a sampled loop, and the damping that each mode has in it.
+    """Poles of a sampled loop, and the closed-loop damping of each mode.
 
     Attributes:
         poles: (n_states,) in the z plane.
-        damping: (n_modes,) ratio of the pole in which a mode moves most, above half the rate at the alias next to it.
+        damping: (n_modes,) ratio of the pole in whose eigenvector the mode participates most; its frequency is the
+            alias nearest to the mode's.
     """
 
     poles: np.ndarray
@@ -59,24 +59,26 @@ class LoopPoles:
 
 
 def loop_poles(rig: Rig, controller: DigitalController, modes: Modes | None = None) -> LoopPoles:
-    """Poles of the loop of small motion: delays exact, dead zones and limits left out, on-off control switched off.
+    """Poles of the linearised loop, with exact delays, without dead zones, limits and relays.
 
     Args:
-        rig: whose actuators and sensors close the loop.
+        rig: gives the actuators and sensors.
         controller: with or without compensation.
-        modes: of the motion, where elements stand at points; those of the rig unless given.
+        modes: linearised about the motion, see `modes_in_motion`; by default those of the rig.
     """
     modes = modes or rig.modes
     closed, _, _ = _closed(rig, controller, modes)
     poles, vectors = np.linalg.eig(closed)
     n = modes.n_modes
-    moved = np.abs(modes.omega[:, None] * vectors[:n]) ** 2 + np.abs(vectors[n : 2 * n]) ** 2
-    share = moved / np.maximum(moved.sum(axis=0), 1e-300) * (np.abs(poles) > 1e-6)
+    energy = np.abs(modes.omega[:, None] * vectors[:n]) ** 2 + np.abs(vectors[n : 2 * n]) ** 2
+    participation = energy / np.maximum(energy.sum(axis=0), 1e-300) * (np.abs(poles) > 1e-6)
     rates = np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / controller.sample_time
-    own = rates[np.argmax(share, axis=1)]
-    # a pole in the z plane is that of every alias
-    around = 2.0 * np.pi / controller.sample_time
-    aliases = np.array([way * own.imag + around * np.round((modes.omega - way * own.imag) / around) for way in (1, -1)])
+    own = rates[np.argmax(participation, axis=1)]
+    # a pole in the z plane does not distinguish aliases
+    sampling = 2.0 * np.pi / controller.sample_time
+    aliases = np.array(
+        [sign * own.imag + sampling * np.round((modes.omega - sign * own.imag) / sampling) for sign in (1, -1)]
+    )
     nearest = np.abs(aliases - modes.omega).argmin(axis=0)
     omega = np.take_along_axis(aliases, nearest[None], axis=0)[0]
     ratio = -own.real / np.maximum(np.hypot(own.real, omega), 1e-300)
@@ -84,22 +86,22 @@ def loop_poles(rig: Rig, controller: DigitalController, modes: Modes | None = No
 
 
 def _closed(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The loop z ← A z, what errors of the readings add to it, and the readings: A, B, C."""
+    """A, B and C of the closed loop, as of `closed_by`: z ← A z + B e, reading C z + e."""
     actuators = [named(rig.actuators, name) for name in controller.actuators]
     a, b, _ = linear_plant(modes, actuators, ())
     stepped, into = held(a, b, controller.sample_time, np.array([x.delay for x in actuators]))
-    return closed_by(stepped, into, _reads(rig, controller, modes, len(stepped)), controller)
+    return closed_by(stepped, into, _output(rig, controller, modes, len(stepped)), controller)
 
 
-def _reads(rig: Rig, controller: DigitalController, modes: Modes, total: int) -> np.ndarray:
-    """C (n_sensors, total) of the readings: modes first, sensors late or slow as they are at each mode's frequency."""
+def _output(rig: Rig, controller: DigitalController, modes: Modes, total: int) -> np.ndarray:
+    """C (n_sensors, total) of the readings, modal states first, with sensors' lags and delays at modal frequencies."""
     sensors = [named(rig.sensors, name) for name in controller.sensors]
     n = modes.n_modes
     reads = np.zeros((len(sensors), total))
     shapes = output_matrix(modes, sensors)
     for i, sensor in enumerate(sensors):
         order = MEASURED[sensor.quantity][1]
-        # a late or slow sensor by what it makes of each mode at its frequency
+        # transfer function of the sensor's delay and lag at each mode's frequency
         h = np.exp(-1j * modes.omega * max(sensor.delay, 0.0)) / (1.0 + 1j * modes.omega * sensor.time_constant)
         safe = np.where(modes.omega > 0, modes.omega, 1.0)
         if order == 0:
@@ -116,11 +118,12 @@ def _reads(rig: Rig, controller: DigitalController, modes: Modes, total: int) ->
 
 
 def small_gain_margin(rig: Rig, controller: DigitalController, modes: Modes | None = None) -> tuple[float, float]:
-    """The relative error of all readings that a loop bears whatever its phase, and the frequency where it is least, Hz.
+    """The small-gain margin of a loop, and the frequency (Hz) of its minimum.
 
-    With y_real = (I + Δ) y, Δ = diag(δ_j), and M from what Δ adds to the readings, the loop is stable for all
-    |δ_j| < 1 / max_ω ρ(|M(e^{iωT})|): ρ(|M|), the Perron root, bounds the structured singular value of M for a
-    diagonal Δ (Safonov, IEE Proc. D 129 (1982) 251).
+    It is the relative error of all readings, of any phase, that cannot destabilise the loop. With y_real = (I + Δ) y,
+    Δ = diag(δ_j), and M from the error Δ y to the readings y, the loop is stable for all
+    |δ_j| < 1 / max_ω ρ(|M(e^{iωT})|): the Perron root ρ(|M|) bounds the structured singular value of M for a diagonal Δ
+    (Safonov, IEE Proc. D 129 (1982) 251). nan for on-off control, 0 for an unstable loop, inf without feedback.
     """
     if controller.relays is not None:
         return np.nan, np.nan

@@ -1,4 +1,4 @@
-"""Monte Carlo verification: what a controller does on samples of the uncertain rig, with a small-gain bound."""
+"""Monte Carlo verification of a controller on samples of the uncertain rig, with its small-gain margin."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,18 +22,18 @@ from workbench.structure.printed import rounded
 from workbench.threads import one_blas_thread
 
 SETTLED = 0.01  # of the largest energy: a tenth of the amplitude
-GROWN = 2.0  # times the largest energy of the first quarter, in the last: it grows
+GROWN = 2.0  # ratio of the largest energies in the last and in the first quarter above which the motion grows
 LEVEL = 0.95
 
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """A controller on samples of an uncertain rig.
+    """The performance of a controller on samples of an uncertain rig.
 
     Attributes:
-        stable: (n_draws,) whether the loop of small motion is stable and the motion under test does not grow, or
-            decays after it where forces act in it.
-        damping: (n_draws, n_modes) ratio of each mode's pole in the closed loop, about the motion under test.
+        stable: (n_draws,) whether the linearised loop is stable and the motion under test does not grow; with forces
+            in the test, whether the motion decays after it.
+        damping: (n_draws, n_modes) closed-loop damping ratio of each mode, linearised about the motion under test.
         peak_force, stroke: (n_draws,) the largest force of any actuator, N, and displacement at any actuator, m.
         work: (n_draws, n_modes) W_r; controlled: zero-based modes among them.
         effort: (n_draws,) ∫ FᵀF dt.
@@ -42,9 +42,9 @@ class Verification:
             test.
         controlled_settling: the same of the energy of the controlled modes; of all where none is named.
         energy: (3, n_samples) of all modes: median over the draws, and lower and upper end of the 95 % interval.
-        small_gain_margin: relative uncertainty of all outputs at once, of any phase, that the loop surely tolerates; 0
-            where it is not stable, inf where nothing is fed back, nan where it has no linear part.
-        margin_frequency_hz: where the least of it is.
+        small_gain_margin: relative error of all outputs at once, of any phase, that cannot destabilise the loop; 0
+            where the loop is unstable, inf without feedback, nan for on-off control.
+        margin_frequency_hz: frequency of its minimum.
     """
 
     stable: np.ndarray
@@ -98,8 +98,8 @@ class Verification:
         return np.asarray(self.work.sum(axis=1) - self.controlled_work)
 
     def to_json(self) -> dict[str, Any]:
-        """Median and 95 % interval of each figure, as plain numbers; null where a figure is not finite."""
-        figures = {
+        """Median and 95 % interval of each quantity, as JSON numbers; null where not finite."""
+        quantities = {
             "worst_damping": self.worst_damping,
             "peak_force": self.peak_force,
             "stroke": self.stroke,
@@ -116,15 +116,15 @@ class Verification:
             "small_gain_margin": rounded(self.small_gain_margin),
             "margin_frequency_hz": rounded(self.margin_frequency_hz),
             "damping": [[rounded(v) for v in interval(self.damping[:, r])] for r in self.controlled],
-            **{name: [rounded(v) for v in interval(values)] for name, values in figures.items()},
+            **{name: [rounded(v) for v in interval(values)] for name, values in quantities.items()},
         }
 
 
 def interval(values: np.ndarray) -> tuple[float, float, float]:
-    """Median, and lower and upper end of the 95 % interval; as an order statistic where some are infinite."""
+    """Median, and lower and upper end of the 95 % interval, as order statistics, since values may be infinite."""
     outer = 0.5 * (1.0 - LEVEL)
-    middle, low, high = np.quantile(values, (0.5, outer, 1.0 - outer), method="nearest")
-    return float(middle), float(low), float(high)
+    median, low, high = np.quantile(values, (0.5, outer, 1.0 - outer), method="nearest")
+    return float(median), float(low), float(high)
 
 
 @former_arguments(possible="rig", centre="margin_rig")
@@ -139,21 +139,21 @@ def verify(
     seed: int = 0,
     margin_rig: Rig | None = None,
 ) -> Verification:
-    """What a controller does on samples of an uncertain rig under a test, all nonlinear elements in.
+    """The performance of a controller on samples of an uncertain rig under a test, with all nonlinear elements.
 
-    What the diagnosis leaves unexplained is drawn too: an error of each sensor's gain within ± that share.
+    The unexplained share of a diagnosis is drawn too, as an error of each sensor's gain within ± that share.
 
     Args:
         rig: rig with its uncertainty, or rigs drawn from it.
         controller: of the test's sample time.
-        test: what each loop is put through, with noise of its own where it has a seed.
+        test: the excitation, with independent noise in each draw where it has a seed.
         controlled: zero-based modes whose work is W_C.
-        draws: how many rigs, where they are not drawn yet.
+        draws: number of rigs to draw from an uncertain rig.
         seed: of the draws.
-        margin_rig: the rig whose small-gain margin is stated; the first where rigs are given.
+        margin_rig: the rig for the small-gain margin; by default the central estimate, or the first of given rigs.
 
     Raises:
-        TypeError: no uncertain rig, no sampled controller or no test, or no number where one is asked for.
+        TypeError: no uncertain rig, no sampled controller, no test, or an argument that is no number.
         ValueError: a controller or a test that does not fit the rig, draws that are no whole number above zero, or a
             controlled mode that the rigs do not have.
     """
@@ -166,16 +166,16 @@ def verify(
         rigs, margin_rig = rig, margin_rig or rig[0]
     index = _indices(controlled)
     n_modes = min(rig.modes.n_modes for rig in rigs)
-    strange = [r for r in index if not 0 <= r < n_modes]
-    if strange:
-        raise ValueError(f"controlled are modes 0 to {n_modes - 1} of the rigs, counted from zero; got {strange[0]}")
+    unknown = [r for r in index if not 0 <= r < n_modes]
+    if unknown:
+        raise ValueError(f"controlled are modes 0 to {n_modes - 1} of the rigs, counted from zero; got {unknown[0]}")
 
     def drawn(rig: Rig, one: LoopTest, run: LoopRun) -> _Draw:
         poles, energy = loop_poles(rig, controller, modes_in_motion(rig, run)), run.response.energy
         with np.errstate(over="ignore", invalid="ignore"):
             total = energy.sum(axis=0)
             return _Draw(
-                stable=poles.spectral_radius <= 1.0 + 1e-9 and _stays(rig, controller, one, run),
+                stable=poles.spectral_radius <= 1.0 + 1e-9 and _stays_bounded(rig, controller, one, run),
                 damping=poles.damping[:n_modes],
                 peak_force=np.abs(run.response.forces).max(),
                 stroke=_stroke(rig, controller, run),
@@ -185,68 +185,68 @@ def verify(
                 of_controlled=energy[index].sum(axis=0) if index else total,
             )
 
-    found = _Draw(*(list(values) for values in zip(*of_loops(rigs, controller, test, drawn))))
+    results = _Draw(*(list(values) for values in zip(*of_loops(rigs, controller, test, drawn))))
     margin, frequency = small_gain_margin(
         margin_rig, controller, modes_in_motion(margin_rig, run_loop(margin_rig, controller, test))
     )
     dt = test.sample_time
     with np.errstate(over="ignore", invalid="ignore"):
         return Verification(
-            stable=np.array(found.stable),
-            damping=np.array(found.damping),
-            peak_force=_finite(found.peak_force),
-            stroke=_finite(found.stroke),
-            work=_finite(found.work),
+            stable=np.array(results.stable),
+            damping=np.array(results.damping),
+            peak_force=_finite(results.peak_force),
+            stroke=_finite(results.stroke),
+            work=_finite(results.work),
             controlled=tuple(index),
-            effort=_finite(found.effort),
-            vibration=_finite([energy.sum() * dt for energy in found.energy]),
-            settling=_settlings(found.energy, found.stable, dt),
-            controlled_settling=_settlings(found.of_controlled, found.stable, dt),
-            energy=_band(found.energy),
+            effort=_finite(results.effort),
+            vibration=_finite([energy.sum() * dt for energy in results.energy]),
+            settling=_settlings(results.energy, results.stable, dt),
+            controlled_settling=_settlings(results.of_controlled, results.stable, dt),
+            energy=_band(results.energy),
             small_gain_margin=margin,
             margin_frequency_hz=frequency,
         )
 
 
 def _indices(controlled: Sequence[int]) -> list[int]:
-    """Zero-based modes, each a whole number."""
+    """Zero-based modes as a list of whole numbers."""
     if isinstance(controlled, str) or not isinstance(controlled, Sequence | np.ndarray):
         raise TypeError(f"controlled is a sequence of modes, counted from zero, such as (0, 1); got {controlled!r}")
     return [whole(r, "each of controlled, a mode counted from zero,") for r in controlled]
 
 
 def _check_kinds(uncertain: object, controller: object, test: object, margin_rig: object) -> None:
-    """Refuse what no loop can be made of."""
+    """Refuse arguments of `verify` of the wrong type."""
     drawn = isinstance(uncertain, Sequence) and len(uncertain) > 0 and all(isinstance(rig, Rig) for rig in uncertain)
     if not (isinstance(uncertain, UncertainRig) or drawn):
         raise TypeError(
             f"a controller is verified on an UncertainRig, or on rigs drawn from it; got {type(uncertain).__name__}:"
-            " UncertainRig.of(verdict) is what a diagnosis leaves"
+            " make one from a diagnosis by UncertainRig.of(verdict)"
         )
     check_loop_kinds(controller, test)
     if not isinstance(margin_rig, Rig | None):
-        raise TypeError(f"margin_rig is the rig whose small-gain margin is stated; got {type(margin_rig).__name__}")
+        raise TypeError(f"margin_rig must be a Rig, for the small-gain margin; got {type(margin_rig).__name__}")
 
 
 def check_loop_kinds(controller: object, test: object) -> None:
-    """Refuse what is no sampled controller, or no test of one.
+    """Refuse a controller that is not a `DigitalController`, or a test that is not a `LoopTest`.
 
     Raises:
-        TypeError: saying what makes one.
+        TypeError: with the way to make one.
     """
     if not isinstance(controller, DigitalController):
         raise TypeError(
-            f"the controller must be a sampled one; got {type(controller).__name__}: make one of a law and an"
+            f"the controller must be a DigitalController; got {type(controller).__name__}: make one of a law and an"
             " estimator by sampled(kalman(...), sample_time)"
         )
     check_test(test)
 
 
 def check_test(test: object) -> None:
-    """Refuse what is no test.
+    """Refuse a test that is not a `LoopTest`.
 
     Raises:
-        TypeError: saying what makes one.
+        TypeError: with the way to make one.
     """
     if not isinstance(test, LoopTest):
         raise TypeError(
@@ -256,7 +256,7 @@ def check_test(test: object) -> None:
 
 
 class _Draw(NamedTuple):
-    """What is kept of a draw's run, see `Verification`; and lists of these, of all draws."""
+    """The results of one draw, see `Verification`; with lists as fields, those of all draws."""
 
     stable: Any
     damping: Any
@@ -269,7 +269,7 @@ class _Draw(NamedTuple):
 
 
 def drawn_with_errors(uncertain: UncertainRig, draws: int, seed: int = 0) -> tuple[Rig, ...]:
-    """Samples of an uncertain rig, each sensor's gain off by what is unexplained: uniform within ± that share."""
+    """Samples of an uncertain rig, with an error of each sensor's gain, uniform within ± the unexplained share."""
     rng = np.random.default_rng(seed)
     rigs = uncertain.draws(draws, rng)
     if not uncertain.unexplained:
@@ -286,6 +286,7 @@ def drawn_with_errors(uncertain: UncertainRig, draws: int, seed: int = 0) -> tup
 
 
 def _band(energies: Sequence[np.ndarray]) -> np.ndarray:
+    """Median and 95 % interval (3, n_samples) of the draws at each sample."""
     outer = 0.5 * (1.0 - LEVEL)
     return np.asarray(np.quantile(energies, (0.5, outer, 1.0 - outer), axis=0, method="nearest"))
 
@@ -295,14 +296,14 @@ def _finite(values: ArrayLike) -> np.ndarray:
     return np.where(np.isfinite(values), values, np.inf)
 
 
-def _stays(rig: Rig, controller: DigitalController, test: LoopTest, run: LoopRun) -> bool:
-    """Whether the motion does not grow of itself: under test, or after it where forces act in it.
+def _stays_bounded(rig: Rig, controller: DigitalController, test: LoopTest, run: LoopRun) -> bool:
+    """Whether the free motion does not grow: under test, or after a test with forces.
 
-    Forces may well make a stable motion grow. Once they are gone it can only decay, and as long a time as that of the
-    test shows whether it does.
+    Forces may make the motion of a stable loop grow. A test with forces is therefore continued without them for as long
+    again, in which the motion must decay.
     """
-    pushed = test.forces is not None or any(isinstance(e, PeriodicForce | RandomForce) for e in rig.elements)
-    if not (run.bounded and pushed):
+    forced = test.forces is not None or any(isinstance(e, PeriodicForce | RandomForce) for e in rig.elements)
+    if not (run.bounded and forced):
         return run.bounded and not _grows(run.response.energy.sum(axis=0))
     after = run_loop(rig, controller, test, free=test.n_samples)
     return after.bounded and not _grows(after.response.energy.sum(axis=0)[test.n_samples :])
@@ -320,18 +321,18 @@ def _settlings(energies: Sequence[np.ndarray], stable: Sequence[bool], sample_ti
 def settling(energy: np.ndarray, sample_time: float) -> float:
     """Time until an energy (n_samples,) stays below a hundredth of its peak, s; infinite where it does not."""
     above = np.flatnonzero(energy > SETTLED * energy.max())
-    last = above[-1] if above.size else -1  # nothing moves
+    last = above[-1] if above.size else -1  # none above: no motion
     return np.inf if last == energy.size - 1 else float(sample_time * (last + 1))
 
 
 def displacement_at(modes: Modes, actuator: Actuator) -> np.ndarray:
-    """What each mode moves at an actuator (n_modes,): at the middle of a patch; at named points what it drives."""
+    """Displacement (n_modes,) of each mode at an actuator: at the middle of a patch; at named points its own motion."""
     if actuator.kind == "force" or isinstance(modes.domain, NamedPoints):
         return modes.phi_at(actuator.at, int(actuator.kind == "moment"), direction=actuator.direction)
     return np.asarray(modes.phi(middle(actuator.at))[0])
 
 
 def _stroke(rig: Rig, controller: DigitalController, run: LoopRun) -> float:
-    there = [a for a in rig.actuators if a.name in controller.actuators]
-    shapes = np.array([displacement_at(rig.modes, a) for a in there])
+    driven = [a for a in rig.actuators if a.name in controller.actuators]
+    shapes = np.array([displacement_at(rig.modes, a) for a in driven])
     return float(np.abs(shapes @ run.response.modal[: rig.modes.n_modes]).max())

@@ -1,4 +1,4 @@
-"""How a structure loses energy: the coefficients c_rs of (2.10)-(2.11)."""
+"""Damping of a structure: the modal coefficients c_rs of (2.10)-(2.11)."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from workbench.structure.profile import ProfileLike
 
 @dataclass(frozen=True, eq=False)
 class ModalDamping:
-    """One damping ratio for every mode, or one per mode, lowest first (the last one serves all modes above)."""
+    """One damping ratio for every mode, or one per mode, lowest first; the last one applies to all higher modes."""
 
     zeta: ArrayLike = 0.0
 

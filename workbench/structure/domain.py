@@ -1,8 +1,8 @@
-"""Which places a structure has: along an interval, over a rectangle, or at named points.
+"""The domain of a structure, its set of places: an interval, a rectangle, or named points.
 
-A place is a float (m, along an interval), a pair (x, y) of floats (m, on a rectangle) or a name (of a point). What acts
-between two places, on the displacement of the first less that of the second, stands at `Between(first, second)`. What
-acts along the edges of a patch of a plate stands at `Patch(x, y, width, height)`.
+A place is a float (m, along an interval), a pair (x, y) of floats (m, on a rectangle) or a name (of a point). The place
+of an element between two, which acts on the displacement of the first minus that of the second, is
+`Between(first, second)`. The place of a patch on a plate, which acts along its edges, is `Patch(x, y, width, height)`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,13 +16,13 @@ import numpy as np
 
 from workbench.arrays import Floats
 
-SLACK = 1e-9  # of the extent: how far outside a place may lie by rounding
+SLACK = 1e-9  # of the extent: tolerance of places outside
 
 Place = float | tuple[float, float] | str
 
 
 class Between(NamedTuple):
-    """A pair of places: what joins them acts on the displacement of the first less that of the second."""
+    """A pair of places, for an element on the displacement of the first minus that of the second."""
 
     first: Place
     second: Place
@@ -101,13 +101,13 @@ class Interval:
         return np.asarray(np.clip(x, 0.0, self.length))
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
-        """Places, derivative along x and sign of a displacement (derivative 0), slope (1) and so on."""
+        """Places, order of the derivative along x, and sign, of a displacement (derivative 0), slope (1) and so on."""
         if direction not in (None, "w"):
             raise PlaceError(f"along an interval there is one direction, so none is named; got {direction!r}")
         return places, derivative, 1.0
 
     def grid(self, n: int) -> tuple[float, ...]:
-        """Places inside, `n` spacings from end to end."""
+        """Uniform places (n - 1,) inside, m, `n` spacings from end to end."""
         return tuple((self.length * np.arange(1, n) / n).tolist())
 
     def quadrature(self, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +119,7 @@ class Interval:
         return abs(float(one) - float(other)) / self.length  # type: ignore[arg-type]
 
     def text(self, place: Where, digits: int = 3) -> str:
-        """How a place is written: x = 3.4."""
+        """Text of a place, such as "x = 3.4"."""
         if isinstance(place, Between):
             return f"between {self.text(place.first, digits)} and {self.text(place.second, digits)}"
         return f"x = {_rounded(place, digits)}"  # type: ignore[arg-type]
@@ -177,7 +177,10 @@ class Rectangle:
         return np.asarray(np.clip(xy, 0.0, extent))
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
-        """Places, derivatives along x and y and sign of a displacement, a slope about an axis, or (i, j) as it is."""
+        """Places, orders of the derivatives along x and y, and sign, of a displacement or a slope about an axis.
+
+        A derivative (i, j) is returned unchanged.
+        """
         if isinstance(derivative, tuple):
             return places, derivative, 1.0
         if derivative == 0 and direction in (None, "w", "z"):
@@ -191,17 +194,17 @@ class Rectangle:
     def around(
         self, patches: Any, direction: str | None, n: int
     ) -> Iterator[tuple[np.ndarray, tuple[int, int], Floats]]:
-        """The edges of patches, one pair of opposite ones after the other, for ∮ ∂w/∂n ds along them.
+        """Quadrature of ∮ ∂w/∂n ds along the edges of patches, for each pair of opposite edges.
 
         Args:
             patches: (n_patches, 4) middle, width and height, m.
             direction: "y" for the two edges across x, whose moments act about y, "x" for the two across y; None for
                 all four.
-            n: Gauss-Legendre points of an edge.
+            n: Gauss-Legendre points per edge.
 
         Yields:
-            Points (n_patches, 2 n, 2), the derivative along their outward normal, and weights (n_patches, 2 n), m,
-            negative where the normal is.
+            Points (n_patches, 2 n, 2), orders (i, j) of the derivative normal to the edges, and weights
+            (n_patches, 2 n), m, negative where the outward normal points in the negative direction.
 
         Raises:
             PlaceError: a patch that reaches outside, or another axis.
@@ -231,7 +234,7 @@ class Rectangle:
             yield at, ((1, 0), (0, 1))[across], np.concatenate([weight, -weight], axis=1)
 
     def grid(self, n: int) -> tuple[tuple[float, float], ...]:
-        """Places inside, `n` spacings along the longer side and as many a metre along the other."""
+        """Uniform places inside, `n` spacings along the longer side and about the same spacing along the other."""
         spacing = max(self.length) / n
         along = [np.arange(1, m) * side / m for side in self.length for m in [max(round(side / spacing), 2)]]
         return tuple((float(x), float(y)) for x in along[0] for y in along[1])
@@ -239,8 +242,8 @@ class Rectangle:
     def quadrature(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Gauss-Legendre points (n_points, 2), m, and weights (n_points,), m²: ∫∫ f dx dy = Σ w f.
 
-        Modes are as many over a rectangle as along an interval, so that each way there are fewer waves: 8 + 2 √n points
-        each way serve as many modes as n along an interval.
+        The same number of modes has fewer waves along each side than along an interval: 8 + 2 √n points per side
+        integrate as many modes as n points along an interval.
         """
         points, weights = _gauss(8 + round(2.0 * np.sqrt(n)))
         a, b = self.length
@@ -252,7 +255,7 @@ class Rectangle:
         return float(np.hypot(one[0] - other[0], one[1] - other[1])) / self.size  # type: ignore
 
     def text(self, place: Where, digits: int = 3) -> str:
-        """How a place is written: (x, y) = (0.63, 0.72)."""
+        """Text of a place, such as "(x, y) = (0.63, 0.72)"."""
         if isinstance(place, Between):
             return f"between {self.text(place.first, digits)} and {self.text(place.second, digits)}"
         if isinstance(place, Patch):
@@ -267,16 +270,16 @@ TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("rx", "ry", "rz")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NamedPoints:
-    """Places with a name each, a degree of freedom of a node: those of a finite-element model, or of a bench's sensors.
+    """Named degrees of freedom of nodes: of a finite-element model, or of the sensors of a test bench.
 
     Attributes:
         names: (n_points,) all different.
-        positions: (n_points, 3), m; None where they are not known.
+        positions: (n_points, 3), m; None where not known.
         directions: (n_points,) of "x", "y", "z", "rx", "ry", "rz", or "" where not known.
-        nodes: (n_points,) the node that each belongs to; each its own where not given.
+        nodes: (n_points,) the node of each point; by default each point is its own node.
 
     Raises:
-        ValueError: no names or two alike, positions or directions that do not fit the names.
+        ValueError: no names or two equal ones, positions or directions that do not fit the names.
     """
 
     names: tuple[str, ...]
@@ -314,15 +317,15 @@ class NamedPoints:
 
     @cached_property
     def _of_nodes(self) -> dict[str, dict[str, str]]:
-        """Of each node its points by their direction."""
-        found: dict[str, dict[str, str]] = {}
+        """The points of each node, {node: {direction: name}}."""
+        points: dict[str, dict[str, str]] = {}
         for name, node, direction in zip(self.names, self.nodes, self.directions, strict=True):
-            found.setdefault(node, {})[direction] = name
-        return found
+            points.setdefault(node, {})[direction] = name
+        return points
 
     @cached_property
     def size(self) -> float:
-        """The diagonal of the box that holds all points, m.
+        """The diagonal of the bounding box of all points, m.
 
         Raises:
             PlaceError: positions are not known.
@@ -345,25 +348,25 @@ class NamedPoints:
             PlaceError: a name that no point has.
         """
         names = _as_list(places)
-        found = [self._index.get(name, -1) if isinstance(name, str) else -1 for name in names]
-        if -1 in found:
-            name = names[found.index(-1)]
-            meant = "".join(f"; did you mean {alike!r}?" for alike in get_close_matches(str(name), self.names, n=1))
+        indices = [self._index.get(name, -1) if isinstance(name, str) else -1 for name in names]
+        if -1 in indices:
+            name = names[indices.index(-1)]
+            meant = "".join(f"; did you mean {match!r}?" for match in get_close_matches(str(name), self.names, n=1))
             raise PlaceError(f"there is no point {name!r}; {self._known(name)}: give one of these{meant}")
-        return np.array(found, int)
+        return np.array(indices, int)
 
     def _known(self, name: Any) -> str:
-        """The points of the node that a name begins with, in words; all points where it begins with none."""
+        """The points of the node that a name begins with, as text; all points where there is no such node."""
         node = max((m for m in self.nodes if str(name).startswith(m)), key=len, default=None)
         points = [n for n, m in zip(self.names, self.nodes, strict=True) if m == node]
-        if node is None or points == [node]:  # a point alone is no node that a name could begin with
+        if node is None or points == [node]:  # the node of a single point has no further names
             return f"the points are {_some(self.names)}"
         return f"node {node!r} has {_some(points)}"
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
-        """Names, derivative 0 and sign: the point of the same node that moves or turns in the direction."""
+        """Names of the points of the same nodes in a direction (for a slope, the rotation), derivative 0, and sign."""
         if derivative not in (0, 1):
-            raise PlaceError(f"named points know displacements and rotations, no derivative of order {derivative}")
+            raise PlaceError(f"named points have displacements and rotations, no derivative of order {derivative}")
         names = _as_list(places)
         if direction is not None:
             wanted = direction if derivative == 0 or direction.startswith("r") else f"r{direction}"
@@ -384,17 +387,17 @@ class NamedPoints:
         """
         node = self.nodes[self._index[name]] if name in self._index else name
         if node not in self._of_nodes:
-            self.locate(name)  # says which points there are
-        alike = self._of_nodes[node]
-        if direction not in alike:
+            self.locate(name)  # raises with the names of the points
+        points = self._of_nodes[node]
+        if direction not in points:
             raise PlaceError(
                 f"point {name!r} has no direction {direction!r}; it has"
-                f" {', '.join(d or 'one without a name' for d in alike)}: give one of these, or another node"
+                f" {', '.join(d or 'one without a name' for d in points)}: give one of these, or another node"
             )
-        return alike[direction]
+        return points[direction]
 
     def translations(self, name: str) -> tuple[str, ...]:
-        """The points of the same node that are displacements: what a mass there moves with."""
+        """The displacements of the same node, in which an attached mass moves."""
         node = self.nodes[int(self.locate(name)[0])]
         each = zip(self.names, self.nodes, self.directions, strict=True)
         return tuple(n for n, m, direction in each if m == node and direction not in ROTATIONS) or (name,)
@@ -408,14 +411,14 @@ class NamedPoints:
         return tuple(x for x, d in zip(self.names, self.directions, strict=True) if d in ROTATIONS) or self.names
 
     def pairs(self) -> Iterator[Between]:
-        """Any two points of one direction, of different nodes."""
+        """Every pair of points with the same direction, of different nodes."""
         each = list(zip(self.grid(), self.locate(self.grid()), strict=True))
         for (one, i), (other, j) in combinations(each, 2):
             if self.directions[i] == self.directions[j] and self.nodes[i] != self.nodes[j]:
                 yield Between(one, other)
 
     def quadrature(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """There is none.
+        """Not available at named points.
 
         Raises:
             PlaceError: always.
@@ -423,11 +426,11 @@ class NamedPoints:
         raise PlaceError("named points have no shapes between them to integrate; describe the structure as a member")
 
     def separation(self, one: Where, other: Where) -> float:
-        """0 for the same place and 1 for another: there is no way from one to the other."""
+        """0 for the same place and 1 for another, as named points have no common coordinate."""
         return float(_unordered(one) != _unordered(other))
 
     def text(self, place: Where, digits: int = 3) -> str:
-        """How a place is written: its name, which has no digits to round."""
+        """Text of a place: its name; `digits` is not used."""
         if isinstance(place, Between):
             return f"between {place.first} and {place.second}"
         return str(place)
@@ -436,16 +439,16 @@ class NamedPoints:
 Domain = Interval | Rectangle | NamedPoints
 
 
-@lru_cache(maxsize=1024)  # a search makes a rig for every prediction, of ports that hardly change
+@lru_cache(maxsize=1024)  # a search makes a rig for every prediction, mostly with the same ports
 def check_place(domain: Domain, where: Where, derivative: int = 0, direction: str | None = None) -> None:
-    """Refuse where nothing can act or measure: a place, or both of two, or a patch, and a direction or an axis.
+    """Refuse a place, a pair of places or a patch, with a direction or an axis, that a domain does not have.
 
     Raises:
-        PlaceError: what a domain does not have.
+        PlaceError: no such place or direction.
     """
     if isinstance(where, Patch):
         if not isinstance(domain, Rectangle):
-            raise PlaceError(f"a patch has its place on a plate; these modes are of {domain}")
+            raise PlaceError(f"a patch is placed on a plate; these modes are of {domain}")
         next(domain.around([where], direction, 1))
         return
     for place in where if isinstance(where, Between) else (where,):
@@ -459,10 +462,10 @@ def as_domain(domain: Domain | float) -> Domain:
 
 
 def same_place(place: Any) -> Any:
-    """A place in a form that can be kept and compared: a float, a pair of floats, a name, `Between` two, or a `Patch`.
+    """A place in its hashable form: a float, a pair of floats, a name, `Between` two, or a `Patch`.
 
     Raises:
-        PlaceError: nothing of the kind.
+        PlaceError: none of these.
     """
     if isinstance(place, str) or type(place) is float:
         return place
@@ -484,7 +487,7 @@ def same_place(place: Any) -> Any:
 def place_array(places: Sequence[Where | None]) -> np.ndarray:
     """Places of one kind as an array: (n_places,) m, (n_places, 2) m, or (n_places,) names.
 
-    A place that is not known is nan, or None among names; all are nan where there are several kinds of them.
+    An unknown place is nan, or None among names; all are nan where places are of several kinds.
     """
     known = [place for place in places if place is not None]
     if known and all(isinstance(place, str) for place in known):
@@ -502,10 +505,10 @@ def listed(places: np.ndarray) -> list[Place]:
 
 
 def middle(where: Where) -> Place:
-    """The middle of a patch or of the stretch between two positions; a place itself.
+    """The middle of a patch or of the interval between two positions; a single place itself.
 
     Raises:
-        PlaceError: between two places that are no positions along an interval.
+        PlaceError: `Between` two places that are no positions along an interval.
     """
     if isinstance(where, Patch):
         return (where.x, where.y)
@@ -515,7 +518,7 @@ def middle(where: Where) -> Place:
 
 
 def centred_at(where: Where, at: Place) -> Where:
-    """A place, or a patch or the stretch between two positions with its middle there."""
+    """The patch, or the interval between two positions, moved to have its middle at `at`; else `at` itself."""
     if isinstance(where, Patch):
         x, y = at  # type: ignore[misc, str-unpack]
         return Patch(x, y, where.width, where.height)  # type: ignore[arg-type]
@@ -526,7 +529,7 @@ def centred_at(where: Where, at: Place) -> Where:
 
 
 def reach(domain: Interval | Rectangle, where: Where) -> tuple[np.ndarray, np.ndarray]:
-    """Where the middle of what stands at a place can stand at most: from, to (n_coordinates,) m."""
+    """Range of the middle of a place, patch or pair of positions within the domain: from and to (n_coordinates,), m."""
     half = np.zeros(len(domain.coordinates))
     if isinstance(where, Patch):
         half = 0.5 * np.array([where.width, where.height])
@@ -536,7 +539,7 @@ def reach(domain: Interval | Rectangle, where: Where) -> tuple[np.ndarray, np.nd
 
 
 def _rounded(value: float, digits: int) -> str:
-    """To so many digits, and those before the point in full: 1341, not 1.34e+03."""
+    """Text of a value to a number of digits, without an exponent: 1341, not 1.34e+03."""
     return f"{value:.{max(digits, len(f'{abs(value):.0f}'))}g}"
 
 
@@ -553,7 +556,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def gauss_between(nodes: np.ndarray, n: int) -> tuple[Floats, Floats]:
-    """Gauss-Legendre points and weights, n on each stretch between nodes that increase: Σ w f is exact to 2 n - 1."""
+    """Gauss-Legendre points and weights, n on each interval between increasing nodes, exact to degree 2 n - 1."""
     points, weights = _gauss(n)
     halves = 0.5 * np.diff(nodes)[:, None]
     return (nodes[:-1, None] + halves * (points + 1.0)).ravel(), (halves * weights).ravel()

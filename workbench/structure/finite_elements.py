@@ -1,4 +1,4 @@
-"""Models known by their matrices, M ẍ + C ẋ + K x = f, one degree of freedom a named point."""
+"""Finite-element models given by matrices, M ẍ + C ẋ + K x = f, with a named point for each degree of freedom."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,25 +18,25 @@ from workbench.structure.modes import Modes
 from workbench.structure.printed import Printed, counted
 from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
 
-SYMMETRIC = 1e-9  # of the largest entry: more is no rounding of the program that wrote the matrix
+SYMMETRIC = 1e-9  # of the largest entry: tolerated asymmetry, by rounding in the program that wrote the matrix
 SINGULAR = 1e-12  # smallest pivot of K over the largest: below it the structure can move as a rigid body
 MASSLESS = 1e-12  # of the largest ν = 1 / (ω² - σ): below it a motion has no mass
 SHIFT = 1e-11  # of the highest ω², by which K is shifted where it is singular
 ROUNDING = 64.0 * np.finfo(float).eps  # of φᵀ |K| φ: a smaller ω² cannot be distinguished from zero
 
-MATRICES = {PointMass: "mass", PointSpring: "stiffness", PointDamper: "damping"}  # that an attachment adds to
+MATRICES = {PointMass: "mass", PointSpring: "stiffness", PointDamper: "damping"}  # to which an attachment is added
 
 Matrix: TypeAlias = sparray | spmatrix | np.ndarray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FiniteElements(Printed):
-    """A structure of finite elements, known by its matrices.
+    """A finite-element model of a structure, given by its matrices.
 
     Attributes:
         mass, stiffness: M (kg, kg m²) and K (N/m, N m/rad), (n, n) symmetric, sparse or not, supports eliminated.
         nodes: the degrees of freedom in the order of the matrices, as `NamedPoints`; or coordinates (n_nodes, 3), m,
-            each node having all `directions` in turn: its points are then named 1x, 1y, ..., 2x, ...
+            for which every node has all `directions` in turn, and points are named 1x, 1y, ..., 2x, ...
         damping: C (n, n), or `ModalDamping` or `ProportionalDamping`.
         directions: of each node, where coordinates are given.
 
@@ -64,7 +64,7 @@ class FiniteElements(Printed):
         object.__setattr__(self, "mass", _symmetric("mass", mass, n))
         object.__setattr__(self, "stiffness", _symmetric("stiffness", stiffness, n))
         if isinstance(damping, ViscousDamping):
-            raise ValueError("a coefficient per length means nothing to matrices; give a damping matrix C")
+            raise ValueError("damping per length does not apply to a model given by matrices; give a damping matrix C")
         if damping is None or isinstance(damping, Damping):
             object.__setattr__(self, "damping", damping or ModalDamping())
         else:
@@ -94,7 +94,7 @@ class FiniteElements(Printed):
         """
         n, n_modes = len(self.nodes.names), index(n_modes)
         if not 1 <= n_modes <= n:
-            raise ValueError(f"from 1 to {n} modes can be asked of {n} degrees of freedom; got {n_modes}")
+            raise ValueError(f"{n} degrees of freedom have 1 to {n} modes; got {n_modes}")
         if _negative_pivots(self.mass):
             raise ValueError("the mass matrix is not positive semidefinite: a motion has negative kinetic energy")
         shift, factor = self._shifted_factor()
@@ -103,13 +103,15 @@ class FiniteElements(Printed):
             start = np.random.default_rng(0).standard_normal(n)
             try:
                 _, shapes = eigsh(self.stiffness, k=n_modes, M=self.mass, sigma=shift, OPinv=inverse, v0=start)
-            except ArpackError:  # hardly more motions have mass than modes are asked for
+            except ArpackError:  # hardly more degrees of freedom with mass than modes
                 shapes = self._massive_shapes(n_modes, shift)
         else:
             try:
                 shapes = eigh(self.stiffness.toarray(), self.mass.toarray())[1]
             except LinAlgError as error:
-                raise ValueError("some motion has no mass, so there are fewer modes; ask for fewer") from error
+                raise ValueError(
+                    "some degrees of freedom have no mass, so there are fewer modes; ask for fewer"
+                ) from error
         sizes = np.sum(shapes * (self.mass @ shapes), axis=0)
         if (sizes <= 0).any():
             raise ValueError("the mass matrix is not positive semidefinite: a mode has no kinetic energy")
@@ -134,7 +136,7 @@ class FiniteElements(Printed):
         return Modes(omega=omega, damping=damping, shapes=lambda index, _: shapes[index], domain=self.nodes)
 
     def _massive_shapes(self, n_modes: int, shift: float) -> Floats:
-        """The lowest shapes by LAPACK, M φ = ν (K - σ M) φ, with ν = 0 for each motion that has no mass."""
+        """The lowest shapes (n, n_modes) by LAPACK, M φ = ν (K - σ M) φ, with ν = 0 for massless motions."""
         stiffness = (self.stiffness - shift * self.mass).toarray()
         values, shapes = eigh(self.mass.toarray(), stiffness)
         massive = int((values > MASSLESS * values[-1]).sum())
@@ -146,7 +148,7 @@ class FiniteElements(Printed):
         return np.asarray(shapes[:, ::-1][:, :n_modes])
 
     def attached(self, parts: Sequence[Attachment]) -> "FiniteElements":
-        """The structure with masses, springs and dampers at its points, or between two of them, in its matrices.
+        """The model with masses, springs and dampers at its points, or between two of them, added to its matrices.
 
         A mass moves in every direction of its node; a spring or damper acts in the direction of its point. Rotary
         inertia and rotational springs and dampers act at a point that is a rotation.
@@ -160,12 +162,12 @@ class FiniteElements(Printed):
             kind, places = MATRICES[type(part)], [part.at]
             if isinstance(part, PointMass):
                 if isinstance(part.at, Between):
-                    raise ValueError(f"{part}: a mass stands at one point; give it at each of the two")
+                    raise ValueError(f"{part}: a mass is attached to one point; give it at each of the two")
                 places = [*self.nodes.translations(str(part.at))]
-            linear, turning = part.pair
+            linear, rotational = part.pair
             added[kind] += [(self._row(at), linear) for at in places]
-            if turning:
-                added[kind].append((self._rotation(part), turning))
+            if rotational:
+                added[kind].append((self._rotation(part), rotational))
         damping: Any = self.damping
         if added["damping"]:
             if not isinstance(damping, csc_array):
@@ -182,7 +184,7 @@ class FiniteElements(Printed):
         )
 
     def _row(self, where: Where) -> np.ndarray:
-        """(k, 2) degrees of freedom and factors of what an attachment is stretched by."""
+        """(k, 2) degrees of freedom and factors of the elongation of an attachment."""
         if isinstance(where, Between):
             first, second = self.nodes.locate(list(where))
             return np.array([(first, 1.0), (second, -1.0)])
@@ -194,7 +196,7 @@ class FiniteElements(Printed):
         return self._row(part.at)
 
     def _shifted_factor(self) -> tuple[float, SuperLU]:
-        """A shift σ ≤ 0 and the factors of K - σ M: no shift unless the structure can move as a rigid body."""
+        """A shift σ ≤ 0 and the factors of K - σ M; σ = 0 unless the structure has rigid-body modes."""
         try:
             factor = _factor(self.stiffness)
             pivots = factor.U.diagonal()
@@ -223,7 +225,7 @@ def _negative(factor: SuperLU) -> int:
 
 
 def _negative_pivots(matrix: csc_array) -> int:
-    """Number of negative eigenvalues of a matrix, of which massless degrees of freedom are left out."""
+    """Number of negative eigenvalues of a mass matrix without its massless degrees of freedom."""
     massive = np.flatnonzero(matrix.diagonal() > 0)
     try:
         return _negative(_factor(matrix[:, massive][massive].tocsc()))

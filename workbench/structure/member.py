@@ -1,4 +1,4 @@
-"""Bars and beams: profiles, ends and attachments, and the modes they have."""
+"""Bars and beams, with profiles, end conditions and attachments, and their modes by finite elements of high degree."""
 
 import warnings
 from collections.abc import Sequence
@@ -31,17 +31,17 @@ from workbench.structure.supports import (
 from workbench.threads import one_blas_thread
 
 HIGHEST_DEGREE = 60
-EVERY = 3  # degrees are multiples of it, so that few bases are made
+EVERY = 3  # degrees are multiples of this, so that few bases are computed
 MOST_FUNCTIONS = 2400
 MOST_SEGMENTS = 600  # more would take minutes and gigabytes
-THINNEST = {0: 1e-9, 1: 1e-4}  # segment, of the length, by continuity: thinner, bending is lost in round-off
-NO_SLIVER = 1e-5  # of the length: a jump of a profile this near an end or another stands there
-TIP = 1e-9  # of the stiffness at midspan: an end that is no stiffer ends in a point
-CROWDING, COARSEST = 4.0, 0.25  # from segment to segment towards a tip, and the widest of them, of the length
-INSIDE = (np.arange(8) + 0.5) / 8  # where along a segment the length of waves is asked for
-BUCKLED = 3  # half waves that its segments can carry, and loads asked for: it buckles in the longest, beside a turn
-TURNS = 1e-7  # of the load of a half wave: below it a beam turns as a rigid body
-RIGID = 1e-13  # of the eigenvalue of a half wave: below it a mode moves as a rigid body
+THINNEST = {0: 1e-9, 1: 1e-4}  # least segment over the length, by continuity; bending is lost in round-off below
+NO_SLIVER = 1e-5  # of the length: a jump of a profile nearer to an end, or to another jump, is moved there
+TIP = 1e-9  # of the stiffness at midspan: an end of no more stiffness is a tip, where the stiffness vanishes
+CROWDING, COARSEST = 4.0, 0.25  # ratio of neighbouring segments towards a tip, and the largest of them over the length
+INSIDE = (np.arange(8) + 0.5) / 8  # points along a segment at which the wavelength is evaluated
+BUCKLED = 3  # half waves for the segments, and loads computed: the first bending load, after rigid-body rotations
+TURNS = 1e-7  # of the load of a half wave: a lower load is that of a rigid-body rotation
+RIGID = 1e-13  # of the eigenvalue of a half wave: a lower one is that of a rigid-body mode
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -78,13 +78,13 @@ class _Member(Printed):
             if not 0 <= part.at <= self.length:
                 raise ValueError(f"{part} stands outside the structure, which runs from 0 to {self.length:g}")
             if isinstance(part, PointMass) and (part.mass < 0 or part.rotary_inertia < 0):
-                raise ValueError(f"{part}: a negative mass is not a structure; leave it out or lower mass_per_length")
+                raise ValueError(f"{part}: a mass cannot be negative; leave it out or lower mass_per_length")
 
     def _segments(self, n_modes: int, stiffness: Profile, continuity: int, extra: int) -> Segments:
-        """Segments that can carry n_modes half waves, with `extra` more degrees than the bare count."""
+        """Segments that represent n_modes half waves, with `extra` degrees more than estimated."""
         nodes = _nodes((*self.mass_per_length.breaks, *stiffness.breaks), self.length)
         for part in self.attachments:
-            # a node at an attachment keeps its kink out of the polynomials
+            # a node at an attachment, where a derivative of the shapes jumps
             if np.abs(nodes - part.at).min() >= self._thinnest(continuity):
                 nodes = np.sort(np.r_[nodes, part.at, self._graded(position(part.at), stiffness)])
         if nodes.size > MOST_SEGMENTS:
@@ -93,21 +93,21 @@ class _Member(Printed):
                 f" {MOST_SEGMENTS} are solved: give fewer points, or a smooth function"
             )
         half_waves = n_modes * self._shares_of_waves(nodes, stiffness, continuity)
-        pieces = np.array([-(-(_carrying(each) + extra) // HIGHEST_DEGREE) for each in half_waves])
-        degrees = [_carrying(each / n) + extra // n for each, n in zip(half_waves, pieces, strict=True)]
+        pieces = np.array([-(-(_degree_for(each) + extra) // HIGHEST_DEGREE) for each in half_waves])
+        degrees = [_degree_for(each / n) + extra // n for each, n in zip(half_waves, pieces, strict=True)]
         ends = (np.linspace(a, b, n + 1)[1:] for (a, b), n in zip(pairwise(nodes), pieces, strict=True))
         return Segments(np.concatenate([nodes[:1], *ends]), tuple(np.repeat(degrees, pieces).tolist()), continuity)
 
     def _shares_of_waves(self, nodes: np.ndarray, stiffness: Profile, continuity: int) -> np.ndarray:
-        """Share of a high mode's half waves in each segment: they are shorter where it is heavy or soft."""
+        """Share (n_segments,) of a high mode's half waves in each segment, by the local wavenumber (WKB)."""
         points = nodes[:-1, None] + np.diff(nodes)[:, None] * INSIDE
-        softness = self.mass_per_length(points.ravel()) / stiffness(points.ravel())
-        density = softness.reshape(points.shape) ** (0.5 / (continuity + 1))
+        ratio = self.mass_per_length(points.ravel()) / stiffness(points.ravel())
+        density = ratio.reshape(points.shape) ** (0.5 / (continuity + 1))
         waves: Floats = np.diff(nodes) * density.mean(axis=1)
         return waves / float(waves.sum())
 
     def _graded(self, at: float, stiffness: Profile) -> list[float]:
-        """Nodes graded towards an attachment beside an end that is a tip: the motion there is all but singular."""
+        """Nodes graded from a tip beyond an attachment near it, where the motion is nearly singular."""
         graded = []
         for tip, inward in ((0.0, 1.0), (self.length, -1.0)):
             away = abs(at - tip)
@@ -123,8 +123,8 @@ class _Member(Printed):
     def _thinnest(self, continuity: int) -> float:
         return THINNEST[continuity] * self.length
 
-    def _seen_at(self, segments: Segments, at: float, derivative: int) -> np.ndarray:
-        """The row that gives the motion of an attachment; one just beside a node hangs on it by a rigid lever."""
+    def _motion_at(self, segments: Segments, at: float, derivative: int) -> np.ndarray:
+        """The row that maps coefficients to the motion of an attachment; one very near a node is rigidly tied to it."""
         node = segments.nodes[np.argmin(np.abs(segments.nodes - at))]
         if segments.continuity == 0 or abs(at - node) >= self._thinnest(segments.continuity):
             return segments.evaluation(at, derivative)
@@ -134,7 +134,7 @@ class _Member(Printed):
     @one_blas_thread
     def _solve(self, n_modes: int, stiffness: Profile, continuity: int, tension: float, tolerance: float) -> Modes:
         if n_modes < 1:
-            raise ValueError(f"at least one mode must be asked for; got {n_modes}")
+            raise ValueError(f"the number of modes must be at least 1; got {n_modes}")
         extra = 0
         while True:
             segments = self._segments(n_modes, stiffness, continuity, extra)
@@ -144,8 +144,8 @@ class _Member(Printed):
             extra = 10 + 2 * extra
             if segments.n_functions > MOST_FUNCTIONS:
                 warnings.warn(
-                    "the modes did not settle to the tolerance: is there a jump in a profile given as a function?"
-                    " Name its place with Profile(function, breaks=(x,)).",
+                    "the modes did not converge to the tolerance: is there a jump in a profile given as a function?"
+                    " Give its place by Profile(function, breaks=(x,)).",
                     stacklevel=3,
                 )
                 break
@@ -176,17 +176,17 @@ class _Member(Printed):
         for part in self.attachments:
             if isinstance(part, PointMass):
                 for derivative, value in enumerate(part.pair):
-                    row = self._seen_at(segments, position(part.at), derivative)
+                    row = self._motion_at(segments, position(part.at), derivative)
                     mass += value * row.T @ row
         for spring, row in springs:
             rigidity += spring * row.T @ row
         free = np.delete(np.arange(segments.n_functions), held)
         if n_modes > free.size:
-            raise ValueError(f"{n_modes} modes asked of {free.size} functions")
+            raise ValueError(f"{n_modes} modes requested of {free.size} functions")
         mass, rigidity = mass[np.ix_(free, free)], rigidity[np.ix_(free, free)]
-        # The inverse problem M v = ν (K + σ M) v: its largest eigenvalues are the lowest modes, so round-off is
-        # relative to them and not to the highest frequency the basis can carry. σ keeps K + σ M definite where the
-        # ends leave rigid-body modes.
+        # The inverse problem M v = ν (K + σ M) v: its largest eigenvalues are the lowest modes, so that round-off is
+        # relative to these and not to the highest frequency of the basis. σ keeps K + σ M definite with rigid-body
+        # modes.
         middle = np.linspace(0.05, 0.95, 19) * self.length
         typical = np.mean(stiffness(middle)) / np.mean(self.mass_per_length(middle))
         shift = typical * (np.pi / self.length) ** (2 * order)
@@ -197,8 +197,8 @@ class _Member(Printed):
         vectors = vectors[:, ::-1]
         coefficients = np.zeros((segments.n_functions, n_modes))
         coefficients[free] = vectors / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))
-        # Rayleigh's quotient, from the curvatures themselves: on a short segment the entries of K, EI/h³, cancel in a
-        # soft mode, and 1/ν - σ keeps little of it; a sum of squares keeps all.
+        # Rayleigh quotients from the curvatures: on a short segment the entries of K, EI/h³, cancel in a low mode, so
+        # that 1/ν - σ is inaccurate; a sum of squares does not cancel.
         eigenvalues = segments.form(stiffness, order, coefficients)
         if tension:
             eigenvalues += segments.form(lambda x: np.full(x.shape, tension), 1, coefficients)
@@ -218,7 +218,7 @@ class _Member(Printed):
     def _restraints(
         self, segments: Segments
     ) -> tuple[list[int], list[tuple[float, int]], list[tuple[float, np.ndarray]]]:
-        """Functions that ends hold, where they do (x, derivative), and springs with the rows of their elongations."""
+        """Functions held by the ends, their (x, derivative), and springs with the rows of their elongations."""
         order = segments.continuity + 1
         held, essential = [], []
         springs: list[tuple[float, np.ndarray]] = []
@@ -233,11 +233,11 @@ class _Member(Printed):
         for part in self.attachments:
             if isinstance(part, PointSpring):
                 for derivative, value in enumerate(part.pair):
-                    springs.append((value, self._seen_at(segments, position(part.at), derivative)))
+                    springs.append((value, self._motion_at(segments, position(part.at), derivative)))
         return held, essential, springs
 
     def _signs(self, segments: Segments, coefficients: np.ndarray) -> np.ndarray:
-        """+1 or -1 a mode, so that the first derivative that does not vanish at the left end is positive."""
+        """Signs (n_modes,) that make the first derivative that does not vanish at the left end positive."""
         middle = 0.5 * self.length
         size = 1.0 / np.sqrt(float(self.mass_per_length(middle)) * self.length)
         signs = np.zeros(coefficients.shape[1])
@@ -258,7 +258,7 @@ class _Member(Printed):
             if isinstance(part, PointDamper):
                 for derivative, value in enumerate(part.pair):
                     if value:
-                        row = self._seen_at(segments, position(part.at), derivative) @ coefficients
+                        row = self._motion_at(segments, position(part.at), derivative) @ coefficients
                         matrix = matrix + value * row.T @ row
         return matrix
 
@@ -269,7 +269,7 @@ def checked_places(breaks: tuple[float, ...], length: float) -> np.ndarray:
     return np.asarray((nodes[:-1, None] + np.diff(nodes)[:, None] * np.linspace(0.002, 0.998, 101)).ravel())
 
 
-@lru_cache(maxsize=64)  # one profile stays where another changes
+@lru_cache(maxsize=64)  # often only one of the profiles changes
 def _check_positive(name: str, profile: Profile, length: float) -> None:
     inside = checked_places(profile.breaks, length)
     values = profile(inside)
@@ -292,13 +292,13 @@ def _nodes(breaks: tuple[float, ...], length: float) -> np.ndarray:
 
 
 def _end_text(end: End) -> str:
-    """The name of an end, as far as stiffnesses of 0 and infinity have one."""
+    """Text of an end: its name, or its stiffnesses."""
     names = {(known.translation, known.rotation): name for name, known in NAMED_ENDS.items() if name != "fixed"}
     return names.get((end.translation, end.rotation), f"on springs of {end.translation:g} N/m and {end.rotation:g} N m")
 
 
-def _carrying(half_waves: float) -> int:
-    """The degree of a polynomial that carries so many half waves to ten digits: Bessel's J_k(z) < 1e-10 beyond it."""
+def _degree_for(half_waves: float) -> int:
+    """The degree of a polynomial that represents half waves to ten digits, beyond which J_k(z) < 1e-10 (Bessel)."""
     degree = int(np.ceil(0.5 * np.pi * half_waves + 10.0 * half_waves ** (1.0 / 3.0))) + 3
     return -(-degree // EVERY) * EVERY
 
@@ -320,7 +320,7 @@ class Bar(_Member):
         left, right: "fixed", "free" or an `End(translation)`.
         attachments: `PointMass`, `PointSpring`, `PointDamper`.
         damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping`.
-        frequency_errors: (n_modes,) logarithms of what natural frequencies are over those of the profiles.
+        frequency_errors: (n_modes,) ln of the ratio of natural frequencies to those computed from the profiles.
 
     Raises:
         ValueError: a profile that is not positive, an end of unknown name, an attachment outside, a spring or mass on a
@@ -329,7 +329,7 @@ class Bar(_Member):
 
     axial_stiffness: Profile
 
-    if TYPE_CHECKING:  # the door is wider than the fields: short forms become `Profile` and `End` on the way in
+    if TYPE_CHECKING:  # the arguments may have short forms, which become `Profile` and `End`
 
         def __init__(
             self,
@@ -352,8 +352,8 @@ class Bar(_Member):
             on_end = abs(at - end) < NO_SLIVER * self.length and isinstance(part, PointSpring | PointMass)
             if on_end and self._is_tip(end, self.axial_stiffness):
                 raise ValueError(
-                    f"{part} stands on a tip: axial_stiffness vanishes at x = {end:g}, where a point force moves the"
-                    " bar without bound; attach it further in, or give the tip some stiffness"
+                    f"{part} stands on a tip: axial_stiffness vanishes at x = {end:g}, where a point force has an"
+                    " infinite displacement; attach it further in, or give the tip some stiffness"
                 )
 
     def modes(self, n_modes: int, *, tolerance: float = 1e-10) -> Modes:
@@ -373,7 +373,7 @@ class Beam(_Member):
         attachments: `PointMass`, `PointSpring`, `PointDamper`.
         damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping`.
         tension: axial load in N, positive in tension.
-        frequency_errors: (n_modes,) logarithms of what natural frequencies are over those of the profiles.
+        frequency_errors: (n_modes,) ln of the ratio of natural frequencies to those computed from the profiles.
 
     Raises:
         ValueError: a profile that is not positive, an end of unknown name, an attachment outside, buckling.
@@ -382,7 +382,7 @@ class Beam(_Member):
     bending_stiffness: Profile
     tension: float = 0.0
 
-    if TYPE_CHECKING:  # the door is wider than the fields: short forms become `Profile` and `End` on the way in
+    if TYPE_CHECKING:  # the arguments may have short forms, which become `Profile` and `End`
 
         def __init__(
             self,
@@ -407,12 +407,12 @@ class Beam(_Member):
 
     @one_blas_thread
     def buckling_load(self) -> float:
-        """The least compression, N, that bends the beam in equilibrium: P of K v = P G v, without its present tension.
+        """The buckling load, N: the least P of K v = P G v, G = ∫ w' w' dx, without the present tension.
 
-        G = ∫ w' w' dx. Turning as a rigid body, which an unheld beam does under any compression, is left out.
+        Rigid-body rotation of an unsupported beam, which occurs under any compression, is left out.
 
         Raises:
-            ValueError: springs so negative that the beam is unstable without any compression.
+            ValueError: negative springs that make the beam unstable without compression.
         """
         segments = self._segments(BUCKLED, self.bending_stiffness, 1, 0)
         rigidity = segments.assemble(self.bending_stiffness, 2)
@@ -422,14 +422,14 @@ class Beam(_Member):
             rigidity += spring * row.T @ row
         on_ground = [part.pair[0] for part in self.attachments if isinstance(part, PointSpring)]
         if not any((self.left.translation, self.right.translation, *on_ground)):
-            held.append(0)  # moved as a whole it bears no other load
+            held.append(0)  # excludes the rigid-body translation
         free = np.delete(np.arange(segments.n_functions), held)
         rigidity, slopes = rigidity[np.ix_(free, free)], slopes[np.ix_(free, free)]
         unit = float(np.mean(self.bending_stiffness(self.length * INSIDE))) * (np.pi / self.length) ** 2
-        few = [free.size - BUCKLED, free.size - 1]
+        largest = [free.size - BUCKLED, free.size - 1]
         try:
-            # largest eigenvalues of the inverse problem, as of the modes
-            loads = 1.0 / eigh(slopes, rigidity + unit * slopes, eigvals_only=True, subset_by_index=few) - unit
+            # largest eigenvalues of the inverse problem, as for the modes
+            loads = 1.0 / eigh(slopes, rigidity + unit * slopes, eigvals_only=True, subset_by_index=largest) - unit
         except LinAlgError as error:
             raise ValueError(_unstable(0.0)) from error
         if (loads < -TURNS * unit).any():

@@ -27,13 +27,13 @@ from workbench.structure.printed import Printed, counted
 from workbench.structure.supports import PointMass
 
 Shapes = Callable[[np.ndarray, Any], np.ndarray]
-HELD = 1e-9  # of the largest motion anywhere: what moves less is held by a support
-EDGE_POINTS = 12, 2.0  # of a patch's edge, for its integrals: besides, and for each half wave that may lie on it
+HELD = 1e-9  # of the largest displacement: a place that moves less is held by a support
+EDGE_POINTS = 12, 2.0  # quadrature points of a patch's edge: fixed number, and per half wave along it
 PATCHES_AT_ONCE = 256
 
 
 def frozen(array: ArrayLike, dtype: type = float) -> np.ndarray:
-    """A read-only copy, as the fields of every frozen type hold it; the array itself where it is read-only already."""
+    """A read-only copy of an array, for the fields of frozen types; the array itself where it is read-only already."""
     if type(array) is np.ndarray and array.dtype == dtype and array.base is None and not array.flags.writeable:
         return array
     copy: np.ndarray = np.array(array, dtype=dtype)
@@ -62,7 +62,7 @@ def modal_state_matrix(stiffness: ArrayLike, damping: ArrayLike) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Modes(Printed):
-    """Mass-normalised modes, known all over their domain: ∫ m φ_r φ_s dx = δ_rs (2.5), attached masses included.
+    """Mass-normalised modes with shapes at every place of a domain: ∫ m φ_r φ_s dx = δ_rs (2.5), with attached masses.
 
     Each modal coordinate obeys q_r'' + Σ_s c_rs q_s' + ω_r² q_r = f_r (2.10).
 
@@ -70,15 +70,15 @@ class Modes(Printed):
         omega: (n_modes,) undamped natural frequencies, rad/s, not decreasing; 0 for a rigid-body mode.
         damping: (n_modes, n_modes) coefficients c_rs of (2.11), 1/s; diagonal 2 ζ_r ω_r for modal damping. A vector
             (n_modes,) is taken as the damping ratios ζ_r.
-        shapes: callable (located, derivative) -> (n_points, n_modes) of what `domain.locate` makes of places:
-            positions (n_points,) on an interval, with the order of derivative along x; (n_points, 2) on a rectangle,
-            with the orders (i, j) along x and y; indices (n_points,) of named points, where there is no derivative.
-        domain: which places there are; a number is the length, m, of an interval.
+        shapes: callable (located, derivative) -> (n_points, n_modes), located as returned by `domain.locate`:
+            positions (n_points,) on an interval, with the order of the derivative along x; (n_points, 2) on a
+            rectangle, with the orders (i, j) along x and y; indices (n_points,) of named points, without derivative.
+        domain: the set of places; a number is the length, m, of an interval.
         essential: ((x, derivative), ...) where the supports of an interval hold the shape or its slope at zero.
-        covariance: (2 n_modes, 2 n_modes) of (ω, ζ), where the modes were identified; None where computed.
-        shape_covariance: (n_modes, n_points, n_points) of each mode's shape at named points, where identified, each
-            mode by itself; None where computed, or where the identification gives none.
-        masses: attached at points, which the normalisation counts beside the mass per length or area.
+        covariance: (2 n_modes, 2 n_modes) of (ω, ζ) of identified modes; None of computed ones.
+        shape_covariance: (n_modes, n_points, n_points) of each identified mode's shape at named points; None of
+            computed modes, or where the identification gives none.
+        masses: attached at points; the normalisation includes them beside the mass per length or area.
 
     Raises:
         ValueError: negative or non-finite frequencies, mismatched shapes.
@@ -150,7 +150,7 @@ class Modes(Printed):
 
     @property
     def proportional(self) -> bool:
-        """Whether damping leaves the modes uncoupled (2.14)."""
+        """Whether damping does not couple the modes (2.14)."""
         diagonal = np.diag(self.damping)
         return bool(np.abs(self.damping - np.diag(diagonal)).max() <= 1e-12 * max(np.abs(diagonal).max(), 1e-300))
 
@@ -178,17 +178,17 @@ class Modes(Printed):
             ValueError: a place outside the structure, a direction that it does not have there.
         """
         places, derivative, sign = self.domain.slope(places, derivative, direction)
-        found = np.asarray(self.shapes(self.domain.locate(places), derivative), float)
-        return found if sign == 1.0 else sign * found
+        values = np.asarray(self.shapes(self.domain.locate(places), derivative), float)
+        return values if sign == 1.0 else sign * values
 
     def phi_at(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> Floats:
-        """Mode shapes (n_modes,) at a place, at the first of two less those at the second, or ∮ ∂φ/∂n ds of a patch."""
+        """Mode shapes (n_modes,) at a place, their difference between two, or ∮ ∂φ/∂n ds of a patch."""
         if isinstance(where, Between):
             first, second = (self.phi(place, derivative, direction=direction)[0] for place in where)
             return np.asarray(first - second)
         if isinstance(where, Patch):
             if derivative != 1:
-                raise PlaceError("a patch turns a plate by moments along its edges and has no force or displacement")
+                raise PlaceError("a patch acts on a plate by moments along its edges, not by a force or displacement")
             return np.asarray(self.edge_slopes([where], direction=direction)[0])
         at = position(where) if isinstance(self.domain, Interval) else where
         return np.asarray(self.phi(at, derivative, direction=direction)[0])
@@ -207,22 +207,22 @@ class Modes(Printed):
             PlaceError: another domain, or a patch that reaches outside.
         """
         if not isinstance(self.domain, Rectangle):
-            raise PlaceError(f"a patch has its place on a plate; these modes are of {self.domain}")
-        found = np.asarray(patches, float).reshape(-1, 4)
-        if len(found) > PATCHES_AT_ONCE:
-            parts = np.array_split(found, -(-len(found) // PATCHES_AT_ONCE))
+            raise PlaceError(f"a patch is placed on a plate; these modes are of {self.domain}")
+        each = np.asarray(patches, float).reshape(-1, 4)
+        if len(each) > PATCHES_AT_ONCE:
+            parts = np.array_split(each, -(-len(each) // PATCHES_AT_ONCE))
             return np.concatenate([self.edge_slopes(part, direction=direction) for part in parts])
-        # no mode of so many has more half waves along a side than its number
-        besides, each = EDGE_POINTS
-        n_points = besides + round(each * self.n_modes * (found[:, 2:] / self.domain.length).clip(0, 1).max(initial=0))
-        total = np.zeros((len(found), self.n_modes))
-        for at, derivative, weights in self.domain.around(found, direction, n_points):
+        # mode n has at most n half waves along a side
+        fixed, per_wave = EDGE_POINTS
+        n_points = fixed + round(per_wave * self.n_modes * (each[:, 2:] / self.domain.length).clip(0, 1).max(initial=0))
+        total = np.zeros((len(each), self.n_modes))
+        for at, derivative, weights in self.domain.around(each, direction, n_points):
             slopes = self.phi(at.reshape(-1, 2), derivative).reshape(*weights.shape, -1)
             total += np.einsum("pk,pkr->pr", weights, slopes)
         return total
 
     def is_held(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> bool:
-        """Whether a support holds the displacement, or the slope, at a place, so that no mode moves it."""
+        """Whether a support holds the displacement, or the slope, of every mode at a place at zero."""
         if isinstance(self.domain, Interval) and not isinstance(where, Between):
             slack = 1e-9 * self.domain.length
             return any(held == derivative and abs(where - at) <= slack for at, held in self.essential)  # type: ignore
@@ -233,11 +233,11 @@ class Modes(Printed):
     are_still = Renamed("are_held")
 
     def are_held(self, places: ArrayLike) -> Flags:
-        """`is_held` of displacements at several places: whether no mode moves them, (n_places,)."""
+        """Whether supports hold the displacements at places (n_places,); see `is_held`."""
         return self._hardly_move(self.phi(places))
 
     def _hardly_move(self, phi: Floats) -> Flags:
-        """Whether all of some mode shapes' values (..., n_modes) are nothing beside the largest displacement, (...)."""
+        """Whether all mode shapes' values (..., n_modes) are negligible beside the largest displacement, (...)."""
         return np.asarray(np.abs(phi).max(axis=-1) <= HELD * self._largest)
 
     @cached_property
@@ -246,7 +246,7 @@ class Modes(Printed):
         return float(np.abs(self.phi(self.domain.grid(12))).max())
 
     def select(self, modes: Sequence[int] | slice) -> "Modes":
-        """Only some of the modes, by zero-based index."""
+        """The modes of some zero-based indices."""
         index = np.arange(self.n_modes)[modes] if isinstance(modes, slice) else np.asarray(modes, int)
         if index.size == 0 or index.min() < 0 or index.max() >= self.n_modes:
             raise ValueError(f"modes {index.tolist()} are not all among the {self.n_modes} modes at hand (from 0)")
@@ -284,7 +284,7 @@ class PointShapes:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SampledModes(Printed):
-    """Modes as a measurement gives them: complex, unscaled, known at the sensors only.
+    """Identified modes: complex, of arbitrary scale, with shapes at the sensors only.
 
     Attributes:
         omega: (n_modes,) rad/s, increasing.
@@ -300,7 +300,7 @@ class SampledModes(Printed):
 
     @classmethod
     def of_poles(cls, poles: Complexes, shapes: np.ndarray, positions: np.ndarray) -> "SampledModes":
-        """Modes of poles λ (n_modes,), rad/s, by rising |λ|: ω = |λ| and ζ = -Re λ / |λ|."""
+        """Modes of poles λ (n_modes,), rad/s, in order of increasing |λ|: ω = |λ| and ζ = -Re λ / |λ|."""
         return cls(np.abs(poles), -poles.real / np.abs(poles), shapes, positions)
 
     def __post_init__(self) -> None:
@@ -345,12 +345,12 @@ class SampledModes(Printed):
 
     @property
     def on_interval(self) -> bool:
-        """Whether every sensor has a known place along an interval."""
+        """Whether every sensor has a known position along an interval."""
         return self.positions.ndim == 1 and self.positions.dtype != object and not self.without_position.any()
 
     @property
     def on_plate(self) -> bool:
-        """Whether every sensor has a known place on a plate."""
+        """Whether every sensor has a known position on a plate."""
         return self.positions.ndim == 2 and not self.without_position.any()
 
     @property
@@ -359,20 +359,20 @@ class SampledModes(Printed):
         return -self.zeta * self.omega + 1j * self.omega * np.sqrt(np.maximum(1.0 - self.zeta**2, 0.0))
 
     def select(self, modes: Sequence[int] | slice) -> "SampledModes":
-        """Only some of the modes, by zero-based index."""
+        """The modes of some zero-based indices."""
         index = np.arange(self.n_modes)[modes] if isinstance(modes, slice) else np.asarray(modes, int)
         return SampledModes(self.omega[index], self.zeta[index], self.shapes[:, index], self.positions)
 
     @property
     def phase_collinearity(self) -> Floats:
-        """Modal phase collinearity MPC (n_modes,): 1 for a real shape, towards 0 for a travelling one.
+        """Modal phase collinearity MPC (n_modes,): 1 for a real shape, 0 for a travelling wave.
 
         Pappa, Elliott & Schenk, NASA TM-102664 (1990).
         """
         x, y = self.shapes.real, self.shapes.imag
         sxx, syy, sxy = (x * x).sum(0), (y * y).sum(0), (x * y).sum(0)
-        spread: Floats = np.hypot(sxx - syy, 2.0 * sxy) / np.maximum(sxx + syy, 1e-300)
-        return spread**2
+        ratio: Floats = np.hypot(sxx - syy, 2.0 * sxy) / np.maximum(sxx + syy, 1e-300)
+        return ratio**2
 
 
 def mac(first: ArrayLike, second: ArrayLike) -> Floats:

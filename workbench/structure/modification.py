@@ -1,4 +1,4 @@
-"""Modes of a structure with something attached, from its modes alone."""
+"""Structural modification: modes of a structure with attachments, computed from its modes alone."""
 
 from dataclasses import replace
 from typing import Any
@@ -11,28 +11,28 @@ from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
 from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring, masses_among
 
-OWN = 4  # modes that move on their own, for each that is asked for
-DIVERGES = 0.9  # of that ratio: from here on the flexibility at a point has no end in sight
-ROUNDING = 1e-9  # of the largest eigenvalue: what a rigid-body mode may be off by
+OWN = 4  # dynamic modes per requested mode
+DIVERGES = 0.9  # ratio of flexibilities (see `truncation_error`) from which on the series counts as divergent
+ROUNDING = 1e-9  # of the largest eigenvalue: rounding error of that of a rigid-body mode
 
 
 @former_arguments(kept="n_modes", residual="residual_flexibility")
 def attach(
     modes: Modes, attachments: tuple[Attachment, ...], *, n_modes: int | None = None, residual_flexibility: float = 0.0
 ) -> Modes:
-    """The modes with masses, springs and dampers attached, by Rayleigh-Ritz in the modes at hand.
+    """The modes with masses, springs and dampers attached, by Rayleigh-Ritz in the given modes.
 
-    Exact for dampers; for masses and springs as good as the modes at hand span the changed shapes (`truncation_error`).
-    Damping ratios stay with the modes, in order; a damping matrix that couples them is that of dampers, and stays with
-    the structure. Where profiles or matrices are known, solve anew instead.
+    Exact for dampers; for masses and springs the accuracy depends on how well the given modes span the changed shapes
+    (`truncation_error`). Damping ratios stay with the modes, in order; a damping matrix that couples the modes is
+    transformed as a property of the structure. Where profiles or matrices are known, solve the changed structure
+    instead.
 
     Args:
-        modes: as many as the changed shapes take.
-        attachments: what is attached.
-        n_modes: how many modes come out, and how many of those at hand move on their own, four times as many; the
-            others go with the force of each attachment as they do at rest: an error of the order of (ω / ω_n)⁴. All of
-            them where not given.
-        residual_flexibility: flexibility at a point of all modes that are not at hand, m/N.
+        modes: of the structure without attachments; enough to represent the changed shapes.
+        attachments: masses, springs and dampers.
+        n_modes: number of modes returned. Four times as many of the given modes are dynamic; the others respond
+            statically to the force of each attachment, with an error of the order of (ω / ω_n)⁴. By default all modes.
+        residual_flexibility: flexibility at a point of all modes that are not given, m/N.
 
     MacNeal, Computers & Structures 1 (1971) 581, on residual flexibility.
     """
@@ -47,12 +47,12 @@ def attach(
         target = mass if isinstance(part, PointMass) else stiffness
         for derivative, value in enumerate(part.pair):
             if value:
-                shapes = _moved(modes, part, derivative)
+                shapes = _shapes_at(modes, part, derivative)
                 target += value * shapes.T @ shapes
     if any(isinstance(part, PointMass | PointSpring) for part in attachments):
         omega, vectors = _eigen(stiffness, mass)
         if modes.proportional:
-            # a rigid mode has no ratio: what damps it stays as it is
+            # a rigid mode has no damping ratio: its coefficient c is kept
             damping = np.diag(np.where(modes.omega > 0, 2.0 * modes.zeta * omega, np.diag(modes.damping)))
         else:
             damping = vectors.T @ modes.damping @ vectors
@@ -61,24 +61,24 @@ def attach(
     for part in extra_damping:
         for derivative, value in enumerate(part.pair):
             if value:
-                shape = _moved(modes, part, derivative) @ vectors
+                shape = _shapes_at(modes, part, derivative) @ vectors
                 damping = damping + value * shape.T @ shape
     return _combined(modes, vectors, omega, damping, attachments)
 
 
 def truncation_error(modes: Modes, attachments: tuple[Attachment, ...]) -> np.ndarray:
-    """What leaving out further modes costs the frequencies of `attach`: (n_modes,) relative, inf where unknown.
+    """Estimated relative errors (n_modes,) of the frequencies of `attach` by modal truncation; inf where not known.
 
-    The change of a frequency as the upper half of the modes at hand is left out, c, times r / (1 - r), and no less than
-    c. Here r is what the last half of the modes adds to the mean flexibility at a point over what the quarter before
-    adds: 1/8 of a beam, 1/2 of a plate. Of a membrane or a solid it is 1 or more: the flexibility at a point grows with
-    every mode that is known, and nothing is known of the rest. The upper half of the frequencies have no such estimate.
+    The estimate is c max(r / (1 - r), 1). Here c is the change of a frequency when the upper half of the modes is left
+    out, and r the ratio of contributions to the mean flexibility at a point: of the upper half of the modes over the
+    quarter below. r is 1/8 for a beam and 1/2 for a plate. For a membrane or a solid it is 1 or more, as the
+    flexibility at a point diverges, and there is no estimate; nor is there one for the upper half of the frequencies.
     """
     half = modes.n_modes // 2
     error = np.full(modes.n_modes, np.inf)
     if half:
-        whole, part = attach(modes, attachments).omega[:half], attach(modes.select(slice(half)), attachments).omega
-        change = np.abs(np.divide(part, whole, out=np.ones(half), where=whole > 0) - 1.0)
+        full, truncated = attach(modes, attachments).omega[:half], attach(modes.select(slice(half)), attachments).omega
+        change = np.abs(np.divide(truncated, full, out=np.ones(half), where=full > 0) - 1.0)
         ratio = _decay(modes)
         error[:half] = (
             change * max(ratio / (1.0 - ratio), 1.0) if ratio < DIVERGES else np.where(change > 0, np.inf, 0.0)
@@ -87,7 +87,7 @@ def truncation_error(modes: Modes, attachments: tuple[Attachment, ...]) -> np.nd
 
 
 def _decay(modes: Modes) -> float:
-    """What the upper half of modes adds to the mean flexibility at a point, over what the quarter before adds."""
+    """Contribution of the upper half of modes to the mean flexibility at a point, over that of the quarter below."""
     n, elastic = modes.n_modes, modes.omega > 0
     mean = np.mean(modes.phi(modes.domain.grid(16)) ** 2, axis=0)
     flexibility = np.divide(mean, modes.omega**2, out=np.zeros(n), where=elastic)
@@ -96,30 +96,31 @@ def _decay(modes: Modes) -> float:
 
 
 def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int, residual: float) -> Modes:
-    """The lowest modes, from the next few as they are and the rest by their static answer to each attachment.
+    """The lowest `kept` modes, with the higher modes by their static response to each attachment.
 
-    Modes that are not at hand answer at the place of the force alone: a coordinate of its own, as fast as the highest.
+    The residual flexibility of modes that are not given is a further coordinate per attachment, of the highest
+    frequency.
     """
     own = min(OWN * kept, modes.n_modes)
-    moving = [part for part in attachments if not isinstance(part, PointDamper)]
-    rows = np.vstack([np.zeros((0, modes.n_modes)), *(_moved(modes, part, 0) for part in moving)])
-    # each row of `rest` is the rest's static answer to one force, all of them of unit energy and apart from each other
+    conservative = [part for part in attachments if not isinstance(part, PointDamper)]
+    rows = np.vstack([np.zeros((0, modes.n_modes)), *(_shapes_at(modes, part, 0) for part in conservative)])
+    # rows of `rest`: static responses of the higher modes to the forces, of unit energy and orthogonal
     _, sizes, directions = np.linalg.svd(rows[:, own:] / modes.omega[own:], full_matrices=False)
     rest = directions[sizes > 1e-6 * sizes.max(initial=0.0)] / modes.omega[own:]
-    places = list(dict.fromkeys(part.at for part in moving)) if residual else []
-    alone = own + len(rest)
-    basis = np.zeros((modes.n_modes, alone + len(places)))
+    places = list(dict.fromkeys(part.at for part in conservative)) if residual else []
+    first = own + len(rest)  # of the coordinates of residual flexibility
+    basis = np.zeros((modes.n_modes, first + len(places)))
     basis[:own, :own] = np.eye(own)
-    basis[own:, own:alone] = rest.T
+    basis[own:, own:first] = rest.T
     reduced = _combined(modes, basis, *np.zeros((2, basis.shape[1])))
     mass, stiffness = basis.T @ basis, basis.T @ (modes.omega[:, None] ** 2 * basis)
-    stiffness[alone:, alone:] = np.eye(len(places))  # of unit energy, as the others
-    mass[alone:, alone:] = np.eye(len(places)) / modes.omega[-1] ** 2
-    for part in moving:
-        shapes = _moved(reduced, part, 0)
+    stiffness[first:, first:] = np.eye(len(places))  # of unit energy
+    mass[first:, first:] = np.eye(len(places)) / modes.omega[-1] ** 2
+    for part in conservative:
+        shapes = _shapes_at(reduced, part, 0)
         if places:
             shapes = shapes.copy()
-            shapes[:, alone + places.index(part.at)] = np.sqrt(residual)
+            shapes[:, first + places.index(part.at)] = np.sqrt(residual)
         target = mass if isinstance(part, PointMass) else stiffness
         target += part.pair[0] * shapes.T @ shapes
     omega, vectors = _eigen(stiffness, mass, subset_by_index=[0, kept - 1])
@@ -127,10 +128,10 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
     return attach(changed, tuple(part for part in attachments if isinstance(part, PointDamper)))
 
 
-def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
-    """Shapes (n_directions, n_modes) of what an attachment moves by: a mass moves in every direction of its node."""
+def _shapes_at(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
+    """Shapes (n_directions, n_modes) at an attachment: of a mass, in every direction of its node."""
     if isinstance(part, PointMass) and isinstance(part.at, Between):
-        raise ValueError(f"{part}: a mass stands at one point; give it at each of the two")
+        raise ValueError(f"{part}: a mass is attached to one point; give it at each of the two")
     if isinstance(part, PointMass) and isinstance(modes.domain, NamedPoints) and derivative == 0:
         return modes.phi(modes.domain.translations(str(part.at)))
     return modes.phi_at(part.at, derivative)[None, :]
@@ -143,7 +144,7 @@ def _combined(
     damping: np.ndarray,
     attachments: tuple[Attachment, ...] = (),
 ) -> Modes:
-    """Modes whose shapes are the columns of `vectors` (n_modes, n_combined) in those at hand."""
+    """Modes whose shapes are combinations `vectors` (n_modes, n_combined) of the given ones."""
     shapes = modes.shapes
     return replace(
         modes,
@@ -157,11 +158,11 @@ def _combined(
 
 
 def _eigen(stiffness: np.ndarray, mass: np.ndarray, **which: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies, rad/s, and vectors of K v = ω² M v, each with its own mode positive."""
+    """Frequencies, rad/s, and vectors of K v = ω² M v, with positive diagonal entries."""
     try:
         eigenvalues, vectors = eigh(stiffness, mass, **which)
     except LinAlgError as error:
-        raise ValueError("more mass is taken away than there is: a negative one is too large") from error
+        raise ValueError("a negative mass is too large: the mass matrix is not positive definite") from error
     if eigenvalues[0] < -ROUNDING * eigenvalues[-1]:
-        raise ValueError("the structure is unstable with these springs: one of negative stiffness is too strong")
+        raise ValueError("the structure is unstable with these springs: a negative stiffness is too large")
     return np.sqrt(np.maximum(eigenvalues, 0.0)), vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Plates and membranes over a rectangle, and the modes they have."""
+"""Rectangular plates and membranes, and their modes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,8 +25,8 @@ from workbench.structure.supports import (
 from workbench.structure.surface_basis import EdgeSpring, PointTerm, Square, SurfaceProblem
 from workbench.structure.surface_ritz import SurfaceModes, solve
 
-SAMPLES = 41  # each way, where a field is checked to be positive
-SAME_POINT = 1e-6  # of a side: attachments nearer to one another stand at one point
+SAMPLES = 41  # per side, at which a field is checked to be positive
+SAME_POINT = 1e-6  # of a side: attachments nearer to one another are at one point
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -38,7 +38,7 @@ class _Surface:
 
     @property
     def domain(self) -> Rectangle:
-        """The places of the surface."""
+        """The rectangle of the surface."""
         return Rectangle(self.length)
 
     def _prepare(self, allowed_edges: tuple[str, ...], fields: tuple[str, ...]) -> None:
@@ -86,7 +86,7 @@ class _Surface:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plate(_Surface):
-    """A thin rectangular plate in bending (Kirchhoff): ω² m w is what the strain energy gives,
+    """A thin rectangular plate in bending (Kirchhoff), of strain energy
 
     ½ ∫ D [w_xx² + w_yy² + 2 ν w_xx w_yy + 2 (1 - ν) w_xy²] + N_x w_x² + N_y w_y² + 2 N_xy w_x w_y dA;
     Leissa, Vibration of Plates, NASA SP-160 (1969).
@@ -99,13 +99,13 @@ class Plate(_Surface):
         edges: "simply supported", "clamped", "free", "guided" or an `Edge(translation, rotation)`: one for all, or a
             mapping of left (x = 0), right, bottom (y = 0) and top.
         attachments: `PointMass`, `PointSpring`, `PointDamper` at (x, y); without rotary inertia and rotational
-            stiffness, since a moment at a point turns a Kirchhoff plate without bound.
+            stiffness, since the rotation of a Kirchhoff plate under a point moment is infinite.
         damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping` (a coefficient per area, N s/m³).
-        tension: in-plane N/m, positive in tension: one number for both ways, (N_x, N_y) or (N_x, N_y, N_xy).
+        tension: in-plane N/m, positive in tension: one number for both directions, (N_x, N_y) or (N_x, N_y, N_xy).
 
     Raises:
-        ValueError: a field that is not positive, an edge of unknown name, an attachment outside, a Poisson's ratio that
-            no material has.
+        ValueError: a field that is not positive, an edge of unknown name, an attachment outside, a Poisson's ratio
+            out of range.
     """
 
     bending_stiffness: Field
@@ -113,7 +113,7 @@ class Plate(_Surface):
     attachments: tuple[Attachment, ...] = ()
     tension: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    if TYPE_CHECKING:  # the door is wider than the fields: short forms become `Field`, `Edge` and a triple
+    if TYPE_CHECKING:  # the arguments may have short forms, which become `Field`, `Edge` and a triple
 
         def __init__(
             self,
@@ -134,19 +134,18 @@ class Plate(_Surface):
         tension = np.atleast_1d(np.asarray(self.tension, float))
         if tension.size > 3 or not np.isfinite(tension).all():
             raise ValueError(f"tension is one number, (N_x, N_y) or (N_x, N_y, N_xy) in N/m; got {self.tension}")
-        whole = np.r_[tension, tension] if tension.size == 1 else tension
-        object.__setattr__(self, "tension", tuple(np.r_[whole, np.zeros(3)][:3].tolist()))
+        normal = np.r_[tension, tension] if tension.size == 1 else tension
+        object.__setattr__(self, "tension", tuple(np.r_[normal, np.zeros(3)][:3].tolist()))
         object.__setattr__(self, "attachments", tuple(self.attachments))
         for part in self.attachments:
             self.domain.locate([part.at])
-            turning = getattr(part, ROTATIONAL[type(part)])
-            if turning:
+            if getattr(part, ROTATIONAL[type(part)]):
                 raise ValueError(
-                    f"{part}: a moment at a point turns a thin plate without bound, so {ROTATIONAL[type(part)]} has no"
-                    " meaning there; spread it over two points or more"
+                    f"{part}: the rotation of a thin plate under a point moment is infinite, so"
+                    f" {ROTATIONAL[type(part)]} has no meaning there; distribute it over two points or more"
                 )
             if isinstance(part, PointMass) and part.mass < 0:
-                raise ValueError(f"{part}: a negative mass is not a structure; leave it out or lower mass_per_area")
+                raise ValueError(f"{part}: a mass cannot be negative; leave it out or lower mass_per_area")
 
     @classmethod
     def of_thickness(
@@ -177,28 +176,30 @@ class Plate(_Surface):
         )
 
     def modes(self, n_modes: int, *, tolerance: float = 1e-6, beyond: int = 0) -> Modes:
-        """The lowest `n_modes` modes, mass-normalised, their frequencies to `tolerance`, relative.
+        """The lowest `n_modes` modes, mass-normalised, with frequencies to a relative `tolerance`.
 
         In closed form where all edges are simply supported and mass, stiffness and tension constant; else by the
-        Rayleigh-Ritz method, refined until the frequencies stand (`surface_ritz.solve`).
+        Rayleigh-Ritz method, refined until the frequencies converge (`surface_ritz.solve`).
 
         Args:
-            beyond: so many further modes at most, as they come with those asked for, to no tolerance.
+            n_modes: number of modes.
+            tolerance: relative, of the frequencies.
+            beyond: largest number of further modes, returned without the tolerance.
 
         Raises:
-            ValueError: the tolerance cannot be reached, and how far the frequencies are known; buckling.
+            ValueError: the tolerance cannot be reached (with the accuracy that is reached), or buckling.
         """
         if n_modes < 1:
-            raise ValueError(f"at least one mode must be asked for; got {n_modes}")
-        heavy = any(isinstance(part, PointMass | PointSpring) for part in self.attachments)
-        if self.is_navier and not heavy and not isinstance(self.damping, ViscousDamping):
+            raise ValueError(f"the number of modes must be at least 1; got {n_modes}")
+        loaded = any(isinstance(part, PointMass | PointSpring) for part in self.attachments)
+        if self.is_navier and not loaded and not isinstance(self.damping, ViscousDamping):
             return self._with_dampers(self._closed_form(n_modes + beyond))
-        found = solve(self.ritz_problem(), n_modes, tolerance=tolerance, beyond=beyond)
-        return self._with_dampers(self._solved(found))
+        solution = solve(self.ritz_problem(), n_modes, tolerance=tolerance, beyond=beyond)
+        return self._with_dampers(self._solved(solution))
 
     @property
     def is_navier(self) -> bool:
-        """Whether, but for attachments, the modes have a closed form: constant, simply supported all round."""
+        """Whether the plate without attachments has modes in closed form: constant, simply supported on all edges."""
         simple = all(edge == Edge(HELD, 0.0) for edge in self.edges.values()) and not self.tension[2]
         return simple and self.mass_per_area.is_constant and self.bending_stiffness.is_constant
 
@@ -224,7 +225,7 @@ class Plate(_Surface):
         )
 
     def _point_terms(self) -> tuple[PointTerm, ...]:
-        """Masses and springs, those at one point as one; what stands on a held edge moves nothing."""
+        """Masses and springs, summed at each point; those on a held edge are left out."""
         terms: list[PointTerm] = []
         for part in self.attachments:
             if isinstance(part, PointDamper) or self._is_held(part.at):
@@ -248,25 +249,25 @@ class Plate(_Surface):
     def _singular_corners(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Coordinates of the corners where a clamped edge meets a free or an elastic one.
 
-        The other corners of 90° are smooth, or nearly so: by reflection, an edge beside a simply supported or guided
-        one goes straight on.
+        At other corners of 90° the solution is smooth, or nearly so: it can be continued by reflection beyond a simply
+        supported or guided edge.
         """
-        found: tuple[set[float], set[float]] = set(), set()
-        for i, upright in enumerate(SIDES[:2]):
-            for j, level in enumerate(SIDES[2:]):
-                pair = [self.edges[upright], self.edges[level]]
+        corners: tuple[set[float], set[float]] = set(), set()
+        for i, vertical in enumerate(SIDES[:2]):
+            for j, horizontal in enumerate(SIDES[2:]):
+                pair = [self.edges[vertical], self.edges[horizontal]]
                 clamped = [edge.translation == HELD and edge.rotation == HELD for edge in pair]
                 free = [edge.translation != HELD and edge.rotation != HELD for edge in pair]
                 if any(clamped) and any(free):
-                    found[0].add(i * self.length[0])
-                    found[1].add(j * self.length[1])
-        return tuple(sorted(found[0])), tuple(sorted(found[1]))
+                    corners[0].add(i * self.length[0])
+                    corners[1].add(j * self.length[1])
+        return tuple(sorted(corners[0])), tuple(sorted(corners[1]))
 
     def _closed_form(self, n_modes: int) -> Modes:
         """Modes of the simply supported plate, sin(i π x / a) sin(j π y / b) (Navier)."""
         (a, b), (nx, ny, _) = self.length, self.tension
         m, d = self._mean(self.mass_per_area), self._mean(self.bending_stiffness)
-        numbers = np.array([4, 4])  # of half waves along x and y: as many as hold all of the lowest modes
+        numbers = np.array([4, 4])  # of half waves along x and y, increased until they include all of the lowest modes
         while True:
             i, j = np.meshgrid(*(np.arange(1, n + 1) for n in numbers), indexing="ij")
             kx, ky = np.pi / a * i, np.pi / b * j
@@ -281,7 +282,7 @@ class Plate(_Surface):
             raise ValueError(
                 f"a tension of {self.tension} N/m compresses the plate beyond buckling; lower its magnitude"
             )
-        # repeated modes in the order of their slopes along x, as `surface_ritz` has them
+        # repeated modes in the order of their slopes along x, as in `surface_ritz`
         order = np.lexsort((kx, np.round(values / values.min(), 9)))[:n_modes]
         kx, ky = kx[order], ky[order]
         size = 2.0 / np.sqrt(m * a * b)
@@ -304,7 +305,7 @@ class Plate(_Surface):
 
 
 def check_poisson_ratio(value: float) -> None:
-    """Refuse a ratio that no isotropic material has.
+    """Refuse a Poisson's ratio that no isotropic material has.
 
     Raises:
         ValueError: outside -1 to 0.5.
@@ -314,7 +315,7 @@ def check_poisson_ratio(value: float) -> None:
 
 
 def bending_squares(rigidity: Field, poisson_ratio: float) -> tuple[Square, ...]:
-    """The strain energy of bending as squares, so that nothing cancels."""
+    """The strain energy of bending as a sum of squares, which does not cancel."""
     nu = poisson_ratio
     return (
         Square(lambda x, y: 0.5 * (1.0 + nu) * rigidity(x, y), ((1.0, 2, 0), (1.0, 0, 2))),
@@ -337,7 +338,7 @@ class Membrane(_Surface):
         edges: "fixed", "free" or an `Edge(translation)`: one for all, or a mapping of left, right, bottom and top.
         damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping` (a coefficient per area, N s/m³).
 
-    Masses and springs at points are not taken: a point force moves a membrane without bound.
+    Masses and springs at points are not supported: the displacement of a membrane under a point force is infinite.
 
     Raises:
         ValueError: a field that is not positive, an edge of unknown name.
@@ -362,13 +363,13 @@ class Membrane(_Surface):
         self._prepare(("fixed", "free"), ("mass_per_area", "tension"))
 
     def modes(self, n_modes: int, *, tolerance: float = 1e-6) -> Modes:
-        """The lowest `n_modes` modes, mass-normalised, their frequencies to `tolerance`, relative.
+        """The lowest `n_modes` modes, mass-normalised, with frequencies to a relative `tolerance`.
 
         Raises:
-            ValueError: the tolerance cannot be reached, and how far the frequencies are known.
+            ValueError: the tolerance cannot be reached (with the accuracy that is reached).
         """
         if n_modes < 1:
-            raise ValueError(f"at least one mode must be asked for; got {n_modes}")
+            raise ValueError(f"the number of modes must be at least 1; got {n_modes}")
         a, b = self.length
         problem = SurfaceProblem(
             length=self.length,

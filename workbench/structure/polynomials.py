@@ -1,9 +1,9 @@
-"""Piecewise polynomials of high degree along the structure: the basis in which its modes are found.
+"""Piecewise polynomials of high degree along a structure: the basis of its modes (hierarchic p-elements).
 
 On each segment the internal functions are integrals of Legendre polynomials: the second integral for a beam, the
 first for a bar. Their highest derivatives are then orthogonal, the stiffness matrix of a uniform segment is the
-identity, and round-off stays near machine precision at any degree. Low-order elements refined to the same
-accuracy would lose it to the condition number, which grows with the fourth power of their count.
+identity, and round-off stays near machine precision at any degree. With low-order elements the condition number grows
+with the fourth power of their number, so that refinement to the same accuracy fails.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,7 +22,7 @@ from workbench.arrays import Floats
 def reference_basis(degree: int, continuity: int) -> np.ndarray:
     """Legendre coefficients of the basis on [-1, 1]: (degree + 1 functions, degree + 1 coefficients).
 
-    The first 2 (continuity + 1) functions carry the values (and slopes, per unit of the local coordinate) at the
+    The first 2 (continuity + 1) functions are those of the values (and slopes, per unit of the local coordinate) at the
     ends, left before right; the others vanish there.
     """
     basis = np.zeros((degree + 1, degree + 1))
@@ -39,7 +39,7 @@ def reference_basis(degree: int, continuity: int) -> np.ndarray:
     integrals = np.zeros((rows.size, degree + 2 + continuity))
     integrals[np.arange(rows.size), n] = np.sqrt(n + 0.5)
     for _ in range(continuity + 1):
-        # from -1 on, P_n integrates to (P_n+1 - P_n-1) / (2 n + 1); no order below 1 comes up
+        # the integral of P_n from -1 is (P_n+1 - P_n-1) / (2 n + 1); orders are at least 1 here
         share = integrals / (2.0 * np.arange(integrals.shape[1]) + 1.0)
         integrals = np.zeros_like(integrals)
         integrals[:, 1:] += share[:, :-1]
@@ -50,7 +50,7 @@ def reference_basis(degree: int, continuity: int) -> np.ndarray:
 
 @cache
 def _derived(degree: int, continuity: int, derivative: int) -> np.ndarray:
-    """Legendre coefficients of a derivative of the basis, a column a function."""
+    """Legendre coefficients (n_coefficients, degree + 1) of a derivative of the basis functions."""
     basis = reference_basis(degree, continuity).T
     return legendre.legder(basis, derivative) if derivative else basis
 
@@ -72,7 +72,7 @@ class Segments:
 
     Attributes:
         nodes: (n_segments + 1,) ends of the segments, m.
-        degrees: of the polynomials, one a segment.
+        degrees: of the polynomials, one per segment.
         continuity: 0 (values; bar) or 1 (values and slopes; beam) shared across nodes.
     """
 
@@ -91,7 +91,7 @@ class Segments:
 
     @cached_property
     def _inner(self) -> np.ndarray:
-        """Global index (n_segments + 1,) of the first function inside each segment, and the number of all."""
+        """Global index (n_segments + 1,) of the first internal function of each segment; last, the total number."""
         nodal = self.continuity + 1
         return nodal * self.nodes.size + np.cumsum([0, *(degree + 1 - 2 * nodal for degree in self.degrees)])
 
@@ -155,7 +155,7 @@ class Segments:
         return total
 
     def unresolved(self, coefficients: np.ndarray) -> float:
-        """Largest share of the last two internal coefficients among all: small once the degree suffices."""
+        """Largest ratio of the last two internal coefficients to all; small once the degree is sufficient."""
         nodal = 2 * (self.continuity + 1)
         largest = np.abs(coefficients).max(axis=0)
         tail = [np.abs(coefficients[self.indices(s)[nodal:][-2:]]).max(axis=0) for s in range(self.n_segments)]
@@ -173,19 +173,19 @@ def _scales(degree: int, continuity: int, width: float) -> Floats:
 def _tabulated(
     start: float, end: float, degree: int, continuity: int, derivative: int
 ) -> tuple[Floats, Floats, Floats]:
-    """`Segments.tabulated`, remembered: a structure that is changed a little is solved on the same segments."""
+    """`Segments.tabulated`, cached, since a slightly changed structure is solved on the same segments."""
     h = end - start
     points, weights, tables = tabulated_basis(degree, continuity, degree + 4)
     table = tables[derivative] * _scales(degree, continuity, h) * (2.0 / h) ** derivative
-    found = start + 0.5 * h * (points + 1.0), 0.5 * h * weights, table
-    for array in found:
+    arrays = start + 0.5 * h * (points + 1.0), 0.5 * h * weights, table
+    for array in arrays:
         array.flags.writeable = False
-    return found
+    return arrays
 
 
 @lru_cache(maxsize=512)
 def _evaluation(nodes: bytes, degrees: tuple[int, ...], continuity: int, places: bytes, derivative: int) -> np.ndarray:
-    """`Segments.evaluation`, remembered: sensors and actuators are asked for at the same places again and again."""
+    """`Segments.evaluation`, cached, since sensors and actuators are often at the same places."""
     segments = Segments(np.frombuffer(nodes), degrees, continuity)
     x = np.frombuffer(places)
     matrix = np.zeros((x.size, segments.n_functions))

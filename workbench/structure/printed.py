@@ -1,4 +1,4 @@
-"""How a result is printed: a line that sums it up and a short table, as text and in a notebook."""
+"""Printing of results: a summary line and a short table, as text and in a notebook."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -11,7 +11,7 @@ from workbench.structure.domain import Patch
 
 
 class Remarked(Protocol):
-    """What has remarks of its own."""
+    """A result with remarks."""
 
     @property
     def remarks(self) -> tuple[str, ...]: ...
@@ -22,10 +22,10 @@ R = TypeVar("R", bound=Remarked)
 
 
 class Printed:
-    """A result with a line (empty for a table alone), headings, rows and remarks of its own."""
+    """A result that prints as a summary line and a table."""
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        """The line that sums it up, headings, rows, and remarks below the table."""
+        """The summary line (empty for a table alone), headings, rows, and remarks below the table."""
         raise NotImplementedError
 
     def __str__(self) -> str:
@@ -53,26 +53,28 @@ def rounded(value: float) -> float | None:
 
 
 def warns_of_remarks(function: Callable[P, R]) -> Callable[P, R]:
-    """The function, its caller warned of the remarks of what it returns; the outermost decorator, so that the warning
-    names the caller's line."""
+    """The function with a warning for each remark of its result.
+
+    It must be the outermost decorator, so that warnings refer to the caller's line.
+    """
 
     @wraps(function)
     def warned(*args: P.args, **kwargs: P.kwargs) -> R:
-        found = function(*args, **kwargs)
-        for remark in found.remarks:
+        result = function(*args, **kwargs)
+        for remark in result.remarks:
             warn(remark, stacklevel=2)
-        return found
+        return result
 
     return warned
 
 
 def counted(number: int, word: str) -> str:
-    """A number of things: 1 mode, 2 modes."""
+    """A number with its noun: "1 mode", "2 modes"."""
     return f"{number} {word}{'s' * (number != 1)}"
 
 
 def joined_in_words(parts: Sequence[str]) -> str:
-    """Such as: a, b and c; empty where there are none."""
+    """Texts joined as "a, b and c"; empty where there are none."""
     return " and ".join(part for part in (", ".join(parts[:-1]), *parts[-1:]) if part)
 
 
@@ -87,7 +89,7 @@ def command_headings(unit: str) -> tuple[str, str]:
 
 
 def place_text(place: object) -> str:
-    """A place: x in m, (x, y), a name, or two of these, a patch of a plate; empty where unknown."""
+    """Text of a place: x or x, y in m, a name, two of these, or a patch of a plate; empty where unknown."""
     if isinstance(place, Patch):
         return f"{place.x:.4g}, {place.y:.4g} ({place.width:.4g} by {place.height:.4g})"
     if isinstance(place, tuple):
@@ -96,5 +98,5 @@ def place_text(place: object) -> str:
 
 
 def mode_text(r: int, hz: float, more: str = "") -> str:
-    """A mode as a remark names it: mode 2 (4.1 Hz)."""
+    """Text of a zero-based mode: "mode 2 (4.1 Hz)"."""
     return f"mode {r + 1} ({hz:.4g} Hz{more})"

@@ -16,7 +16,7 @@ class Profile:
 
     Attributes:
         function: takes positions (n_points,) in m, returns values (n_points,).
-        breaks: positions in m where the quantity or its slope jumps; quadrature never straddles one.
+        breaks: positions in m where the quantity or its slope jumps; quadrature is split there.
     """
 
     function: Callable[[np.ndarray], np.ndarray]
@@ -52,7 +52,7 @@ class Profile:
             i = int(np.argmax(steps < 0))
             raise ValueError(f"profile points must not go back: x[{i + 1}] = {x[i + 1]} after {x[i]}; sort them")
         if (steps[1:] + steps[:-1] == 0).any():
-            raise ValueError("more than two profile points stand at the same x; two make a jump")
+            raise ValueError("more than two profile points have the same x; two make a jump")
         pieces = [i for i in range(x.size - 1) if x[i + 1] > x[i]]
         starts = x[pieces]
 
@@ -106,9 +106,9 @@ class Field:
     Attributes:
         function: takes coordinates x and y of one shape, m, and returns values of that shape.
         x_breaks, y_breaks: lines x = const and y = const, m, across which the quantity or its slope jumps;
-            quadrature never straddles one.
+            quadrature is split there.
         is_constant: whether the quantity is the same everywhere.
-        multiple_of: (another field, factor) where this is so many times that one; None where it stands by itself.
+        multiple_of: (another field, factor) of which this is a multiple; None for others.
     """
 
     function: Callable[[np.ndarray, np.ndarray], ArrayLike]
@@ -125,20 +125,20 @@ class Field:
         return cls(lambda x, y: np.full(x.shape, float(value)), is_constant=True)
 
     def __call__(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
-        """The values at (x, y), in the shape that x and y have together."""
+        """The values at (x, y), in the broadcast shape of x and y."""
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         return np.broadcast_to(np.asarray(self.function(x, y), float), x.shape)
 
     def mapped(self, change: Callable[[np.ndarray], np.ndarray]) -> "Field":
-        """A field of changed values, with the same breaks."""
+        """The field change(values), with the same breaks."""
         return Field(lambda x, y: change(self(x, y)), self.x_breaks, self.y_breaks, self.is_constant)
 
     def scaled(self, factor: float) -> "Field":
-        """A field of so many times the values."""
-        base, already = self.multiple_of or (self, 1.0)
-        whole = already * factor
-        values = base.mapped(lambda each: whole * each)
-        return Field(values.function, self.x_breaks, self.y_breaks, self.is_constant, (base, whole))
+        """The field times a factor."""
+        base, own = self.multiple_of or (self, 1.0)
+        total = own * factor
+        values = base.mapped(lambda each: total * each)
+        return Field(values.function, self.x_breaks, self.y_breaks, self.is_constant, (base, total))
 
 
 FieldLike = Field | float | Callable[[np.ndarray, np.ndarray], ArrayLike]

@@ -1,4 +1,4 @@
-"""What holds a structure at its ends and what is attached to it in between."""
+"""Boundary conditions of a structure, and masses, springs and dampers attached to it."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -37,7 +37,11 @@ NAMED_ENDS = {
 
 
 def as_end(end: str | End, *, allowed: tuple[str, ...]) -> End:
-    """An `End` from its name or itself; the error lists the names that this kind of structure knows."""
+    """An `End` from its name, or itself.
+
+    Raises:
+        ValueError: a name that is not allowed for this kind of structure.
+    """
     if isinstance(end, End):
         return end
     if end not in allowed:
@@ -73,20 +77,20 @@ def as_edges(edges: str | Edge | Mapping[str, str | Edge], *, allowed: tuple[str
     if set(each) != set(SIDES):
         got = ", ".join(map(str, each)) or "none"
         raise ValueError(f"edges are given for {', '.join(SIDES)}, or one for all; got {got}")
-    found = {}
+    by_side = {}
     for side in SIDES:
         edge = each[side]
         if not isinstance(edge, Edge) and edge not in allowed:
             raise ValueError(
                 f"the {side} edge is one of {', '.join(allowed)} or an Edge(translation, rotation); got {edge!r}"
             )
-        found[side] = edge if isinstance(edge, Edge) else NAMED_EDGES[edge]
-    return found
+        by_side[side] = edge if isinstance(edge, Edge) else NAMED_EDGES[edge]
+    return by_side
 
 
 @dataclass(frozen=True)
 class AtPlace:
-    """What stands at a place, or between two: kept as a float, a pair or a name, whatever it was given as."""
+    """A part at a place, or between two; the place is stored in the form of `same_place`."""
 
     at: Where
 
@@ -95,10 +99,10 @@ class AtPlace:
 
 
 class _Attached(AtPlace):
-    """A part of a structure, whose figures are finite.
+    """An attachment of a structure, with finite coefficients.
 
     Raises:
-        ValueError: one that is not.
+        ValueError: a coefficient that is not finite.
     """
 
     def __post_init__(self) -> None:
@@ -109,7 +113,7 @@ class _Attached(AtPlace):
 
     @property
     def pair(self) -> tuple[float, float]:
-        """The figure that counts for displacement, and the one that counts for rotation."""
+        """The coefficients of displacement and of rotation."""
         _, linear, angular = vars(self).values()
         return linear, angular
 
@@ -142,5 +146,5 @@ Attachment = PointMass | PointSpring | PointDamper
 
 
 def masses_among(attachments: Iterable[Attachment]) -> tuple[PointMass, ...]:
-    """The masses among what is attached."""
+    """The masses among the attachments."""
     return tuple(part for part in attachments if isinstance(part, PointMass))

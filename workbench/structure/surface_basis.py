@@ -1,8 +1,8 @@
-"""Products of piecewise polynomials over a rectangle, and the matrices that they make of a strain energy.
+"""Products of piecewise polynomials over a rectangle, and their matrices of a strain energy.
 
-The functions are X_i(x) Y_j(y), with the one-dimensional functions of `Segments` of which those that an edge holds are
-left out. A strain energy is given as a sum of weighted squares, so that a mode's Rayleigh quotient is a sum of squares
-too and keeps all digits.
+The functions are X_i(x) Y_j(y), with the one-dimensional functions of `Segments` that satisfy the essential boundary
+conditions. A strain energy is given as a sum of weighted squares, so that a mode's Rayleigh quotient is a sum of
+squares too and does not cancel.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from workbench.structure.supports import HELD
 Weight = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 GRADING = 0.15  # ratio of neighbouring segments towards a singular place (Szabó & Babuška 1991, section 10.3)
-THINNEST = 8e-4  # segment, of the side: thinner, bending is lost in round-off
+THINNEST = 8e-4  # least segment over the side; bending is lost in round-off below
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class SurfaceProblem:
         continuity: 0 (values shared between segments; membrane) or 1 (slopes too; plate).
         mass: per area, a function of (x, y), kg/m².
         squares: of the strain energy.
-        edges: springs along edges, held ones among them.
+        edges: springs along edges, held ones mutual them.
         points: masses and springs at points.
         breaks: coordinates of jumps, along x and along y, m.
         corners: coordinates of edges that end in a singular corner, along x and along y, m.
@@ -88,13 +88,13 @@ class SurfaceProblem:
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """The one-dimensional functions along x or along y that no edge holds, tabulated at Gauss points.
+    """The free one-dimensional functions along x or along y, tabulated at Gauss points.
 
     Attributes:
         segments: all functions.
-        kept: (n_kept,) indices of those that are free.
+        kept: (n_kept,) indices of those that satisfy the essential boundary conditions.
         points, weights: (n_quadrature,) of the quadrature, m.
-        tables: one a derivative, (n_quadrature, n_kept).
+        tables: values (n_quadrature, n_kept) for each order of derivative.
     """
 
     segments: Segments
@@ -105,7 +105,7 @@ class Axis:
 
     @classmethod
     def of(cls, segments: Segments, held: tuple[tuple[float, int], ...]) -> "Axis":
-        """The axis of some segments; `held` names (at, derivative) of the essential conditions at its ends."""
+        """The axis of segments with essential conditions `held` ((at, derivative), ...) at its ends."""
         nodal = segments.continuity + 1
         last = segments.nodes.size - 1
         dropped = [nodal * (0 if at <= segments.nodes[0] else last) + derivative for at, derivative in held]
@@ -146,7 +146,7 @@ class Functions:
         return np.moveaxis(np.tensordot(along_x, tables[1], axes=(1, 1)), 2, 1)
 
     def energies(self, problem: SurfaceProblem) -> np.ndarray:
-        """(n_functions,) twice the strain energy of each function, that of the edges' springs included."""
+        """(n_functions,) twice the strain energy of each function, including the springs along edges."""
         total = np.zeros(self.coefficients.shape[2])
         for square in problem.squares:
             strain = np.zeros((1, 1, 1))
@@ -160,7 +160,7 @@ class Functions:
         return total
 
     def on_edge(self, edge: EdgeSpring, points: np.ndarray) -> np.ndarray:
-        """(n_points, n_functions) what a spring along an edge is stretched by."""
+        """(n_points, n_functions) elongation of a spring along an edge."""
         own, other = _own_and_other(edge, self.x_axis, self.y_axis)
         coefficients = self.coefficients if edge.axis == 0 else np.swapaxes(self.coefficients, 0, 1)
         across = np.tensordot(own.values(edge.at, edge.derivative)[0], coefficients, axes=(0, 0))
@@ -204,7 +204,7 @@ def edge_matrix(edges: tuple[EdgeSpring, ...], x_axis: Axis, y_axis: Axis) -> np
 
 
 def common_grid(*grids: tuple[Axis, Axis]) -> tuple[Axis, Axis]:
-    """Gauss points, without functions, that integrate products of the functions of all these axes exactly."""
+    """Gauss points (axes without functions) that integrate products of the functions of all given axes exactly."""
 
     def joined(axes: tuple[Axis, ...]) -> Axis:
         nodes = np.unique(np.concatenate([axis.segments.nodes for axis in axes]))
@@ -223,31 +223,34 @@ def products(
     others: tuple[Functions, ...],
     grid: tuple[Axis, Axis],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Energy products of other functions, one each, with those of the axes (n, n_others) and with one another.
+    """Energy products of other functions with those of the axes (n, n_others) and with each other (n_others, n_others).
 
     Args:
+        edges, squares: of the energy.
+        axes: of the polynomial functions.
+        others: functions on other axes, a single one each.
         grid: of the quadrature, see `common_grid`.
     """
-    beside = np.zeros((axes[0].n, axes[1].n, len(others)))
-    among = np.zeros((len(others), len(others)))
+    cross = np.zeros((axes[0].n, axes[1].n, len(others)))
+    mutual = np.zeros((len(others), len(others)))
     for square in squares:
         strains = [sum(c * other.on_grid(*grid, (dx, dy))[:, :, 0] for c, dx, dy in square.parts) for other in others]
         weighted = [weights_on(square.weight, *grid) * strain for strain in strains]
-        among += np.array([[np.sum(one * other) for other in strains] for one in weighted])
+        mutual += np.array([[np.sum(one * other) for other in strains] for one in weighted])
         for p, load in enumerate(weighted):
             for c, dx, dy in square.parts:
                 tables = axes[0].values(grid[0].points, dx), axes[1].values(grid[1].points, dy)
-                beside[:, :, p] += c * (tables[0].T @ load @ tables[1])
+                cross[:, :, p] += c * (tables[0].T @ load @ tables[1])
     for edge in edges:
         if edge.stiffness != HELD:
             own, along = _own_and_other(edge, *axes), _own_and_other(edge, *grid)[1]
             on_edge = [other.on_edge(edge, along.points)[:, 0] for other in others]
             loads = [edge.stiffness * along.weights * values for values in on_edge]
-            among += np.array([[one @ other for other in on_edge] for one in loads])
+            mutual += np.array([[one @ other for other in on_edge] for one in loads])
             for p, load in enumerate(loads):
                 outer = np.outer(own[0].values(edge.at, edge.derivative)[0], own[1].values(along.points).T @ load)
-                beside[:, :, p] += outer if edge.axis == 0 else outer.T
-    return beside.reshape(-1, len(others)), among
+                cross[:, :, p] += outer if edge.axis == 0 else outer.T
+    return cross.reshape(-1, len(others)), mutual
 
 
 def point_row(x_axis: Axis, y_axis: Axis, at: tuple[float, float]) -> np.ndarray:
@@ -258,10 +261,13 @@ def point_row(x_axis: Axis, y_axis: Axis, at: tuple[float, float]) -> np.ndarray
 def axes_of(
     problem: SurfaceProblem, n_modes: int, level: int, *, near: tuple[float, float] | None = None
 ) -> tuple[Axis, Axis]:
-    """Functions that carry so many modes; each level has higher degrees and one more layer at a singular place.
+    """Functions that represent n_modes modes; each level has higher degrees and one more layer at a singular place.
 
     Args:
-        near: a point towards which segments shrink, in place of the singular corners.
+        problem: the eigenvalue problem.
+        n_modes: number of modes.
+        level: of refinement.
+        near: a point towards which segments shrink, instead of the singular corners.
     """
     first, second = (_axis(problem, axis, n_modes, level, None if near is None else near[axis]) for axis in (0, 1))
     return first, second
@@ -291,10 +297,10 @@ def _axis(problem: SurfaceProblem, axis: int, n_modes: int, level: int, near: fl
 
 
 def _half_waves(length: tuple[float, float], n_modes: int) -> tuple[float, float]:
-    """Half waves along x and y of the n-th mode at most, by Weyl's law for a held rim."""
+    """Upper bounds of the half waves along x and y of the n-th mode, by Weyl's law for held edges."""
     a, b = length
-    rim = (a + b) / (2.0 * np.pi)
-    wavenumber = (rim + np.sqrt(rim**2 + a * b * n_modes / np.pi)) / (a * b / (2.0 * np.pi))
+    boundary = (a + b) / (2.0 * np.pi)
+    wavenumber = (boundary + np.sqrt(boundary**2 + a * b * n_modes / np.pi)) / (a * b / (2.0 * np.pi))
     return a * wavenumber / np.pi, b * wavenumber / np.pi
 
 

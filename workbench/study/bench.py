@@ -1,4 +1,4 @@
-"""The bench: a page on this machine alone, where a design is moved about and answers at once."""
+"""The bench: a local web page on which a design is changed by hand and evaluated at once."""
 
 import json
 from contextlib import suppress
@@ -17,7 +17,7 @@ from workbench.structure.domain import Interval, NamedPoints, Rectangle
 from workbench.study.pages.page import asset, in_script
 from workbench.study.runs.cases import StudyError
 from workbench.study.saved_design import save
-from workbench.study.trying import asked, setting, shown
+from workbench.study.trying import design_from, results_of, setting
 
 HERE = "127.0.0.1"
 DRAG = "Drag a triangle (actuator), a circle (sensor) or the hammer; the arrow keys move them too."
@@ -28,8 +28,8 @@ SEEN = {
     " them too.",
 }
 MOST_BYTES = 65536
-CLIENT_SECONDS = 10.0  # in which a request must come whole, or the client is dropped
-MOST_WAITING = 128  # connections not yet taken
+CLIENT_SECONDS = 10.0  # time limit of a whole request, after which the connection is closed
+MOST_WAITING = 128  # connections not yet accepted
 POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self';"
     " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -37,16 +37,16 @@ POLICY = (
 
 
 def bench_server(rig: Rig, structure: str, *, port: int = 0, folder: Path = Path("studies")) -> ThreadingHTTPServer:
-    """A server of the bench on 127.0.0.1, not yet serving; port 0 takes one that is free.
+    """The server of the bench on 127.0.0.1, not yet serving.
 
     Args:
-        rig: that designs are tried on.
-        structure: TOML that describes it, saved with a design.
-        port: to listen on.
+        rig: the rig on which designs are evaluated.
+        structure: the TOML description of the rig, saved with a design.
+        port: to listen on; 0 for any free one.
         folder: where designs are saved as studies.
 
     Raises:
-        StudyError: modes at points without positions, or a port that cannot be had.
+        StudyError: modes at points without positions, or a port that is not available.
     """
     content = {**setting(rig), "folder": str(folder)}
     template = Environment(autoescape=True, trim_blocks=True).from_string(asset("bench.html"))
@@ -61,31 +61,31 @@ def bench_server(rig: Rig, structure: str, *, port: int = 0, folder: Path = Path
     try:
         return _Server((HERE, port), handler)
     except (OSError, OverflowError) as error:
-        raise StudyError(f"port {port} cannot be had ({error}); give another --port, or 0 for any") from error
+        raise StudyError(f"port {port} is not available ({error}); give another --port, or 0 for any") from error
 
 
 class _Server(ThreadingHTTPServer):
-    """A thread a connection; a burst of them waits instead of being refused."""
+    """A server with one thread per connection; a burst of connections waits instead of being refused."""
 
     request_queue_size, daemon_threads = MOST_WAITING, True
 
     def handle_error(self, request: socket | tuple[bytes, socket], client_address: object) -> None:
-        """Say nothing of a client that went away: only the command prints."""
+        """Print nothing about closed connections: only the command prints."""
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers the bench's own page and no other: a name that leads here from elsewhere is turned away."""
+    """Answers requests of the bench's own page only; other Host and Origin headers are refused (DNS rebinding)."""
 
     server_version, sys_version, protocol_version = "workbench", "", "HTTP/1.1"
     timeout = CLIENT_SECONDS
-    wbufsize, disable_nagle_algorithm = -1, True  # an answer leaves whole and at once
+    wbufsize, disable_nagle_algorithm = -1, True  # a response is sent whole and at once
 
     def __init__(self, rig: Rig, structure: str, folder: Path, page: bytes, *arguments: Any) -> None:
         self.rig, self.structure, self.folder, self.page = rig, structure, folder, page
         super().__init__(*arguments)
 
     def handle_one_request(self) -> None:
-        """One request; the time limit of a socket is for each read, so bytes one by one would hold it for ever."""
+        """Handle one request within a time limit; that of a socket is per read, and single bytes never reach it."""
         self.late = Timer(CLIENT_SECONDS, self._drop)
         self.late.daemon = True
         self.late.start()
@@ -95,7 +95,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.late.cancel()
 
     def _drop(self) -> None:
-        with suppress(OSError):  # gone already
+        with suppress(OSError):  # already closed
             self.connection.shutdown(SHUT_RDWR)
 
     def do_GET(self) -> None:
@@ -120,12 +120,12 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.OK, answer)
 
     def _try(self, content: dict[str, Any]) -> dict[str, Any]:
-        return shown(self.rig, asked(content))
+        return results_of(self.rig, design_from(content))
 
     def _save(self, content: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(content, dict) or not isinstance(content.get("name"), str):
-            raise StudyError("a design is saved under a name")
-        path = save(self.rig, self.structure, asked(content.get("design", {})), content["name"], self.folder)
+            raise StudyError("a design needs a name to be saved under")
+        path = save(self.rig, self.structure, design_from(content.get("design", {})), content["name"], self.folder)
         return {"saved": str(path)}
 
     def _content(self) -> Any:
@@ -138,7 +138,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.late.cancel()
             return json.loads(content)
         except RecursionError:
-            raise StudyError("that is no design") from None
+            raise StudyError("the request is not a design") from None
 
     def _from_here(self) -> bool:
         port = self.connection.getsockname()[1]
@@ -148,7 +148,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, status: HTTPStatus, content: dict[str, Any]) -> None:
         if status in (HTTPStatus.FORBIDDEN, HTTPStatus.NOT_FOUND):
-            self.close_connection = True  # what was sent along has not been read
+            self.close_connection = True  # the body of the request has not been read
         self._send(status, "application/json", json.dumps(content, allow_nan=False).encode())
 
     def _send(self, status: HTTPStatus, kind: str, body: bytes) -> None:
@@ -165,4 +165,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *arguments: object) -> None:
-        """Say nothing: only the command prints."""
+        """Print nothing: only the command prints."""

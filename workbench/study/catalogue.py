@@ -22,12 +22,12 @@ class StudyFile:
     """A study's script.
 
     Attributes:
-        path: of the file.
-        name: its stem.
-        question: the first line of its docstring.
-        needs_data: what --data must name, where it must be given.
-        fault: why it cannot be run, where it cannot.
-        defined: whether there is a function `study`; without, it may hold what the studies beside it share.
+        path: of the script.
+        name: the stem of the path.
+        question: the first line of the docstring.
+        needs_data: what --data must name; None if the study needs no data.
+        fault: why the study cannot be run; None if it can.
+        defined: whether the script defines a function `study`; a script without one may be a module of other studies.
     """
 
     path: Path
@@ -39,13 +39,13 @@ class StudyFile:
 
 
 def study_scripts(*, here_first: bool = False) -> dict[str, Path]:
-    """The scripts by name: those in `studies/` here, and those that came with the package.
+    """The scripts by name: those in `studies/` of the current folder, and those installed with the package.
 
     Args:
-        here_first: only those here, where there are any.
+        here_first: only those of the current folder, if there are any.
     """
     root = Path(__file__).resolve().parents[2]
-    # beside the package as its source has it or as an installer's --target does, or where the interpreter keeps data
+    # beside the package (a source tree, or an installer's --target), or in the data folder of the interpreter
     installed = [folder / "share" / "workbench" / "studies" for folder in (root, Path(sysconfig.get_path("data")))]
     came = next((folder for folder in (root / "studies", *installed) if folder.is_dir()), installed[-1])
     folders = [Path.cwd() / "studies", came]
@@ -56,12 +56,12 @@ def study_scripts(*, here_first: bool = False) -> dict[str, Path]:
         for path in sorted(folder.glob("*.py")):
             scripts.setdefault(path.stem, path)
     if not scripts:
-        raise StudyError("there are no studies: none came with the package, and no folder studies/ is here")
+        raise StudyError("there are no studies: none are installed, and the current folder has no folder studies/")
     return dict(sorted(scripts.items()))
 
 
 def output_root(study: StudyFile) -> Path:
-    """The folder that takes a study's figures, pages and results: its project, where we are in that, else this one."""
+    """The output folder of a study: its project if the current folder is inside, else the current folder."""
     project, here = study.path.resolve().parent.parent, Path.cwd()
     return project if here.is_relative_to(project) and study.path.resolve().parent.name == "studies" else here
 
@@ -84,13 +84,13 @@ def describe(path: Path) -> StudyFile:
             try:
                 needs = str(ast.literal_eval(node.value))
             except ValueError:
-                raise StudyError(f"{path}: NEEDS_DATA is a text that says what --data must name") from None
+                raise StudyError(f"{path}: NEEDS_DATA must be a text that states what --data must name") from None
     question = (ast.get_docstring(tree) or "").splitlines()
     return StudyFile(path, path.stem, question[0] if question else "", needs)
 
 
 def list_studies(*, here_first: bool = False) -> list[StudyFile]:
-    """All studies, by name; one that is unfinished has a fault and keeps no other from running."""
+    """All studies, by name; an invalid script is listed with its fault, so that the others still run."""
     return [_described(path) for path in study_scripts(here_first=here_first).values()]
 
 
@@ -105,7 +105,7 @@ def find_study(name: str) -> StudyFile:
     """A study by name, or by path.
 
     Raises:
-        StudyError: naming the studies there are.
+        StudyError: no study has this name; the message lists the names.
     """
     path = Path(name)
     if path.suffix == ".py":
@@ -121,14 +121,14 @@ def find_study(name: str) -> StudyFile:
 def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path) -> tuple[Path, Path]:
     """Run a study; write its JSON (studies/results of its project, else out/results), its page and its tables (out).
 
-    It can import what lies beside it.
+    The study can import modules from its own folder.
 
     Returns:
         The paths of the JSON and of the page.
 
     Raises:
-        StudyError: data that are needed and not given, or not there.
-        Exception: what the study raises, with a note of the script and the line that it comes from.
+        StudyError: needed data are not given, or do not exist.
+        Exception: an exception of the study, with a note of its script and line.
     """
     if data is None and study.needs_data:
         raise StudyError(f"study {study.name} needs --data: {study.needs_data}")
@@ -150,7 +150,7 @@ def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path)
 
 @contextmanager
 def _own_folder(script: Path) -> Iterator[None]:
-    """Imports from a script's folder, after all else so that no study stands for a library; errors say their line."""
+    """Allow imports from a script's folder, last on the path to shadow no library; add the line to exceptions."""
     folder = str(script.resolve().parent)
     sys.path.append(folder)
     try:
@@ -166,7 +166,7 @@ def _own_folder(script: Path) -> Iterator[None]:
 
 
 def _inputs(study: StudyFile, data: Path | None) -> dict[str, str]:
-    """The script, and a checksum of the data."""
+    """The source of the script, and a checksum of the data, by title."""
     found = {f"studies/{study.path.name}": study.path.read_text(encoding="utf-8")}
     if data is not None and data.is_file():
         found["data (SHA-256)"] = f"{hashlib.sha256(data.read_bytes()).hexdigest()}  {data.name}"

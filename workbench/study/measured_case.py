@@ -1,4 +1,4 @@
-"""A case from records alone: a linear model learnt at a low level, and records of a higher level to diagnose."""
+"""A case from records alone: a linear model identified at a low level, and records at a higher level to diagnose."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,18 +25,19 @@ def measured_case(
     """The case whose nominal rig is identified from one driven record.
 
     Args:
-        nominal: file of a record at a level so low that the structure is linear.
-        records: files to diagnose, of the same channels.
-        validation: files that only measure how far the gap shrinks.
-        inputs: names of the input channels, where the files do not say.
-        input_hold: "zero", "first" or "band-limited", how they run between samples; as the files say unless given.
-        quantity: of outputs whose files state none: "displacement", "velocity" or "acceleration".
-        driving_point: an input and the output at its place, which scale the shapes; those of one name or place unless
+        nominal: file of a record at so low a level that the structure is linear.
+        records: files of the records to diagnose, with the same channels.
+        validation: files of records for validation only.
+        inputs: names of the input channels, if the files do not state them.
+        input_hold: hold of the inputs between samples, "zero", "first" or "band-limited"; that of the files unless
             given.
+        quantity: of outputs whose files state none: "displacement", "velocity" or "acceleration".
+        driving_point: an input and the output at its place, which scale the shapes; a pair of the same name or place
+            unless given.
 
     Raises:
-        ValueError: no inputs, outputs of no known quantity, files of other channels, a driving point of other names,
-            one file twice.
+        ValueError: no inputs, outputs of unknown quantity, files with different channels, a driving point with unknown
+            names, or a file given twice.
     """
 
     def read(path: Path, name: str) -> Record:
@@ -47,7 +48,7 @@ def measured_case(
     names = _names((*records, *validation))
     low = read(nominal, nominal.stem)
     if not low.n_inputs:
-        raise ValueError(f"{nominal}: no channel is an input, so no model can be simulated; name them by --inputs")
+        raise ValueError(f"{nominal}: no channel is an input, so no model can be simulated; name inputs by --inputs")
     unknown = [channel.name for channel in low.output_channels if channel.quantity not in MEASURED]
     if unknown:
         raise ValueError(f"{nominal}: the quantity of {', '.join(unknown)} is not stated; give --quantity acceleration")
@@ -60,11 +61,11 @@ def measured_case(
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """What records are called: by their files, with as many folders before as make all differ."""
+    """Names of the records: file names without suffix, preceded by as many folders as make them unique."""
     whole = [path.resolve() for path in paths]
     for depth in range(max(len(path.parts) for path in whole)):
         names = ["/".join((*path.parts[-1 - depth : -1], path.stem)) for path in whole]
         if len(set(names)) == len(names):
             return names
     twice = next(path for path, name in zip(paths, names, strict=True) if names.count(name) > 1)
-    raise ValueError(f"{twice}: another record is that file too, or has its name but for the ending; give it once")
+    raise ValueError(f"{twice} is given twice, or another record differs only in the suffix; give each record once")

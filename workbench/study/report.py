@@ -1,4 +1,4 @@
-"""A report of what is at hand: a study that has run, a case folder, or a JSON file that the command wrote."""
+"""The report page of a study that has run, of a case folder, or of a JSON file that the command wrote."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -30,16 +30,16 @@ from workbench.study.runs.cases import StudyError
 TURN = 2.0 * np.pi
 MOST_BYTES = 200_000_000
 MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram
-BEYOND = 8  # orders more than modes that it shows
-SAMPLES_AN_ORDER = 8  # at least
-STABLE = "Stabilisation diagram: the poles of models of each order, blue where a shape is real; bands where they stay."
+EXTRA_ORDERS = 8  # highest model order of the diagram, above the number of modes
+SAMPLES_PER_ORDER = 8  # at least
+STABLE = "Stabilisation diagram: the poles of models of each order, blue if the shape is real; bands mark stable poles."
 
 
 def page_content_about(what: str) -> tuple[str, PageContent]:
     """The name and the page content of a JSON file, a case folder, or a study by name.
 
     Raises:
-        StudyError: none of these, a study that has not run here, or a file that holds something else.
+        StudyError: none of these, a study that has not run here, or a file with other content.
     """
     path = Path(what)
     if path.is_dir():
@@ -49,12 +49,12 @@ def page_content_about(what: str) -> tuple[str, PageContent]:
     study = find_study(what)
     kept = output_root(study) / "out" / f"{study.name}.page.json"
     if not kept.is_file():
-        raise StudyError(f"study {study.name} has left no page here; run it: workbench study {what}")
+        raise StudyError(f"study {study.name} has no page here yet; run it: workbench study {what}")
     return study.name, page_content_in(kept)
 
 
 def case_page_content(folder: Path) -> PageContent:
-    """What a case holds before any diagnosis: its nominal model, in motion, and its records beside what that says."""
+    """The page of a case before any diagnosis: the nominal modes, and the records beside the nominal responses."""
     case = read_case(folder)
     rig, records = case.rig, (*case.fit, *case.validation)
     beside = plot_responses({"nominal": rig}, records)
@@ -78,15 +78,15 @@ def case_page_content(folder: Path) -> PageContent:
 
 
 def page_content_in(path: Path) -> PageContent:
-    """The content that a JSON file holds, or that is made of it.
+    """The page content stored in a JSON file, or made from its results.
 
     Raises:
-        StudyError: no such file, no JSON, or JSON of something else.
+        StudyError: the file does not exist, is not JSON, or has other content.
     """
     if not path.is_file():
         raise StudyError(f"{path}: there is no such file")
     if path.stat().st_size > MOST_BYTES:
-        raise StudyError(f"{path} holds {path.stat().st_size} bytes; a report reads at most {MOST_BYTES}")
+        raise StudyError(f"{path} has {path.stat().st_size} bytes; a report reads at most {MOST_BYTES}")
     try:
         content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:
@@ -110,7 +110,7 @@ def page_content_in(path: Path) -> PageContent:
 
 
 def _refuse(word: str) -> NoReturn:
-    raise ValueError(f"{word} is no number of JSON")
+    raise ValueError(f"{word} is not a JSON number")
 
 
 def _finite(digits: str) -> float:
@@ -126,7 +126,7 @@ def _tables(content: Mapping[str, Any]) -> list[Table]:
 
 def _words(lines: list[str]) -> list[str]:
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-        raise TypeError(f"{lines!r:.60} is no list of texts")
+        raise TypeError(f"{lines!r:.60} is not a list of texts")
     return lines
 
 
@@ -148,7 +148,7 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
     shapes = np.array(content["shapes_real"], float) + 1j * np.array(content["shapes_imag"], float)
     hertz = np.array(content["frequencies_hz"], float)
     if not (np.isfinite(shapes).all() and np.isfinite(hertz).all()):
-        raise ValueError("a shape or frequency is no number")
+        raise ValueError("a shape or frequency is not finite")
     given = content.get("positions") or [None] * len(shapes)
     places = place_array([None if at is None else same_place(at) for at in given])
     modes = SampledModes(TURN * hertz, np.array(content["damping_ratios"], float), shapes, places)
@@ -157,10 +157,10 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
     damping = plot_deviations(names, columns[2], columns[3], "damping ratio")
     heads = ("mode", "frequency [Hz]", "standard error", "damping ratio", "standard error ")
     blocks = [block(damping, "Damping ratio of each mode, ± 2 standard errors.")]
-    if len(shapes) > 1:  # one sensor knows no shape
+    if len(shapes) > 1:  # one sensor gives no shape
         moving = mode_motion({"identified": modes})
         numbered = "" if modes.on_interval or modes.on_plate else ", numbered as in the record"
-        blocks.insert(0, block(moving, f"The shapes identified, at the sensors{numbered}, with the phase of each."))
+        blocks.insert(0, block(moving, f"The identified shapes at the sensors{numbered}, with phase."))
     if len(shapes) > 1 and hertz.size > 1:
         blocks.append(
             block(plot_mac(mac(modes.shapes, modes.shapes)), "Modal assurance criterion of each pair of modes.")
@@ -227,7 +227,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
             block(plot_two_works(works, first=len(controlled)), "Spillover work of each law in each residual mode."),
             block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
             *(
-                [block(plot_poles(seen), "Closed-loop poles through sensors, those of the estimators too.")]
+                [block(plot_poles(seen), "Closed-loop poles with sensors, including those of the estimators.")]
                 if seen
                 else []
             ),
@@ -277,7 +277,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         "lines": [f"The search: {placements[0]['status']}."],
         "blocks": [
             block(
-                plot_places(dict(zip(names, places, strict=True)), content.get("length")), "Where the actuators stand."
+                plot_places(dict(zip(names, places, strict=True)), content.get("length")), "Positions of the actuators."
             ),
             block(plot_two_works(works, first=n), "Spillover work of each placement in each residual mode."),
         ],
@@ -292,7 +292,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _short(number: float) -> float:
-    """To four digits, of which a table of comparison needs no more."""
+    """The number to four significant digits, enough for a comparison."""
     return float(f"{float(number):.4g}")
 
 
@@ -316,7 +316,7 @@ def _studied(content: dict[str, Any]) -> dict[str, Any]:
 def _anything(content: dict[str, Any]) -> dict[str, Any]:
     """A table."""
     if not _tables(content):
-        raise ValueError("it holds no rows of named figures")
+        raise ValueError("it has no rows of named numbers")
     return {}
 
 
@@ -335,7 +335,7 @@ def identification_page(
     *,
     made_by: str,
 ) -> PageContent:
-    """The page of a report, and of the data that it is of; of transfer functions, the band that was fitted."""
+    """The page of an identification report and its data; transfer functions are shown over the fitted band."""
     content = identified({**report.content, "heading": report.heading, "lines": list(report.lines)})
     blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured[0], report.fitted)]
     return PageContent(title="Identified modes", blocks=blocks, made_by=made_by, **content)
@@ -346,7 +346,7 @@ def _stabilisation(report: IdentificationReport) -> list[dict[str, Any]]:
     if not decays:
         return []
     shortest = min(decay.n_samples for decay in decays)
-    highest = min(len(report.rows) + BEYOND, shortest // SAMPLES_AN_ORDER)
+    highest = min(len(report.rows) + EXTRA_ORDERS, shortest // SAMPLES_PER_ORDER)
     if highest < 2:
         return []
     diagram = stabilise(decays, orders=range(1, highest + 1))

@@ -1,4 +1,4 @@
-"""A design found on the bench, saved as a study of its own."""
+"""Saving a design of the bench as a study."""
 
 import re
 from dataclasses import fields
@@ -38,7 +38,7 @@ def study(outcome, data=None):
     outcome.figure("work", plot_work({{"this design": tried.work}}), "Spillover work by residual mode.")
 {motion}'''
 TABLE = re.compile(r"^([ \t]*)points[ \t]*=.*$", re.MULTILINE)
-# what shows the motion: of a member, a plate, and a frame
+# imports and plots of the motion of a member, a plate and a frame
 MEMBER = (
     """from workbench.draw.design import plot_motion, plot_work
 from workbench.draw.motion import response_motion""",
@@ -73,7 +73,7 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
     """Write a design as a study: folder/name.py, and the structure (TOML, and a table of named points) beside it.
 
     Raises:
-        StudyError: a name that is none, or that is taken.
+        StudyError: an invalid name, or one that is taken.
     """
     path = free_path(name, folder)
     tried = try_out(rig, design)

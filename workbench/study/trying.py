@@ -1,4 +1,4 @@
-"""A design tried out: what actuators, sensors and gains at these places do to a structure after an impulse."""
+"""Evaluation of a design of the bench: the closed-loop response of a structure to an impulse."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
@@ -28,26 +28,26 @@ LAWS = ("IMSC", "coupled LQR")
 MOST_PORTS = 40
 LARGEST = 1e100
 N_TIMES, N_FRAMES, N_PLACES, N_CELLS = 2001, 251, 121, 44
-USUAL_WEIGHT, FIRMNESS = 20.0, 25.0
-SLENDER = 0.03  # least share of a frame's larger side that the other one is drawn with
-ON_AXIS = 1e-9  # damping ratio below which a pole stands on the imaginary axis
-MOST_GROWTH = 100.0  # e-folds until the final time that are still shown
+MEMBER_WEIGHT, WEIGHT_OMEGA_SQUARED = 20.0, 25.0
+SLENDER = 0.03  # least drawn size of a frame in any direction, relative to its largest side
+ON_AXIS = 1e-9  # damping ratio below which a pole counts as on the imaginary axis
+MOST_GROWTH = 100.0  # e-folds until the final time, above which an unstable loop is refused
 
 
 @dataclass(frozen=True)
 class Design:
-    """What can be moved on the bench.
+    """A design, as it can be changed on the bench.
 
-    Places are x along a member and (x, y) on a plate, m, and names of points.
+    Places are x along a member and (x, y) on a plate, in m, or names of points.
 
     Attributes:
-        actuators: places; middles of piezo patches, where the rig has these.
+        actuators: places; the centres of piezo patches if the rig has patches.
         sensors: places of displacement sensors whose modal filters feed the law; none for exact modal coordinates.
-        controlled: how many of the lowest modes.
-        weight: R of force against motion, one for each controlled mode; coupled LQR takes the first.
+        controlled: number of controlled modes, lowest first.
+        weight: weight R of force for each controlled mode; coupled LQR uses the first.
         law: one of LAWS.
         impulse_at: place of a unit impulse.
-        final_time: until which the work is counted, s.
+        final_time: end of the integration of the work, s.
     """
 
     actuators: tuple[Place, ...]
@@ -61,13 +61,13 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """What a design does.
+    """The results of a design.
 
     Attributes:
-        law: in force.
-        loop: closed.
+        law: the control law.
+        loop: the closed loop.
         response: to the impulse, at N_TIMES instants.
-        work: in every mode, residual modes at rest at first.
+        work: spillover work in every mode, with residual modes initially at rest.
         effort: ∫ FᵀF dt up to the final time.
     """
 
@@ -78,11 +78,11 @@ class Tried:
     effort: float
 
 
-def asked(content: Mapping[str, Any]) -> Design:
+def design_from(content: Mapping[str, Any]) -> Design:
     """A design from JSON.
 
     Raises:
-        StudyError: naming what is missing, unknown or no number.
+        StudyError: a value is missing, unknown or not a number.
     """
     names = {field.name for field in fields(Design)}
     if not isinstance(content, Mapping) or set(content) != names:
@@ -94,7 +94,7 @@ def asked(content: Mapping[str, Any]) -> Design:
     weight = tuple(_number(v, "weight") for v in content["weight"])
     count = content["controlled"]
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-        raise StudyError(f"controlled is how many modes are controlled, at least 1; got {count!r:.40}")
+        raise StudyError(f"controlled is the number of controlled modes, at least 1; got {count!r:.40}")
     if content["law"] not in LAWS:
         raise StudyError(f"law is one of {', '.join(LAWS)}; got {content['law']!r:.40}")
     if len(weight) != count or min(weight) <= 0:
@@ -119,12 +119,12 @@ def _place(value: object, name: str) -> Place:
 
 def _number(value: object, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
-        raise StudyError(f"{name} is made of finite numbers; got {value!r:.40}")
+        raise StudyError(f"{name} must be finite numbers; got {value!r:.40}")
     return float(value)
 
 
 def start(rig: Rig) -> Design:
-    """The design that a rig begins with: its actuators, as many modes as these, its hammer, exact modal coordinates.
+    """The initial design of a rig: its actuators and hammer, one controlled mode per actuator, and no sensors.
 
     Raises:
         StudyError: points without positions, or no elastic mode.
@@ -132,22 +132,22 @@ def start(rig: Rig) -> Design:
     domain = _domain(rig)
     elastic = rig.modes.omega[rig.modes.omega > 0]
     if elastic.size == 0:
-        raise StudyError("the structure has no elastic mode; ask for more modes")
+        raise StudyError("the structure has no elastic mode; compute more modes")
     places = sorted({middle(a.at) for a in rig.actuators if not a.direct}) or [_share(rig, 0.37)]
     struck = next((a.at for a in rig.actuators if a.direct), _share(rig, 0.63))
     count = min(len(places), rig.modes.n_modes)
-    # on a plate a damping ratio of some 0.14 of the first mode; along a member that of section 5.8
-    weight = USUAL_WEIGHT if isinstance(domain, Interval) else float(f"{FIRMNESS / elastic[0] ** 2:.3g}")
+    # R ω_1² = 25 gives the first mode of a plate a damping ratio of about 0.14; the weight of a member is from 5.8
+    weight = MEMBER_WEIGHT if isinstance(domain, Interval) else float(f"{WEIGHT_OMEGA_SQUARED / elastic[0] ** 2:.3g}")
     return Design(
         tuple(places), (), count, (weight,) * count, LAWS[0], cast(Place, struck), float(2.0 * np.pi / elastic[0])
     )
 
 
 def _domain(rig: Rig) -> Domain:
-    """Where actuators can be moved about.
+    """The domain in which actuators can be moved.
 
     Raises:
-        StudyError: modes at points that stand nowhere, or along or over nothing that is known.
+        StudyError: points without positions, or modes of an unknown structure.
     """
     domain = rig.modes.domain
     if isinstance(domain, NamedPoints):
@@ -157,32 +157,32 @@ def _domain(rig: Rig) -> Domain:
                 " a beam, a rod or a plate"
             )
     elif rig.structure is None:
-        raise StudyError("these modes have no structure behind them; describe it as a beam, a rod or a plate")
+        raise StudyError("the rig has no structure; describe it as a beam, a rod or a plate")
     return domain
 
 
 def _share(rig: Rig, share: float) -> Place:
-    """A place at that share of the structure; of named points the one that moves most."""
+    """The place at this fraction of the length (of both sides of a plate); for named points that of largest motion."""
     domain = rig.modes.domain
     if isinstance(domain, NamedPoints):
-        return _liveliest(rig)
+        return _largest_motion(rig)
     if isinstance(domain, Interval):
         return share * domain.length
     return (share * domain.length[0], share * domain.length[1])
 
 
-def _liveliest(rig: Rig) -> str:
-    """The named point that the first elastic mode moves most."""
+def _largest_motion(rig: Rig) -> str:
+    """The named point with the largest shape of the first elastic mode."""
     first = int(np.argmax(rig.modes.omega > 0))
     names = rig.modes.domain.grid(1)
     return str(names[int(np.argmax(np.abs(rig.modes.phi(names)[:, first])))])
 
 
 def try_out(rig: Rig, design: Design) -> Tried:
-    """Design the law, close the loop through the sensors' modal filters, strike, and add up.
+    """Design the law, close the loop through the sensors' modal filters, and simulate the response to the impulse.
 
     Raises:
-        ValueError: places, weights or numbers that make no design, and the way out.
+        ValueError: places, weights or numbers that admit no design; the message states a remedy.
     """
     modes, domain = rig.modes, _domain(rig)
     if isinstance(domain, NamedPoints):
@@ -192,7 +192,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
             wanted = "a pair (x, y) on the plate" if isinstance(domain, Rectangle) else "a position along the structure"
             raise StudyError(f"a place is {wanted}, m; got {at}")
     if design.controlled > modes.n_modes:
-        raise DesignError(f"{design.controlled} modes controlled of {modes.n_modes} at hand; control fewer")
+        raise DesignError(f"{design.controlled} controlled modes, but the rig has {modes.n_modes}; control fewer")
     kind = patch_of(rig) or Actuator("F", design.impulse_at)
     actuators = [replace(kind, name=f"F{i + 1}", at=centred_at(kind.at, at)) for i, at in enumerate(design.actuators)]
     if design.law == "IMSC":
@@ -206,19 +206,19 @@ def try_out(rig: Rig, design: Design) -> Tried:
     fastest = float(loop.poles.real.max())
     if fastest * design.final_time > MOST_GROWTH:
         raise DesignError(
-            f"the loop is unstable: a pole at {fastest:+.3g} rad/s, because the sensors mistake residual modes for"
-            " controlled ones; move or add sensors, or raise R"
+            f"the loop is unstable, with a pole at {fastest:+.3g} rad/s, by observation spillover of residual modes;"
+            " move or add sensors, or raise R"
         )
     state = impulse_state(modes, design.impulse_at)
     at_rest = state.copy()
-    at_rest[modes.n_modes + design.controlled :] = 0.0  # so that W_r is what control puts there
+    at_rest[modes.n_modes + design.controlled :] = 0.0  # so that W_r is the energy that control adds to the mode
     response = initial_response(loop, state, np.linspace(0.0, design.final_time, N_TIMES))
     effort = float(simpson((response.forces**2).sum(axis=0), x=response.time))
     return Tried(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
 
 
-def shown(rig: Rig, design: Design) -> dict[str, Any]:
-    """What the bench shows of a design, as plain numbers."""
+def results_of(rig: Rig, design: Design) -> dict[str, Any]:
+    """The results of a design that the bench displays, as plain numbers."""
     tried = try_out(rig, design)
     step = (N_TIMES - 1) // (N_FRAMES - 1)
     poles = tried.loop.poles
@@ -241,13 +241,13 @@ def shown(rig: Rig, design: Design) -> dict[str, Any]:
 
 
 def setting(rig: Rig) -> dict[str, Any]:
-    """What the bench needs to know once: the structure, its modes and its shapes."""
+    """Data that the page of the bench loads once: the structure, its modes and its shapes."""
     domain, patch = _domain(rig), patch_of(rig)
     if isinstance(domain, NamedPoints):
         return {**_points(rig, domain), **_common(rig, [])}
     if isinstance(domain, Interval):
         shown_at, across = np.linspace(0.0, domain.length, N_PLACES), [N_PLACES]
-    else:  # middles of cells, each a spot of one colour
+    else:  # centres of cells, each drawn in one colour
         across = [max(round(N_CELLS * side / max(domain.length)), 8) for side in domain.length]
         x, y = ((np.arange(n) + 0.5) / n * side for n, side in zip(across, domain.length, strict=True))
         shown_at = np.column_stack([np.repeat(x, y.size), np.tile(y, x.size)])
@@ -261,11 +261,11 @@ def setting(rig: Rig) -> dict[str, Any]:
 
 
 def _points(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
-    """A frame as it is seen: spots and what joins them, how they move, and where each point is taken hold of."""
+    """Drawing data of a frame: nodes, lines between them, mode shapes, and the drawn position of each point."""
     net = frame_net(domain)
     corner, size = net.rest.min(axis=0), float(np.ptp(net.rest, axis=0).max())
     names = domain.grid()
-    # points of one node are drawn beside it, each in its own direction
+    # points of one node are drawn beside the node, each in its own direction
     ways = {"": (0.0, 0.0), "x": (1.0, 0.0), "y": (0.0, 1.0), "z": (0.6, 0.6)}
     moves = np.asarray(net.moves(rig.modes))
     return {
@@ -293,7 +293,7 @@ def _common(rig: Rig, patch: list[float]) -> dict[str, Any]:
 
 
 def _plain(values: ArrayLike) -> Any:
-    """Six digits of each number, as JSON holds them; what is not finite is null."""
+    """The values as JSON numbers of six digits; None where not finite."""
     values = np.asarray(values, float).tolist()
     return _short(values) if isinstance(values, list) else _short([values])[0]
 
@@ -305,7 +305,7 @@ def _short(values: list[Any]) -> list[Any]:
 
 
 def read_structure(path: Path | None) -> tuple[Rig, str]:
-    """A rig and the TOML that describes it, or a case folder's; the hinged beam of the dissertation unless given."""
+    """The rig of a TOML file or case folder (the hinged beam of the dissertation unless given), and the TOML text."""
     path = Path(__file__).with_name("assets") / "bench.toml" if path is None else path
     path = path / "case.toml" if path.is_dir() else path
     return read_rig(path), path.read_text(encoding="utf-8")

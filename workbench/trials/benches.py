@@ -1,4 +1,4 @@
-"""Benches of blind trials: nominal rigs, and the experiments done on them."""
+"""Benches of blind trials: nominal rigs and their experiments."""
 
 from dataclasses import dataclass, replace
 
@@ -13,21 +13,21 @@ from workbench.trials.rigs import MEMBERS, draw_rig
 
 SAMPLES = 2000
 LEVELS = {"low": 0.25, "high": 1.0, "mid": 0.625}
-STRIKE = 6.25  # of a hammer, in rms of the high level
+STRIKE = 6.25  # force of a hammer, over the rms of the high level
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A nominal rig and how it is tested.
+    """A nominal rig and the settings of its tests.
 
     Attributes:
-        rig: nominal, its sensors with their noise.
+        rig: the nominal rig, with the noise of its sensors.
         sample_time: s.
-        band_hz: excitation reaches up to here.
+        band_hz: upper frequency of the excitation.
         level: rms of the high level, N.
-        snr_db: of each sensor in the low record of the nominal structure; None where the noise was given.
-        feedback: of the closed loop, N s/m; None for no such record.
-        frame: makes the matrices behind modes at named points; None where there are none.
+        snr_db: signal-to-noise ratio of each sensor in the low record of the nominal structure; None for given noise.
+        feedback: gain of the closed-loop record, N s/m; None for no such record.
+        frame: makes the matrices behind the modes at named points; None for a member, a plate or plain modal data.
     """
 
     rig: Rig
@@ -39,28 +39,29 @@ class Bench:
     frame: Frame | None = None
 
     def plant(self) -> Plant:
-        """The real structure that is just what the rig takes it for."""
+        """The real structure, equal to the nominal rig."""
         return Plant.of(self.rig, self.frame)
 
 
 def draw_bench(rng: np.random.Generator, structure: str = MEMBERS) -> Bench:
-    """A structure at random, with its actuators, a hammer, sensors, levels and noise.
+    """A random structure with actuators, a hammer, sensors, levels and noise.
 
     Args:
-        structure: "members" for a beam or a rod, "plates", or "frames", whose rig knows modes at named points alone.
+        structure: "members" for a beam or a rod, "plates", or "frames", whose rig has only modes at named points.
 
     Raises:
-        ValueError: another word.
+        ValueError: an unknown structure.
     """
     return _suited(*draw_rig(rng, structure), rng)
 
 
 def bench_of(case: Case) -> Bench:
-    """The bench that a case was tested on: its rig and noise, and from its records to fit the sample time, the band
-    that holds 95 % of the loudest actuator's power, and the level of the loudest record.
+    """The bench of a case: its rig with noise; sample time and level of the record to fit with the largest input rms.
+
+    The band of the bench contains 95 % of the power of the largest input of this record.
 
     Raises:
-        ValueError: records in which no actuator acts.
+        ValueError: no actuator acts in the records.
     """
     rows = [j for j, a in enumerate(case.rig.actuators) if not a.direct]
     if not rows:
@@ -77,7 +78,7 @@ def bench_of(case: Case) -> Bench:
 
 
 def _suited(rig: Rig, frame: Frame | None, rng: np.random.Generator) -> Bench:
-    """A bench with sample time, band, level and noise that suit a rig; a member may be tested in closed loop too."""
+    """A bench with random sample time, band, level and noise for a rig; a member may have a closed-loop record."""
     top = min(int(rng.integers(3, 6)), rig.modes.n_modes) - 1
     band = 1.1 * float(rig.modes.omega[top]) / (2.0 * np.pi)
     snr_db = float(rng.choice([30.0, 40.0, 50.0]))
@@ -97,7 +98,7 @@ def _suited(rig: Rig, frame: Frame | None, rng: np.random.Generator) -> Bench:
 
 
 def multisine(bench: Bench, rng: np.random.Generator) -> np.ndarray:
-    """Commands (n_inputs, n_samples) of unit rms: equal lines of random phase from 0.04 of the band up to it."""
+    """Multisine commands (n_inputs, n_samples) of unit rms: equal lines of random phase over 0.04 to 1 of the band."""
     lines = np.arange(1, SAMPLES // 2)
     frequency = lines / (SAMPLES * bench.sample_time)
     lines = lines[(frequency >= 0.04 * bench.band_hz) & (frequency <= bench.band_hz)]
@@ -127,7 +128,7 @@ def _strike(bench: Bench, commands: np.ndarray, sample: int, share: float = 1.0)
 
 
 def experiments(bench: Bench, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """The inputs of every record by name, (n_inputs, n_samples); of `closed_loop` what is added to the feedback."""
+    """The commands (n_inputs, n_samples) of every record by name; those of `closed_loop` are added to the feedback."""
     tests = {name: share * bench.level * multisine(bench, rng) for name, share in LEVELS.items()}
     still = np.zeros_like(tests["low"])
     if any(a.direct for a in bench.rig.actuators):
@@ -141,6 +142,6 @@ def experiments(bench: Bench, rng: np.random.Generator) -> dict[str, np.ndarray]
 def tested(
     plant: SolvedPlant, bench: Bench, name: str, commands: np.ndarray, rng: np.random.Generator | None = None
 ) -> tuple[ModalMotion, np.ndarray]:
-    """The motion of a plant in one of the experiments, and the commands that were sent."""
+    """The motion of a plant in one of the experiments, and the commands sent to its actuators."""
     feedback = (bench.feedback or 0.0) if name == "closed_loop" else 0.0
     return plant.move(commands, bench.sample_time, feedback=feedback, rng=rng)

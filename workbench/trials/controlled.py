@@ -1,4 +1,4 @@
-"""A hidden plant under a digital controller, by the numerical route of the trials."""
+"""Simulation of a hidden plant under a digital controller, by the numerical method of the trials."""
 
 from dataclasses import dataclass
 
@@ -15,16 +15,16 @@ RUN_AWAY = 1e6  # times the energy that the impulse gives
 
 @dataclass(frozen=True, eq=False)
 class Controlled:
-    """What a plant did under a controller.
+    """The response of a plant under a controller.
 
     Attributes:
-        modal_energy: (n_modes, n_samples) of each mode.
-        work: (n_modes,) of the actuators in each mode.
+        modal_energy: (n_modes, n_samples) energy of each mode.
+        work: (n_modes,) work of the actuators in each mode.
         effort: ∫ FᵀF dt.
-        peak_force: of any actuator, N.
-        bounded: whether the energy stayed within a million times that of the impulse.
+        peak_force: largest force of any actuator, N.
+        bounded: whether the energy stayed below a million times that of the impulse.
         sample_time: s.
-        outputs: (n_outputs, n_samples) what the controller's sensors read.
+        outputs: (n_outputs, n_samples) readings of the controller's sensors.
     """
 
     modal_energy: np.ndarray
@@ -37,25 +37,25 @@ class Controlled:
 
     @property
     def energy(self) -> np.ndarray:
-        """(n_samples,) of all modes."""
+        """(n_samples,) energy of all modes."""
         return np.asarray(self.modal_energy.sum(axis=0))
 
     @property
     def vibration(self) -> float:
-        """∫ of the energy of all modes over time; infinite where the motion ran away."""
+        """∫ of the energy of all modes over time; infinite if the motion is not bounded."""
         return float(self.energy.sum() * self.sample_time) if self.bounded else np.inf
 
     @property
     def stable(self) -> bool:
-        """Whether the motion stayed, and its last quarter holds less energy than its first."""
+        """Whether the motion is bounded, and its energy peaks lower in the last quarter than in the first."""
         quarter = max(self.energy.size // 4, 1)
         return self.bounded and bool(self.energy[-quarter:].max() < self.energy[:quarter].max())
 
     def settling(self, modes: int | None = None) -> float | None:
-        """Time until the energy stays below a hundredth of its peak, s; None where it does not within the test.
+        """Time after which the energy stays below a hundredth of its peak, s; None if it does not within the test.
 
         Args:
-            modes: number of modes whose energy counts, lowest first; all unless given.
+            modes: number of modes whose energy is summed, lowest first; all unless given.
         """
         time = settling(self.modal_energy[:modes].sum(axis=0), self.sample_time)
         return time if self.bounded and np.isfinite(time) else None
@@ -71,15 +71,15 @@ def control_plant(
     rng: np.random.Generator | None = None,
     finest: float = FINEST,
 ) -> Controlled:
-    """The plant after an impulse at one of its inputs, and controlled from then on.
+    """The response of the plant to an impulse at one of its inputs, under control.
 
     Args:
         real: the plant.
-        controller: names the plant's sensors and actuators.
-        n_samples: of the test, at the controller's sample time.
+        controller: its sensors and actuators are those of the plant of the same names.
+        n_samples: length of the test, at the controller's sample time.
         impulse_input: name of the input at which the impulse acts.
         impulse: N s.
-        rng: of the sensors' noise and of random forces; None for neither.
+        rng: generator of the sensors' noise and of random forces; None for neither.
         finest: radians of the highest mode in one step.
     """
     plant, n, dt = real.plant, real.plant.n_modes, controller.sample_time
@@ -118,7 +118,7 @@ def control_plant(
 
 
 class _Reading:
-    """What the controller's sensors read at each sample, as `SolvedPlant.readings` has it of a whole record."""
+    """The readings of the controller's sensors, sample by sample; `SolvedPlant.readings` does this for a record."""
 
     def __init__(
         self,
@@ -148,7 +148,7 @@ class _Reading:
             late = np.round(sensor.delay / self.dt, 12)
             if order > 1:
                 continue
-            if late <= 0:  # what is read ahead of the clock is not there yet
+            if late <= 0:  # in real time a reading cannot be ahead of the clock
                 self.truth[j, k] = self.shapes[j] @ y[order * n : (order + 1) * n]
                 continue
             whole = int(np.ceil(late))

@@ -1,7 +1,7 @@
-"""Hidden effects at random: a kind, a place, and a strength at which the gap can be seen.
+"""Random hidden effects: a kind, a place, and a strength at which the gap is detectable.
 
-A draw, one per kind, gives the numbers of an effect, or a function of a strength near 1 that gives them. Truncated
-modes are drawn with the bench, whose nominal model gives them up.
+The draw of a kind returns the parameters of an effect, or a function from a strength near 1 to the parameters.
+Truncated modes are drawn with the bench, from whose nominal model they are removed.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,7 +39,7 @@ def _factor(name: str, size: float) -> Draw:
 
 
 def _typical_stiffness(scene: Scene) -> float:
-    """A stiffness that matters at a point, N/m: that of the first elastic mode."""
+    """A typical stiffness at a point, N/m: that of the first elastic mode."""
     modes = scene.bench.rig.modes
     first = int(np.argmax(modes.omega > 0))
     domain = modes.domain
@@ -49,14 +49,14 @@ def _typical_stiffness(scene: Scene) -> float:
 
 
 def _place(where: Where) -> Numbers:
-    """A place in the words of the case format."""
+    """A place in the case format."""
     if isinstance(where, Between):
         return {"between": list(where)}
     return {"at": list(where) if isinstance(where, tuple) else where}
 
 
 def _at_point(make: Callable[[PointSizes, np.random.Generator], Strengths]) -> Draw:
-    """Draws of an effect at a point, or between two, from what is typical there."""
+    """The draw of an effect at a point, or between two, from the typical sizes there."""
 
     def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
         where = scene.place(rng, between=True)
@@ -118,7 +118,7 @@ def _axial(scene: Scene, rng: np.random.Generator) -> OfStrength:
 def _stretching(scene: Scene, rng: np.random.Generator) -> OfStrength:
     modes, (member, stiffness) = scene.bench.rig.modes, _beam(scene)
     if not (member.left.translation == HELD and member.right.translation == HELD):
-        raise Unsuitable("only ends held apart stretch the midplane")
+        raise Unsuitable("the midplane stretches only between ends held in translation")
     grid = np.linspace(0.0, 1.0, 101) * modes.length
     slopes = modes.phi(grid, 1) @ scene.moved[0].T
     size = float(np.mean(slopes**2)) * modes.length
@@ -146,7 +146,7 @@ def _mass(scene: Scene, rng: np.random.Generator) -> OfStrength:
 
 
 def _drive(name: str, make: Callable[[Scene, np.random.Generator], Number], every: float = 0.6) -> Draw:
-    """Draws of an effect on all actuators, or with chance 1 - every on one of them."""
+    """The draw of an effect on all actuators, or with probability 1 - every on one of them."""
 
     def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
         which = "all" if rng.random() < every else str(rng.choice(scene.acting))
@@ -182,7 +182,7 @@ def _bias_force(scene: Scene, rng: np.random.Generator) -> Number:
 
 
 def _rate_limit(scene: Scene, rng: np.random.Generator) -> Number:
-    """No faster than twice the changes of the command: beyond, an accelerometer shows a delay and nothing else."""
+    """A rate limit at most twice the 0.9 quantile of the command's rate: above, readings show a delay and no more."""
     steps = np.abs(np.diff(scene.commands[0])) / scene.bench.sample_time
     return lambda s: float(np.quantile(steps, 0.9)) / max(s, 0.5)
 
@@ -209,12 +209,12 @@ def _sensor_crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
 
 
 def _late(scene: Scene, strength: float) -> float:
-    """A time, s, of half a sample and no less than a twentieth: an accelerometer shows the least delay as a jump."""
+    """A delay, s, of about half a sample and at least a twentieth: an accelerometer shows any delay as a jump."""
     return max(0.5 * strength, 0.05) * scene.bench.sample_time
 
 
 def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
-    """An actuator (of side "input") or a sensor ("output") elsewhere."""
+    """The draw of a misplaced actuator (side "input") or sensor ("output")."""
     rig = scene.bench.rig
     ports: Sequence[Actuator | Sensor] = rig.sensors if side == "output" else [a for a in rig.actuators if not a.direct]
     port, domain = ports[int(rng.integers(len(ports)))], scene.bench.rig.modes.domain
@@ -223,7 +223,7 @@ def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
             return {side: port.name, "at": str(rng.choice([name for name in domain.names if name != port.at]))}
         at = scene.place(rng)
         if at == port.at:
-            raise Unsuitable("the port would stay where it is")
+            raise Unsuitable("the actuator or sensor would stay at its place")
         return {side: port.name, "at": at}
     lengths, stands = np.atleast_1d(domain.length), np.atleast_1d(np.asarray(middle(port.at), float))
     if isinstance(domain, Rectangle):
@@ -238,7 +238,7 @@ def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
 
     moved = stands + step if inside(stands + step) else stands - step
     if not inside(moved):
-        raise Unsuitable("the port would leave the structure")
+        raise Unsuitable("the actuator or sensor would leave the structure")
     place = np.round(moved, 4).tolist()
     return {side: port.name, "at": place if isinstance(domain, Rectangle) else place[0]}
 
@@ -269,7 +269,7 @@ def _quantisation(scene: Scene, rng: np.random.Generator) -> Numbers:
     sensor = scene.bench.rig.sensors[row]
     step = float(f"{min(rng.uniform(4.0, 12.0) * sensor.noise_std, 0.3 * scene.outputs[row].std()):.3g}")
     if step < 2.0 * sensor.noise_std:
-        raise Unsuitable("the noise hides the steps")
+        raise Unsuitable("the noise exceeds the quantisation step")
     return {"output": sensor.name, "step": step}
 
 
@@ -369,10 +369,10 @@ TRIES = 9
 
 
 def draw_effect(kind: str, scene: Scene, rng: np.random.Generator) -> dict[str, Any]:
-    """An effect of a kind, in the words of the case format, at a strength that gives a gap drawn at random.
+    """A random effect of a kind, in the case format, with a strength found by iteration for a random gap.
 
     Raises:
-        Unsuitable: the bench cannot show the kind, or no strength gave a gap between 2 and 150 %.
+        Unsuitable: the kind is impossible on the bench, or no strength gives a gap between 2 and 150 %.
     """
     drawn = DRAWS[kind](scene, rng)
     if isinstance(drawn, dict):

@@ -1,5 +1,6 @@
-"""Modes of an altered member by Hermite and quadratic finite elements of scikit-fem, sharing nothing with
-`Structure.modes`; of altered matrices; of altered modal data.
+"""Modes of an altered member, of altered matrices and of altered modal data.
+
+Those of a member are computed with Hermite and quadratic elements of scikit-fem, independently of `Structure.modes`.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,14 +27,14 @@ ELEMENTS = 240
 
 @dataclass(frozen=True)
 class Alterations:
-    """What a real structure has that the nominal one has not.
+    """Differences of a real structure from the nominal one.
 
     Attributes:
-        stiffness_factor: of EI, EA, D or the whole stiffness matrix, everywhere.
-        losses: (at, width, loss) of the stiffness, several allowed.
+        stiffness_factor: of EI, EA, D or the stiffness matrix, uniform.
+        losses: (at, width, loss) of local losses of stiffness.
         masses: (at, mass), kg.
         springs: (at, stiffness) to ground, or between two named points, N/m.
-        rotational_stiffness: (left, right) in N m/rad, in place of the nominal one; None leaves it.
+        rotational_stiffness: (left, right), N m/rad, instead of the nominal ones; None for the nominal one.
         tension: N, added to the nominal one.
         stiffness_waves, mass_waves: (c_1, c_2, ...) of a smooth variation, 1 + Σ c_k cos(k π x / L) times nominal:
             along a member, along x of a plate, over the height of a frame.
@@ -50,13 +51,13 @@ class Alterations:
 
 
 AS_NOMINAL = Alterations()
-# The matrices of a frame with `waves` of its stiffness and of its mass.
+# (stiffness_waves, mass_waves) -> the matrices of a frame with this variation
 Frame = Callable[[Sequence[float], Sequence[float]], FiniteElements]
 
 
 @dataclass(frozen=True, eq=False)
 class ElementModes:
-    """Modes at chosen places.
+    """Modes with their shapes at given places.
 
     Attributes:
         omega: (n_modes,) rad/s.
@@ -78,7 +79,7 @@ def element_modes(
     """The lowest modes of an altered member, K v = ω² M v, with a node at every place.
 
     Args:
-        places: (n_places,) where shapes are wanted, m.
+        places: (n_places,) of the shapes returned, m.
     """
     beam = isinstance(member, Beam)
     special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
@@ -97,14 +98,15 @@ def element_modes(
         beside[displacement[_node(nodes, at)], displacement[_node(nodes, at)]] += value
     free = np.setdiff1d(np.arange(basis.N), held)
     stiffness, mass = csr_matrix(strain + beside)[free][:, free].tocsc(), csr_matrix(mass)[free][:, free].tocsc()
-    # the shift makes the pencil definite with rigid-body modes, and stands far below the first elastic one
-    shift = -1e-3 * _typical(member) ** 2
+    # the shift makes the pencil definite with rigid-body modes, and is far below the first elastic eigenvalue
+    shift = -1e-3 * _typical_frequency(member) ** 2
     values, vectors = eigsh(stiffness, k=n_modes, M=mass, sigma=shift, which="LM", v0=np.ones(free.size))
     order = np.argsort(values)
     full = np.zeros((basis.N, n_modes))
     full[free] = vectors[:, order]
     full /= np.sqrt(np.einsum("ir,ir->r", full[free], mass @ full[free]))
-    # the matrix of hundreds of elements is rounded by as much as the lowest modes are stiff; their strains are not
+    # With hundreds of elements, rounding of the stiffness matrix is as large as the lowest ω²; the strain energy of
+    # each shape is accurate.
     energy = [strain_energy.assemble(basis, shape=basis.interpolate(shape)) for shape in full.T]
     values = np.array(energy) + np.einsum("ir,ir->r", full, beside @ full)
     omega2 = np.where(np.abs(values) < 1e-6 * abs(shift), 0.0, values)
@@ -120,7 +122,7 @@ def matrix_modes(
     """The lowest modes of altered matrices, K v = ω² M v, all degrees of freedom at once.
 
     Args:
-        places: names of points, or two that something is between.
+        places: names of points, or pairs `Between` two of them.
 
     Raises:
         ValueError: alterations that only a member can have.
@@ -142,16 +144,16 @@ def matrix_modes(
 
 
 def modal_modes(nominal: Modes, places: Sequence[Where], *, altered: Alterations = AS_NOMINAL) -> ElementModes:
-    """The modes of plain modal data once altered: the nominal ones as a basis, without a member behind them.
+    """The modes of altered modal data, in the basis of the nominal modes.
 
-    (Ω² f + Σ k φ φᵀ) v = ω² (I + Σ m φ φᵀ) v; a mass moves in every direction of its node.
+    (Ω² f + Σ k φ φᵀ) v = ω² (I + Σ m φ φᵀ) v; a mass acts in every direction of its node.
 
     Raises:
         ValueError: alterations that only a member can have.
     """
     _check_no_member(altered)
     points = nominal.domain
-    every = points.translations if isinstance(points, NamedPoints) else lambda at: (at,)  # all directions of a node
+    every = points.translations if isinstance(points, NamedPoints) else lambda at: (at,)
     moving = [(name, value) for at, value in altered.masses for name in every(at)]
     stiffness, mass = np.diag(altered.stiffness_factor * nominal.omega**2), np.eye(nominal.n_modes)
     _add(stiffness, [(nominal.phi_at(at), value) for at, value in altered.springs])
@@ -164,7 +166,7 @@ def modal_modes(nominal: Modes, places: Sequence[Where], *, altered: Alterations
 def _check_no_member(altered: Alterations) -> None:
     of_a_member = (altered.losses, altered.tension, altered.stiffness_waves, altered.mass_waves)
     if any(of_a_member) or altered.rotational_stiffness != (None, None):
-        raise ValueError("named points know no local stiffness, tension or rotation; describe a beam or a rod")
+        raise ValueError("named points have no local stiffness, tension or rotation; describe a beam or a rod")
 
 
 def _add(matrix: Floats, parts: list[tuple[Floats, float]]) -> None:
@@ -174,7 +176,7 @@ def _add(matrix: Floats, parts: list[tuple[Floats, float]]) -> None:
 
 
 def _nodes(special: np.ndarray, length: float) -> np.ndarray:
-    """Even nodes and the special ones; an even node beside a special one gives way, so no element is a sliver."""
+    """Evenly spaced nodes and the special ones; an even node near a special one is dropped, to avoid tiny elements."""
     special = np.unique(np.r_[0.0, special[(special > 0) & (special < length)], length])
     special = special[np.r_[True, np.diff(special) > 1e-9 * length]]
     even = np.linspace(0.0, length, ELEMENTS + 1)
@@ -187,7 +189,7 @@ def _node(nodes: np.ndarray, at: float) -> int:
 
 
 def _matrices(basis: Basis, member: Structure, altered: Alterations) -> tuple[sparray, sparray, sparray, Functional]:
-    """Of strain, mass and slopes, and the strain energy of one shape, twice."""
+    """The matrices of strain, mass and slopes, and the functional of twice the strain energy of a shape."""
     profile = _stiffness(member)
 
     def rigidity(x: Floats) -> Floats:
@@ -217,7 +219,7 @@ def waves(coefficients: Sequence[float], share: np.ndarray) -> np.ndarray:
 
 
 def _hold_ends(stiffness: sparray, basis: Basis, member: Structure, altered: Alterations) -> list[int]:
-    """Add the springs of the ends, and give back what is held."""
+    """Add the springs of the ends to the stiffness, in place, and return the held degrees of freedom."""
     held = []
     for end, rotation, node in zip((member.left, member.right), altered.rotational_stiffness, (0, -1), strict=True):
         rules = [(basis.nodal_dofs[0][node], end.translation)]
@@ -235,8 +237,8 @@ def _attached(member: Structure, name: str) -> list[tuple[float, float]]:
     return [(position(part.at), getattr(part, name)) for part in member.attachments if hasattr(part, name)]
 
 
-def _typical(member: Structure) -> float:
-    """A frequency of the size of the first elastic one, rad/s."""
+def _typical_frequency(member: Structure) -> float:
+    """A frequency of the order of the first elastic one, rad/s."""
     order = 2 if isinstance(member, Beam) else 1
     x = np.linspace(0.05, 0.95, 19) * member.length
     ratio = _stiffness(member)(x).mean() / member.mass_per_length(x).mean()

@@ -1,4 +1,4 @@
-"""Hidden effects: from the words of a label to a changed plant."""
+"""Hidden effects: changes of a plant by the effects of a label."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,12 +11,12 @@ from workbench.structure.domain import Between, centred_at
 from workbench.trials.laws import POINT_LAWS, PointLaw
 from workbench.trials.plant import Plant, with_ports
 
-NONE, UNKNOWN = "none", "unknown"  # kinds of a label: nothing hides, or what no catalogue holds
+NONE, UNKNOWN = "none", "unknown"  # kinds of a label: no hidden effect, or one outside every catalogue
 Hide = Callable[[Plant, dict[str, Any]], Plant]
 
 
 def stands(effect: dict[str, Any]) -> Any:
-    """Where an effect stands, of a label: `Between` two points, a place, or None."""
+    """The place of an effect of a label: `Between` two points, a place, or None."""
     if "between" in effect:
         return Between(*effect["between"])
     at = effect.get("at")
@@ -46,13 +46,13 @@ def _support(plant: Plant, e: dict[str, Any]) -> Plant:
 
 
 def _moved(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
-    """One actuator or sensor elsewhere; a patch keeps its size."""
+    """The plant with one actuator or sensor moved; a patch keeps its size."""
     (stood,) = (port.at for port in getattr(plant, side) if port.name == e[key])
     return with_ports(plant, side, e[key], at=centred_at(stood, stands(e)))
 
 
 def _swapped(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
-    """Two actuators or two sensors on each other's wires; a channel keeps its name, its noise and its rounding."""
+    """The plant with the cables of two actuators or sensors swapped; a channel keeps its name, noise and rounding."""
     by_name = {port.name: port for port in getattr(plant, side)}
     pair = {e[key]: by_name[e["with"]], e["with"]: by_name[e[key]]}
     kept = ("name", "noise_std", "step") if side == "sensors" else ("name",)
@@ -149,7 +149,7 @@ HIDE: dict[str, Hide] = {
     "stiffness_drift": lambda p, e: replace(p, stiffness_rate=e["rate"]),
 }
 
-# Kinds that no catalogue of the diagnosis holds: an honest verdict on them is "unknown".
+# Kinds outside every catalogue of the diagnosis: the right verdict on them is "unknown".
 OUTSIDE: dict[str, Hide] = {
     **{name: partial(_law, law) for name, law in POINT_LAWS.items() if law.outside},
     "cross_talk": _actuator_crosstalk,
@@ -161,7 +161,7 @@ OUTSIDE: dict[str, Hide] = {
 
 
 def hide(plant: Plant, effects: list[dict[str, Any]]) -> Plant:
-    """The plant with effects in it, given in the words of the case format (inputs and outputs by name)."""
+    """The plant with these effects of the case format (inputs and outputs by name)."""
     for effect in effects:
         plant = (HIDE | OUTSIDE)[effect["kind"]](plant, effect)
     return plant

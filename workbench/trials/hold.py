@@ -18,7 +18,7 @@ from workbench.trials.scoring import Tally, score, score_imperfect, tally
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """Blind trials as they were held.
+    """The results of blind trials.
 
     Attributes:
         verdicts: by case, as JSON.
@@ -43,16 +43,15 @@ def hold_trials(
     report: Callable[[str, float], None] = lambda text, share: None,
     **hidden: Any,
 ) -> Trials:
-    """Make n blind cases, diagnose each, and only then open the labels and score.
+    """Make n blind cases, diagnose each, and then score the verdicts by the labels.
 
-    The labels are read into memory and their file deleted before the first diagnosis; a diagnosis is handed a folder
-    that holds cases alone.
+    The labels are read into memory and their file is deleted before the first diagnosis; the folder of a diagnosis
+    contains no labels.
 
     Args:
         diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
-        report: called with (what, share done).
-        hidden: `like`, `structure`, `kinds`, `imperfections` and `size` of `write_trials`: what the cases are,
-            and hide.
+        report: called with (text, share done).
+        hidden: `like`, `structure`, `kinds`, `imperfections` and `size` of `write_trials`.
     """
     with TemporaryDirectory() as cases, TemporaryDirectory() as vault:
         sealed = Path(vault) / "labels.json"
@@ -74,7 +73,7 @@ def hold_trials(
 
 
 def hold_one(seed: int, kinds: Sequence[str], **hidden: Any) -> dict[str, Any]:
-    """One blind trial: {"score", "sentence" of its verdict, "processor": time that it took, s}."""
+    """The result of one blind trial: {"score", "sentence" of its verdict, "processor": processor time, s}."""
     begun = process_time()
     held = hold_trials(1, seed, kinds=[kinds], **hidden)
     (found,), (verdict,) = (held.imperfect_scores or held.scores).values(), held.verdicts.values()
@@ -82,7 +81,7 @@ def hold_one(seed: int, kinds: Sequence[str], **hidden: Any) -> dict[str, Any]:
 
 
 def processor_times(trials: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """Median, ninth decile and longest of the processor times of `hold_one`, s."""
+    """Median, ninth decile and maximum of the processor times of `hold_one`, s."""
     times = np.quantile([trial["processor"] for trial in trials], (0.5, 0.9, 1.0)).round(1).tolist()
     return dict(zip(("median", "nine of ten", "longest"), times, strict=True))
 

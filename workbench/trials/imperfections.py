@@ -1,4 +1,4 @@
-"""Imperfections: the small errors of a real test that no effect of the catalogue names, in classes and sizes."""
+"""Imperfections: small errors of a real test that are not effects of the catalogue, in classes and sizes."""
 
 from dataclasses import dataclass, replace
 
@@ -13,19 +13,19 @@ IMPERFECTIONS = (CLEAN, "shape", "offset", "noise", "coloured", "input", "late",
 SIZES = (0.5, 1.0, 2.0)
 MIXED = ("shape", "offset", "noise", "input", "late")  # each at half the size
 
-# At size 1, and in proportion to the size unless said otherwise.
-VARIATION = 0.02  # standard deviation along the structure of its stiffness, and of its mass
+# Values at size 1, proportional to the size unless stated otherwise.
+VARIATION = 0.02  # standard deviation of stiffness and of mass along the structure
 WAVES = 4  # half waves along the structure of the finest variation
-DAMPING_SPREAD = 0.3  # each mode's damping ratio is off by at most this share
-STIFFNESS_OFFSET, DAMPING_OFFSET = 0.015, 0.2  # of all stiffness and all damping, at most
+DAMPING_SPREAD = 0.3  # largest relative error of each mode's damping ratio
+STIFFNESS_OFFSET, DAMPING_OFFSET = 0.015, 0.2  # largest relative error common to all stiffness, to all damping
 NOISE_RATIO = 1.0 / 0.6  # the true noise over the stated one, to the power of the size
 NOISE_MEMORY = 0.9  # correlation of coloured noise over one sample, to the power of 1 / size
 LOGGING_NOISE = 0.01  # of an input's rms
-LATE = 0.3  # of a sample: the latest sensor, at most
+LATE = 0.3  # largest delay of a sensor, in samples
 CALIBRATION = 0.01  # standard deviation of the gain of each actuator and each sensor
 PLACED = 0.002  # standard deviation of the place of each, in each coordinate, over the extent: 4 mm of 2 m
 
-# What imperfections of a class do themselves, and no verdict could tell from them.
+# Effects that cannot be distinguished from the imperfections of a class.
 MIMICS: dict[str, frozenset[str]] = {
     CLEAN: frozenset(),
     "shape": frozenset({"modulus_error", "modal_damping", "axial_load", "truncated_modes"}),
@@ -46,16 +46,16 @@ class Imperfections:
     """Small errors of a test.
 
     Attributes:
-        stiffness_waves, mass_waves: of their smooth variation along the structure, see `Alterations`.
+        stiffness_waves, mass_waves: coefficients of the smooth variation along the structure, see `Alterations`.
         stiffness_factor, damping_factor: of all stiffness, of all damping.
         damping_factors: of each mode's damping ratio.
         noise_ratio: the true standard deviation of the sensors' noise over the stated one.
         noise_memory: correlation of that noise over one sample.
         logging_noise: of each logged input, as a share of its rms.
         delays: of each sensor, in samples.
-        interpolated: whether they come of straight lines between samples, as where a logger puts channels on one clock.
-        gains: of each actuator, then of each sensor, over those stated.
-        moved: of each actuator, then of each sensor, (n_coordinates,) m from the place stated.
+        interpolated: whether the delays are made by linear interpolation, as when a logger resamples to one clock.
+        gains: of each actuator, then of each sensor, relative to the stated ones.
+        moved: of each actuator, then of each sensor, (n_coordinates,) m from the stated place.
     """
 
     stiffness_waves: tuple[float, ...] = ()
@@ -111,17 +111,17 @@ class Imperfections:
 
 
 def draw_imperfections(name: str, size: float, bench: Bench, rng: np.random.Generator) -> Imperfections:
-    """Imperfections of a class at random.
+    """Random imperfections of a class.
 
     Args:
-        name: of `IMPERFECTIONS`.
-        size: 1 for what a careful laboratory has; 0 for none.
+        name: one of `IMPERFECTIONS`.
+        size: 1 for those of a careful laboratory; 0 for none.
 
     Raises:
         ValueError: an unknown class, a negative size.
     """
     if name not in IMPERFECTIONS:
-        raise ValueError(f"imperfections {name!r} are none of {', '.join(IMPERFECTIONS)}")
+        raise ValueError(f"imperfections must be one of {', '.join(IMPERFECTIONS)}; got {name!r}")
     if not size >= 0:
         raise ValueError(f"the size of imperfections must be 0 or more; got {size}")
     imperfections = Imperfections()
@@ -160,7 +160,7 @@ def _with_part(
 
 
 def _moved(where: Where, by: tuple[float, ...]) -> Where:
-    """A place, or a patch or a stretch, moved by (n_coordinates,) m; by none, it stays."""
+    """The place, patch or pair of points moved by (n_coordinates,) m; unchanged if empty."""
     if not by:
         return where
     at = np.atleast_1d(np.asarray(middle(where), float)) + by
@@ -168,7 +168,7 @@ def _moved(where: Where, by: tuple[float, ...]) -> Where:
 
 
 def _off_places(bench: Bench, size: float, rng: np.random.Generator) -> tuple[tuple[float, ...], ...]:
-    """What each actuator and each sensor of a bench stands off its place by, on the structure still, m."""
+    """Random errors of place of each actuator and sensor, m, limited to stay on the structure."""
     domain, rig = bench.rig.modes.domain, bench.rig
     stated: list[Where] = [*(a.at for a in rig.actuators), *(s.at for s in rig.sensors)]
     if isinstance(domain, NamedPoints):

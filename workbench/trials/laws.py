@@ -1,6 +1,6 @@
-"""Laws of force at a point that a plant may hide: the force, its parameters in a label, and how they are drawn.
+"""Hidden force laws at a point: the force, its parameters in a label, and the draw of these.
 
-A new law is a code, a line in `law_force`, and an entry in `POINT_LAWS`.
+A new law needs a code, a line in `law_force`, and an entry in `POINT_LAWS`.
 """
 
 from collections.abc import Callable
@@ -46,7 +46,7 @@ def law_force(code: int, p: np.ndarray, w: float, v: float, z: float) -> Any:
 
 @dataclass(frozen=True)
 class PointSizes:
-    """What is typical at a point: a stiffness (N/m), rms displacement (m) and velocity (m/s), and a force (N)."""
+    """Typical sizes at a point: a stiffness (N/m), rms displacement (m) and velocity (m/s), and a force (N)."""
 
     stiffness: float
     displacement: float
@@ -65,11 +65,11 @@ class PointLaw:
 
     Attributes:
         code: of `law_force`.
-        parameters: their names in a label, in the order of the law.
-        draw: sizes, rng -> numbers at a strength near 1; None where they are drawn otherwise.
-        outside: whether no catalogue of a diagnosis holds it: an honest verdict on it is "unknown".
-        limit: effect -> its limiting case, which is meant where no record shows the difference; None for a law that is
-            drawn far from any.
+        parameters: names in a label, in the order of `law_force`.
+        draw: (sizes, rng) -> function from a strength near 1 to the parameters; None if `draws` draws the law itself.
+        outside: whether the law is outside every catalogue of the diagnosis: the right verdict is then "unknown".
+        limit: effect -> its limiting case, the right answer if no record shows the difference; None for a law that is
+            drawn far from any limiting case.
     """
 
     code: int
@@ -102,7 +102,7 @@ def _two_way_friction(p: PointSizes, rng: np.random.Generator) -> Strengths:
 
 
 def _same_both_ways(e: Label) -> Label:
-    """Friction of the mean force; a constant force is what it lacks."""
+    """Friction with the mean of both forces; it differs from two-way friction by a constant force."""
     both = "force_forward", "force_backward"
     rest = {name: value for name, value in e.items() if name not in both}
     return {**rest, "kind": "coulomb_friction", "force": 0.5 * sum(e[name] for name in both)}
@@ -119,7 +119,7 @@ def _magnet(p: PointSizes, rng: np.random.Generator) -> Strengths:
 
 
 def _power(name: str, share: float, of_displacement: float, of_velocity: float = 0.0) -> Draw:
-    """One number, such that the force is that share of the typical spring's at the typical motion."""
+    """The draw of one coefficient: at the typical motion the force is this share of that of the typical spring."""
 
     def draw(p: PointSizes, rng: np.random.Generator) -> Strengths:
         force = share * p.stiffness * p.displacement

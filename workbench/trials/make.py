@@ -1,4 +1,4 @@
-"""Blind trials: cases with a hidden effect, made by another numerical route than the diagnosis, with sealed labels."""
+"""Blind trials: cases with hidden effects and sealed labels, simulated independently of the diagnosis."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -33,15 +33,15 @@ KINDS = tuple(HIDE)
 OUTSIDE_KINDS = tuple(OUTSIDE)
 MOST_BENCHES, MOST_DRAWS, MOST_SEEDS = 40, 8, 100
 VISIBLE = 0.02
-SEEN = 0.03  # each effect of several must alter the response by this much beside the others
-DISTINCT = 0.1  # of the noise: what tells an effect from its limiting case must alter the readings by this much
-STRONG = 0.7  # of the gap that imperfections make: what an effect beside it must make at least
+SEEN = 0.03  # least relative change of the response by each of several effects
+DISTINCT = 0.1  # least change of the readings between an effect and its limiting case, over the noise
+STRONG = 0.7  # least gap of the effects, over the gap of the imperfections
 
-# Kinds that a structure cannot show.
+# Kinds that are impossible on a structure.
 OF_MEMBERS = frozenset({"local_stiffness_loss", "support_rotation", "axial_load", "air_drag", "midplane_stretching"})
 NOT_ON = {MEMBERS: frozenset(), PLATES: OF_MEMBERS, FRAMES: OF_MEMBERS | {"truncated_modes"}}
 
-# Pairs that do the same thing: no records of a case can hold them apart.
+# Pairs of kinds that the records of a case cannot distinguish.
 TWINS = (
     {"actuator_lag", "actuator_delay"},
     {"sensor_lag", "actuator_lag"},
@@ -54,7 +54,7 @@ TWINS = (
 
 
 class ImperfectDraw(NamedTuple):
-    """What an imperfect trial is made of: class and size of its imperfections, kinds of its effects."""
+    """The draw of a trial with imperfections: their class and size, and the kinds of the hidden effects."""
 
     imperfections: str
     size: float
@@ -77,27 +77,27 @@ def make_trial_with_plant(
     imperfections: str = CLEAN,
     size: float = 1.0,
 ) -> tuple[Case, dict[str, Any], SolvedPlant]:
-    """A case that hides effects of the given kinds, its label in the words of the case format, and the real structure.
+    """A case with hidden effects of the given kinds, its label in the case format, and the real structure.
 
     Args:
         seed: the same seed makes the same case.
-        kinds: of `KINDS` or `OUTSIDE_KINDS`; none for a structure that is what it is taken for.
+        kinds: of `KINDS` or `OUTSIDE_KINDS`; none for a real structure equal to the nominal one.
         like: a case whose nominal rig, levels, band, noise and records are taken; None draws a bench.
-        structure: of a bench that is drawn: "members" (beams and rods), "plates" or "frames".
+        structure: of a drawn bench: "members" (beams and rods), "plates" or "frames".
         name: of the case.
-        imperfections: class of the small errors beside them, of `IMPERFECTIONS`.
+        imperfections: class of small additional errors, of `IMPERFECTIONS`.
         size: of these errors, 1 for those of a careful laboratory.
 
     Returns:
         The case; {"title", "snr_db", "effects", "class", "size", "length", "budget", "records": {name: {"gap",
-        "noise_floor", "true_model"}}}: `true_model` is the gap that the exact model leaves, small errors and all;
-        the budget is of the validation records, as in the case format; the structure, to try a controller on.
+        "noise_floor", "true_model"}}}, where `true_model` is the gap of the exact model with its small errors, and
+        the budget is of the validation records, as in the case format; and the real structure.
 
     Raises:
-        ValueError: an unknown kind or class, or kinds that the bench cannot show.
+        ValueError: an unknown kind or class, or kinds that are impossible on the bench.
     """
     if imperfections not in IMPERFECTIONS:
-        raise ValueError(f"imperfections {imperfections!r} are none of {', '.join(IMPERFECTIONS)}")
+        raise ValueError(f"imperfections must be one of {', '.join(IMPERFECTIONS)}; got {imperfections!r}")
     unknown = [kind for kind in kinds if kind not in (*KINDS, *OUTSIDE_KINDS)]
     if unknown:
         raise ValueError(f"kind {unknown[0]!r} is neither in the vocabulary nor among {', '.join(OUTSIDE_KINDS)}")
@@ -136,7 +136,7 @@ def _draw_effects(
 
 
 def _truncate(bench: Bench, rng: np.random.Generator) -> tuple[Bench, dict[str, Any]]:
-    """The nominal model gives up modes: the rig is left with few, the structure shows what it had."""
+    """The bench with a truncated nominal model, and the effect; the real structure keeps all modes."""
     modes = bench.rig.modes
     if bench.rig.structure is None or modes.n_modes < 6:
         raise Unsuitable("truncation needs a beam or a rod with six modes or more")
@@ -153,9 +153,9 @@ def _check_each_seen(scene: Scene, effects: list[dict[str, Any]], rng: np.random
         rest = [e for e in effects if e is not one]
         gap = scene.gap(hide(nominal, effects), rng, reference=hide(nominal, rest))
         if (len(effects) > 1 and gap < SEEN) or gap > 5.0:
-            raise Unsuitable(f"{one['kind']} beside the rest alters the response by {gap:.2g}")
+            raise Unsuitable(f"{one['kind']}, added to the other effects, alters the response by {gap:.2g}")
         if one["kind"] == "truncated_modes" and gap < 0.01:
-            raise Unsuitable(f"the modes left out alter the response by {gap:.2g} only")
+            raise Unsuitable(f"the truncated modes alter the response by {gap:.2g} only")
 
 
 def _case(
@@ -186,7 +186,7 @@ def _case(
         figures[test] = {
             "gap": _gap(measured, _predicted(nominal, record.inputs, bench)),
             "noise_floor": _gap(np.array([[s.noise_std] for s in real.plant.sensors]), 0.0, measured),
-            # without random forces the motion is what the exact model predicts
+            # without random forces the exact model predicts the motion itself
             "true_model": _gap(
                 measured,
                 _predicted(real, sent, bench) if real.plant.noises else real.readings(moved, bench.sample_time),
@@ -216,9 +216,9 @@ def _check_strong(
     real: SolvedPlant,
     rng: np.random.Generator,
 ) -> None:
-    """Some record to fit must show the effects well, and at least nearly as strongly as the imperfections.
+    """Require a record to fit in which the effects are visible and at least `STRONG` times the imperfections.
 
-    Else nothing strong hides: what alters the readings by less than a diagnosis explains has no right name.
+    Weaker effects cannot be named: they alter the readings by less than a diagnosis explains.
     """
     rounded = any(e["kind"] == "sensor_quantisation" for e in effects)
     gaps, ratios = [], []
@@ -242,9 +242,9 @@ def _check_strong(
 def _check_distinct(
     bench: Bench, tests: dict[str, np.ndarray], effects: list[dict[str, Any]], imperfect: Plant, real: SolvedPlant
 ) -> None:
-    """The records to fit must tell an effect from its limiting case, else the simpler one is meant, and right.
+    """Require that the records to fit distinguish an effect from its limiting case, else the simpler one is right.
 
-    Accelerometers see nothing of the constant force in friction that differs between directions but how it sets in.
+    Of the constant force in friction that differs between directions, accelerometers show only the initial transient.
     """
     for one in effects:
         law = POINT_LAWS.get(one["kind"])
@@ -258,13 +258,13 @@ def _check_distinct(
             moved = [tested(p, bench, test, tests[test], np.random.default_rng(0))[0] for p in (real, simpler)]
             y, without = (p.readings(m, bench.sample_time) for p, m in zip((real, simpler), moved, strict=True))
             squares.append(np.mean(((y - without) / noise) ** 2))
-        apart = float(np.sqrt(np.mean(squares)))
-        if not apart > DISTINCT:
-            raise Unsuitable(f"{one['kind']} alters the readings by {apart:.2g} of the noise beside its limiting case")
+        difference = float(np.sqrt(np.mean(squares)))
+        if not difference > DISTINCT:
+            raise Unsuitable(f"{one['kind']} differs from its limiting case by {difference:.2g} of the noise only")
 
 
 def _logged(sent: Floats, noise: float, rng: np.random.Generator) -> Floats:
-    """Inputs as they are logged, with noise of a share of their rms; those at rest are logged as they are."""
+    """The logged inputs, with noise of this share of their rms; an input at rest has none."""
     if noise == 0:
         return sent
     rms: Floats = np.sqrt(np.mean(sent**2, axis=1, keepdims=True))
@@ -272,16 +272,16 @@ def _logged(sent: Floats, noise: float, rng: np.random.Generator) -> Floats:
 
 
 def _budget(figures: dict[str, float]) -> dict[str, float]:
-    """Shares of the mean square of the nominal residual: what a perfect account of the test explains, and noise.
+    """Shares of the mean square of the nominal residual that the exact model explains and that noise makes.
 
-    What a random force or noise of the logged inputs leaves of a perfect model is theirs: nothing is unexplained.
+    The residual of the exact model under random forces or input noise counts as explained: nothing is unexplained.
     """
     noise = min(figures["noise_floor"], figures["true_model"]) ** 2 / figures["gap"] ** 2
     return {"explained": 1.0 - noise, "unexplained": 0.0, "noise": noise}
 
 
 def _check_visible(figures: dict[str, dict[str, Any]], effects: list[dict[str, Any]]) -> None:
-    """Some record to fit must show the gap well above its noise, else nobody could name it."""
+    """Require a record to fit whose gap is well above its noise."""
     shown = [f["gap"] ** 2 - f["noise_floor"] ** 2 for test, f in figures.items() if test != "validate"]
     ratio = max(f["gap"] / f["noise_floor"] for test, f in figures.items() if test != "validate")
     rounded = any(e["kind"] == "sensor_quantisation" for e in effects)
@@ -299,14 +299,14 @@ def _gap(measured: np.ndarray, predicted: np.ndarray | float, scaled_by: np.ndar
 
 
 def draw_kinds(n: int, seed: int, *, like: Case | None = None, structure: str = MEMBERS) -> list[tuple[str, ...]]:
-    """Kinds for n trials: of every 60, 40 of one effect, 10 pairs, 5 of none and 5 from outside the vocabulary."""
+    """Random kinds for n trials: of every 60, 40 of one effect, 10 pairs, 5 without and 5 outside the vocabulary."""
     rng = np.random.default_rng(seed)
     missing = NOT_ON[structure] if like is None else {"truncated_modes"}
     pool = [kind for kind in KINDS if kind not in missing]
     singles = [(str(kind),) for _ in range(n // len(pool) + 1) for kind in rng.permutation(pool)]
     drawn: list[tuple[str, ...]] = []
     for i in range(n):
-        turn = (i * 7 + 3) % 60  # spreads the families over the list, whatever n is
+        turn = (i * 7 + 3) % 60  # spreads the families over the list for any n
         if turn < 5:
             drawn.append(())
         elif turn < 10:
@@ -321,7 +321,7 @@ def draw_kinds(n: int, seed: int, *, like: Case | None = None, structure: str = 
 def draw_imperfect_kinds(
     n: int, seed: int, *, imperfections: str = "all", size: float | None = None
 ) -> list[ImperfectDraw]:
-    """What n imperfect trials hide: the class and size of the imperfections, and the kinds; every third hides nothing.
+    """Random imperfections and kinds for n trials; every third trial has no hidden effect.
 
     Args:
         imperfections: a class, or "all" for each in turn.
@@ -345,7 +345,7 @@ def draw_imperfect_kinds(
 
 
 def _draw_several(n: int, pool: list[str], rng: np.random.Generator) -> tuple[str, ...]:
-    """n kinds that records can hold apart."""
+    """n random kinds that records can distinguish."""
     while True:
         kinds = tuple(str(kind) for kind in rng.choice(pool, n, replace=False))
         if "truncated_modes" not in kinds and not any(twins <= set(kinds) for twins in TWINS):
@@ -368,20 +368,20 @@ def write_trials(
     """Write n cases as folders, and their labels as one JSON file elsewhere.
 
     Args:
-        like: a case whose rig and records all are like; None draws a bench a case. Kinds that a bench cannot show
-            give way to others.
-        structure: of benches that are drawn: "members" (beams and rods), "plates" or "frames".
-        kinds: what each case hides; None draws them, see `draw_kinds` and `draw_imperfect_kinds`.
-        imperfections: class of the small errors beside what hides, of `IMPERFECTIONS`, or "all" in turn; None for none.
+        like: a case whose rig and kinds of record all cases have; None draws a bench for each case. Kinds that are
+            impossible on a bench are replaced by others.
+        structure: of drawn benches: "members" (beams and rods), "plates" or "frames".
+        kinds: of the hidden effects of each case; None draws them, see `draw_kinds` and `draw_imperfect_kinds`.
+        imperfections: class of small additional errors, of `IMPERFECTIONS`, or "all" in turn; None for none.
         size: of these errors; None for each of `SIZES` in turn.
-        report: called with (what, share done).
+        report: called with (name, share done).
 
     Raises:
-        ValueError: labels that would lie in the folder that the diagnosis reads.
+        ValueError: the labels would be in the folder that the diagnosis reads.
     """
     folder, labels = Path(folder), Path(labels)
     if labels.resolve().is_relative_to(folder.resolve()):
-        raise ValueError(f"labels {labels} would lie among the cases in {folder}; seal them elsewhere")
+        raise ValueError(f"labels {labels} would be in the folder of the cases, {folder}; give another folder")
     if imperfections is None:
         draws = [ImperfectDraw(CLEAN, 1.0, k) for k in draw_kinds(n, seed, like=like, structure=structure)]
     else:
@@ -411,13 +411,13 @@ def write_trials(
 def find_trial_with_plant(
     rng: np.random.Generator, *, kinds: Sequence[str] = (), others: Sequence[str] = (), tries: int = 20, **how: Any
 ) -> tuple[Case, dict[str, Any], SolvedPlant]:
-    """The first of some seeds whose bench shows the kinds; after one that does not, of kinds among the others if any.
+    """A trial of the first random seed with which it is possible.
 
     Args:
-        rng: of the seeds.
-        kinds, how: as `make_trial_with_plant` takes them.
-        others: kinds that take their place.
-        tries: seeds.
+        rng: generator of the seeds.
+        kinds, how: arguments of `make_trial_with_plant`.
+        others: kinds that replace `kinds` at random after a failure; none to keep them.
+        tries: number of seeds.
 
     Raises:
         ValueError: none of these seeds makes a trial.
@@ -427,7 +427,7 @@ def find_trial_with_plant(
         try:
             return make_trial_with_plant(case_seed, kinds=kinds, **how)
         except ValueError as error:
-            reason = error  # a variable of `except` ends with it
+            reason = error  # `error` is deleted at the end of the `except` clause
         if others:
             kinds = tuple(str(k) for k in rng.choice(others, len(kinds), replace=False))
     raise ValueError(

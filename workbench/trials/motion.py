@@ -1,7 +1,7 @@
-"""Motion of a real structure by the classical Runge-Kutta method in many small steps, sharing nothing with `simulate`.
+"""Motion of a real structure by the classical Runge-Kutta method in many small steps, independent of `simulate`.
 
-Steps end where a delayed command changes, so that forces are smooth within each. What is stepped together: modal
-coordinates and rates, the lags of actuators, the hysteretic variables of laws at points.
+Steps end where a delayed command changes, so that forces are smooth within each. The state consists of modal
+coordinates and velocities, actuator lags, and hysteretic variables of laws at points.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ System = tuple[
 
 @njit(cache=True)
 def headed(target: float, before: float, rate: float, time: float) -> float:
-    """What an actuator gives that heads for a target for some time, from what it gave before, no faster than a rate."""
+    """The rate-limited output of an actuator, a time after the target changed, from its output before."""
     if np.isinf(rate):
         return target
     most = rate * time
@@ -51,9 +51,9 @@ def _hysteretic_rate(z: float, change: float, width: float) -> float:
 
 @njit(cache=True)
 def _rates(t: float, y: Floats, dy: Floats, system: System, drive: tuple[Floats, Floats, float], held: Floats) -> None:
-    """dy/dt under the forces that the actuators head for and the modal forces held over the interval.
+    """Fill dy = dy/dt under the actuator forces and the modal forces held over the interval.
 
-    drive: targets (m,), what each actuator gave when it began to head for them (m,), and that time, s.
+    drive: targets (m,) of the actuators, their outputs at the last change of target (m,), and the time of that, s.
     """
     structure, (lags, shapes, rates, biases), (tones, tone_shapes), (laws, law_shapes), (drag, field) = system
     targets, before, begun = drive
@@ -104,7 +104,7 @@ def _rates(t: float, y: Floats, dy: Floats, system: System, drive: tuple[Floats,
 
 @njit(cache=True)
 def aim(commands: Floats, drive: tuple[Floats, Floats], earlier: Floats, z: Floats, aims: Floats) -> None:
-    """Fill what the actuators head for (m,) by the commands at a sample (m,); earlier and z are of their hysteresis."""
+    """Fill `aims` (m,), the actuators' targets for the commands (m,) of a sample; earlier, z: state of hysteresis."""
     mix, table = drive
     m = commands.size
     for j in range(m):
@@ -137,22 +137,22 @@ def interval(
     out: Floats,
     forces: tuple[Floats, Floats, Floats, Floats],
 ) -> None:
-    """Step y over a sample interval, and fill the motion where each of its pieces begins.
+    """Step y over a sample interval, and fill `out` with the motion at the start of each of its pieces.
 
     Args:
         k: the sample.
         y: (size,) state, in place.
         system: see `integrate`.
         delays: (m,) s.
-        aims: (m, n_samples) what the actuators head for, by sample.
+        aims: (m, n_samples) targets of the actuators, by sample.
         headed_for: targets (m,), forces before them (m,), and the time of the last change (1,), in place.
         held: (n,) unmeasured modal forces.
-        dt: s.
+        dt: sample time, s.
         edges, steps: see `integrate`.
-        work: (5, size) to work in.
-        out: (3, n_edges, n) displacement, velocity and acceleration where each piece begins.
-        forces: sums over the steps of the actuators' forces (m,), their squares (m,), their work by mode (n,), and the
-            largest (m,), in place; empty arrays where they are not wanted.
+        work: (5, size) work space.
+        out: (3, n_edges, n) displacement, velocity and acceleration at the start of each piece.
+        forces: integrals of the actuators' forces (m,), of their squares (m,), of their work by mode (n,), and the
+            largest force (m,), in place; empty arrays to omit them.
     """
     targets, before, begun = headed_for
     trial, k1, k2, k3, k4 = work[0], work[1], work[2], work[3], work[4]
@@ -218,18 +218,19 @@ def integrate(
             (lags (m,), shapes (m, n), rate limits (m,), biases (m,)); tones (n_tones, 3) of amplitude, rad/s, phase,
             and shapes; laws (n_laws, 4) of code and parameters, and shapes; air drag: coefficient, and shapes and
             weights (n_points, n + 1).
-        drive: mix (m, m), what each actuator gets of every command, and a table (m, 7): gain, dead zone, limit, delay,
-            curvature (u + curvature u |u| of the command, before the gain), share and width of hysteresis.
-        commands: (m, n_samples); lowered by the feedback, in place.
-        feedback: (m, n) command taken away per modal rate at each sample.
-        held: (n_samples, n) unmeasured modal forces, over each interval.
+        drive: mix (m, m), the share of every command in that of each actuator, and a table (m, 7): gain, dead zone,
+            limit, delay, curvature (u + curvature u |u| of the command, before the gain), share and width of
+            hysteresis.
+        commands: (m, n_samples); the feedback is subtracted, in place.
+        feedback: (m, n) gain from modal velocities to commands, at each sample.
+        held: (n_samples, n) unmeasured modal forces, constant over each interval.
         sample_time: s.
-        edges: fractions of a sample interval where its pieces end, the last one 1.
-        steps: in each piece.
+        edges: fractions of a sample interval at which its pieces end, the last one 1.
+        steps: number of steps in each piece.
 
     Returns:
-        (3, n_edges, n_samples, n) displacement, velocity and acceleration where each piece of a sample interval begins,
-        the first of them at the sample itself.
+        (3, n_edges, n_samples, n) displacement, velocity and acceleration at the start of each piece of a sample
+        interval; the first is at the sample.
     """
     dt = sample_time
     m, n_samples = commands.shape

@@ -24,7 +24,7 @@ class Section:
 
     @classmethod
     def of_strip(cls, width: float, thickness: float, *, youngs_modulus: float, density: float) -> "Section":
-        """A rectangle, m, of a material, Pa and kg/m³."""
+        """A rectangular section; lengths in m, modulus in Pa, density in kg/m³."""
         area = width * thickness
         return cls(youngs_modulus * area, youngs_modulus * area * thickness**2 / 12, density * area)
 
@@ -42,11 +42,11 @@ def plane_frame(
 
     Args:
         nodes: (x, y) of each, m.
-        strips: the two nodes that each joins, and its section.
-        fixed: nodes that are clamped to the ground; they have no points.
+        strips: the two nodes of each, and its section.
+        fixed: nodes clamped to the ground; they have no points.
         stiffness_waves, mass_waves: of a smooth variation over the height, see `waves`.
     """
-    upright = any(y for _, y in nodes.values())  # one that lies flat varies along its length
+    upright = any(y for _, y in nodes.values())  # a flat structure varies along its length
     along = {node: place[upright] for node, place in nodes.items()}
     size = max(along.values())
     free = [node for node in nodes if node not in fixed]

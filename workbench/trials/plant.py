@@ -1,4 +1,4 @@
-"""The real structure of a blind trial: a nominal rig, and everything in which it differs."""
+"""The real structure of a blind trial: a nominal rig and all differences from it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -34,22 +34,22 @@ class Plant:
     """A real structure.
 
     Attributes:
-        nominal: the rig it is taken for.
-        actuators, sensors: as they really are, in the nominal order.
-        n_modes: how many modes it shows.
-        frame: makes the matrices behind nominal modes at named points; None where those are all there is.
-        altered: what its structure has that the nominal one has not.
+        nominal: the nominal rig.
+        actuators, sensors: the real ones, in the nominal order.
+        n_modes: number of modes of the real structure.
+        frame: makes the matrices behind nominal modes at named points; None for a member, a plate or modal data.
+        altered: differences of the structure from the nominal one.
         damping_factor: of every damping ratio.
-        damping_factors: of each mode's damping ratio, in their order; a mode beyond them takes 1.
-        laws: (code, at, parameters) of forces at points, codes of `motion`.
+        damping_factors: of the damping ratios of the lowest modes; 1 for higher modes.
+        laws: (code, at, parameters) of forces at points, with the codes of `laws`.
         drag, stretching, stiffness_rate: N s²/m³, N/m, 1/s.
         tones: (at, amplitude, frequency in Hz, phase) of unmeasured forces.
         noises: (at, rms, corner in Hz) of unmeasured random forces.
-        mix: (n_inputs, n_inputs) what each actuator gets of every command; None for the identity.
+        mix: (n_inputs, n_inputs) share of every command in that of each actuator; None for the identity.
         curvature: (n_inputs,) of u + curvature u |u|; None for none.
         reading_laws: readings (n_outputs, n_samples), sample time -> readings, before gain and bias.
-        noise_memory: correlation of a sensor's noise with its noise one sample before; 0 for white noise.
-        logging_noise: standard deviation of the noise of each logged input, as a share of the input's rms in a record.
+        noise_memory: lag-one correlation of a sensor's noise; 0 for white noise.
+        logging_noise: standard deviation of the noise of each logged input, over the input's rms in a record.
     """
 
     nominal: Rig
@@ -74,11 +74,11 @@ class Plant:
 
     @classmethod
     def of(cls, nominal: Rig, frame: Frame | None = None) -> "Plant":
-        """The real structure that is just what it is taken for."""
+        """The real structure equal to the nominal rig."""
         return cls(nominal, nominal.actuators, nominal.sensors, nominal.modes.n_modes, frame)
 
     def solved(self) -> "SolvedPlant":
-        """The plant with its modes solved."""
+        """The plant with its modes computed."""
         domain = self.nominal.modes.domain
         field_places, weights = domain.quadrature(DRAG_POINTS) if self.drag else (np.zeros(0), np.zeros(0))
         groups: list[list[Any] | np.ndarray] = [
@@ -146,13 +146,13 @@ class SolvedPlant:
         rng: np.random.Generator | None = None,
         finest: float = FINEST,
     ) -> tuple[ModalMotion, np.ndarray]:
-        """The modal motion, and the commands that were sent.
+        """The modal motion, and the commands sent to the actuators.
 
         Args:
-            commands: (n_inputs, n_samples); with feedback, what is added to it.
+            commands: (n_inputs, n_samples), added to those of the feedback.
             sample_time: s.
-            feedback: command taken away per velocity at each actuator, N s/m.
-            rng: of the random forces; None leaves them out.
+            feedback: gain of the negative feedback of the velocity at each actuator, N s/m.
+            rng: generator of the random forces; None for no random forces.
             finest: radians of the highest mode in one step.
         """
         plant = self.plant
@@ -166,7 +166,7 @@ class SolvedPlant:
         return ModalMotion(pieces[0, 0], pieces[1, 0], pieces[2, 0], np.r_[0.0, edges[:-1]], pieces), sent
 
     def random_forces(self, n_samples: int, sample_time: float, rng: np.random.Generator | None) -> np.ndarray:
-        """Unmeasured random modal forces (n_samples, n_modes), held over each sample; none without `rng`."""
+        """Unmeasured random modal forces (n_samples, n_modes), constant over each sample; zero without `rng`."""
         held = np.zeros((n_samples, self.plant.n_modes))
         if rng is not None:
             for (_, rms, corner), shape in zip(self.plant.noises, self.at_noises, strict=True):
@@ -174,7 +174,7 @@ class SolvedPlant:
         return held
 
     def system(self, sample_time: float, finest: float = FINEST) -> tuple[Any, Any, np.ndarray, np.ndarray]:
-        """The plant as `motion.integrate` takes it: system, drive, edges and steps of the pieces of an interval."""
+        """The arguments system, drive, edges and steps of `motion.integrate`."""
         plant, modes = self.plant, self.modes
         zeta = _damping_ratios(plant)
         m = len(plant.actuators)
@@ -205,7 +205,7 @@ class SolvedPlant:
         return system, (mix, np.ascontiguousarray(np.c_[drives, curvature, hysteresis])), edges, steps
 
     def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
-        """What perfect sensors would read, each after its delay, (n_outputs, n_samples)."""
+        """The readings (n_outputs, n_samples) of perfect sensors, each with its delay."""
         rows = []
         for sensor, shape in zip(self.plant.sensors, self.at_sensors, strict=True):
             order = MEASURED[sensor.quantity][1]
@@ -226,7 +226,7 @@ class SolvedPlant:
         return np.array(rows)
 
     def readings(self, moved: ModalMotion, sample_time: float, rng: np.random.Generator | None = None) -> np.ndarray:
-        """What the sensors read, (n_outputs, n_samples); without `rng` the mean of what rounding makes of noise."""
+        """The readings (n_outputs, n_samples) of the sensors; without `rng` their mean over the noise."""
         y = self.truth(moved, sample_time)
         for law in self.plant.reading_laws:
             y = law(y, sample_time)
@@ -246,7 +246,7 @@ class SolvedPlant:
 
 
 def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float, corner_hz: float) -> np.ndarray:
-    """Gaussian noise of unit rms, white up to a corner frequency and fading steeply above it."""
+    """Gaussian noise (n_samples,) of unit rms, white up to a corner frequency, with a steep roll-off above it."""
     spectrum = np.fft.rfft(rng.standard_normal(2 * n_samples))
     frequency = np.fft.rfftfreq(2 * n_samples, sample_time)
     noise: Floats = np.fft.irfft(spectrum / np.sqrt(1.0 + (frequency / corner_hz) ** 8), 2 * n_samples)[:n_samples]
@@ -254,7 +254,7 @@ def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float,
 
 
 def _damping_ratios(plant: Plant) -> Floats:
-    """The nominal ratios, mode by mode; modes beyond the nominal ones take the last."""
+    """The damping ratio of each mode of the plant; modes above the nominal ones have the last nominal ratio."""
     zeta = plant.nominal.modes.zeta
     padded: Floats = np.r_[zeta, np.full(max(plant.n_modes - zeta.size, 0), zeta[-1])][: plant.n_modes]
     factors = np.ones(plant.n_modes)
@@ -275,7 +275,7 @@ def sensor_noise(rng: np.random.Generator, n_samples: int, memory: float) -> np.
 
 
 def _lag(y: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
-    """First-order lag of a signal that is linear between samples, settled at its first value, step by step."""
+    """First-order lag of a signal that is linear between samples, initially settled at its first value."""
     if time_constant == 0:
         return y
     fade, out = np.exp(-sample_time / time_constant), y.copy()
@@ -287,7 +287,7 @@ def _lag(y: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
 
 
 def _mean_rounded(y: Floats, step: float, noise_std: float) -> Floats:
-    """The mean of round((y + noise) / step) step: every half step that noise carries a reading across counts one."""
+    """The mean of step round((y + noise) / step): a sum of the probabilities that noise crosses each half step."""
     nearest = np.round(y / step)
     reach = np.arange(int(np.ceil(8.0 * noise_std / step)) + 1)[:, None] + 0.5
     above: Floats = ndtr((y - (nearest + reach) * step) / noise_std).sum(axis=0)
@@ -296,7 +296,7 @@ def _mean_rounded(y: Floats, step: float, noise_std: float) -> Floats:
 
 
 def with_ports(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
-    """The plant with one actuator or sensor changed, or all of them (never a hammer) for the name "all"."""
+    """The plant with one actuator or sensor changed, or all of them (except hammers) for the name "all"."""
 
     def meant(port: Actuator | Sensor) -> bool:
         return port.name == name or (name == "all" and not getattr(port, "direct", False))

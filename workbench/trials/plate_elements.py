@@ -1,6 +1,6 @@
-"""Modes of a rectangular plate by Bogner-Fox-Schmit finite elements, sharing nothing with `Plate.modes`.
+"""Modes of a rectangular plate by Bogner-Fox-Schmit finite elements, independent of `Plate.modes`.
 
-Their displacement is a product of Hermite cubics along x and along y, so that the matrices of a plate are sums of
+The displacement is a product of Hermite cubics along x and along y, so that the matrices of a plate are sums of
 Kronecker products of those of two beams (Bogner, Fox & Schmit, AFFDL-TR-66-80 (1966) 397).
 """
 
@@ -21,9 +21,9 @@ from workbench.structure.supports import HELD
 from workbench.trials.finite_elements import AS_NOMINAL, Alterations, ElementModes, waves
 
 ELEMENTS = 60  # along the longer side
-CROWDED = 0.7  # how much denser they are at the edges, for the singular corner of a clamped and a free one; below 1
+CROWDED = 0.7  # grading of the mesh towards the edges, for the singular corner of a clamped and a free edge; below 1
 ROUNDED = 0.05  # of the shift: a smaller ω² is rounding of the matrix of thousands of elements
-CUBICS = (  # of the place t in an element: value and slope at its left node, then at its right one
+CUBICS = (  # of the coordinate t in an element: for value and slope at its left node, then at its right one
     np.polynomial.Polynomial([1.0, 0.0, -3.0, 2.0]),
     np.polynomial.Polynomial([0.0, 1.0, -2.0, 1.0]),
     np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0]),
@@ -37,16 +37,16 @@ def plate_modes(
     """The lowest modes of an altered plate, K v = ω² M v.
 
     Args:
-        places: pairs (x, y) or `Patch`es where shapes, or ∮ ∂φ/∂n ds, are wanted, m.
+        places: pairs (x, y) of the shapes, or `Patch`es of ∮ ∂φ/∂n ds, that are returned, m.
 
     Raises:
-        ValueError: a plate that varies, is stretched or carries something; alterations that only a member can have.
+        ValueError: a plate with varying properties, tension or attachments; alterations that only a member can have.
     """
     constant = plate.mass_per_area.is_constant and plate.bending_stiffness.is_constant
     if not constant or any(plate.tension) or plate.attachments:
-        raise ValueError("trials are made on plates of one mass and one stiffness, without tension and attachments")
+        raise ValueError("trials need plates of uniform mass and stiffness, without tension and attachments")
     if altered.losses or altered.tension:
-        raise ValueError("trials know no local loss and no tension of a plate")
+        raise ValueError("trials have no local loss and no tension of a plate")
     rigidity, nu = altered.stiffness_factor * float(plate.bending_stiffness(0.0, 0.0)), plate.poisson_ratio
     spacing = max(plate.length) / ELEMENTS
     x, y = (_Cubics.over(side, max(round(side / spacing), 8)) for side in plate.length)
@@ -75,7 +75,7 @@ def plate_modes(
         mass = mass + value * _square(_row(x, y, at))
     kept = (free[0][:, None] * y.size + free[1]).ravel()
     stiffness, mass = stiffness[:, kept][kept].tocsc(), mass[:, kept][kept].tocsc()
-    # the shift makes the pencil definite with rigid-body modes, and stands far below the first elastic one
+    # the shift makes the pencil definite with rigid-body modes, and is far below the first elastic eigenvalue
     a, b = plate.length
     shift = -1e-3 * rigidity / float(plate.mass_per_area(0.0, 0.0)) * (np.pi / max(a, b)) ** 4
     values, vectors = eigsh(stiffness, k=n_modes, M=mass, sigma=shift, which="LM", v0=np.ones(kept.size))
@@ -110,7 +110,7 @@ class _Cubics:
 
     @classmethod
     def over(cls, length: float, elements: int, weight: Sequence[float] = ()) -> "_Cubics":
-        """Between the ends of a side, where g is that of `waves`."""
+        """Cubics over the length of a side, with the weight g of `waves`."""
         share = np.linspace(0.0, 1.0, elements + 1)
         nodes = length * (share - CROWDED / (2.0 * np.pi) * np.sin(2.0 * np.pi * share))
         basis = Basis(MeshLine(nodes), ElementLineHermite(), intorder=8)
@@ -132,7 +132,7 @@ class _Cubics:
         return int(self.values[-which]), int(self.slopes_at[-which])
 
     def at(self, x: float, derivative: int = 0) -> Floats:
-        """(size,) the cubics, or their slopes, at a place."""
+        """(size,) values of the cubics, or of their derivatives, at x."""
         i = int(np.clip(np.searchsorted(self.nodes, x) - 1, 0, self.nodes.size - 2))
         h = self.nodes[i + 1] - self.nodes[i]
         t = (x - self.nodes[i]) / h
@@ -152,7 +152,7 @@ class _Cubics:
 
 
 def _row(x: _Cubics, y: _Cubics, at: Any) -> Floats:
-    """(n_dofs,) what all degrees of freedom add to the displacement at (x, y), or to ∮ ∂w/∂n ds of a patch."""
+    """(n_dofs,) coefficients of the displacement at (x, y), or of ∮ ∂w/∂n ds of a patch, in all degrees of freedom."""
     if isinstance(at, Patch):
         left, right = at.x - 0.5 * at.width, at.x + 0.5 * at.width
         bottom, top = at.y - 0.5 * at.height, at.y + 0.5 * at.height
@@ -162,6 +162,6 @@ def _row(x: _Cubics, y: _Cubics, at: Any) -> Floats:
 
 
 def _square(row: Floats) -> csc_array:
-    """The sparse matrix of the products of a row's entries."""
+    """The sparse matrix r rᵀ of a row r."""
     column = csc_array(row[:, None])
     return column @ column.T

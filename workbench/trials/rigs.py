@@ -1,4 +1,4 @@
-"""Nominal rigs of blind trials at random: beams and rods, plates, and frames known at named points."""
+"""Random nominal rigs of blind trials: beams and rods, plates, and frames known at named points."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -18,17 +18,17 @@ from workbench.trials.finite_elements import Frame
 from workbench.trials.plane_frame import Section, plane_frame
 
 MEMBERS, PLATES, FRAMES = STRUCTURES = ("members", "plates", "frames")
-APART = 0.13  # of the diagonal: inputs and outputs of a plate from one another
-MARGIN = 0.08  # of a side: they from the edges
+SPACING = 0.13  # least distance between inputs and outputs of a plate, over the diagonal
+MARGIN = 0.08  # least distance from the edges, over the side
 STEEL = {"youngs_modulus": 2.1e11, "density": 7850.0}  # Pa, kg/m³
-PARTS = 6  # elements of a column or a floor, every other node a point
+PARTS = 6  # elements of a column or a floor; every other node is a named point
 
 
 def draw_rig(rng: np.random.Generator, structure: str) -> tuple[Rig, Frame | None]:
-    """A nominal rig whose sensors have no noise yet, and for a frame what makes the matrices behind its modes.
+    """A random nominal rig with noise-free sensors, and for a frame the function of its matrices.
 
     Raises:
-        ValueError: a structure that is none of `STRUCTURES`.
+        ValueError: a structure not in `STRUCTURES`.
     """
     if structure == MEMBERS:
         return _member(rng), None
@@ -45,7 +45,7 @@ def _inputs(places: Sequence[Place], hammer: Place) -> tuple[Actuator, ...]:
 
 
 def _accelerometers_first(places: Sequence[Place], n: int) -> tuple[Sensor, ...]:
-    """n accelerometers a1, a2, ..., then velocities, numbered on."""
+    """n accelerometers a1, a2, ..., then velocity sensors with the next numbers."""
     return tuple(
         Sensor(f"a{i + 1}", at, "acceleration") if i < n else Sensor(f"v{i + 1}", at, "velocity")
         for i, at in enumerate(places)
@@ -70,7 +70,7 @@ def _member(rng: np.random.Generator) -> Rig:
 
 
 def _sensors(places: np.ndarray, quantities: str) -> tuple[Sensor, ...]:
-    """d1, d2, ..., v1, ...: a letter of `quantities` a place."""
+    """Sensors d1, d2, ..., v1, ..., one at each place; the letters of `quantities` are their quantities."""
     words = {"d": "displacement", "v": "velocity", "a": "acceleration"}
     return tuple(
         Sensor(f"{q}{quantities[: i + 1].count(q)}", round(float(x), 4), words[q])
@@ -151,7 +151,7 @@ EDGES = (
 def _plate(rng: np.random.Generator) -> Rig:
     a = round(float(rng.uniform(0.9, 1.4)), 2)
     length = (a, round(float(rng.uniform(0.6, 0.9)) * a, 2))
-    # half of them simply supported all round
+    # half of the plates are simply supported on all edges
     edges = EDGES[max(int(rng.integers(-3, len(EDGES))), 0)]
     plate = Plate(
         length=length,
@@ -169,11 +169,11 @@ def _plate(rng: np.random.Generator) -> Rig:
 
 
 def _scattered(rng: np.random.Generator, length: tuple[float, float], n: int) -> list[tuple[float, float]]:
-    """n places on a rectangle, away from one another and from the edges."""
+    """n random places on a rectangle, with a least distance between them and from the edges."""
     places: list[tuple[float, float]] = []
     while len(places) < n:
         x, y = np.round(rng.uniform(MARGIN, 1.0 - MARGIN, 2) * length, 3).tolist()
-        if all(np.hypot(x - p, y - q) > APART * np.hypot(*length) for p, q in places):
+        if all(np.hypot(x - p, y - q) > SPACING * np.hypot(*length) for p, q in places):
             places.append((x, y))
     return places
 
@@ -182,7 +182,7 @@ def _scattered(rng: np.random.Generator, length: tuple[float, float], n: int) ->
 
 
 def _frame(rng: np.random.Generator) -> tuple[Rig, Frame]:
-    """A portal frame of two or three storeys, clamped at its feet."""
+    """A random portal frame of two or three storeys, clamped at its feet."""
     storeys = int(rng.integers(2, 4))
     width, height = (round(float(x), 2) for x in rng.uniform(0.3, 0.5, 2))
     column = Section.of_strip(0.03, float(rng.uniform(0.003, 0.005)), **STEEL)
@@ -216,7 +216,7 @@ def _frame(rng: np.random.Generator) -> tuple[Rig, Frame]:
 
 
 def _at_points(frame: FiniteElements, nodes: Sequence[str], n_modes: int) -> Modes:
-    """Modes of a frame as they are known at some of its nodes, along x and y."""
+    """Modes of a frame with shapes at some of its nodes only, along x and y."""
     every = frame.modes(n_modes)
     names = tuple(f"{node}.{direction}" for node in nodes for direction in "xy")
     positions = frame.nodes.positions

@@ -1,4 +1,4 @@
-"""A scene: a bench with its nominal motion, by which hidden effects are drawn."""
+"""A scene: a bench with its nominal motion, from which the strengths of hidden effects are drawn."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,27 +9,27 @@ from workbench.structure.domain import Domain, NamedPoints, Rectangle, Where
 from workbench.trials.benches import Bench
 from workbench.trials.plant import ModalMotion, Plant, SolvedPlant
 
-DISTINCT = 0.1  # sine of the angle between what forces at two named points do to the modes
-COARSE = 0.2  # radians of the highest mode in one step: enough to draw a strength by
+DISTINCT = 0.1  # least sine of the angle between the modal force vectors at two named points
+COARSE = 0.2  # radians of the highest mode in one step: accurate enough to draw a strength
 
 
 class Unsuitable(ValueError):
-    """A kind that a bench cannot show, or a draw that shows no gap."""
+    """A kind that is impossible on a bench, or a draw without a detectable gap."""
 
 
 def extent(domain: Domain) -> float:
-    """What errors of place are measured by, m; 1 where names have no positions."""
+    """The length that errors of place are divided by, m; 1 for points without positions."""
     return 1.0 if isinstance(domain, NamedPoints) and domain.positions is None else domain.size
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A bench with the nominal motion at its middle level, by which strengths are drawn.
+    """A bench with the nominal motion at its middle level, from which strengths are drawn.
 
     Attributes:
         commands: (n_inputs, n_samples) of the middle level.
-        moved: nominal modal displacement and velocity.
-        outputs: (n_outputs, n_samples) nominal.
+        moved: nominal modal motion.
+        outputs: (n_outputs, n_samples) nominal readings.
     """
 
     bench: Bench
@@ -54,10 +54,10 @@ class Scene:
         return self.moved[0] @ shape, self.moved[1] @ shape
 
     def place(self, rng: np.random.Generator, *, between: bool = False) -> Where:
-        """A place that moves: at least a third of what the liveliest does.
+        """A random place whose rms motion is at least a third of the largest.
 
         Args:
-            between: whether it may be between two points, as it then is in every other draw.
+            between: whether half of the draws at named points are a pair `Between` two points.
         """
         domain = self.bench.rig.modes.domain
         if isinstance(domain, NamedPoints):
@@ -77,10 +77,10 @@ class Scene:
         return round(float(at) - float(rng.uniform(0.0, 0.01)) * domain.size, 4)
 
     def _distinct(self, rng: np.random.Generator, between: bool) -> Where:
-        """A named point, or two that something is between, where a force acts on the modes as nowhere else.
+        """A random named point, or pair of points, whose modal force vector is not nearly parallel to another one.
 
-        What a force does to the modes shows in its direction among them, weighted by how they move: a weaker one of
-        the same direction is an equally good answer, so that what stands there has no one right place.
+        A force at a place with a parallel vector (weighted by the modal velocities) and another strength explains the
+        records equally well, so that the place of an effect would not be identifiable.
         """
         modes = self.bench.rig.modes
         points = modes.domain
@@ -103,7 +103,7 @@ class Scene:
         raise Unsuitable("no two places are distinguishable by their mode shapes")
 
     def gap(self, plant: Plant, rng: np.random.Generator, reference: Plant | None = None) -> float:
-        """Noise-free gap between a plant and the nominal one, or another, at the middle level."""
+        """Noise-free gap between a plant and the nominal one (or the reference) at the middle level."""
         outputs = [self.outputs]
         for one in (plant, reference):
             if one is not None:

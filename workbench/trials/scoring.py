@@ -1,4 +1,4 @@
-"""Scoring: verdicts against the labels of blind trials."""
+"""Scores of verdicts by the labels of blind trials."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -11,15 +11,15 @@ import numpy as np
 from workbench.structure.domain import Domain, NamedPoints, as_domain
 from workbench.trials.hidden import NONE, UNKNOWN, stands
 
-NEAR = 0.02  # of the length: how far off a place may be
-NEAR_IF_IMPERFECT = 0.03  # likewise beside the small errors of a real test
-HONEST = 0.05  # of the nominal residual's mean square: how far off a budget's unexplained share may be
+NEAR = 0.02  # largest error of a place that counts as right, over the length
+NEAR_IF_IMPERFECT = 0.03  # the same for trials with imperfections
+HONEST = 0.05  # largest error of the unexplained share of a budget that counts as right
 NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
 BINS = 5  # of a reliability diagram, of equal width
 
 
 class Reliability(NamedTuple):
-    """Claims of about one probability: the mean of that, the share of them that are right, how many they are."""
+    """Claims in one range of probability: their mean probability, the share that is right, and their number."""
 
     probability: float
     right: float
@@ -28,13 +28,13 @@ class Reliability(NamedTuple):
 
 @dataclass(frozen=True)
 class Tally:
-    """How a set of verdicts fared.
+    """Statistics of a set of verdicts.
 
     Attributes:
-        counts: (hidden, named) -> how many cases, each a set of kinds joined by " + ".
-        shares: of the cases that were named rightly: "single", "pair", "none", "unknown" -> (right, of).
-        misplaced: places named more than 2 % of the length off, of `placed` places.
-        placed: how many effects at a point were named.
+        counts: confusion matrix, (hidden, named) -> number of cases; each a set of kinds joined by " + ".
+        shares: number of right verdicts by family, "single", "pair", "none", "unknown" -> (right, of).
+        misplaced: number of places with an error above 2 % of the length.
+        placed: number of effects with a place that were named.
     """
 
     counts: dict[tuple[str, str], int]
@@ -51,17 +51,18 @@ def score(
     inputs: Sequence[str] = (),
     outputs: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """How a verdict (as JSON) agrees with a label.
+    """The agreement of a verdict (as JSON) with a label.
 
     Args:
-        domain: of the structure, or its length; places count as right within 2 % of that or of the diagonal, and by
-            their names.
-        inputs, outputs: names in order, needed where a label counts them from zero.
+        domain: of the structure, or its length; a place is right within 2 % of the length or diagonal, a named point
+            only exactly.
+        inputs, outputs: names in order, needed if a label has indices from zero.
 
     Returns:
-        {"hidden", "diagnosed": sets of kinds in words; "family": single, pair, none or unknown; "kinds": right;
-        "channels": inputs and outputs right, None without any; "position_errors": shares of the length or the
-        diagonal, 1 for another name; "positions": right, None without any; "shrinkage": by validation record}.
+        {"hidden", "diagnosed": sets of kinds as text; "family": single, pair, none or unknown; "kinds": whether right;
+        "channels": whether inputs and outputs are right, None without any; "position_errors": over the length or
+        diagonal, 1 for another named point; "positions": whether right, None without any; "shrinkage": by validation
+        record}.
     """
     hidden = [e for e in label["effects"] if e["kind"] != NONE]
     named = verdict["effects"]
@@ -89,27 +90,27 @@ def score_imperfect(
     inputs: Sequence[str] = (),
     outputs: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """How a verdict (as JSON) agrees with the label of a trial that has small errors beside its effects.
+    """The agreement of a verdict (as JSON) with the label of a trial with imperfections.
 
     Args:
-        domain: of the structure, or its length; places count as right within 3 % of that or of the diagonal, and by
-            their names.
-        inputs, outputs: names in order, needed where a label counts them from zero.
+        domain: of the structure, or its length; a place is right within 3 % of the length or diagonal, a named point
+            only exactly.
+        inputs, outputs: names in order, needed if a label has indices from zero.
 
     Returns:
-        {"class", "size": of the small errors; "hidden", "diagnosed": sets of kinds in words;
-        "named": what hides is named, its channels and places right, and nothing else is; of three effects, two and an
-        honest budget will do;
-        "wrong": a kind, or a channel, is named that does not hide; "false_alarm": anything is, and nothing hides;
-        "position_errors": of effects named rightly, shares of the length;
-        "covered": (within their 95 % interval, of) of the numbers and places of those effects;
-        "budget_error": of the unexplained share; None without a budget, or where not all that hides is named;
-        "claims": (probability, whether it is right) of the set named and of each alternative, where a gap is explained
-        by effects; an alternative is right that has the kinds of what hides}.
+        {"class", "size": of the imperfections; "hidden", "diagnosed": sets of kinds as text;
+        "named": whether exactly the hidden effects are named, with right channels and places; of three effects, two
+        suffice if the budget states an unexplained share;
+        "wrong": whether a kind or channel is named that is not hidden; "false_alarm": the same if nothing is hidden;
+        "position_errors": of the effects named rightly, over the length;
+        "covered": (inside their 95 % interval, of) of the parameters and places of those effects;
+        "budget_error": of the unexplained share; None without a budget, or unless exactly the hidden effects are named;
+        "claims": (probability, whether right) of the named set and of each alternative, if effects explain the gap; an
+        alternative is right if it has the hidden kinds}.
     """
     hidden = [e for e in label["effects"] if e["kind"] not in (NONE, UNKNOWN)]
     named = [e for e in verdict["effects"] if e["kind"] != UNKNOWN]
-    pairs = _found(hidden, named, domain, inputs, outputs)
+    pairs = _pairs(hidden, named, domain, inputs, outputs)
     errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
     covered = [inside for h, t in pairs for inside in _inside(h, t)]
     budget = verdict.get("budget", {}).get("unexplained")
@@ -142,9 +143,9 @@ def _claims(verdict: dict[str, Any], label: dict[str, Any], complete: bool) -> l
 
 
 def reliability(scores: Iterable[dict[str, Any]]) -> list[Reliability]:
-    """How often claims of a probability are right: one entry for each of five equal ranges that holds any.
+    """The points of a reliability diagram (Murphy & Winkler, Applied Statistics 26 (1977) 41).
 
-    The points of a reliability diagram (Murphy & Winkler, Applied Statistics 26 (1977) 41).
+    One for each of five equal ranges of probability that has any claims.
     """
     claims = np.array([claim for s in scores for claim in s["claims"]], float).reshape(-1, 2)
     ranges = np.minimum((claims[:, 0] * BINS).astype(int), BINS - 1)
@@ -159,7 +160,7 @@ def tally_imperfect(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
 
     Returns:
         {"cases", "named", "wrong", "false_alarms" (a count), "placed" within 3 %, "covered" by 95 % intervals,
-        "honest" budgets (within 0.05)}; NaN where there is nothing to count.
+        "honest" budgets (within 0.05)}; NaN for shares of none.
     """
     scores = list(scores)
     hiding = [s for s in scores if s["hidden"] != NONE]
@@ -181,14 +182,14 @@ def _share(flags: Sequence[bool]) -> float:
     return float(np.mean(flags)) if flags else float("nan")
 
 
-def _found(
+def _pairs(
     hidden: list[dict[str, Any]],
     named: list[dict[str, Any]],
     domain: Domain | float,
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Hidden effects beside those named of the same kind and channel, each once, the nearest first."""
+    """Pairs of a hidden and a named effect of the same kind and channel, each used once, nearest pairs first."""
     alike = [
         (_off(h, t, domain), i, j)
         for i, h in enumerate(hidden)
@@ -203,9 +204,9 @@ def _found(
 
 
 def _off(hidden: dict[str, Any], named: dict[str, Any], domain: Domain | float) -> float:
-    """How far an effect is named off its place, over the length or the diagonal; 1 where a named point is another one.
+    """The error of the named place of an effect, over the length or diagonal; 1 for another named point.
 
-    A mass moves with its node, whichever direction of it is named.
+    A mass acts in all directions of its node, so that any point of the node is right.
     """
     places = as_domain(domain)
     one, other = stands(hidden), stands(named)
@@ -217,7 +218,7 @@ def _off(hidden: dict[str, Any], named: dict[str, Any], domain: Domain | float) 
 
 
 def _inside(hidden: dict[str, Any], named: dict[str, Any]) -> Iterable[bool]:
-    """Whether each number that has a standard deviation is within its 95 % interval of the truth."""
+    """Whether the truth is inside the 95 % interval, for each parameter with a standard deviation."""
     deviations = {**named.get("parameters_std", {}), "at": named.get("at_std")}
     values = {**named.get("parameters", {}), "at": named.get("at")}
     for name, deviation in deviations.items():
@@ -229,7 +230,7 @@ def _inside(hidden: dict[str, Any], named: dict[str, Any]) -> Iterable[bool]:
 
 
 def tally(scores: Iterable[dict[str, Any]]) -> Tally:
-    """Count scores into a confusion matrix and shares."""
+    """The confusion matrix and shares of a set of scores."""
     counts: Counter[tuple[str, str]] = Counter()
     right: Counter[str] = Counter()
     total: Counter[str] = Counter()
@@ -259,7 +260,7 @@ def _words(effects: list[dict[str, Any]]) -> str:
 def _matched(
     hidden: list[dict[str, Any]], named: list[dict[str, Any]], domain: Domain | float
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Hidden and named effects of one kind side by side, two of a kind by their places."""
+    """Pairs of hidden and named effects of the same kind; two of the same kind are paired by their places."""
 
     def cost(order: Iterable[dict[str, Any]]) -> float:
         pairs = list(zip(hidden, order, strict=True))

@@ -83,13 +83,13 @@ def test_a_pole_that_stays_costs_nothing():
         (lambda m: coupled_poles(m, 2, actuators(5.0), poles=wanted(m.omega[:2])), "mode 2 is uncontrollable"),
         (lambda m: coupled_lqr(m, 2, actuators(5.0), weight=1.0), "mode 2 is uncontrollable"),
         (lambda m: coupled_poles(m, 2, [], poles=wanted(m.omega[:2])), "no actuators"),
-        (lambda m: coupled_poles(m, 2, actuators(3.0), poles=[-1 + 1j]), "one pole a mode"),
+        (lambda m: coupled_poles(m, 2, actuators(3.0), poles=[-1 + 1j]), "one pole per mode"),
         (lambda m: coupled_poles(m, 2, actuators(3.0), poles=[-1 + 1j, 1 + 1j]), "mode 2 is not stable"),
         (lambda m: coupled_poles(m, 2, actuators(3.0), poles=[-1, -1 + 1j]), "is real"),
         (lambda m: coupled_poles(m, 2, actuators(3.0), poles=[-1 + 1j, -1 + 1j]), "cannot assign 2 pairs"),
         (
             lambda m: coupled_poles(m, 2, actuators(3.0), poles=[-1e-300 + 1j * m.omega[1], -1 + 1j]),
-            "of mode 1 is that of mode 2 without control",
+            "of mode 1 is the open-loop pole of mode 2",
         ),
     ],
 )

@@ -120,7 +120,7 @@ def test_a_state_of_another_size_starts_no_response():
         (lambda: imsc(modes(), 3, actuators(2.0, 4.0), weight=1.0), "3 controlled modes need as many actuators"),
         (lambda: imsc(modes(), 2, actuators(5.0, 1.0), weight=-1.0), "weight R must be positive"),
         (lambda: imsc_poles(modes(), 1, actuators(2.0), poles=[0.1 + 1j]), "not stable"),
-        (lambda: pole_gains([1.0, 2.0], [-1.0]), "one pole a mode"),
+        (lambda: pole_gains([1.0, 2.0], [-1.0]), "one pole per mode"),
         (lambda: imsc(modes(), [1], actuators(5.0), weight=1.0), "mode 2 is uncontrollable"),
         (lambda: imsc(modes(), [11], actuators(5.0), weight=1.0), "not distinct modes"),
         (lambda: coupled_lqr(modes(), 2, actuators(2.0, 3.0), weight=[1.0, -1.0]), "positive definite"),

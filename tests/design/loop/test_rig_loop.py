@@ -139,7 +139,7 @@ def test_what_does_not_fit_is_named(rig):
     one = restless(rig)
     with pytest.raises(ValueError, match=r"sensor 'd0'.* it has v0, v1"):
         run_loop(replace(rig, sensors=rig.sensors[3:]), one, LoopTest(10, DT))
-    with pytest.raises(ValueError, match="sample both alike"):
+    with pytest.raises(ValueError, match="give both the same"):
         run_loop(rig, one, LoopTest(10, 2 * DT))
     with pytest.raises(ValueError, match="Is time last"):
         LoopTest(10, DT, forces=np.zeros((10, 1)), ports=rig.actuators[:1])

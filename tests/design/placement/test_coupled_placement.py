@@ -56,7 +56,7 @@ def test_no_grid_beats_the_optimum(modes):
 def test_refusals(modes):
     with pytest.raises(DesignError, match="no residual mode"):
         place_coupled(modes, 9, 2, impulse_at=6.3, weight=10.0, limits=Limits())
-    with pytest.raises(DesignError, match="keeps the limits"):
+    with pytest.raises(DesignError, match="meets the limits"):
         place_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(effort=1e-6))
     with pytest.raises(DesignError, match="on the grid"):
         scan_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(effort=1e-6), n_places=9)

@@ -98,12 +98,12 @@ def test_a_step_of_stiffness_bends_the_participation_no_more_than_bounds_allow()
             off = np.linspace(-half, half, 101)
             tangent = participation(np.array([centre])) + off[:, None] * participation(np.array([centre]), 1)
             left = np.abs(participation(centre + off) - tangent).max(axis=0)
-            bound = task.curved(np.array([centre]), np.array([half]))[0]
+            bound = task.tangent_error(np.array([centre]), np.array([half]))[0]
             assert (left <= bound * (1 + 1e-6) + 1e-12).all()
 
 
 def test_what_cannot_be_placed_is_refused():
-    with pytest.raises(DesignError, match="no room"):
+    with pytest.raises(DesignError, match="do not fit"):
         report(6, np.eye(6))
     with pytest.raises(DesignError, match="square"):
         report(1, [[0.4, 0.0]])

@@ -140,7 +140,7 @@ def test_an_actuator_that_is_not_perfect_is_refused_not_left_out(trait, value):
     modes, state = beam(4), impulse_state(beam(4), 6.3)
     law = on_off(modes, 1, [Actuator("F", 2.0, **{trait: value})], force=0.02, dead_band=0.01)
     for told in (lambda: respond_on_off(modes, law, state, [1.0]), lambda: on_off_work(modes, law, state, 1.0)):
-        with pytest.raises(DesignError, match=f"F has {trait} = {value:g}, which .* leaves out"):
+        with pytest.raises(DesignError, match=f"F has {trait} = {value:g}, which .* cannot include"):
             told()
     wide = on_off(modes, 1, [Actuator("F", 2.0, limit=1.0)], force=0.02, dead_band=0.01)
     assert on_off_work(modes, wide, state, 1.0).by_mode[0] < 0.0

@@ -1,8 +1,8 @@
-"""A controller as the full plant meets it: from the readings of sensors to the forces of actuators.
+"""A controller: the state-space system from the readings of the sensors to the forces of the actuators.
 
     z' = A_z z + B_z y,   u = C_z z + D_z y,   y = R x
 
-A law through a modal filter has no state z; an observer has one. Both close the same loop.
+z is the state of an observer; a law through a modal filter has none.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,18 +22,18 @@ from workbench.structure.printed import Printed, counted, place_text
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Controller(Printed):
-    """A law with what it knows of the state.
+    """A law with its state estimator, a modal filter or an observer.
 
     Attributes:
-        law: whose forces it commands.
-        sensors: that it reads, one per channel: displacement, slope, velocity or angular velocity.
+        law: u = -K x̂.
+        sensors: one per channel: displacement, slope, velocity or angular velocity.
         state: (n_states, n_states) A_z, 1/s; empty for a filter.
         reads: (n_states, n_channels) B_z.
         commands: (n_actuators, n_states) C_z.
         direct: (n_actuators, n_channels) D_z.
         name: for tables and plots.
         estimator: (2 n_controlled, n_channels) L of an observer; of a filter, x̂ = estimator y; None where not known.
-        designed_by: designs it anew with the settings that it has, from modes, a law and sensors; None where not known.
+        designed_by: repeats the design with the same settings for other modes, law and sensors; None where not known.
     """
 
     law: Law
@@ -65,7 +65,7 @@ class Controller(Printed):
 
 
 def check_readable(sensors: Sequence[Sensor]) -> None:
-    """Refuse what is not a function of the state alone.
+    """Refuse sensors that do not read the state alone.
 
     Raises:
         ValueError: an accelerometer.
@@ -90,7 +90,7 @@ def reading(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
 
 
 def filtered(law: Law, filter_: ModalFilter) -> Controller:
-    """A law through a modal filter: displacements and velocities at its places, slopes and theirs where it has any.
+    """A law through a modal filter, from displacements and velocities, slopes and angular velocities where it has any.
 
     Raises:
         ValueError: a filter of other modes than the law controls, or a law that has no gain.
@@ -102,14 +102,14 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
             f"the filter gives {n_filtered} modal coordinates and the law controls {len(law.controlled)} modes; make"
             " the filter of the controlled modes: modes.select(list(law.controlled))"
         )
-    weights, kinds = [filter_.displacement], [("displacement", "velocity", "")]
+    weights, quantities = [filter_.displacement], [("displacement", "velocity", "")]
     if filter_.slope.size:
         weights.append(filter_.slope)
-        kinds.append(("slope", "angular velocity", "s"))
+        quantities.append(("slope", "angular velocity", "s"))
     sensors = [
-        Sensor(f"{'yv'[order]}{kind[2]}{i + 1}", place, kind[order])
+        Sensor(f"{'yv'[order]}{quantity[2]}{i + 1}", place, quantity[order])
         for order in (0, 1)
-        for kind in kinds
+        for quantity in quantities
         for i, place in enumerate(filter_.places)
     ]
     estimator = np.kron(np.eye(2), np.hstack(weights))
@@ -122,5 +122,5 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
 def _filtered_anew(
     design: Callable[[Modes, Sequence[int]], ModalFilter], modes: Modes, law: Law, sensors: Sequence[Sensor]
 ) -> Controller:
-    """The law through the same filter of other modes; its sensors stand where the filter has them."""
+    """A law through a filter redesigned for other modes; the filter places the sensors, so `sensors` is not used."""
     return filtered(law, design(modes, law.controlled))

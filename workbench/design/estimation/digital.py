@@ -1,12 +1,12 @@
-"""A controller as a computer runs it: once a sample, from readings to commands, with what it makes up for.
+"""A digital controller: once per sample, from readings to commands, with compensation of actuators and sensors.
 
     y = scale (reading - offset)
     w = C z + D y + friction feed-forward,          on-off: w = -spread relay(C z + D y)
-    v = w within ± limit, and within ± rate of the v before
+    v = w within ± limit, and within ± rate of the previous v
     command = v + dead zone in the direction of v - bias
     z ← A z + B y + E v
 
-v is the command that the actuator follows: an observer that is fed v instead of w does not wind up.
+v is the command that the actuator can follow: an observer driven by v instead of w does not wind up.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from workbench.design.estimation.controller import Controller
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import freeze, frozen
 
-ONSET = 0.01  # of a dead zone: the v over which its inverse sets in, so that it does not jump at zero
+ONSET = 0.01  # of a dead zone: |v| over which its inverse rises from zero, so that the command does not jump
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +69,11 @@ class DigitalController:
         a, b, c, d, e: (n_states, n_states), (n_states, n_sensors), (n_outputs, n_states), (n_outputs, n_sensors) and
             (n_states, n_actuators); n_outputs is n_actuators, or the number of relays.
         offset, scale: (n_sensors,) y = scale (reading - offset).
-        limit, rate, dead_zone, bias: (n_actuators,) in units of the command; the rate by sample.
+        limit, rate, dead_zone, bias: (n_actuators,) in units of the command; the rate per sample.
         relays: of on-off control.
         friction: fed forward.
         name: for tables and plots.
-        states: (n_states,) what each state is, in words; empty where nobody says.
+        states: (n_states,) what each state is, in words; may be empty.
     """
 
     sample_time: float
@@ -113,11 +113,11 @@ class DigitalController:
                 raise ValueError(f"DigitalController.{name} must have shape {shape}; got {getattr(self, name).shape}")
 
     def step(self, z: np.ndarray, before: np.ndarray, reading: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The commands at a sample, what the actuators are to follow of them, and the next state.
+        """The commands and v (n_actuators,) at a sample, and the next state z (n_states,).
 
         Args:
             z: (n_states,), zero at the start.
-            before: (n_actuators,) what they were to follow a sample ago, zero at the start.
+            before: (n_actuators,) v of the previous sample, zero at the start.
             reading: (n_sensors,).
         """
         y = self.scale * (reading - self.offset)
@@ -134,7 +134,7 @@ class DigitalController:
 
     @property
     def onset(self) -> np.ndarray:
-        """(n_actuators,) the v at which the inverse of a dead zone is whole; 1 where there is no dead zone."""
+        """(n_actuators,) |v| from which the dead zone is compensated in full; 1 where there is no dead zone."""
         return np.asarray(np.where(self.dead_zone > 0, ONSET * self.dead_zone, 1.0))
 
     @property
@@ -144,7 +144,7 @@ class DigitalController:
         return not (bounded or self.bias.any() or self.offset.any() or self.relays or self.friction)
 
     def state_space(self) -> control.StateSpace:
-        """Its linear part as python-control's discrete `StateSpace` from readings to commands, limits left out.
+        """The linear part as python-control's discrete `StateSpace` from readings to commands, without limits.
 
         Raises:
             ValueError: on-off control, which has no linear part.
@@ -157,13 +157,13 @@ class DigitalController:
 
 
 def modal_states(modes: Sequence[int]) -> tuple[str, ...]:
-    """What an observer's estimates of these modes (zero-based) are, in words and in their order."""
+    """The states of an observer of these modes (zero-based), in words: displacements, then rates."""
     kinds = (("displacement", "kg^0.5 m"), ("rate", "kg^0.5 m/s"))
     return tuple(f"estimated {kind} of mode {r + 1}, {unit}" for kind, unit in kinds for r in modes)
 
 
 def sampled(controller: Controller, sample_time: float) -> DigitalController:
-    """A controller as it is, run once a sample, each reading held until the next.
+    """A continuous controller discretised, each reading held until the next sample (zero-order hold).
 
     z' = A_z z + B_z y becomes z ← e^{A_z T} z + ∫ e^{A_z t} dt B_z y.
 
@@ -181,11 +181,11 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
             " luenberger or filtered"
         )
     if not 0 < number(sample_time, "sample_time", "s") < np.inf:
-        raise ValueError(f"a controller runs once every sample_time seconds, above 0; got {sample_time:g}")
+        raise ValueError(f"sample_time must be above 0; got {sample_time:g} s")
     n, n_sensors = controller.state.shape[0], len(controller.sensors)
-    moving = np.zeros((n + n_sensors, n + n_sensors))
-    moving[:n] = np.hstack([controller.state, controller.reads])
-    held = expm(sample_time * moving)
+    augmented = np.zeros((n + n_sensors, n + n_sensors))
+    augmented[:n] = np.hstack([controller.state, controller.reads])
+    held = expm(sample_time * augmented)
     return DigitalController(
         sample_time,
         tuple(sensor.name for sensor in controller.sensors),

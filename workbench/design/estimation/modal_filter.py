@@ -1,9 +1,9 @@
-"""Modal filters: from sensors to modal coordinates; weights computed once.
+"""Modal filters: constant weights from sensor readings to modal coordinates.
 
-Along a structure, dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors;
-attached masses add M φ_r w and J φ_r' w' where they stand, since the modes are orthogonal only with them. At named
-points, between which there is nothing, w is what bends the structure least. Over a rectangle w is a thin-plate
-spline through sensors that stand anywhere on it.
+Along a structure, dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors.
+Attached masses add M φ_r w and J φ_r' w' at their places, since the modes are orthogonal only with them. At named
+points w is the displacement of least strain energy. Over a rectangle w is a thin-plate spline through sensors at any
+places.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,23 +25,23 @@ from workbench.structure.printed import Printed, counted, place_text
 from workbench.structure.profile import FieldLike, Profile, ProfileLike, as_field, as_profile
 
 GAUSS_POINTS = 24
-BLIND = 1e-6  # of the largest singular value of the shapes at the sensors: below, noise is raised a million times
-RIGID = 1e-4  # of the slowest elastic frequency: a rigid mode counts as one so slow, which costs next to no energy
-READINGS = 3  # not on one line: what a plane through them needs
-PER_SIDE = 24  # readings of zero along a held edge of the longer side
-SAME = 1e-6  # of the diagonal: nearer, a sensor stands at a place of the rim
-QUADRATURE = 500  # modes that the rule would serve: the spline is rougher than they are at its sensors
+BLIND = 1e-6  # of the largest singular value of the shapes at the sensors: below, noise is amplified a million times
+RIGID = 1e-4  # of the slowest elastic frequency: that of a rigid mode here, at which it costs almost no energy
+READINGS = 3  # not on one line, to determine a plane
+PER_SIDE = 24  # zero displacements along a held edge of the longer side
+SAME = 1e-6  # of the diagonal: a sensor nearer to a place on the edge replaces the zero there
+QUADRATURE = 500  # order of the rule, in modes: the spline is less smooth than the modes are
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModalFilter(Printed):
-    """Weights that turn readings into modal coordinates; rates go through the same weights.
+    """Weights that turn readings into modal coordinates; velocities use the same weights.
 
     Attributes:
         positions: (n_sensors,) m, increasing; on a plate (n_sensors, 2) m; at named points (n_sensors,) names.
         displacement: (n_modes, n_sensors) weights of the displacements (or velocities).
         slope: (n_modes, n_sensors) weights of the slopes (or angular velocities); no columns where none are read.
-        designed_by: designs it anew, with the settings that it has, from modes and the indices of the filtered ones.
+        designed_by: repeats the design with the same settings, from modes and the indices of the filtered ones.
     """
 
     positions: np.ndarray
@@ -66,7 +66,7 @@ class ModalFilter(Printed):
 
     @property
     def places(self) -> list[Place]:
-        """The positions as places: floats, pairs of floats, or names."""
+        """The positions as floats, pairs of floats, or names."""
         return [same_place(at) for at in self.positions]
 
     def __call__(self, displacement: ArrayLike, slope: ArrayLike | None = None) -> Floats:
@@ -79,9 +79,9 @@ class ModalFilter(Printed):
     seen = Renamed("response_to")
 
     def response_to(self, modes: Modes) -> Floats:
-        """The filter's modal coordinates for a unit of each mode, (n_filtered, n_modes); the identity if it is perfect.
+        """The filter's modal coordinates for a unit of each mode, (n_filtered, n_modes); ideally the identity.
 
-        Columns beyond the filtered modes are observation spillover.
+        The columns of other than the filtered modes are observation spillover.
         """
         matrix = self.displacement @ modes.phi(self.positions)
         return matrix if self.slope.size == 0 else matrix + self.slope @ modes.phi(self.positions, 1)
@@ -92,17 +92,17 @@ def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileL
 
     Args:
         modes: to be filtered, n_modes of them.
-        positions: (n_sensors,) increasing, m; the first and last sensor bound what is integrated.
+        positions: (n_sensors,) increasing, m; the integral runs from the first sensor to the last.
         mass_per_length: kg/m.
 
     Raises:
         ValueError: fewer than two sensors, or positions that do not increase.
     """
     x = _checked(positions, 2)
-    one, none = np.eye(x.size), np.zeros((x.size, x.size))
+    unit, zero = np.eye(x.size), np.zeros((x.size, x.size))
     displacement, slope = (
-        _weights(modes, as_profile(mass_per_length), x, CubicHermiteSpline(x, *unit))
-        for unit in ((one, none), (none, one))
+        _weights(modes, as_profile(mass_per_length), x, CubicHermiteSpline(x, *values))
+        for values in ((unit, zero), (zero, unit))
     )
     again = partial(anew, hermite_filter, positions=x, mass_per_length=mass_per_length)
     return ModalFilter(x, displacement, slope, again)
@@ -113,10 +113,11 @@ def displacement_filter(
 ) -> ModalFilter:
     """The filter of displacements alone: a spline of odd degree through the sensors and the held ends.
 
-    Where a support holds the displacement at an end that carries no sensor, its zero is a reading too.
+    A held end without a sensor counts as a reading of zero.
 
     Args:
-        degree: of the spline, lowered where there are too few sensors for it.
+        modes, positions, mass_per_length: as for `hermite_filter`; one sensor is enough where an end is held.
+        degree: of the spline; lowered where there are too few sensors.
 
     Raises:
         ValueError: fewer than two readings, or positions that do not increase.
@@ -138,20 +139,20 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
     """The filter of displacements at named points: w of least strain energy through the readings.
 
     Minimise ½ Σ ω_k² η_k² over all modes k under Φ η = y, Φ (n_sensors, n_modes) the shapes at the sensors, and take
-    q_r = η_r. It is the spline of a structure that is known at points alone: what bends least. From as many sensors as
-    modes on, it is the least-squares fit.
+    q_r = η_r. This is the counterpart of a spline for a structure known at points alone. With as many sensors as modes
+    or more it is the least-squares fit.
 
     Args:
-        modes: all that are known, at named points.
+        modes: all known modes, at named points.
         points: of the sensors.
         filtered: indices of the modes to be filtered, from 0.
 
     Raises:
-        ValueError: two sensors at one point, fewer sensors than filtered modes, modes that they cannot tell apart, or
-            that are not at hand.
+        ValueError: two sensors at one point, fewer sensors than filtered modes, modes that the sensors cannot
+            distinguish, or an index without a mode.
     """
     names, index = list(points), list(filtered)
-    modes.select(index)  # refuses what is not at hand
+    modes.select(index)  # refuses an index without a mode
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise ValueError(f"two of the {len(names)} sensors stand at point {twice}; move one")
@@ -161,30 +162,31 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
             " sensors, or filter fewer modes"
         )
     shapes = modes.phi(names)
-    _, strength, right = np.linalg.svd(shapes[:, index], full_matrices=False)
-    if strength[-1] < BLIND * strength[0]:
+    _, singular_values, right = np.linalg.svd(shapes[:, index], full_matrices=False)
+    if singular_values[-1] < BLIND * singular_values[0]:
         mixed = [str(index[i] + 1) for i in np.flatnonzero(np.abs(right[-1]) > 0.5 * np.abs(right[-1]).max())]
         raise ValueError(
             f"the sensors at {', '.join(names)} cannot distinguish filtered mode(s) {', '.join(mixed)} from rest or"
             " from each other; move or add a sensor"
         )
     slowest = modes.omega[modes.omega > 0].min(initial=np.inf)
-    softness = 1.0 / np.maximum(modes.omega, RIGID * slowest if np.isfinite(slowest) else 1.0)
-    weights: Floats = (softness[:, None] * np.linalg.pinv(shapes * softness))[index]
+    compliance = 1.0 / np.maximum(modes.omega, RIGID * slowest if np.isfinite(slowest) else 1.0)
+    weights: Floats = (compliance[:, None] * np.linalg.pinv(shapes * compliance))[index]
     again = partial(point_filter, points=names)
     return ModalFilter(np.array(names, object), weights, np.zeros((len(index), 0)), again)
 
 
 def anew(design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[int], **settings: Any) -> ModalFilter:
-    """A filter between whose sensors w is interpolated, of other modes: the filtered ones are all that it asks of."""
+    """A filter by interpolation, redesigned for other modes, of which it needs the filtered ones alone."""
     return design(modes.select(list(filtered)), **settings)
 
 
 def _weights(modes: Modes, mass: Profile, nodes: np.ndarray, splines: Callable[[ArrayLike, int], Floats]) -> Floats:
-    """∫ m φ_r w dx and the share of attached masses, (n_modes, n_readings), w the splines (x, derivative) of readings.
+    """∫ m φ_r w dx with the terms of attached masses, (n_modes, n_readings), for w of a unit of each reading.
 
     Args:
-        nodes: from the first to the last it is integrated, piece by piece, m.
+        nodes: bounds of the pieces of the integral, m.
+        splines: (x, derivative) → w and its derivatives (n_points, n_readings).
     """
     at, lengths = gauss_between(nodes, GAUSS_POINTS)
     weights: Floats = (modes.phi(at) * (mass(at) * lengths)[:, None]).T @ splines(at, 0)
@@ -206,8 +208,8 @@ def _checked(positions: ArrayLike, least: int) -> np.ndarray:
 def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) -> ModalFilter:
     """The filter of displacements at scattered places: q_r = ∫∫ m φ_r w dA, w a thin-plate spline through the readings.
 
-    The spline bends least of all surfaces through the readings (Duchon 1977). Along an edge that holds the displacement
-    its zero is read too.
+    The spline has the least bending energy of all surfaces through the readings (Duchon 1977). Held edges count as
+    readings of zero.
 
     Args:
         modes: to be filtered, n_modes of them, over a rectangle.
@@ -237,20 +239,20 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
     points, weights = domain.quadrature(QUADRATURE)
     density = weights * as_field(mass_per_area)(points[:, 0], points[:, 1])
     splines = RBFInterpolator(nodes, np.eye(len(nodes)), kernel="thin_plate_spline", degree=1)
-    spread: Floats = (modes.phi(points) * density[:, None]).T @ splines(points)
+    filter_weights: Floats = (modes.phi(points) * density[:, None]).T @ splines(points)
     for part in modes.masses:
-        spread = spread + part.mass * modes.phi(part.at).T @ splines(domain.locate(part.at))
+        filter_weights = filter_weights + part.mass * modes.phi(part.at).T @ splines(domain.locate(part.at))
     again = partial(anew, surface_filter, places=at, mass_per_area=mass_per_area)
-    return ModalFilter(at, spread[:, : len(at)], np.zeros((modes.n_modes, 0)), again)
+    return ModalFilter(at, filter_weights[:, : len(at)], np.zeros((modes.n_modes, 0)), again)
 
 
 def filter_on(
     structure: Structure | Plate | Membrane | None, modes: Modes, filtered: Sequence[int], places: ArrayLike
 ) -> ModalFilter:
-    """The filter of displacements of a structure's own kind: along it, over it, or at its named points.
+    """The displacement filter that fits a structure: along it, over it, or at its named points.
 
     Args:
-        structure: whose mass a filter along or over it needs; None at named points.
+        structure: gives the mass; None at named points.
         modes: of the structure, all that are known.
         filtered: indices of the modes to be filtered, from 0.
         places: of the sensors, in any order.
@@ -269,7 +271,7 @@ def filter_on(
 def filter_of_mass(
     mass: ProfileLike | FieldLike | None, modes: Modes, filtered: Sequence[int], places: ArrayLike
 ) -> ModalFilter:
-    """The filter of displacements that `filter_on` gives, of modes whose mass is known and not the whole structure.
+    """The filter of `filter_on`, from the distribution of mass instead of the structure.
 
     Args:
         mass: kg/m along a structure, kg/m² over a surface; not needed at named points.
@@ -281,7 +283,7 @@ def filter_of_mass(
     if isinstance(modes.domain, NamedPoints):
         return point_filter(modes, [str(name) for name in np.ravel(np.asarray(places, object))], filtered)
     if mass is None:
-        raise ValueError("a modal filter needs the structure between the sensors, for its mass; describe it")
+        raise ValueError("a modal filter needs the mass of the structure between the sensors; describe the structure")
     own = modes.select(list(filtered))
     if isinstance(modes.domain, Rectangle):
         return surface_filter(own, places, cast(FieldLike, mass))
@@ -289,11 +291,11 @@ def filter_of_mass(
 
 
 def _held(modes: Modes, domain: Rectangle, at: np.ndarray) -> Floats:
-    """Places along the rim (n_places, 2) that no mode moves and where no sensor stands, m."""
+    """Places along the held edges (n_places, 2) where no sensor stands, m."""
     (a, b), spacing = domain.length, max(domain.length) / PER_SIDE
     x, y = (np.linspace(0.0, side, max(round(side / spacing), 4) + 1) for side in (a, b))
-    along = [(each, edge) for edge in (0.0, b) for each in x] + [(edge, each) for edge in (0.0, a) for each in y[1:-1]]
-    rim = np.array(along)
+    edges = [(each, edge) for edge in (0.0, b) for each in x] + [(edge, each) for edge in (0.0, a) for each in y[1:-1]]
+    rim = np.array(edges)
     rim = rim[modes.are_held(rim)]
     distance = np.linalg.norm(rim[:, None] - at, axis=2).min(axis=1, initial=np.inf)
     return np.asarray(rim[distance > SAME * domain.size])

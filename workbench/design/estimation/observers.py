@@ -1,8 +1,8 @@
-"""Observers: the state of the controlled modes from the readings, by a model that knows nothing of the residual ones.
+"""Observers: the state of the controlled modes estimated from the readings, by a model without the residual modes.
 
     x̂' = (A - B K - L C) x̂ + L y,   u = -K x̂
 
-What the residual modes add to y is observation spillover (Balas, IEEE Trans. Automatic Control 23 (1978) 673).
+The part of y due to the residual modes is observation spillover (Balas, IEEE Trans. Automatic Control 23 (1978) 673).
 """
 
 from collections.abc import Callable, Sequence
@@ -20,44 +20,47 @@ from workbench.design.laws.pole_assignment import assign
 from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes
 
-UNSEEN = 1e-9
-# as fast as the mode that is watched, and damped enough to forget where it started within two periods
+UNSEEN = 1e-9  # of a mode's largest displacement: a smaller reading does not observe the mode
+# pole over ω: as fast as the observed mode, and damped enough that the initial error decays within two periods
 USUAL = -0.3 + 1j
 
 
 def luenberger(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: ArrayLike) -> Controller:
-    """The law on the state of a Luenberger observer.
+    """The controller of a law on the state of a Luenberger observer.
 
     Args:
-        modes: at hand; the observer knows the controlled ones.
-        law: u = -K x on those.
-        sensors: displacement, slope, velocity or angular velocity; one will do.
-        poles: (n_controlled,) of the observer's error, one of each conjugate pair a mode, rad/s.
+        modes: of the structure; the observer models the controlled ones.
+        law: u = -K x of the controlled modes.
+        sensors: displacement, slope, velocity or angular velocity; one is enough.
+        poles: (n_controlled,) of the estimation error, one of each conjugate pair per mode, rad/s.
 
     Raises:
-        DesignError: a mode that no sensor sees, or poles that these sensors cannot place.
+        DesignError: a mode that no sensor observes, or poles that these sensors cannot assign.
     """
     a, b, c = observed_plant(modes, law, sensors)
     n = law.n_controlled
     names = [f"mode {r + 1} of the observer" for r in law.controlled]
-    # along (q_r, q_r' = λ q_r) the readings see mode r with c_q + λ c_v
-    seen = c[:, :n] + 1j * modes.omega[list(law.controlled)] * c[:, n:]
-    gain = assign(a.T, c.T, poles, seen.conj(), names).T
+    # of the motion (q_r, q_r' = λ q_r) of mode r the sensors read c_q + λ c_v
+    outputs = c[:, :n] + 1j * modes.omega[list(law.controlled)] * c[:, n:]
+    gain = assign(a.T, c.T, poles, outputs.conj(), names).T
     return _controller(law, sensors, a, b, c, gain, "Luenberger observer", partial(luenberger, poles=poles))
 
 
 def usual_poles(modes: Modes, controlled: Sequence[int]) -> Complexes:
-    """Poles (n_controlled,) of an observer's error where none are given, rad/s: (-0.3 + i) ω of each mode.
+    """Default poles (n_controlled,) of an observer's estimation error, rad/s: (-0.3 + i) ω of each mode.
 
-    Rigid modes have no frequency: theirs are evenly spaced below that of the slowest elastic mode at hand.
+    Rigid modes have no frequency: ω is then evenly spaced below that of the slowest elastic mode.
 
     Raises:
-        DesignError: rigid modes alone, which set no speed.
+        DesignError: rigid modes alone.
     """
     omega = np.array(modes.omega[list(controlled)])
     rigid, elastic = omega == 0, modes.omega[modes.omega > 0]
     if rigid.any() and not elastic.size:
-        raise DesignError("rigid modes alone set no speed of an observer; give the poles of luenberger, or take kalman")
+        raise DesignError(
+            "rigid modes alone have no frequency that sets the observer's poles; give luenberger its poles, or use"
+            " kalman"
+        )
     omega[rigid] = elastic[:1] * np.arange(1, rigid.sum() + 1) / (rigid.sum() + 1)
     poles: Complexes = USUAL * omega
     return poles
@@ -66,7 +69,7 @@ def usual_poles(modes: Modes, controlled: Sequence[int]) -> Complexes:
 def kalman(
     modes: Modes, law: Law, sensors: Sequence[Sensor], *, disturbance: ArrayLike, noise: ArrayLike
 ) -> Controller:
-    """The law on the state of a steady Kalman filter (python-control's `lqe`).
+    """The controller of a law on the state of a steady-state Kalman filter (python-control's `lqe`).
 
     Args:
         modes, law, sensors: as for `luenberger`.
@@ -74,16 +77,16 @@ def kalman(
         noise: intensity of the readings' white noise, scalar, (n_channels,) or (n_channels, n_channels); positive.
 
     Raises:
-        DesignError: a mode that no sensor sees, intensities that are not positive.
+        DesignError: a mode that no sensor observes, intensities that are not positive.
     """
     a, b, c = observed_plant(modes, law, sensors)
     n = law.n_controlled
-    push = positive_definite(disturbance, n, f"the disturbance intensity must be positive, one number or {n}")
-    spread = positive_definite(
+    process = positive_definite(disturbance, n, f"the disturbance intensity must be positive, one number or {n}")
+    measurement = positive_definite(
         noise, len(sensors), f"the noise intensity must be positive, one number or {len(sensors)}"
     )
     try:
-        gain, _, _ = control.lqe(a, np.vstack([np.zeros((n, n)), np.eye(n)]), c, push, spread)
+        gain, _, _ = control.lqe(a, np.vstack([np.zeros((n, n)), np.eye(n)]), c, process, measurement)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(
             f"the Kalman filter's Riccati equation has no stabilising solution: {error}; move or add a sensor"
@@ -96,7 +99,7 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
     """A, B and C of the controlled modes alone, from forces to readings.
 
     Raises:
-        DesignError: a law that has no gain, no sensors, or a mode that none sees.
+        DesignError: a law that has no gain, no sensors, or a mode that none of them observes.
     """
     law = linear(law)
     index = list(law.controlled)
@@ -110,13 +113,13 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
         strength = max(np.abs(c[:, j]).max(), np.abs(c[:, n + j]).max())
         if strength <= UNSEEN * grid[j]:
             raise DesignError(f"mode {r + 1} is unobservable: all sensors stand at its nodes; move or add one")
-    # where rigid modes stand is in displacements alone, and of all of them together
+    # rigid modes are observable through displacements alone, and need as many independent ones as there are modes
     rigid = np.flatnonzero(own.omega == 0)
-    told = int(np.linalg.matrix_rank(c[:, rigid] / grid[rigid], tol=UNSEEN)) if rigid.size else 0
-    if told < rigid.size:
+    rank = int(np.linalg.matrix_rank(c[:, rigid] / grid[rigid], tol=UNSEEN)) if rigid.size else 0
+    if rank < rigid.size:
         raise DesignError(
-            f"{rigid.size} rigid-body {'modes need' if rigid.size > 1 else 'mode needs'} as many displacements that"
-            f" distinguish them, and the sensors read {told}: velocity alone leaves them unobservable; add a"
+            f"{rigid.size} rigid-body {'modes need' if rigid.size > 1 else 'mode needs'} as many independent"
+            f" displacement sensors; there are {rank}: velocity alone leaves rigid modes unobservable; add a"
             " displacement sensor, at another place"
         )
     a, b = controlled_plant(modes, index, law.actuators)

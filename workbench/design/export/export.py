@@ -1,4 +1,4 @@
-"""A design handed over: python-control objects, a MAT file, or a step function in C or Python."""
+"""Export of a design: python-control objects, a MAT file, or a step function in C or Python."""
 
 import keyword
 from dataclasses import replace
@@ -28,22 +28,22 @@ def export(
     computing_delay: float = 0.0,
     units: Units = SI,
 ) -> SampledDesign:
-    """The controller as a computer runs it once a sample, written to a file where a path is given.
+    """The controller discretised at a sampling rate, written to a file where a path is given.
 
-    Its `controller.state_space()` is python-control's discrete `StateSpace` from readings to commands.
+    `controller.state_space()` of the result is python-control's discrete `StateSpace` from readings to commands.
 
     Args:
         modes: of the structure, controlled and residual; the sampled loop of all of them is checked.
         controller: a law through a modal filter, or on an observer.
         path: NAME.c (with NAME.h beside it), NAME.py or NAME.mat.
-        sample_rate_hz: at which it is to run, Hz.
+        sample_rate_hz: of the controller, Hz.
         computing_delay: from a reading to the first effect of its command, beside the actuators' own delays, s.
-        units: by which the file tells readings, commands and states.
+        units: of the readings, commands and states in the file.
 
     Raises:
         DesignError: a law that reads no sensors, a loop that is unstable, or a rate too slow for the modes; see
             `sample_design`.
-        ValueError: a file name of another kind.
+        ValueError: another file suffix.
     """
     kind = None if path is None else check_name(Path(path))
     design = sample_design(modes, controller, sample_rate_hz=sample_rate_hz, computing_delay=computing_delay)
@@ -57,15 +57,15 @@ def export(
 def write_controller(
     controller: DigitalController, path: str | Path, *, readings: tuple[str, ...] = (), commands: tuple[str, ...] = ()
 ) -> tuple[Path, ...]:
-    """The files written: NAME.c and NAME.h, NAME.py or NAME.mat, as the path says.
+    """Write a controller to NAME.c and NAME.h, NAME.py or NAME.mat, and return the paths.
 
     Args:
-        controller: with all that it makes up for: limits, dead zones, relays, friction.
-        path: its ending names the kind; its name that of the functions in C.
-        readings, commands: what each is, in words; names of sensors and actuators unless given.
+        controller: with its limits, dead zones, relays and friction feed-forward.
+        path: the suffix selects the format; NAME is also the name of the functions in C.
+        readings, commands: what each is, in words; by default the names of sensors and actuators.
 
     Raises:
-        ValueError: an ending of another kind, or a name that C or Python cannot have.
+        ValueError: another suffix, or a name that is no identifier in C or Python.
     """
     path = Path(path)
     kind = check_name(path)
@@ -77,14 +77,14 @@ def write_controller(
 
 
 def check_name(path: Path) -> str:
-    """What a file's name says it is to hold: "c", "python" or "mat".
+    """The format of a file by its suffix: "c", "python" or "mat".
 
     Raises:
-        ValueError: an ending of another kind, or a name that C or Python cannot have.
+        ValueError: another suffix, or a name that is no identifier in C or Python.
     """
     kind = "mat" if path.suffix == ".mat" else LANGUAGES.get(path.suffix, "")
     if not kind:
-        raise ValueError(f"{path}: a controller is written as .c, .py or .mat; name the file so")
+        raise ValueError(f"{path}: a controller is written as .c, .py or .mat; use one of these suffixes")
     name = path.stem
     if kind != "mat" and (not (name.isascii() and name.isidentifier()) or keyword.iskeyword(name)):
         raise ValueError(f"{path}: {name!r:.60} cannot name a function; use letters, digits and _, a letter first")
@@ -92,7 +92,7 @@ def check_name(path: Path) -> str:
 
 
 def _mat(controller: DigitalController, readings: tuple[str, ...], commands: tuple[str, ...]) -> dict[str, object]:
-    """Variables of the MAT file: the five matrices, what is made up for, and what each signal is."""
+    """Variables of the MAT file: the matrices, the compensation of actuators and sensors, and what each signal is."""
     one = controller
     content = {
         "name": one.name,

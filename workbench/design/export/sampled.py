@@ -1,4 +1,4 @@
-"""A design at the rate of the computer that is to run it: what sampling costs it, and its delay margin."""
+"""A design at a sampling rate: its stability margin, phase lag and delay margin."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,24 +18,24 @@ from workbench.renamed import Renamed
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed
 
-ON_CIRCLE = 1e-9  # a pole no further outside the unit circle stands on it
-COMFORTABLE = 10.0  # samples per period of the highest controlled mode
-FASTEST = 1024.0  # times the rate asked for, up to which a rate that holds is looked for
-MOST_LATE, TRIES = 40, 160  # samples of further delay that are tried, in so many steps
+ON_CIRCLE = 1e-9  # a pole no further outside the unit circle counts as on it
+COMFORTABLE = 10.0  # samples per period of the highest controlled mode, recommended where the rate is too slow
+FASTEST = 1024.0  # times the given rate: up to there a rate with a stable loop is looked for
+MOST_LATE, TRIES = 40, 160  # further delay that is tried for the delay margin, samples, and the number of steps
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SampledDesign(Printed):
-    """A controller as a computer runs it once a sample, beside the structure that it controls.
+    """A discretised controller with the loop of all modes that it closes.
 
     Attributes:
         modes: controlled and residual.
         source: the controller in continuous time.
-        controller: the same at the sampling rate, each reading held until the next.
+        controller: the discretised controller, each reading held until the next.
         computing_delay: from a reading to the first effect of its command, s.
         poles: (n_states,) of the sampled loop of all modes, in the z-plane.
-        delay_margin: further delay until a pole leaves the unit circle, s; infinite where 40 samples do not do it.
-        units: by which readings, commands and states are told.
+        delay_margin: least further delay that destabilises, s; infinite where 40 samples do not.
+        units: of readings, commands and states.
     """
 
     modes: Modes
@@ -60,7 +60,7 @@ class SampledDesign(Printed):
 
     @property
     def phase_lag(self) -> np.ndarray:
-        """Phase lag (n_controlled,) of the held command and the computer at each controlled mode, ω (T/2 + τ), rad."""
+        """Phase lag (n_controlled,) of hold and computing delay at each controlled mode, ω (T/2 + τ), rad."""
         own = self.modes.omega[list(self.source.law.controlled)]
         return np.asarray(own * (0.5 * self.controller.sample_time + self.computing_delay))
 
@@ -93,36 +93,36 @@ class SampledDesign(Printed):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a user should know before it runs: stability before and after sampling, and what is aliased."""
+        """Stability before and after sampling, rigid modes that are not held, and modes that are aliased."""
         before = close_with(self.modes, self.source)
         delay = f"delay margin {1e3 * self.delay_margin:.3g} ms"
         if not np.isfinite(self.delay_margin):
             delay = f"delay margin beyond {MOST_LATE} samples"
-        # rounding is no margin
+        # a margin within rounding is stated as zero
         own = 0.0 if abs(self.margin) * self.controller.sample_time < ON_CIRCLE else self.margin
         continuous = 0.0 if before.stability == "marginally stable" else before.margin
-        said = [f"stability margin {own:.3g} 1/s, {continuous:.3g} 1/s in continuous time; {delay}"]
+        remarks = [f"stability margin {own:.3g} 1/s, {continuous:.3g} 1/s in continuous time; {delay}"]
         rate, law = self.sample_rate_hz, self.source.law
         free = [r for i, r in enumerate(law.controlled) if self.modes.omega[r] == 0 and not law.gain[:, i].any()]
         if free:
-            said.append(
-                f"nothing holds the displacement of what is rigid (mode {numbered(free)}); poles of its own would"
+            remarks.append(
+                f"no gain acts on the displacement of the rigid mode(s) {numbered(free)}; assign poles to hold it"
             )
         folded = [(r, f) for r, f in enumerate(self.modes.frequencies_hz) if f > 0.5 * rate and r not in law.controlled]
         if folded:
             r, f = folded[0]
             more = f", and {len(folded) - 1} more above it" if len(folded) > 1 else ""
-            said.append(
+            remarks.append(
                 f"mode {r + 1} at {f:.4g} Hz{more}: above the Nyquist frequency, aliased to"
                 f" {abs(f - rate * round(f / rate)):.4g} Hz; add an anti-aliasing filter, or sample faster"
             )
-        return tuple(said)
+        return tuple(remarks)
 
 
 def sample_design(
     modes: Modes, controller: Controller | Law | OnOffLaw, *, sample_rate_hz: float, computing_delay: float = 0.0
 ) -> SampledDesign:
-    """The controller run at a rate, with the loop of all modes that it then closes.
+    """The controller discretised at a sampling rate, with the loop of all modes that it closes.
 
     Args:
         modes: controlled and residual.
@@ -132,8 +132,8 @@ def sample_design(
 
     Raises:
         TypeError: no modes, no controller, or a rate or a delay that is no number.
-        DesignError: a law that reads no sensors, a loop that is unstable before any sampling, a rate too slow for the
-            modes, or a delay under which no rate is stable.
+        DesignError: a law that reads no sensors, a loop that is unstable in continuous time, a rate too slow for the
+            modes, or a delay with which no rate is stable.
     """
     if not isinstance(modes, Modes):
         raise TypeError(
@@ -146,8 +146,8 @@ def sample_design(
         )
     if isinstance(controller, OnOffLaw):
         raise DesignError(
-            f"{controller.name} switches, and a controller that is sampled here is linear; redesign(possible, law)"
-            " puts it on a Kalman filter, and its result's export writes it"
+            f"{controller.name} switches, and sample_design needs a linear controller; redesign(possible, law) puts it"
+            " on a Kalman filter, and export of its result writes it"
         )
     if not isinstance(controller, Controller):
         raise DesignError(
@@ -177,16 +177,16 @@ def sample_design(
         loop = sampled_loop(modes, controller.law.actuators, controller.sensors, digital, delay)
         return np.asarray(np.linalg.eigvals(loop))
 
-    found = poles(sample_rate_hz, computing_delay)
-    if not _stable(found):
-        late = computing_delay + max(actuator.delay for actuator in controller.law.actuators)
-        raise DesignError(_too_slow(lambda rate: _stable(poles(rate, computing_delay)), sample_rate_hz, late))
+    sampled_poles = poles(sample_rate_hz, computing_delay)
+    if not _stable(sampled_poles):
+        delay = computing_delay + max(actuator.delay for actuator in controller.law.actuators)
+        raise DesignError(_too_slow(lambda rate: _stable(poles(rate, computing_delay)), sample_rate_hz, delay))
     return SampledDesign(
         modes,
         controller,
         sampled(controller, 1.0 / sample_rate_hz),
         computing_delay,
-        found,
+        sampled_poles,
         _delay_margin(1.0 / sample_rate_hz, lambda more: _stable(poles(sample_rate_hz, computing_delay + more))),
     )
 
@@ -196,14 +196,14 @@ def _stable(poles: np.ndarray) -> bool:
 
 
 def _too_slow(stable: Callable[[float], bool], rate: float, delay: float) -> str:
-    """Why a rate at which the loop is unstable will not do, and which will."""
+    """The message on a rate at which the loop is unstable, with a rate at which it is stable."""
     fast = 2.0 * rate
     while not stable(fast):
         fast *= 2.0
         if fast > FASTEST * rate or fast * delay > MOST_PAST:
             return (
-                f"delays of {1e3 * delay:.4g} ms destabilise the loop at this rate and at faster ones; shorten them, or"
-                " lower the gains"
+                f"delays of {1e3 * delay:.4g} ms destabilise the loop at this rate and at faster rates; shorten the"
+                " delays, or lower the gains"
             )
     slow = 0.5 * fast
     for _ in range(20):
@@ -217,7 +217,7 @@ def _too_slow(stable: Callable[[float], bool], rate: float, delay: float) -> str
 
 
 def _round_up(value: float) -> float:
-    """Two digits, not less than the value."""
+    """The value rounded up to two digits."""
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(np.ceil(value / step - 1e-9) * step)
 

@@ -1,6 +1,6 @@
-"""The loop of all modes under a controller that runs once a sample, exact from sample to sample.
+"""The discrete-time loop of all modes under a digital controller, exact at the samples.
 
-With the plant x' = A x + B u, y = C x and a command held over each sample that acts τ = m T + r late,
+With the plant x' = A x + B u, y = C x and a command that is held over each sample and delayed by τ = m T + r,
 
     x_k+1 = e^{AT} x_k + ∫_0^{T-r} e^{At} dt B u_k-m + e^{A(T-r)} ∫_0^r e^{At} dt B u_k-m-1
 
@@ -21,7 +21,7 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
 from workbench.structure.modes import Modes
 
-MOST_PAST = 400  # commands under way at a time
+MOST_PAST = 400  # delayed commands, in samples
 
 
 def sampled_loop(
@@ -31,21 +31,24 @@ def sampled_loop(
     controller: DigitalController,
     computing_delay: float = 0.0,
 ) -> np.ndarray:
-    """The matrix (n_states, n_states) of the loop: plant, commands that are still under way, then controller.
+    """The matrix (n_states, n_states) of the loop; the states are the plant, delayed commands, then the controller.
 
     Args:
         modes: controlled and residual.
-        actuators: in the order of the commands; their gains, lags and delays count, limits and dead zones do not.
+        actuators: in the order of the commands; gains, lags and delays count, limits and dead zones do not.
         sensors: in the order of the readings, likewise.
-        controller: its linear part, limits left out.
+        controller: its linear part counts.
         computing_delay: from a reading to the command's first effect, beside the actuators' own delays, s.
 
     Raises:
-        DesignError: a sensor that is late by itself, or a negative delay.
+        DesignError: a sensor with a delay or cross-talk, or a negative delay.
     """
-    late = [sensor.name for sensor in sensors if sensor.delay or sensor.crosstalk]
-    if late:
-        raise DesignError(f"sensor {late[0]} is late or reads others too; count its delay as computing delay")
+    refused = [sensor.name for sensor in sensors if sensor.delay or sensor.crosstalk]
+    if refused:
+        raise DesignError(
+            f"sensor {refused[0]} has a delay or cross-talk; include the delay in the computing delay, leave out"
+            " cross-talk"
+        )
     if not (np.isfinite(computing_delay) and computing_delay >= 0):
         raise DesignError(f"the computing delay must be 0 s or more; got {computing_delay:g} s")
     a, b, c = linear_plant(modes, actuators, sensors)
@@ -56,22 +59,22 @@ def sampled_loop(
 
 
 def held(a: np.ndarray, b: np.ndarray, period: float, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A and B from sample to sample; the states are x, then each actuator's commands under way, newest first.
+    """A and B of the plant in discrete time; the states are x, then each actuator's delayed commands, newest first.
 
     Args:
-        a: (n, n); b: (n, n_actuators).
+        a: (n, n) of x' = A x + B u.
+        b: (n, n_actuators).
         period: s.
-        delays: (n_actuators,) until a command acts, s.
+        delays: (n_actuators,) of the commands, s.
 
     Raises:
-        DesignError: too many commands under way.
+        DesignError: delays of too many samples.
     """
     parts = [whole_samples(float(delay), period) for delay in delays]
     past = [whole + (rest > 0) for whole, rest in parts]
     if max(past, default=0) > MOST_PAST:
         raise DesignError(
-            f"{max(past)} samples pass until a command acts, more than {MOST_PAST}; sample slower, or shorten the"
-            " delays"
+            f"the delay of a command is {max(past)} samples, more than {MOST_PAST}; sample slower, or shorten the delay"
         )
     n, starts = len(a), len(a) + np.r_[0, np.cumsum(past)].astype(int)
     stepped, into = np.zeros((starts[-1],) * 2), np.zeros((starts[-1], len(parts)))
@@ -93,7 +96,7 @@ def held(a: np.ndarray, b: np.ndarray, period: float, delays: np.ndarray) -> tup
 def closed_by(
     a: np.ndarray, b: np.ndarray, c: np.ndarray, controller: DigitalController
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The loop z ← A z, what errors of the readings add to it, and the readings: A, B, C; relays switched off."""
+    """A, B and C of the closed loop, without relays: z ← A z + B e, reading C z + e, e the error of the readings."""
     n_c, n_u = len(controller.a), len(controller.actuators)
     rows, direct = controller.c, controller.d * controller.scale
     if controller.relays is not None:
@@ -107,17 +110,17 @@ def closed_by(
 def linear_plant(
     modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[Sensor]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B and C of the structure, its actuators and sensors, as far as they are linear; delays left out."""
-    drives = [
+    """A, B and C of the structure with the linear part of its actuators and sensors, without delays."""
+    linear_actuators = [
         replace(a, delay=0.0, dead_zone=0.0, limit=np.inf, rate_limit=np.inf, hysteresis_share=0.0, bias=0.0)
         for a in actuators
     ]
-    known = [replace(s, bias=0.0, drift=0.0, limit=np.inf, step=0.0) for s in sensors]
-    plant = state_space(modes, drives, known)
+    linear_sensors = [replace(s, bias=0.0, drift=0.0, limit=np.inf, step=0.0) for s in sensors]
+    plant = state_space(modes, linear_actuators, linear_sensors)
     return np.asarray(plant.A), np.asarray(plant.B), np.asarray(plant.C)
 
 
 def _integral(a: np.ndarray, span: float) -> np.ndarray:
-    """∫_0^span e^{At} dt, also where A is singular."""
+    """∫_0^span e^{At} dt; A may be singular."""
     n = a.shape[0]
     return np.asarray(expm(span * np.block([[a, np.eye(n)], [np.zeros((n, 2 * n))]]))[:n, n:])

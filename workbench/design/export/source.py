@@ -1,4 +1,4 @@
-"""A controller as plain C and plain Python, from templates: one function that is called once a sample."""
+"""A controller as C or Python source, from templates: one function that is called once per sample."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ from workbench.structure.domain import Domain
 HERE = Path(__file__).parent
 TEMPLATES = {"c": ("h", "c"), "python": ("py",)}
 WIDTH = 108
-DIGITS = 6  # of a place: channels are distinguished by it
+DIGITS = 6  # of a place, to distinguish channels
 
 
 def source(
@@ -29,13 +29,13 @@ def source(
     readings: Sequence[str] = (),
     commands: Sequence[str] = (),
 ) -> dict[str, str]:
-    """Text by file name of a controller in "c" or "python".
+    """The source of a controller, {file name: text}.
 
     Args:
         controller: to write.
-        language: one of TEMPLATES.
+        language: "c" or "python".
         name: of the files and, in C, of the functions.
-        readings, commands: what each is, in words; bare names unless given.
+        readings, commands: what each is, in words; by default the names.
     """
     infinite = "INFINITY" if language == "c" else "inf"
     given = _Numbers(controller, infinite)
@@ -63,7 +63,7 @@ def source(
 
 
 class _Numbers:
-    """The numbers of a controller as text, without those that do nothing."""
+    """The matrices and vectors of a controller as text; those without effect are left out."""
 
     def __init__(self, controller: DigitalController, infinite: str) -> None:
         def text(value: Any) -> Any:
@@ -101,7 +101,7 @@ class _Numbers:
 
 
 def _equations(given: _Numbers) -> list[str]:
-    """What the step computes, line by line."""
+    """The equations of one step, line by line."""
     there, states = given.vectors, "z" if given.sizes["n_states"] else ""
     lines = ["y = SCALE (reading - OFFSET)" if "SCALE" in there else "y = reading"]
     lines.append("w = C z + D y" if states else "w = D y")
@@ -131,7 +131,7 @@ def reading_words(domain: Domain, sensors: Sequence[Sensor], units: Units = SI) 
 
 
 def command_words(domain: Domain, actuators: Sequence[Actuator], units: Units = SI) -> tuple[str, ...]:
-    """What each command is: actuator, kind, place and unit; where it has a gain, what a unit of the command does."""
+    """What each command is: actuator, kind, place and unit; with a gain, the force per unit of the command."""
     return tuple(
         f"{a.name}: {a.kind} at {domain.text(a.at, DIGITS)}, {unit}"
         if a.gain == 1
@@ -145,6 +145,6 @@ def _listed(array: str, words: Sequence[str]) -> list[str]:
 
 
 def _plain(text: str) -> str:
-    """Words that can stand in a comment: a name in a case file must not end it."""
+    """Text that is safe in a comment: a name in a case file must not end the comment."""
     line = "".join(sign if sign.isprintable() else " " for sign in text)
     return line.replace("\\", "/").replace("*/", "* /").replace('"', "'")

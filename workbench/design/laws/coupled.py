@@ -1,4 +1,4 @@
-"""Coupled control: one law for all controlled modes together, by the Riccati equation or by poles."""
+"""Coupled control: one law for all controlled modes together, by a Riccati equation or by pole assignment."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -20,7 +20,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes, modal_state_matrix
 
-ON_AXIS = 1e-13  # of the fastest pole: a part that rounding alone moves off the axis is not stabilised
+ON_AXIS = 1e-13  # of the fastest pole: a real part that may be rounding alone; the pole counts as not stabilised
 
 
 def controlled_plant(
@@ -38,7 +38,7 @@ def coupled_lqr(
 ) -> Law:
     """The regulator that minimises ∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt over the actuator forces F.
 
-    The displacement of a rigid mode costs nothing, so none of its gains answers to it, as in `imsc`.
+    The displacement of a rigid mode costs nothing, so its gains are zero, as in `imsc`.
 
     Args:
         modes, controlled, actuators: as for `imsc`; fewer actuators than modes will do.
@@ -53,14 +53,14 @@ def coupled_lqr(
     a, b = controlled_plant(modes, index, actuators)
     omega, size = modes.omega[list(index)], len(actuators)
     states = weighed_states(omega)
-    # states ω q and q', of like size at any frequency, whose squares are the cost
+    # states ω q and q': their squares are the cost, and they are of one order of magnitude at any frequency
     scale = np.r_[omega, np.ones(omega.size)][states]
     a = a[np.ix_(states, states)] * scale[:, None] / scale
     r = positive_definite(weight, size, f"the control weight must be symmetric and positive definite, {size} by {size}")
-    # in commands of like cost, or one in other units makes R look singular
+    # commands scaled to equal cost: one in other units would make R look singular
     unit = np.sqrt(np.diag(r).max() / np.diag(r))
     try:
-        found, _, poles = control.lqr(a, b[states] * unit, np.eye(len(states)), r * np.outer(unit, unit))
+        scaled_gain, _, poles = control.lqr(a, b[states] * unit, np.eye(len(states)), r * np.outer(unit, unit))
     except (np.linalg.LinAlgError, ValueError, control.ControlSlycot) as error:
         raise DesignError(
             f"no regulator stabilises modes {[i + 1 for i in index]} from these places: {error}"
@@ -70,14 +70,14 @@ def coupled_lqr(
             f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator"
         )
     gain = np.zeros((size, 2 * omega.size))
-    gain[:, states] = unit[:, None] * found * scale
+    gain[:, states] = unit[:, None] * scaled_gain * scale
     return Law(gain, index, actuators, "coupled LQR", partial(coupled_lqr, weight=weight))
 
 
 def coupled_poles(
     modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, poles: ArrayLike
 ) -> Law:
-    """The law that puts the poles of all controlled modes together, from any number of actuators.
+    """The law that assigns the poles of all controlled modes together, from any number of actuators.
 
     Each mode's pole is moved by the forces that act on that mode best, F ∝ b_r (see `assign`), which keeps gains low.
 

@@ -42,7 +42,7 @@ def riccati_gains(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0.0)
     if not (np.isfinite(weight).all() and (weight > 0).all()):
         raise DesignError(f"the control weight R must be positive; got {weight.min() if weight.size else weight}")
     square, inverse = omega**2, 1.0 / weight
-    # a rigid-body mode has no potential energy to weigh: the gain on its displacement is then zero
+    # a rigid-body mode has no potential energy, so the gain on its displacement is zero
     sums = square + np.sqrt(square**2 + square * inverse)
     g1 = np.where(square > 0, square * inverse / np.maximum(sums, 1e-300), 0.0)
     excess = inverse + 2.0 * g1
@@ -51,7 +51,7 @@ def riccati_gains(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0.0)
 
 
 def riccati_matrices(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0.0) -> np.ndarray:
-    """The Riccati matrices P (n_modes, 2, 2) behind `riccati_gains`: J = x0ᵀ P x0 per mode."""
+    """The solutions P (n_modes, 2, 2) of the Riccati equations of `riccati_gains`: J = x0ᵀ P x0 per mode."""
     g1, g2 = riccati_gains(omega, weight, damping)
     square = np.asarray(omega, float) ** 2
     p12, p22 = weight * g1, weight * g2
@@ -69,7 +69,7 @@ def pole_gains(omega: ArrayLike, poles: ArrayLike, damping: ArrayLike = 0.0) -> 
     """
     omega, poles = np.asarray(omega, float), np.asarray(poles, complex)
     if poles.shape != omega.shape:
-        raise DesignError(f"one pole a mode is needed, {omega.shape}; got {poles.shape}")
+        raise DesignError(f"one pole per mode is needed, {omega.shape}; got {poles.shape}")
     if not (poles.real < 0).all():
         bad = poles[~(poles.real < 0)][0]
         raise DesignError(f"pole {bad:.4g} is not stable: its real part must be negative")
@@ -80,10 +80,10 @@ def imsc(modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actu
     """The optimal IMSC law: closed-form Riccati gains, one mode at a time; damping that couples modes is left out.
 
     Args:
-        modes: at hand; those not controlled are residual.
-        controlled: how many of the lowest, or which (zero-based).
-        actuators: at least as many.
-        weight: R, scalar or one a controlled mode.
+        modes: of the structure; those not controlled are residual.
+        controlled: number of the lowest modes, or their indices (zero-based).
+        actuators: at least as many as controlled modes.
+        weight: R, scalar or one per controlled mode.
     """
     index = controlled_indices(modes, controlled)
     c = np.diag(modes.damping)[list(index)]
@@ -96,7 +96,7 @@ def imsc_poles(
 ) -> Law:
     """The IMSC law with the closed-loop poles given, one of each conjugate pair per controlled mode, rad/s.
 
-    Damping that couples controlled modes is cancelled, so that each is independent as it is controlled.
+    The gains cancel the damping that couples controlled modes, so that each closed loop is independent.
     """
     index = controlled_indices(modes, controlled)
     g1, g2 = pole_gains(modes.omega[list(index)], poles)
@@ -112,5 +112,5 @@ def _law(
     name: str,
     designed_by: Callable[..., Law],
 ) -> Law:
-    spread = np.linalg.pinv(participation(modes, index, actuators))
-    return Law(spread @ np.hstack(gains), index, tuple(actuators), name, designed_by)
+    pseudo_inverse = np.linalg.pinv(participation(modes, index, actuators))
+    return Law(pseudo_inverse @ np.hstack(gains), index, tuple(actuators), name, designed_by)

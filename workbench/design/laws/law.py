@@ -15,9 +15,9 @@ from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle, r
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, place_text
 
-SINGULAR = 1e8
-UNMOVED = 1e-9
-PER_SIDE = 24  # places along the longer side of a plate, where the most that an actuator could do is looked for
+SINGULAR = 1e8  # condition number of B above which it counts as singular
+UNMOVED = 1e-9  # of an actuator's largest participation in a mode: below, it does not move the mode
+PER_SIDE = 24  # grid points along the longer side of a plate, for an actuator's largest participation
 
 
 class DesignError(ValueError):
@@ -31,10 +31,10 @@ class Law(Printed):
     Attributes:
         gain: (n_actuators, 2 n_controlled) K.
         controlled: (n_controlled,) zero-based indices of the controlled modes among all modes.
-        actuators: that the law drives.
+        actuators: (n_actuators,) driven by the law.
         name: for tables and plots.
-        designed_by: designs the law anew with the settings that it has, from modes, controlled modes and actuators;
-            None for a gain given by hand.
+        designed_by: repeats the design with the same settings for other modes, controlled modes and actuators; None
+            for a gain given by hand.
 
     Raises:
         TypeError: a controlled mode that is no number.
@@ -82,10 +82,10 @@ class Law(Printed):
 
 
 def linear(law: object) -> Law:
-    """The law itself, where it has a gain; one that switches has none.
+    """The law, checked to have a gain K.
 
     Raises:
-        DesignError: naming it.
+        DesignError: a law without one, as of on-off control.
     """
     if not isinstance(law, Law):
         raise DesignError(
@@ -99,7 +99,7 @@ def positive_definite(value: ArrayLike, size: int, refusal: str) -> np.ndarray:
     """A number, a diagonal (size,) or a matrix (size, size) as a matrix.
 
     Raises:
-        DesignError: `refusal`, and the value, where that is not symmetric and positive definite.
+        DesignError: a value that is not symmetric and positive definite; `refusal` begins the message.
     """
     given = np.asarray(value, float)
     matrix = given * np.eye(size) if given.ndim == 0 else np.diag(given) if given.ndim == 1 else given
@@ -130,9 +130,9 @@ def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[i
 
 
 def weighed_states(omega: Floats) -> Integers:
-    """Which of the states (q_1..q_n, q_1'..q_n') have an energy: the displacement of a rigid mode has none.
+    """Indices of the states (q_1..q_n, q_1'..q_n') that carry energy: all but the displacements of rigid modes.
 
-    A law that minimises energies leaves it where it is, so it is no state of the closed loop.
+    A law that minimises energies does not act on such a displacement, which is therefore no state of the closed loop.
     """
     return np.flatnonzero(np.r_[omega > 0, np.full(omega.size, True)])
 
@@ -141,8 +141,8 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     """B of the controlled modes, (n_controlled, n_actuators), checked to be of full row rank.
 
     Raises:
-        DesignError: more modes than actuators, a mode that no actuator moves, or actuators, at one place say, that
-            cannot act on the modes one by one.
+        DesignError: more modes than actuators, a mode that no actuator moves, or a singular B, as of two actuators at
+            one place.
     """
     actuators = tuple(actuators)
     if len(controlled) > len(actuators):
@@ -187,9 +187,10 @@ def controllable_input(modes: Modes, controlled: Sequence[int], actuators: Seque
 
 
 def _inputs(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> tuple[Floats, Floats]:
-    """B of the controlled modes, and each actuator's column of it in units of the most that it could do from anywhere.
+    """B of the controlled modes (n_controlled, n_actuators), and B with each column scaled.
 
-    The second says what is singular whatever the units of the commands.
+    A column is divided by the actuator's largest participation at any place, so that the condition number does not
+    depend on the units of the commands.
     """
     if not actuators:
         raise DesignError("there are no actuators to control with; add one")
@@ -205,25 +206,25 @@ def _inputs(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuato
 
 
 def _largest_participation(modes: Modes, actuator: Actuator) -> Floats:
-    """The most that an actuator could do for each mode from any place, (n_modes,)."""
-    turns = actuator.kind == "moment"
+    """The largest participation of each mode (n_modes,) in an actuator's command, over all places."""
+    moment = actuator.kind == "moment"
     if isinstance(modes.domain, NamedPoints):
-        shapes = modes.phi(modes.domain.rotations() if turns else modes.domain.grid())
+        shapes = modes.phi(modes.domain.rotations() if moment else modes.domain.grid())
     elif isinstance(modes.domain, Rectangle) and isinstance(actuator.at, Patch):
         low, high = reach(modes.domain, actuator.at)
         middles = np.clip(modes.domain.grid(PER_SIDE), low, high)
         sides = np.broadcast_to(actuator.at[2:], middles.shape)
         shapes = modes.edge_slopes(np.hstack([middles, sides]), direction=actuator.direction)
     elif isinstance(modes.domain, Rectangle):
-        shapes = modes.phi(modes.domain.grid(PER_SIDE), int(turns), direction=actuator.direction)
+        shapes = modes.phi(modes.domain.grid(PER_SIDE), int(moment), direction=actuator.direction)
     else:
-        shapes = modes.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9), int(turns))
+        shapes = modes.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9), int(moment))
     most: Floats = abs(actuator.gain) * np.abs(shapes).max(axis=0)
     return most
 
 
 def numbered(indices: Sequence[int]) -> str:
-    """Zero-based modes as they are counted: 1 to 4, or 1, 2, 5."""
+    """Text of zero-based modes, counted from one: "1 to 4", or "1, 2, 5"."""
     if len(indices) > 2 and list(indices) == list(range(indices[0], indices[-1] + 1)):
         return f"{indices[0] + 1} to {indices[-1] + 1}"
     return ", ".join(str(r + 1) for r in indices)

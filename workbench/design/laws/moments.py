@@ -1,6 +1,6 @@
-"""∫ x xᵀ dt of the motion x' = A x from a state on: what costs, efforts and works are linear in.
+"""Second moments ∫ x xᵀ dt of the motion x' = A x from an initial state; cost, effort and work are linear in them.
 
-Balanced first: displacements and rates of a fast structure differ by its frequency, and round-off by its square.
+A is balanced first: displacements and rates differ by the frequency, and their rounding errors by its square.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from workbench.rig.linear import integrated
 
 
 def settled_moments(a: Floats, starts: Floats) -> Floats:
-    """∫_0^∞ x xᵀ dt, (n, n), summed over the motions from every column of `starts` (n,) or (n, n_starts); A stable."""
+    """∫_0^∞ x xᵀ dt (n, n) for a stable A, summed over the initial states `starts`, (n,) or (n, n_starts)."""
     a, (scale, _) = matrix_balance(a, permute=False, separate=True)
     starts = starts.reshape(len(a), -1) / scale[:, None]
     moments: Floats = solve_continuous_lyapunov(a, -starts @ starts.T)
@@ -19,7 +19,7 @@ def settled_moments(a: Floats, starts: Floats) -> Floats:
 
 
 def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
-    """∫_0^t x xᵀ dt, (n, n): from dM/dt = A M + M Aᵀ + x0 x0ᵀ, doubled up from a short time."""
+    """∫_0^t x xᵀ dt (n, n), from dM/dt = A M + M Aᵀ + x0 x0ᵀ over a short time that is doubled repeatedly."""
     a, (scale, _) = matrix_balance(a, permute=False, separate=True)
     state = state / scale
     halvings = max(0, int(np.ceil(np.log2(max(np.abs(a).sum(axis=1).max() * final_time, 1.0)))))

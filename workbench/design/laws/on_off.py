@@ -1,4 +1,4 @@
-"""Modal on-off control: each controlled mode has a relay with a dead band, the actuators share the modal forces.
+"""Modal on-off control: a relay with a dead band per controlled mode; the actuators share the modal forces.
 
 Meirovitch, VanLandingham & Öz (1977), reference [77] of the dissertation: f_r = -k_r sgn(s_r) outside a dead band of
 s_r = q_r' + λ_r q_r, and F = B⁺ f on the actuators.
@@ -40,10 +40,10 @@ class OnOffLaw:
     """A relay on every controlled mode.
 
     Attributes:
-        relays: one a controlled mode.
+        relays: one per controlled mode.
         spread: (n_actuators, n_controlled) B⁺, from modal forces to actuator forces.
         controlled: (n_controlled,) zero-based indices.
-        actuators: that the law drives.
+        actuators: (n_actuators,) driven by the law.
         name: for tables and plots.
         designed_by: as of a `Law`.
     """
@@ -73,12 +73,12 @@ def on_off(
     Args:
         modes, controlled, actuators: as for `imsc`.
         force: k, modal force, scalar or (n_controlled,), positive.
-        dead_band: d of s = q' + λ q, likewise, not negative. Undamped modes are left with at most ½ d² of energy
-            where λ = 0.
+        dead_band: d of s = q' + λ q, likewise, not negative. Where λ = 0, an undamped mode keeps at most ½ d² of
+            energy.
         slope: λ, 1/s, likewise, not negative.
 
     Raises:
-        DesignError: damping that couples the modes, or figures out of range.
+        DesignError: damping that couples the modes, or values out of range.
     """
     index = controlled_indices(modes, controlled)
     if not modes.proportional:
@@ -94,7 +94,7 @@ def on_off(
     ):
         value = np.asarray(value, float)
         if value.shape not in ((), (1,), (n,)):
-            raise DesignError(f"on-off {name} is one number, or one a controlled mode, {n}; got {value.size}")
+            raise DesignError(f"on-off {name} is one number, or one per controlled mode, {n}; got {value.size}")
         value = np.broadcast_to(value, n)
         if not np.isfinite(value).all() or (value < 0).any() or (least == "positive" and not value.all()):
             raise DesignError(f"on-off {name} must be {least}; got {value.min():g}")

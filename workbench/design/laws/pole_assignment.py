@@ -1,8 +1,8 @@
-"""Poles of a multivariable system by the Sylvester equation, at the cost of one linear solve.
+"""Pole assignment of a multivariable system by the Sylvester equation, at the cost of one linear solve.
 
 With X Λ - A X = B G and Λ the wanted poles, K = -G X⁻¹ gives (A - B K) X = X Λ (Bhattacharyya & de Souza, Systems &
-Control Letters 1 (1982) 261). G is free; a column along the input that acts best on a mode moves that mode's pole with
-little of the others in its eigenvector, so X stays well conditioned and K small.
+Control Letters 1 (1982) 261). G is free. Each column is the input that acts best on one mode, so that the eigenvector
+of its pole holds little of the other modes: X stays well conditioned and K small.
 """
 
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from workbench.design.laws.law import DesignError
 
-ILL_CONDITIONED = 1e12
-STAYS = 1e-12
+ILL_CONDITIONED = 1e12  # condition number of X above which the poles count as not assignable
+STAYS = 1e-12  # of the pole: nearer to an open-loop pole it coincides with it, nearer to the real axis it is real
 
 
 def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -32,7 +32,7 @@ def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarra
     n = a.shape[0] // 2
     poles = np.asarray(poles, complex)
     if poles.shape != (n,):
-        raise DesignError(f"one pole a mode is needed, ({n},); got {poles.shape}")
+        raise DesignError(f"one pole per mode is needed, ({n},); got {poles.shape}")
     for pole, name in zip(poles, names, strict=True):
         if not pole.real < 0:
             raise DesignError(f"pole {pole:.4g} of {name} is not stable: its real part must be negative")
@@ -42,13 +42,13 @@ def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarra
             )
     inputs = np.array(directions, complex)
     vectors, determinants = _resolvents(a, poles, b @ inputs)
-    near = np.abs(determinants) <= STAYS * np.abs(poles) ** 2
-    for r, mode in zip(*np.nonzero(near.T), strict=True):
+    coincides = np.abs(determinants) <= STAYS * np.abs(poles) ** 2
+    for r, mode in zip(*np.nonzero(coincides.T), strict=True):
         if r != mode:
             raise DesignError(
-                f"pole {poles[r]:.4g} of {names[r]} is that of {names[mode]} without control; shift it a little"
+                f"pole {poles[r]:.4g} of {names[r]} is the open-loop pole of {names[mode]}; shift it a little"
             )
-        # a pole that stays needs no input: its eigenvector is that of the mode alone
+        # a pole left at its open-loop value needs no input: its eigenvector is the mode's own
         upper = np.zeros(n, complex)
         upper[r] = 1.0
         vectors[:, r], inputs[:, r] = np.r_[upper, (poles[r] - a[r, r]) / (a[r, n + r] or 1.0) * upper], 0.0
@@ -68,8 +68,8 @@ def _resolvents(a: np.ndarray, poles: np.ndarray, forcing: np.ndarray) -> tuple[
     n = a.shape[0] // 2
     qq, qv, vq, vv = (np.diag(block)[:, None] for block in (a[:n, :n], a[:n, n:], a[n:, :n], a[n:, n:]))
     determinants = (poles - qq) * (poles - vv) - qv * vq
-    side_by_side = all(np.count_nonzero(block - np.diag(np.diag(block))) == 0 for block in (a[n:, n:], a[n:, :n]))
-    if side_by_side:
+    uncoupled = all(np.count_nonzero(block - np.diag(np.diag(block))) == 0 for block in (a[n:, n:], a[n:, :n]))
+    if uncoupled:
         upper, lower = forcing[:n], forcing[n:]
         with np.errstate(divide="ignore", invalid="ignore"):
             q = ((poles - vv) * upper + qv * lower) / determinants

@@ -18,34 +18,35 @@ from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import counted, place_text
 
-UNSEEN = 1e-9
-WELL_CONDITIONED = 1e6
-RESONANT = 1e-6
-EVEN = 1e-15
-ON_AXIS = 1e-9  # of the fastest pole
+UNSEEN = 1e-9  # response of a modal filter to a mode, below which the mode is unobservable
+WELL_CONDITIONED = 1e6  # condition number of eigenvectors up to which the closed form is used
+RESONANT = 1e-6  # of the fastest pole: poles nearer to each other have no closed form by partial fractions
+EVEN = 1e-15  # of the last instant: instants count as uniform if they deviate by no more
+ON_AXIS = 1e-9  # of the fastest pole: rounding of real parts
 
 
 def stability(poles: np.ndarray) -> str:
-    """Of a loop: stable, unstable, or marginally stable where its rightmost pole is on the axis but for rounding."""
-    rightmost, by = poles.real.max(), rounding(poles)
-    return "stable" if rightmost < -by else "unstable" if rightmost > by else "marginally stable"
+    """Stability of a loop: stable, unstable, or marginally stable where its rightmost pole is on the imaginary axis."""
+    rightmost, tolerance = poles.real.max(), rounding(poles)
+    return "stable" if rightmost < -tolerance else "unstable" if rightmost > tolerance else "marginally stable"
 
 
 def rounding(poles: np.ndarray) -> float:
-    """How far rounding may move a pole off the axis, 1/s."""
+    """How far rounding may move a pole (of `poles`, rad/s) off the imaginary axis, 1/s."""
     return float(ON_AXIS * max(np.abs(poles).max(), 1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """x' = A x: (q, q') of every mode, lags and delays of actuators and sensors, an observer; forces u = -K x̂ in it.
+    """The closed loop x' = A x of all modes under the forces u = -K x̂.
 
-    A delay is in it as of `delay_line`.
+    The state x holds (q, q') of every mode, then lags and delays (see `delay_line`) of actuators and sensors, then an
+    observer.
 
     Attributes:
-        modes: all of them.
-        law: that closes the loop.
-        matrix: (n_states, n_states) A, rad/s; n_states is 2 n_modes where there is nothing else.
+        modes: controlled and residual.
+        law: u = -K x̂.
+        matrix: (n_states, n_states) A, rad/s; n_states is 2 n_modes where there are no lags, delays or observer.
         feedback: (n_actuators, n_states) from the state to the actuator forces, sign included.
     """
 
@@ -69,39 +70,39 @@ class ClosedLoop:
 
     @property
     def stability(self) -> str:
-        """As of `stability`."""
+        """Stable, marginally stable or unstable, as of `stability`."""
         return stability(self.poles)
 
     @property
     def stable(self) -> bool:
-        """Whether no pole is to the right of the axis (undamped residual modes sit on it)."""
+        """Whether no pole is to the right of the axis; those of undamped residual modes lie on it."""
         return self.stability != "unstable"
 
     def behind(self, states: Flags) -> Flags:
-        """Which states (n_states,) move the given ones, directly or by way of others, themselves among them.
+        """Which states (n_states,) drive the given ones, directly or through others; the given ones are included.
 
-        What couples modes in proportional damping is rounding, and couples none.
+        Off-diagonal terms of proportional damping are rounding and count as zero.
         """
         n, links = self.modes.n_modes, self.matrix != 0
         if self.modes.proportional:
-            unfed = n + np.flatnonzero(~self.feedback[:, n : 2 * n].any(axis=0))
-            links[n : 2 * n, unfed] &= np.eye(n, dtype=bool)[:, unfed - n]
-        found, new = states.copy(), states
+            not_fed_back = n + np.flatnonzero(~self.feedback[:, n : 2 * n].any(axis=0))
+            links[n : 2 * n, not_fed_back] &= np.eye(n, dtype=bool)[:, not_fed_back - n]
+        reached, new = states.copy(), states
         while new.any():
-            new = links[new].any(axis=0) & ~found
-            found = found | new
-        return found
+            new = links[new].any(axis=0) & ~reached
+            reached = reached | new
+        return reached
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Modal motion and forces over time.
+    """Modal motion and actuator forces over time.
 
     Attributes:
         time: (n_times,) s.
-        modal: (2n, n_times) states (q, q').
+        modal: (2 n_modes, n_times) states (q, q').
         forces: (n_actuators, n_times).
-        modes: whose shapes carry the motion.
+        modes: give the shapes.
     """
 
     time: Floats
@@ -124,16 +125,16 @@ class Response:
 
 
 def close_loop(modes: Modes, law: Law | Controller, filter_: ModalFilter | None = None) -> ClosedLoop:
-    """The loop through exact modal coordinates, or through a modal filter of the controlled modes.
+    """The closed loop of a law on exact modal coordinates, through a modal filter, or of a controller.
 
     Args:
         modes: all modes, controlled and residual.
-        law: u = -K x; or a controller, a law with its filter or observer, whose states then follow those of the modes.
-        filter_: rows are the controlled modes, in the law's order; rates are read through the same weights.
+        law: u = -K x, or a controller, a law with its filter or observer.
+        filter_: rows are the controlled modes, in the law's order; velocities use the same weights.
 
     Raises:
-        DesignError: a law that switches, or of modes that are not there.
-        ValueError: a filter of another number of modes, or one whose sensors cannot see a controlled mode.
+        DesignError: an on-off law, or a law of modes that the plant does not have.
+        ValueError: a filter of another number of modes, or one whose sensors do not observe a controlled mode.
     """
     if isinstance(law, Controller) and filter_ is None:
         return close_with(modes, law)
@@ -144,19 +145,19 @@ def close_loop(modes: Modes, law: Law | Controller, filter_: ModalFilter | None 
             f"the law controls mode {max(law.controlled) + 1} and the plant has {counted(n, 'mode')}; give more modes"
         )
     if filter_ is None:
-        seen = np.zeros((law.n_controlled, n))
-        seen[np.arange(law.n_controlled), list(law.controlled)] = 1.0
+        output = np.zeros((law.n_controlled, n))
+        output[np.arange(law.n_controlled), list(law.controlled)] = 1.0
     else:
-        seen = filter_.response_to(modes)
-        if seen.shape[0] != law.n_controlled:
-            raise ValueError(f"the filter gives {seen.shape[0]} modes; the law controls {law.n_controlled}")
-        strength = np.abs(seen[np.arange(law.n_controlled), list(law.controlled)])
+        output = filter_.response_to(modes)
+        if output.shape[0] != law.n_controlled:
+            raise ValueError(f"the filter gives {output.shape[0]} modes; the law controls {law.n_controlled}")
+        strength = np.abs(output[np.arange(law.n_controlled), list(law.controlled)])
         if strength.min() < UNSEEN:
             raise ValueError(
                 f"mode {law.controlled[strength.argmin()] + 1} is unobservable: the filter's sensors at"
                 f" {'; '.join(map(place_text, filter_.places))} all stand at its nodes; move or add a sensor"
             )
-    estimate = np.kron(np.eye(2), seen)
+    estimate = np.kron(np.eye(2), output)
     feedback = -law.gain @ estimate
     a, b, c, d, _ = modal_plant(modes, law.actuators, ())
     commands = np.hstack([feedback, np.zeros((len(feedback), len(a) - 2 * n))])
@@ -164,18 +165,18 @@ def close_loop(modes: Modes, law: Law | Controller, filter_: ModalFilter | None 
 
 
 def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
-    """The loop of all modes, states as of `ClosedLoop`; a law alone reads exact modal coordinates."""
+    """The closed loop of all modes under a controller; a law alone acts on exact modal coordinates."""
     if isinstance(controller, Law):
         return close_loop(modes, controller)
     check_readable(controller.sensors)
     a, b, c, d, _ = modal_plant(modes, controller.law.actuators, controller.sensors)
     count = len(controller.sensors)
-    reads, forces, passed = c[:count], c[count:], d[count:]
+    reads, forces, feedthrough = c[:count], c[count:], d[count:]
     commands = np.hstack([controller.direct @ reads, controller.commands])
     plant = np.block([[a, np.zeros((len(a), len(controller.state)))], [controller.reads @ reads, controller.state]])
     matrix = plant + np.vstack([b @ commands, np.zeros((len(controller.state), len(plant)))])
     forces = np.hstack([forces, np.zeros((len(forces), len(controller.state)))])
-    return ClosedLoop(modes, controller.law, matrix, forces + passed @ commands)
+    return ClosedLoop(modes, controller.law, matrix, forces + feedthrough @ commands)
 
 
 def impulse_state(modes: Modes, at: Place, impulse: float = 1.0) -> Floats:
@@ -186,8 +187,8 @@ def impulse_state(modes: Modes, at: Place, impulse: float = 1.0) -> Floats:
 def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
     """Free response from a state at t = 0, exact at every instant: x(t) = e^{At} x0.
 
-    A state (2 n_modes,) of the modes alone starts an observer from zero. Through exact modal coordinates every instant
-    has a closed form; else uniform instants share one matrix exponential, and others cost one each.
+    A state (2 n_modes,) of the modes alone starts an observer from zero. With exact modal coordinates the response has
+    a closed form; otherwise uniform instants share one matrix exponential, and others need one each.
 
     Raises:
         ValueError: times that do not increase from zero or later, a state of another size or not finite.
@@ -201,21 +202,21 @@ def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] 
     modal = _cascade(loop, state, time)
     if modal is None:
         modal = _stepped(loop.matrix, state, time)
-    modal.flags.writeable = False  # a response of many modes fills the memory once, not twice
+    modal.flags.writeable = False  # so that `Response` does not copy a large array
     motion = modal if modal.shape[0] == 2 * loop.modes.n_modes else modal[: 2 * loop.modes.n_modes]
-    fed = np.flatnonzero(loop.feedback.any(axis=0))
-    return Response(time, motion, loop.feedback[:, fed] @ modal[fed], loop.modes)
+    fed_back = np.flatnonzero(loop.feedback.any(axis=0))
+    return Response(time, motion, loop.feedback[:, fed_back] @ modal[fed_back], loop.modes)
 
 
 def peak_force(loop: ClosedLoop, state: np.ndarray, final_time: float) -> float:
-    """The largest |F| of any actuator up to a time, to a millionth: of all time until then, not of samples of it.
+    """The largest |F| of any actuator in continuous time up to a final time, to a relative error of a millionth.
 
     Args:
-        loop: of which every pole whose motion is fed back decays.
+        loop: every pole that the forces depend on decays.
         state: as for `initial_response`.
         final_time: s; may be infinite.
     """
-    # what the forces do not depend on is left out: residual modes would be poles that need not decay
+    # states that the forces do not depend on are left out: poles of residual modes need not decay
     own = np.flatnonzero(loop.behind(np.asarray(loop.feedback.any(axis=0))))
     if not own.size:
         return 0.0
@@ -226,10 +227,10 @@ def peak_force(loop: ClosedLoop, state: np.ndarray, final_time: float) -> float:
 
 
 def _controlled_alone(loop: ClosedLoop) -> bool:
-    """Whether nothing but the controlled modes moves them: exact modal coordinates, no damping between modes."""
+    """Whether the controlled modes move independently of the others: exact modal coordinates, proportional damping."""
     others = np.setdiff1d(np.arange(loop.modes.n_modes), loop.law.controlled)
-    alone = loop.matrix.shape[0] == 2 * loop.modes.n_modes and loop.modes.proportional
-    return alone and not loop.feedback[:, np.r_[others, loop.modes.n_modes + others]].any()
+    uncoupled = loop.matrix.shape[0] == 2 * loop.modes.n_modes and loop.modes.proportional
+    return uncoupled and not loop.feedback[:, np.r_[others, loop.modes.n_modes + others]].any()
 
 
 def checked_times(time: ArrayLike) -> Floats:
@@ -238,14 +239,14 @@ def checked_times(time: ArrayLike) -> Floats:
     Raises:
         ValueError: times that do not increase from zero or later.
     """
-    found = np.asarray(time, float)
-    if found.ndim != 1 or found.size == 0 or (np.diff(found) <= 0).any() or found[0] < 0:
+    times = np.asarray(time, float)
+    if times.ndim != 1 or times.size == 0 or (np.diff(times) <= 0).any() or times[0] < 0:
         raise ValueError("times must increase, from zero or later")
-    return found
+    return times
 
 
 def _stepped(matrix: np.ndarray, state: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """e^{At} x0 (n_states, n_times), from instant to instant; even instants doubled up, x_{k+m} = (e^{Ah})^m x_k."""
+    """e^{At} x0 (n_states, n_times), step by step; for uniform instants by doubling, x_{k+m} = (e^{Ah})^m x_k."""
     modal = np.empty((state.size, time.size))
     modal[:, 0] = expm(matrix * time[0]) @ state
     steps = np.diff(time)
@@ -264,10 +265,10 @@ def _stepped(matrix: np.ndarray, state: np.ndarray, time: np.ndarray) -> np.ndar
 
 
 def _cascade(loop: ClosedLoop, state: np.ndarray, time: np.ndarray) -> np.ndarray | None:
-    """The same in closed form where nothing residual is fed back: the controlled modes drive the others, one by one.
+    """e^{At} x0 (2 n_modes, n_times) in closed form where only controlled modes are fed back; None elsewhere.
 
-    With z = q' - p* q of a residual mode, z' = p z + g and g = Σ_k g_k e^{λ_k t} of the controlled loop,
-    z = e^{pt} z0 + Σ_k g_k (e^{λ_k t} - e^{pt}) / (λ_k - p). None where the loop is not of this kind.
+    The controlled modes then drive each residual mode by itself. With z = q' - p* q of a residual mode, z' = p z + g,
+    and g = Σ_k g_k e^{λ_k t} of the controlled loop, z = e^{pt} z0 + Σ_k g_k (e^{λ_k t} - e^{pt}) / (λ_k - p).
     """
     modes, n = loop.modes, loop.modes.n_modes
     own = [*loop.law.controlled, *(n + r for r in loop.law.controlled)]
@@ -278,32 +279,35 @@ def _cascade(loop: ClosedLoop, state: np.ndarray, time: np.ndarray) -> np.ndarra
     values, vectors = np.linalg.eig(loop.matrix[np.ix_(own, own)])
     if not np.linalg.cond(vectors) < WELL_CONDITIONED:
         return None
-    held = vectors * np.linalg.solve(vectors, state[own].astype(complex))
-    outer, inner = _halves(time)
+    terms = vectors * np.linalg.solve(vectors, state[own].astype(complex))
+    outer, inner = _split(time)
     left, right = np.exp(np.outer(outer, values)), np.exp(np.outer(values, inner))
     modal = np.empty((2 * n, time.size))
-    for row, amplitudes in zip(own, held):
-        modal[row] = _added_up(amplitudes, left, right)[: time.size]
+    for row, amplitudes in zip(own, terms):
+        modal[row] = _sum_of_exponentials(amplitudes, left, right)[: time.size]
     if not rest.size:
         return modal
     sigma, damped = 0.5 * c[rest], np.sqrt(modes.omega[rest] ** 2 - 0.25 * c[rest] ** 2)
     pole = -sigma + 1j * damped
-    apart = values - pole[:, None]
-    if np.abs(apart).min() < RESONANT * np.abs(pole).max():
+    difference = values - pole[:, None]
+    if np.abs(difference).min() < RESONANT * np.abs(pole).max():
         return None
-    driven = loop.matrix[np.ix_(n + rest, np.asarray(own))] @ held / apart
+    driven = loop.matrix[np.ix_(n + rest, np.asarray(own))] @ terms / difference
     free = state[n + rest] + (sigma + 1j * damped) * state[rest] - driven.sum(axis=1)
     # q = Im z / ω_d and q' = Im(p z) / ω_d
     z = -1j * np.column_stack([driven, free]) / damped[:, None]
     for r, p, amplitudes in zip(rest, pole, z):
         factors = np.column_stack([left, np.exp(p * outer)]), np.vstack([right, np.exp(p * inner)])
-        modal[r] = _added_up(amplitudes, *factors)[: time.size]
-        modal[n + r] = _added_up(p * amplitudes, *factors)[: time.size]
+        modal[r] = _sum_of_exponentials(amplitudes, *factors)[: time.size]
+        modal[n + r] = _sum_of_exponentials(p * amplitudes, *factors)[: time.size]
     return modal
 
 
-def _halves(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Instants (n_outer,), (n_inner,) whose sums, row by row, begin with `time`: √n_times of each where it is even."""
+def _split(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Instants (n_outer,) and (n_inner,) whose sums, row by row, begin with `time`.
+
+    Uniform instants are split into about √n_times of each, so that few exponentials are needed.
+    """
     n = time.size
     step = (time[-1] - time[0]) / max(n - 1, 1)
     if np.abs(time - time[0] - step * np.arange(n)).max() > EVEN * time[-1]:
@@ -312,7 +316,7 @@ def _halves(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return time[0] + step * width * np.arange(-(-n // width)), step * np.arange(width)
 
 
-def _added_up(amplitudes: Complexes, left: Complexes, right: Complexes) -> Floats:
+def _sum_of_exponentials(amplitudes: Complexes, left: Complexes, right: Complexes) -> Floats:
     """Re Σ_k a_k e^{λ_k (t_a + t_b)} at all instants, from factors (n_outer, n_poles) and (n_poles, n_inner)."""
     scaled = left * amplitudes
     return (np.hstack([scaled.real, -scaled.imag]) @ np.vstack([right.real, right.imag])).ravel()

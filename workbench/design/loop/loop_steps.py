@@ -1,6 +1,6 @@
-"""Stepping of a rig under a digital controller: what it reads, commands and does, sample by sample.
+"""Time stepping of a rig under a digital controller: readings, commands and motion, sample by sample.
 
-The structure is stepped as in `workbench.rig.stepping`; the actuators' and sensors' paths are those of `simulate`.
+The structure is stepped as in `workbench.rig.stepping`; actuators and sensors are modelled as in `simulate`.
 """
 
 import math
@@ -12,17 +12,17 @@ from workbench.arrays import Floats, Integers
 from workbench.design.estimation.digital import ONSET
 from workbench.rig.stepping import FAST, LANES, advance, at_rest, drifted_propagators, whole_lanes, yield_update
 
-# As `loop_record` and `_commands` describe them.
+# Described in `loop_record` and `_commands`.
 StructureArrays = tuple[Floats, Floats, Floats, float, float, Floats, Floats, Floats]
 LawArrays = tuple[Integers, Floats, Floats]
 ControllerArrays = tuple[tuple[Floats, ...], ...]
 
-RUN_AWAY = 1e100  # of any unit: no loop comes back
+RUN_AWAY = 1e100  # modal displacement, in any unit, above which the loop has diverged
 
 
 @njit(cache=True, nogil=True)
-def _headed(u: float, drive: Floats, j: int, z: Floats, before: Floats) -> float:
-    """The force that actuator j heads for: hysteresis, gain, dead zone, saturation; z is its hysteresis."""
+def _static_force(u: float, drive: Floats, j: int, z: Floats, before: Floats) -> float:
+    """The static force of actuator j for a command u: hysteresis (state z), gain, dead zone, saturation."""
     if drive[j, 7] > 0.0:
         z[j], _ = yield_update(z[j], u - before[j], drive[j, 8])
         before[j] = u
@@ -35,7 +35,7 @@ def _headed(u: float, drive: Floats, j: int, z: Floats, before: Floats) -> float
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _row(of_state: Floats, of_reading: Floats, i: int, z: Floats, y: Floats) -> float:
-    """What a row of two matrices makes of a state and a reading."""
+    """Row i of C z + D y."""
     s = 0.0
     for m in range(z.size):
         s += of_state[i, m] * z[m]
@@ -48,7 +48,7 @@ def _row(of_state: Floats, of_reading: Floats, i: int, z: Floats, y: Floats) -> 
 def _commands(
     controller: ControllerArrays, k: int, reading: Floats, z: Floats, z_next: Floats, v: Floats, command: Floats
 ) -> None:
-    """Fill the commands of a `DigitalController` (n_actuators,), what is followed of them, and its next state."""
+    """One step of a `DigitalController` at sample k: fill its commands, v and next state z."""
     (a, b, c, d, e), (offset, scale, limit, rate, dead, bias), (spread, on, band), (push, cf, df, force, smooth) = (
         controller
     )
@@ -98,7 +98,7 @@ def loop_record(
     n_sub: int,
     out: tuple[Floats, ...],
 ) -> bool:
-    """Fill a loop's motion from a start; False where it runs away.
+    """Fill the motion of a closed loop from an initial state; False where it diverges.
 
     Args:
         structure: omega (n,), damping (n,), coupling (n, n) or empty, stiffness rate, stretch, stretching, drag shapes
@@ -106,16 +106,16 @@ def loop_record(
         laws: kinds, shapes (n_elements, n), parameters (n_elements, 3).
         drive: (n_actuators, 9) gain, dead zone, limit, delay, time constant, bias, rate limit, share and width of
             hysteresis.
-        into: (n, n_actuators).
-        sense: (n_sensors, 7) gain, bias, drift a sample, delay, time constant, limit, step.
-        seen: (2, n_sensors, n) of displacement and of velocity, cross-talk among it.
+        into: (n, n_actuators) participation factors.
+        sense: (n_sensors, 7) gain, bias, drift per sample, delay, time constant, limit, step.
+        seen: (2, n_sensors, n) output matrices of displacements and of velocities, with cross-talk.
         noise: (n_sensors, n_samples).
         controller: see `_commands`.
         start: (2, n) displacements and rates.
         disturbance: (n_forces, n_samples) held over each sample; at: (n, n_forces).
-        dt: s; n_sub: substeps of a sample.
-        out: displacements and rates (n, n_samples), forces and commands (n_actuators, n_samples), and of each element
-            (n_elements, n_samples) displacement, rate and force.
+        dt: s; n_sub: substeps per sample.
+        out: displacements and rates (n, n_samples), forces and commands (n_actuators, n_samples), and displacement,
+            rate and force of each element (n_elements, n_samples).
     """
     omega, damping, coupling, stiffening, stretch, stretching, drag_shapes, drag_weights = structure
     kinds, shapes, parameters = laws
@@ -135,7 +135,7 @@ def loop_record(
     fine = n_samples * n_sub
     held = np.zeros((nu, fine))
     target, ramp, acting, hyst, before = np.zeros(nu), np.zeros(nu), np.zeros(nu), np.zeros(nu), np.zeros(nu)
-    truth, unlagged, reading = np.zeros((ny, fine + 1)), np.zeros(ny), np.zeros(ny)  # truth: what a lag makes of it
+    truth, unlagged, reading = np.zeros((ny, fine + 1)), np.zeros(ny), np.zeros(ny)  # truth: after the sensor's lag
     nz = controller[0][0].shape[0]
     z, z_next, followed = np.zeros(nz), np.zeros(nz), np.zeros(nu)
     for j in range(ny):
@@ -174,7 +174,7 @@ def loop_record(
         # --- act and move
         for j in range(nu):
             f_out[j, k] = 0.0
-            target[j] = _headed(u_out[j, k], drive, j, hyst, before)
+            target[j] = _static_force(u_out[j, k], drive, j, hyst, before)
         for sub in range(n_sub):
             now = k * n_sub + sub
             for r in range(n_modes):

@@ -1,6 +1,6 @@
-"""The motion of a whole structure under modal on-off control: controlled modes switch, residual modes are driven.
+"""The motion of all modes under modal on-off control, exact between switchings.
 
-Exact between switchings; see `workbench.design.loop.switching` for one mode by itself.
+Controlled modes switch one by one (see `workbench.design.loop.switching`) and drive the residual modes.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Switched:
 
     Attributes:
         response: modal motion and forces.
-        stretches: of each controlled mode, what happened between its switchings.
+        stretches: of each controlled mode, its motion between switchings.
     """
 
     response: Response
@@ -34,7 +34,7 @@ def respond_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, time: ArrayLi
     """The response from a state (2 n_modes,) at t = 0, exact at each of the times (n_times,), however far apart.
 
     Raises:
-        DesignError: an actuator with a delay, a lag, a dead zone, hysteresis, a bias or a limit that its command meets.
+        DesignError: an actuator with a delay, lag, dead zone, hysteresis, bias or rate limit, or one that saturates.
         ValueError: times that do not increase from zero or later.
     """
     time = checked_times(time)
@@ -43,48 +43,48 @@ def respond_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, time: ArrayLi
 
 
 def switchings(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> tuple[tuple[Stretch, ...], ...]:
-    """What each controlled mode does between its switchings, up to the final time.
+    """The motion of each controlled mode between its switchings, up to the final time.
 
     Raises:
         DesignError: an actuator whose force is not its command times its gain.
     """
     for actuator, most in zip(law.actuators, np.abs(law.spread) @ [relay.force for relay in law.relays], strict=True):
-        _check_prompt(actuator, float(most))
+        _check_proportional(actuator, float(most))
     return tuple(
         switch(relay, state[r], state[modes.n_modes + r], final_time)
         for relay, r in zip(law.relays, law.controlled, strict=True)
     )
 
 
-def _check_prompt(actuator: Actuator, most: float) -> None:
-    """Refuse what the closed forms between switchings do not hold; a limit that no command reaches changes nothing."""
-    bends = {
+def _check_proportional(actuator: Actuator, largest: float) -> None:
+    """Refuse an actuator whose force is not its gain times its command, for commands up to the largest."""
+    refused = {
         "delay": actuator.delay,
         "time_constant": actuator.time_constant,
         "dead_zone": actuator.dead_zone,
         "hysteresis_share": actuator.hysteresis_share,
         "bias": actuator.bias,
         "rate_limit": actuator.rate_limit if np.isfinite(actuator.rate_limit) else 0.0,
-        "limit": actuator.limit if actuator.limit < abs(actuator.gain) * most * (1.0 - 1e-12) else 0.0,
+        "limit": actuator.limit if actuator.limit < abs(actuator.gain) * largest * (1.0 - 1e-12) else 0.0,
     }
-    for name, value in bends.items():
+    for name, value in refused.items():
         if value:
             raise DesignError(
-                f"actuator {actuator.name} has {name} = {value:g}, which the exact motion of on-off control leaves out:"
-                " verify or redesign simulates it once a sample; or leave it out of the actuator"
+                f"actuator {actuator.name} has {name} = {value:g}, which the exact motion of on-off control cannot"
+                " include: simulate it by verify or redesign, or leave it out of the actuator"
             )
 
 
 def motion(
     modes: Modes, law: OnOffLaw, state: np.ndarray, time: np.ndarray, stretches: tuple[tuple[Stretch, ...], ...]
 ) -> Response:
-    """Modal motion and forces at the times (n_times,) from what happens between switchings."""
+    """Modal motion and forces at the times (n_times,), from the motion between switchings."""
     n = modes.n_modes
     c = np.diag(modes.damping)
     modal = np.empty((2 * n, time.size))
     force = np.empty((len(law.relays), time.size))
     residual = [r for r in range(n) if r not in law.controlled]
-    push = input_matrix(modes, law.actuators)[residual] @ law.spread
+    coupling = input_matrix(modes, law.actuators)[residual] @ law.spread
     omega, damping = modes.omega[residual, None], c[residual, None]
     position, rate = travel(omega, damping, time, state[residual][:, None], state[n:][residual][:, None], 0.0)
     for j, (relay, r) in enumerate(zip(law.relays, law.controlled, strict=True)):
@@ -94,14 +94,14 @@ def motion(
             if stretch is stretches[j][-1]:
                 inside = np.flatnonzero(time >= stretch.start)
             tau = time[inside] - stretch.start
-            pattern = stretch.steady, stretch.ramp, stretch.fading, relay.slope
-            force[j, inside] = pattern[0] + pattern[1] * tau + pattern[2] * np.exp(-relay.slope * tau)
+            course = stretch.steady, stretch.ramp, stretch.fading, relay.slope
+            force[j, inside] = course[0] + course[1] * tau + course[2] * np.exp(-relay.slope * tau)
             modal[r, inside], modal[n + r, inside] = travel(
-                relay.omega, relay.damping, tau, stretch.displacement, stretch.rate, *pattern
+                relay.omega, relay.damping, tau, stretch.displacement, stretch.rate, *course
             )
-            at = travel(omega, damping, tau, driven[0], driven[1], *pattern)
-            position[:, inside] += push[:, [j]] * at[0]
-            rate[:, inside] += push[:, [j]] * at[1]
-            driven = np.array(travel(omega, damping, stretch.end - stretch.start, driven[0], driven[1], *pattern))
+            at = travel(omega, damping, tau, driven[0], driven[1], *course)
+            position[:, inside] += coupling[:, [j]] * at[0]
+            rate[:, inside] += coupling[:, [j]] * at[1]
+            driven = np.array(travel(omega, damping, stretch.end - stretch.start, driven[0], driven[1], *course))
     modal[residual], modal[[n + r for r in residual]] = position, rate
     return Response(time, modal, law.spread @ force, modes)

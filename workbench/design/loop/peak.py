@@ -1,18 +1,18 @@
-"""The largest value of a sum of damped exponentials over all time, not over samples of it."""
+"""The peak of a sum of damped exponentials in continuous time."""
 
 import numpy as np
 
-SHARE = 1e-6
+TOLERANCE = 1e-6  # relative, of the peak
 MOST_ROUNDS = 80
-MOST_INTERVALS = 500_000  # to be halved: exponentials that hardly decay leave more
+MOST_INTERVALS = 500_000  # to be halved; lightly damped exponentials may need more
 
 
 def largest(poles: np.ndarray, amplitudes: np.ndarray, span: float) -> float:
-    """max |Re Σ_k a_k e^{λ_k t}| over 0 <= t <= span and all signals, at most a millionth too large, never too small.
+    """max |Re Σ_k a_k e^{λ_k t}| over 0 <= t <= span and all signals: an upper bound, a millionth too large at most.
 
-    On an interval of width w about t, |g| <= |g(t)| + |g'(t)| w/2 + (w²/8) Σ_k |a_k λ_k²| e^{Re λ_k (t - w/2)}: what
-    cannot beat the largest seen is dropped, the rest is halved. Where they hardly decay and too many are left, the
-    bound on them is returned, which is never too small either.
+    On an interval of width w about t, |g| <= |g(t)| + |g'(t)| w/2 + (w²/8) Σ_k |a_k λ_k²| e^{Re λ_k (t - w/2)}.
+    Intervals whose bound is below the largest value so far are dropped, the others halved. If too many intervals are
+    left, as of lightly damped exponentials, their upper bound is returned, which may be further above the maximum.
 
     Args:
         poles: (n_poles,), none to the right of the axis.
@@ -33,9 +33,9 @@ def largest(poles: np.ndarray, amplitudes: np.ndarray, span: float) -> float:
         bend = (size[signal] * np.exp(np.outer(start, decay))) @ np.abs(poles) ** 2
         upper = value + 0.5 * width * slope + 0.125 * width**2 * bend
         best = max(best, float(value.max()))
-        kept = upper > best * (1 + SHARE)
+        kept = upper > best * (1 + TOLERANCE)
         if not kept.any():
-            return best * (1 + SHARE)
+            return best * (1 + TOLERANCE)
         if kept.sum() > MOST_INTERVALS:
             break
         width *= 0.5

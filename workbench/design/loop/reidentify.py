@@ -1,10 +1,10 @@
-"""From a closed-loop record with known gains back to the structure: the simultaneous problem of Chapter 6.
+"""Closed-loop identification: the open-loop structure from a closed-loop record with known gains (Chapter 6).
 
-Modal coordinates read in the loop move as q(t) = Σ_k ψ_k e^{p_k t}. With u = -K x known, every pair gives
+Modal coordinates in the closed loop are q(t) = Σ_k ψ_k e^{p_k t}. With u = -K x known, every pair (p_k, ψ_k) gives
 
     S ψ_k + p_k C ψ_k = -p_k² ψ_k - B K (ψ_k, p_k ψ_k),
 
-linear in the stiffness S (Ω² where the shapes still hold) and the damping C of the controlled modes.
+linear in the stiffness S (Ω² where the shapes are unchanged) and the damping C of the controlled modes.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ class Reidentified:
     """Stiffness and damping of the controlled modes, without control.
 
     Attributes:
-        stiffness: (n_controlled, n_controlled) S, 1/s²; diagonal where the shapes still hold.
+        stiffness: (n_controlled, n_controlled) S, 1/s²; diagonal where the shapes are unchanged.
         damping: (n_controlled, n_controlled) C, 1/s.
     """
 
@@ -37,28 +37,28 @@ class Reidentified:
 
     @property
     def omega(self) -> np.ndarray:
-        """Natural frequencies (n_controlled,), rad/s, by the order of the controlled modes."""
+        """Natural frequencies (n_controlled,), rad/s, in the order of the controlled modes."""
         return np.sqrt(np.maximum(np.diag(self.stiffness), 0.0))
 
     @property
     def coupling(self) -> float:
-        """Largest stiffness between modes relative to √(S_rr S_ss): how far the shapes no longer hold."""
+        """Largest |S_rs| / √(S_rr S_ss) between two modes; zero where the shapes are unchanged."""
         size = np.maximum(self.omega, 1e-300)
         off = self.stiffness - np.diag(np.diag(self.stiffness))
         return float(np.abs(off / np.outer(size, size)).max())
 
 
 def open_loop(modes: Modes, law: Law, poles: ArrayLike, shapes: ArrayLike) -> Reidentified:
-    """The structure behind closed-loop poles and shapes.
+    """The open-loop stiffness and damping from closed-loop poles and shapes.
 
     Args:
-        modes: as they were when the law was designed; their shapes at the actuators are taken to hold.
-        law: known, that closed the loop.
+        modes: for which the law was designed; their shapes at the actuators count as unchanged.
+        law: u = -K x of the record.
         poles: (n_controlled,) closed-loop poles, one of each pair, rad/s.
-        shapes: (n_controlled, n_controlled) complex, modal coordinates in rows, one column a pole.
+        shapes: (n_controlled, n_controlled) complex, modal coordinates in rows, one column per pole.
 
     Raises:
-        DesignError: as many poles as controlled modes are needed; shapes too alike to distinguish modes.
+        DesignError: not as many poles as controlled modes, or nearly dependent shapes.
     """
     poles, shapes = np.asarray(poles, complex), np.asarray(shapes, complex)
     n = law.n_controlled
@@ -73,10 +73,11 @@ def open_loop(modes: Modes, law: Law, poles: ArrayLike, shapes: ArrayLike) -> Re
     scale = np.linalg.norm(left, axis=1, keepdims=True)
     if not np.linalg.cond(left / scale) < ILL_CONDITIONED:
         raise DesignError(
-            "the closed-loop shapes are too alike to distinguish the modes; read them longer or excite all"
+            "the closed-loop shapes are nearly dependent, so the modes cannot be distinguished; record longer, or"
+            " excite all modes"
         )
-    found = np.linalg.solve((left / scale).T, right.T).T / scale.T
-    return Reidentified(found[:, :n], found[:, n:])
+    solution = np.linalg.solve((left / scale).T, right.T).T / scale.T
+    return Reidentified(solution[:, :n], solution[:, n:])
 
 
 def updated(modes: Modes, controlled: Sequence[int], found: Reidentified) -> Modes:

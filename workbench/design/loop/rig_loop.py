@@ -1,4 +1,4 @@
-"""A whole rig under a digital controller: every actuator, sensor and element as it is, sample by sample."""
+"""Simulation of a rig under a digital controller, with all imperfections of actuators, sensors and elements."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,7 +29,7 @@ K = TypeVar("K")
 
 @dataclass(frozen=True, eq=False)
 class LoopTest:
-    """What a loop is put through, from rest: an impulse, forces that are held over each sample, or both.
+    """The excitation of a loop from rest: an impulse, forces held over each sample, or both.
 
     Attributes:
         n_samples: of the test.
@@ -37,7 +37,7 @@ class LoopTest:
         impulse_at: the place of an impulse at t = 0; None for none.
         impulse: N s.
         forces: (n_forces, n_samples) N.
-        ports: (n_forces,) where and how they act: their places, kinds and directions; all else of them is left out.
+        ports: (n_forces,) actuators whose place, kind and direction say how the forces act; the rest is not used.
         seed: of the sensors' noise and of random disturbances; None for neither.
     """
 
@@ -70,14 +70,14 @@ class LoopTest:
 
 @dataclass(frozen=True, eq=False)
 class LoopRun:
-    """What a rig does under a controller.
+    """The response of a rig under a controller.
 
     Attributes:
-        response: modal motion, and the actuators' forces in the mean over each sample.
+        response: modal motion, and the mean of the actuators' forces over each sample.
         commands: (n_actuators, n_samples).
         elements: (3, n_elements, n_samples) displacement, rate and force of each element at a point.
-        bounded: whether the motion came to the end of the test; the response is that of the samples before.
-        into: (n_modes, n_actuators) modal forces per force.
+        bounded: whether the motion stayed finite to the end; the response ends before the sample at which it diverged.
+        into: (n_modes, n_actuators) participation factors, modal forces per force.
     """
 
     response: Response
@@ -91,7 +91,7 @@ class LoopRun:
 
     @property
     def work(self) -> np.ndarray:
-        """W_r = ∫ b_rᵀ F q_r' dt (n_modes,), by the mean force over each sample: exact where it is held over it."""
+        """W_r = ∫ b_rᵀ F q_r' dt (n_modes,), by the mean force over each sample; exact for forces held over it."""
         n = self.response.modes.n_modes
         modal = self.into @ self.response.forces[:, :-1]
         return np.asarray((modal * np.diff(self.response.modal[:n], axis=1)).sum(axis=1))
@@ -106,18 +106,17 @@ class LoopRun:
 def run_loop(
     rig: Rig, controller: DigitalController, test: LoopTest, *, substeps: int = SUBSTEPS, free: int = 0
 ) -> LoopRun:
-    """The motion of a rig under a controller.
+    """The response of a rig under a controller.
 
     Args:
-        rig: with the sensors that the controller reads and the actuators that it commands, by name.
+        rig: has the sensors and actuators that the controller names.
         controller: of the test's sample time.
-        test: what the loop is put through.
-        substeps: of a sample.
-        free: samples that follow the test, in which no force acts, the rig's own among them, and no noise.
+        test: the excitation.
+        substeps: per sample.
+        free: samples after the test without noise, forces of the test, or disturbances of the rig.
 
     Raises:
-        ValueError: sensors or actuators that the rig does not have, another sample time, or what the loop cannot
-            simulate.
+        ValueError: sensors or actuators that the rig does not have, another sample time, or an accelerometer.
     """
     check_fits(rig, controller, test)
     modes, n = rig.modes, rig.modes.n_modes
@@ -144,7 +143,7 @@ def run_loop(
         np.array([_drive(a) for a in actuators]).reshape(-1, 9),
         np.ascontiguousarray(into),
         np.array([_sense(s, test.n_samples) for s in sensors]).reshape(-1, 7),
-        _seen(rig, sensors),
+        _output_matrices(rig, sensors),
         noise,
         _arrays(controller),
         start,
@@ -161,21 +160,21 @@ def run_loop(
 
 
 def run_loops(rigs: Sequence[Rig], controller: DigitalController, test: LoopTest) -> list[LoopRun]:
-    """The same of many rigs, each with noise of its own, on all cores."""
+    """The responses of many rigs, each with its own noise, computed on all cores."""
     return of_loops(rigs, controller, test, lambda _rig, _test, run: run)
 
 
 def of_loops(
     rigs: Sequence[Rig], controller: DigitalController, test: LoopTest, kept: Callable[[Rig, LoopTest, LoopRun], K]
 ) -> list[K]:
-    """What is kept of the run of each of many rigs, from rig, its own test and run: a thousand runs fill the memory."""
+    """`kept(rig, test, run)` of each of many rigs, computed on all cores; the runs themselves would fill the memory."""
     tests = [test if test.seed is None else replace(test, seed=test.seed + i) for i in range(len(rigs))]
     with ThreadPoolExecutor(cores()) as pool:
         return list(pool.map(lambda rig, one: kept(rig, one, run_loop(rig, controller, one)), rigs, tests))
 
 
 def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
-    """Refuse a controller that does not fit a rig or a test, or a sensor that no loop simulates."""
+    """Refuse a controller that does not fit a rig or a test, or one that reads an accelerometer."""
     for kind, names, there in (
         ("sensor", controller.sensors, {s.name for s in rig.sensors}),
         ("actuator", controller.actuators, {a.name for a in rig.actuators}),
@@ -184,12 +183,12 @@ def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
         if missing:
             raise ValueError(
                 f"the controller names {kind} {missing[0]!r}, which the rig does not have: it has"
-                f" {', '.join(sorted(there)) or 'none'}; name the controller's {kind}s as the rig does"
+                f" {', '.join(sorted(there)) or 'none'}; use the rig's names of {kind}s in the controller"
             )
     if abs(controller.sample_time / test.sample_time - 1.0) > 1e-9:
         raise ValueError(
-            f"the controller runs every {controller.sample_time:g} s and the test every {test.sample_time:g} s; sample"
-            " both alike"
+            f"the controller has a sample time of {controller.sample_time:g} s and the test of {test.sample_time:g} s;"
+            " give both the same"
         )
     for name in controller.sensors:
         if MEASURED[named(rig.sensors, name).quantity][1] > 1:
@@ -197,34 +196,34 @@ def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
 
 
 def named(parts: Sequence[P], name: str) -> P:
-    """The actuator or the sensor of that name."""
+    """The first of the actuators or sensors with a name."""
     return next(part for part in parts if part.name == name)
 
 
 def _drive(a: Actuator) -> list[float]:
-    late = (a.delay, a.time_constant, a.bias, a.rate_limit)
-    return [a.gain, a.dead_zone, a.limit, *late, a.hysteresis_share, a.hysteresis_width]
+    dynamics = (a.delay, a.time_constant, a.bias, a.rate_limit)
+    return [a.gain, a.dead_zone, a.limit, *dynamics, a.hysteresis_share, a.hysteresis_width]
 
 
 def _sense(s: Sensor, n_samples: int) -> list[float]:
-    # one that is ahead of the inputs' clock cannot read what is not yet there
+    # a negative delay, of a sensor ahead of the inputs' clock, is not causal in a loop
     drift = s.drift / max(n_samples - 1, 1)
     return [s.gain, s.bias, drift, max(s.delay, 0.0), s.time_constant, s.limit, s.step]
 
 
-def _seen(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
-    """(2, n_sensors, n_modes) truth of each sensor by displacements and by rates, gain left out, cross-talk in."""
-    seen = np.zeros((2, len(sensors), rig.modes.n_modes))
+def _output_matrices(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
+    """(2, n_sensors, n_modes) from displacements and from rates to each sensor, without gain, with cross-talk."""
+    matrices = np.zeros((2, len(sensors), rig.modes.n_modes))
     for j, sensor in enumerate(sensors):
         for source, share in ((sensor, 1.0), *((named(rig.sensors, n), part) for n, part in sensor.crosstalk)):
             order = MEASURED[source.quantity][1]
             if order < 2:
-                seen[order, j] += share / source.gain * output_matrix(rig.modes, [source])[0]
-    return seen
+                matrices[order, j] += share / source.gain * output_matrix(rig.modes, [source])[0]
+    return matrices
 
 
 def _disturbances(rig: Rig, test: LoopTest, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
-    """Forces (n_forces, n_samples) that are no commands, and their participation (n_modes, n_forces)."""
+    """Forces (n_forces, n_samples) of the test and the rig's elements, and their participation (n_modes, n_forces)."""
     rows = [] if test.forces is None else list(test.forces)
     columns = list(participation_of(Rig(rig.modes, test.ports, ())).T) if test.ports else []
     middle = test.time + 0.5 * test.sample_time

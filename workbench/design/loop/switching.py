@@ -2,8 +2,8 @@
 
     q'' + c q' + ω² q = f,   f = -k where s > d,  0 where |s| < d,  +k where s < -d,   s = q' + λ q
 
-On an edge s = ±d where the force would throw the mode back and its absence lets it out, the mode slides along the edge
-under the mean force that keeps s' = 0 (Filippov 1988); every piece of the motion has a closed form.
+Where the force drives s back into the dead band and without it s leaves again, the mode slides along the edge s = ±d
+under the mean force that keeps s' = 0 (Filippov 1988). Every piece of the motion has a closed form.
 """
 
 import cmath
@@ -18,8 +18,7 @@ from scipy.optimize import brentq
 from workbench.arrays import Floats
 from workbench.design.laws.on_off import Relay
 
-# of the largest |s| in reach: an extremum of s that comes no further past an edge than this touches and turns back
-TOUCH = 1e-13
+TOUCH = 1e-13  # of the largest |s|: an extremum of s no further past an edge than this touches it without crossing
 MOST_EVENTS = 1_000_000
 
 
@@ -68,7 +67,7 @@ def _stretches(relay: Relay, q: float, v: float, final: float) -> Iterator[Stret
                 q = _slid(relay, q, edge, duration)
                 v, time = edge - slope * q, end
             sign = 1 if pull >= k else -1 if pull <= -k else 0
-            # pulled through the dead band's edge from outside: into it, whatever the force beyond could do
+            # s' points from the edge into the dead band: the force is off there
             sign = 0 if sign * edge < 0 else sign
         force = -k * sign
         levels = (-d, d) if sign == 0 else (sign * d,)
@@ -85,7 +84,7 @@ def _stretches(relay: Relay, q: float, v: float, final: float) -> Iterator[Stret
 def _crossing(
     relay: Relay, q: float, v: float, force: float, levels: Sequence[float], edge: float | None, horizon: float
 ) -> tuple[float, float | None]:
-    """When s first crosses one of the levels, and which; (inf, None) where it does not before the horizon.
+    """The time of the first crossing of one of the levels by s, and the level; (inf, None) if none before the horizon.
 
     s' obeys the free equation of the mode, so its zeros are known and s is monotone between them.
     """
@@ -100,7 +99,7 @@ def _crossing(
         return float(rate + slope * position)
 
     left, value = 0.0, s0 if edge is None else edge
-    for right in _turns(omega, c, acceleration + slope * v, jerk + slope * acceleration, horizon):
+    for right in _extrema(omega, c, acceleration + slope * v, jerk + slope * acceleration, horizon):
         after = s(right)
         for level in levels:
             if abs(value - level) > touch and abs(after - level) > touch and (value < level) != (after < level):
@@ -110,45 +109,45 @@ def _crossing(
     return np.inf, None
 
 
-def _turns(omega: float, c: float, w: float, dw: float, horizon: float) -> Iterator[float]:
-    """Zeros up to the horizon of w'' + c w' + ω² w = 0 from (w, w') = (w, dw), then the horizon.
+def _extrema(omega: float, c: float, w: float, dw: float, horizon: float) -> Iterator[float]:
+    """Extrema of s up to the horizon, then the horizon: zeros of w = s', w'' + c w' + ω² w = 0 from (w, dw).
 
-    An oscillation's later extremes are no larger than its first two, so three zeros show every crossing.
+    The extrema of an oscillation do not grow, so the first few show whether s crosses a level at all.
     """
     sigma = 0.5 * c
-    found: list[float] = []
+    zeros: list[float] = []
     if omega > sigma:
         damped = np.sqrt(omega**2 - sigma**2)
         angle = np.arctan2(-(dw + sigma * w) / damped, w)
         first = ((0.5 * np.pi - angle) % np.pi) / damped
-        found = [first + i * np.pi / damped for i in range(4)]
-        horizon = min(horizon, found[-1])
+        zeros = [first + i * np.pi / damped for i in range(4)]
+        horizon = min(horizon, zeros[-1])
     else:
         r = np.sqrt(sigma**2 - omega**2)
         if r * horizon < 1e-8:
             if w + 0.0 != 0 and dw + sigma * w != 0:
-                found = [-w / (dw + sigma * w)]
+                zeros = [-w / (dw + sigma * w)]
         else:
             a, b = 0.5 * (w + (dw + sigma * w) / r), 0.5 * (w - (dw + sigma * w) / r)
             if a * b < 0:
-                found = [0.5 * np.log(-b / a) / r]
-    yield from (t for t in found if 0 < t < horizon)
+                zeros = [0.5 * np.log(-b / a) / r]
+    yield from (t for t in zeros if 0 < t < horizon)
     yield horizon
 
 
 def _slid(relay: Relay, q: float, edge: float, time: float) -> float:
-    """q after sliding along s = edge for a while: q' = edge - λ q."""
+    """q after sliding along s = edge for a time: q' = edge - λ q."""
     slope = relay.slope
     return q + (edge - slope * q) * (-np.expm1(-slope * time) / slope if slope > 0 else time)
 
 
 def _pull(relay: Relay, q: float, edge: float) -> float:
-    """s' on the edge with the force off: the mean force that holds the mode there, sign reversed."""
+    """s' on the edge with the force off: minus the mean force of sliding."""
     return -(relay.omega**2) * q + (relay.slope - relay.damping) * (edge - relay.slope * q)
 
 
 def _slide(relay: Relay, q: float, edge: float, low: float, high: float) -> tuple[float, float]:
-    """How long the mode slides along an edge, and the pull that then lets it go; inf where nothing does."""
+    """The duration of sliding along an edge, inf where it does not end, and the pull (low or high) at its end."""
     slope, drift = relay.slope, edge - relay.slope * q
     start = _pull(relay, q, edge)
     change = -(relay.omega**2) - slope * (slope - relay.damping)  # of the pull with q
@@ -199,7 +198,7 @@ def kernels(omega: ArrayLike, c: ArrayLike, time: ArrayLike) -> tuple[Any, Any, 
 
 
 def _kernels(omega: float, c: float, time: float) -> tuple[float, float, float, float]:
-    """`kernels` of one number, without the cost of arrays."""
+    """`kernels` of scalars, without the overhead of arrays."""
     sigma = 0.5 * c
     r = cmath.sqrt(sigma**2 - omega**2)
     slow, fast = cmath.exp((r - sigma) * time), cmath.exp((-r - sigma) * time)
@@ -232,7 +231,7 @@ def travel(
     position = q * (dh + c * h) + v * h + steady * once + ramp * twice
     rate = v * dh - q * omega**2 * h + steady * h + ramp * once
     if np.any(fading):
-        # in resonance with an overdamped mode the limit is taken a hair beside it
+        # at a pole of an overdamped mode the fraction is 0/0: λ is shifted by 1e-7 of itself
         slope = np.where(slope**2 - c * slope + omega**2 == 0, (1 + 1e-7) * slope, slope)
         fade = np.exp(-slope * time)
         share = fading / (slope**2 - c * slope + omega**2)

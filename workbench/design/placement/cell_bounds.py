@@ -1,17 +1,18 @@
 """Bounds of the spillover work on cells of places, from intervals of the modal shapes.
 
-A cell is an interval of half-width h_j about c_j for each actuator. With b(x) the participation of the controlled modes
-in a force at x, M = B⁻¹ at the centre and z_r = φ_rᵀ M, what mode r takes is, without approximation,
+A cell is an interval of half-width h_j about c_j for each actuator. Let b(x) be the participation of the controlled
+modes in a force at x, M = B⁻¹ at the centre and z_r = φ_rᵀ M. The root Y_r of the work in mode r is, exactly,
 
     Y_r(x) = Y_r(c) + Σ_j d_rj(x_j) F_rj(x),   d_rj(x) = φ_r(x) - z_rᵀ b(x),   F_r(x) = B(x)⁻¹ T_r,
 
-where d_rj is zero at c_j: an error of the forces F costs only to second order. With E = M ΔB, |E| <= Ē on the cell,
-|F - F(c)| <= (I - Ē)⁻¹ Ē |F(c)| where the spectral radius of Ē is below 1 (Neumann's series, entry by entry). W_R is
-½ ‖Y‖² and ‖Y‖ >= vᵀ Y for any unit vector v, here that of the least ‖Y‖ to first order in the cell; the linear part is
-minimised over the cell under each limit linearised alike (a linear programme of one constraint, solved by its dual).
+where d_rj is zero at c_j, so that an error of the forces F has an effect of second order. With E = M ΔB, |E| <= Ē on
+the cell, |F - F(c)| <= (I - Ē)⁻¹ Ē |F(c)| where the spectral radius of Ē is below 1 (Neumann series, entry by entry).
+W_R is ½ ‖Y‖², and ‖Y‖ >= vᵀ Y for any unit vector v. Here v is along the Y of least norm to first order in the cell.
+The linear part is minimised over the cell under each linearised limit (a linear programme of one constraint, solved by
+its dual).
 
-Where B may be singular, or nearly so, duality bounds ‖Y‖ under each limit (`dual_bound.py`); the larger bound counts.
-A cell that neither bounds as wanted may still be excluded by determinants (`hull_bound.py`).
+Where B is singular or nearly so, duality bounds ‖Y‖ under each limit (`dual_bound.py`); the larger bound counts. A cell
+that neither bounds as wanted may still be excluded by determinants (`hull_bound.py`).
 """
 
 from dataclasses import dataclass
@@ -27,24 +28,24 @@ from workbench.design.placement.small_matrices import inverse_of
 from workbench.design.placement.task import PlacementTask
 from workbench.structure.modes import frozen
 
-LEVELS = 12  # halvings of the length of the structure: its 1/8192 to each side
+LEVELS = 12  # halvings of the length of the structure: the smallest half-width is 1/8192 of it
 INSTANTS = 48  # of the modal forces, for their peak
-SINGULAR = 1e-13  # pivot of B over its largest entry
-SWEEPS = 3  # of the descent to the least ‖Y‖ to first order
-OF_JUMP = 26.0  # h J / 192: by how much a cubic fails at most to follow a jump J of the slope
-FLAT = 1e-12  # a limited square form whose least eigenvalue over the largest is below has no inverse
+SINGULAR = 1e-13  # pivot of B over its largest entry, below which B counts as singular
+SWEEPS = 3  # of the coordinate descent to the least ‖Y‖ to first order
+OF_JUMP = 26.0  # times h J / 192: largest error of a cubic at a jump J of the slope
+FLAT = 1e-12  # ratio of least to largest eigenvalue, below which a limited quadratic form has no inverse
 
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """The modal shapes on every interval of the halved length; interval i halves into 2i + 1 and 2i + 2.
+    """The modal shapes on a binary tree of intervals; interval i halves into 2i + 1 and 2i + 2.
 
     Attributes:
         centre, half: (n_intervals,) m.
         value, slope, bend: (n_intervals, n_modes) φ, φ' and φ'' at the centre.
-        most_bend, most_rate: (n_intervals, n_modes) largest |φ''| and rate of change of φ'' on the interval.
-        most_fourth: (n_intervals, n_modes) largest fourth derivative, enough for a cubic's error also where a lower one
-            jumps; None where the nodes are no intervals.
+        most_bend, most_rate: (n_intervals, n_modes) largest |φ''| and |φ'''| on the interval.
+        most_fourth: (n_intervals, n_modes) largest |φ''''|, increased where a lower derivative jumps so that it bounds
+            a cubic's error there too; None where the nodes are groups of candidates.
     """
 
     centre: np.ndarray
@@ -58,7 +59,7 @@ class Intervals:
 
     @classmethod
     def of(cls, task: PlacementTask) -> "Intervals":
-        """On a grid of which every centre is a point; between its points by the rates of change seen there."""
+        """Intervals of a task's length, from a grid that contains every centre; derivatives by finite differences."""
         first, last = task.reach
         leaves = 2**LEVELS
         grid = np.linspace(first, last, 2 * leaves + 1)
@@ -71,7 +72,7 @@ class Intervals:
         varied = np.abs(np.diff(rate, axis=0, prepend=rate[:1], append=rate[-1:]))
         rate = rate + np.maximum(varied[:-1], varied[1:])
         steep = np.maximum(np.abs(bend[:-1]), np.abs(bend[1:])) + 0.5 * step * rate
-        # jumps of the slope, at a step of a bar's stiffness say: what of its change the bends do not show
+        # jumps of the slope, as at a step of a bar's stiffness: its change less the integral of φ''
         jump = np.abs(np.diff(slope, axis=0) - 0.5 * step * (bend[:-1] + bend[1:]))
         h, levels = step, []
         for _ in range(LEVELS + 1):
@@ -86,11 +87,11 @@ class Intervals:
 
 
 class CellBounds:
-    """Of cells (n_cells, n_actuators) of intervals: lower bounds of √W_R, and whether the limits leave any place.
+    """Lower bounds of √W_R of cells (n_cells, n_actuators) of intervals; inf where no placement meets the limits.
 
     Attributes:
-        intervals: the halved length.
-        wanted: √W_R that cells are to be proven not to go below; 0 where they need not.
+        intervals: the tree of intervals.
+        wanted: √W_R to be proven as a lower bound; 0 for none, which leaves out the test by determinants.
     """
 
     def __init__(
@@ -99,8 +100,8 @@ class CellBounds:
         n, self.wanted = task.n_controlled, wanted
         self.intervals = table = Intervals.of(task) if intervals is None else intervals
         forces = task.forces[:, :: max(1, task.forces.shape[1] // INSTANTS)]
-        # what is limited, as tr(B⁻¹ S B⁻ᵀ) <= L²: the effort; n times the square of the peak, above any mean of the
-        # forces' squares; and the condition, L = limit / ‖B‖
+        # the limits as tr(B⁻¹ S B⁻ᵀ) <= L²: of the effort; of the peak, since n times its square is above any mean of
+        # the squared forces; and of the condition, L = limit / ‖B‖
         squares: list[tuple[np.ndarray, float]] = []
         if np.isfinite(limits.effort):
             squares.append((task.force_gramian, np.sqrt(limits.effort)))
@@ -123,7 +124,7 @@ class CellBounds:
             table.bend,
             table.most_bend,
             table.most_rate,
-            np.array(task.roots, order="C"),  # never read-only: that would be another type, compiled anew
+            np.array(task.roots, order="C"),  # a writeable copy: numba would compile again for a read-only array
             roots,
             np.array([matrix for matrix, _ in squares]).reshape(-1, n, n),
             inverses,
@@ -141,11 +142,11 @@ class CellBounds:
             self._hull = HullBound(task, measures, roots[kept], inverses[kept], bounded, limits.condition)
 
     def __call__(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lower bounds of √W_R (inf where the limits leave no place), √W_R at the centres, and the axis to halve."""
+        """Lower bounds of √W_R (inf: no placement meets the limits), √W_R at the centres, and the axes to halve."""
         lower, work = np.empty(len(cells)), np.empty(len(cells))
         axis = np.empty(len(cells), np.int64)
         _bounds(cells, *self._arguments, lower, work, axis)
-        for j in reversed(range(cells.shape[1] - 1)):  # halving an interval of two actuators parts them
+        for j in reversed(range(cells.shape[1] - 1)):  # halve an interval of two actuators first, to separate them
             axis[cells[:, j] == cells[:, j + 1]] = j
         if self._hull is not None and self.wanted > 0:
             self._hull.raise_to(self.wanted, cells, lower)
@@ -154,7 +155,7 @@ class CellBounds:
 
 @njit(cache=True, nogil=True)
 def _least_linear(cost: Floats, h: Floats, direction: Floats, slack: float) -> float:
-    """min cᵀδ over |δ| <= h with aᵀδ <= slack, by its dual; inf where no δ keeps the constraint."""
+    """min cᵀδ over |δ| <= h with aᵀδ <= slack, by its dual; inf where no δ meets the constraint."""
     n = cost.size
     reach = 0.0
     for j in range(n):
@@ -179,7 +180,7 @@ def _least_linear(cost: Floats, h: Floats, direction: Floats, slack: float) -> f
 
 @njit(cache=True, nogil=True)
 def _largest(score: Floats) -> int:
-    """Index of the largest, the first of equals."""
+    """Index of the largest entry, the first of equals (argmax)."""
     largest = 0
     for j in range(1, score.size):
         if score[j] > score[largest]:
@@ -241,7 +242,7 @@ def _bounds(
         axis[cell] = widest
         frame = np.sqrt(frame)
 
-        # no place in the cell has a ‖B‖ below this
+        # a lower bound of ‖B‖ in the cell
         least_frame = frame
         for j in range(n):
             a = 0.0
@@ -253,7 +254,7 @@ def _bounds(
             if np.isinf(limits[s]) and least_frame > 0:
                 limits[s] = condition / least_frame
 
-        # by duality, under each limit
+        # the bound by duality, under each limit
         nearest = -np.inf
         for s in range(n_squares):
             if regular[s] and np.isfinite(limits[s]):
@@ -264,7 +265,7 @@ def _bounds(
         if np.isinf(lower[cell]) or not inverse_of(matrix, m, SINGULAR * largest):
             continue
 
-        # how the forces change over the cell: E = M ΔB
+        # change of the forces over the cell: E = M ΔB
         for i in range(n):
             for j in range(n):
                 a, c, d, e = 0.0, 0.0, 0.0, 0.0
@@ -283,7 +284,7 @@ def _bounds(
                     score[j] += change[i, j]
             axis[cell] = _largest(score)
 
-        # Neumann's series, where it converges: (I - Ē) w = 1 with w > 0 makes I - Ē an M-matrix
+        # the Neumann series converges if (I - Ē) w = 1 has w > 0, since I - Ē is then an M-matrix
         for i in range(n):
             for j in range(n):
                 matrix[i, j] = (1.0 if i == j else 0.0) - change[i, j]
@@ -364,7 +365,7 @@ def _bounds(
             lower[cell] = np.inf
             continue
 
-        # Y, linear in the places but for a rest
+        # Y as a linear function of the places plus a remainder
         total = 0.0
         for r in range(n_residual):
             for k in range(n):
@@ -402,7 +403,7 @@ def _bounds(
                 least_y[r, q] = y[r, q]
         work[cell] = np.sqrt(0.5 * total)
 
-        # the least ‖Y‖ to first order, coordinate by coordinate
+        # the least ‖Y‖ to first order, by coordinate descent
         for j in range(n):
             shift[j] = 0.0
         for _ in range(SWEEPS):

@@ -1,4 +1,4 @@
-"""What branch and bound halves: the places along an interval, or candidate places in groups of like modal shapes."""
+"""The tree of branch and bound: places along an interval, or candidate places in groups of similar modal shapes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from workbench.design.placement.scan import allowed_places, rated
 from workbench.design.placement.task import PlacementTask
 from workbench.structure.modes import frozen
 
-LEAST_LEVELS = 3  # halvings of candidates, however few they are
+LEAST_LEVELS = 3  # halvings of candidates at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,13 +21,14 @@ class CellTree:
 
     Attributes:
         table: the modal shapes on every node.
-        low, high: (n_nodes,) where each begins and ends: m, or the numbers of its first and last candidate.
-        apart: by how much the end of an actuator's node must be beyond the beginning of the one before.
-        stands: (n_nodes,) whether there is a place to stand.
-        levels: of the tree, but the first.
-        places: of the actuators of a cell (n_actuators,) of nodes; None where an actuator cannot stand at its centre.
-        kept: of cells of single candidates (n_cells, n_actuators), the W_R of those that keep the limits, inf of the
-            others; None along an interval, where a cell is never a single place.
+        low, high: (n_nodes,) first and last place of each: m, or the numbers of its first and last candidate.
+        apart: least distance from the first place of an actuator's node to the last place of the next actuator's.
+        stands: (n_nodes,) whether a node contains an allowed place.
+        levels: below the root.
+        places: the places of the actuators of a cell (n_actuators,) of nodes, in the middle of each; None where one of
+            them is not allowed.
+        kept: W_R of cells (n_cells, n_actuators) of single candidates, inf where a limit is exceeded; None along an
+            interval, where a cell is never a single place.
     """
 
     table: Intervals
@@ -41,7 +42,7 @@ class CellTree:
 
     @classmethod
     def of(cls, task: PlacementTask, limits: Limits) -> "CellTree":
-        """Of the candidates where the limits name such, else of the interval.
+        """The tree of the candidates where the limits name them, else of the interval.
 
         Raises:
             DesignError: no room for all actuators.
@@ -64,7 +65,7 @@ def _of_interval(task: PlacementTask, limits: Limits) -> CellTree:
 
 
 def _of_candidates(task: PlacementTask, limits: Limits) -> CellTree:
-    """Candidates halved where their shapes, each over its largest, spread most; at the end each by itself."""
+    """Candidates halved along the scaled shape that varies most within a node, down to single candidates."""
     grid = allowed_places(task, limits, 0)
     shapes = task.shapes(grid)
     scaled = shapes / np.maximum(np.abs(shapes).max(axis=0), 1e-300)
@@ -77,32 +78,32 @@ def _of_candidates(task: PlacementTask, limits: Limits) -> CellTree:
         half = -(-node.size // 2)
         members += [order[:half], order[half:]]
     sizes = np.array([node.size for node in members])
-    # number the candidates as the leaves have them, so that every node holds a run of them
+    # number the candidates in the order of the leaves, so that every node holds consecutive ones
     leaves = np.concatenate(members[2**levels - 1 :])
     number = np.argsort(leaves)
     n_nodes, n_modes = len(members), task.modes.n_modes
     middle, radius = np.zeros((n_nodes, n_modes)), np.zeros((n_nodes, n_modes))
     first, last = np.full(n_nodes, -np.inf), np.full(n_nodes, -np.inf)
-    likeliest = np.zeros(n_nodes, int)
+    nearest = np.zeros(n_nodes, int)  # candidate whose shapes are nearest to the middle
     for i in np.flatnonzero(sizes):
         own = shapes[members[i]]
         least, most = own.min(axis=0), own.max(axis=0)
         middle[i], radius[i] = 0.5 * (least + most), 0.5 * (most - least)
         first[i], last[i] = number[members[i]].min(), number[members[i]].max()
-        likeliest[i] = members[i][np.argmin(np.linalg.norm(own - middle[i], axis=1))]
-    none = frozen(np.zeros((n_nodes, n_modes)))
-    # ½ h² |φ''| with h = 1 is what the shapes of a node may differ by from their middle
+        nearest[i] = members[i][np.argmin(np.linalg.norm(own - middle[i], axis=1))]
+    zero = frozen(np.zeros((n_nodes, n_modes)))
+    # φ'' is chosen so that ½ h² |φ''| with h = 1 is the largest difference of a node's shapes from their middle
     half_width = np.where(sizes > 1, 1.0, 0.0)
     bend = frozen(2.0 * radius)
-    table = Intervals(frozen(first), frozen(half_width), frozen(middle), none, none, bend, bend)
+    table = Intervals(frozen(first), frozen(half_width), frozen(middle), zero, zero, bend, bend)
     at = coordinates(task.modes.domain, grid)
 
     def places(cell: np.ndarray) -> np.ndarray | None:
-        chosen = np.sort(likeliest[cell])
+        chosen = np.sort(nearest[cell])
         return as_places(task.modes.domain, grid[chosen]) if (np.diff(chosen) > 0).all() else None
 
     def kept(cells: np.ndarray) -> np.ndarray:
-        index = np.sort(likeliest[cells], axis=1)
+        index = np.sort(nearest[cells], axis=1)
         distant = least_distances(at[index]) >= limits.spacing - 1e-12
         return np.where(distant, rated(task, limits, shapes, at, index), np.inf)
 

@@ -1,7 +1,7 @@
-"""How far an optimum of placement can be from the best there is: branch and bound over all places.
+"""Optimality gap of a placement, proven by branch and bound over all places.
 
-Cells of places, or of candidates, are halved, the least bounded first, until none that a limit leaves open could hold a
-placement that beats the optimum by more than the gap; `workbench.design.placement.cell_bounds` has their bounds.
+Cells of places, or of candidates, are halved, those of the lowest bound first, until no cell can hold a placement under
+the limits that improves on the optimum by more than the gap. Bounds are in `workbench.design.placement.cell_bounds`.
 """
 
 import time
@@ -28,8 +28,8 @@ from workbench.threads import cores, one_blas_thread
 
 START_LEVEL = 3  # halvings of the length before the first bound
 BATCH = 50_000  # cells bounded at once
-SHELVES = 64  # of open cells, by their bound: the lowest is halved first
-TRIED = 20  # centres of a batch that are evaluated as placements, where they look better than the optimum
+SHELVES = 64  # groups of open cells by their bound; the lowest is halved first
+TRIED = 20  # centres of a batch, of the lowest W_R, that are evaluated as placements
 
 # (bound reached, W_R of the placement, cells bounded)
 Progress = Callable[[float, float, int], None]
@@ -37,17 +37,17 @@ Progress = Callable[[float, float, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What is proven of a placement.
+    """A proven lower bound of the residual work, beside that of a placement.
 
     Attributes:
-        placement: that was put to the test.
-        lower_bound: no placement under the limits has a smaller W_R.
-        cells: examined.
-        complete: whether the gap asked for is proven; if not, the bound holds none the less.
-        better: places met on the way that beat the placement by more than the gap; None where none do.
-        cell: (n_actuators, 2) the intervals of places (from, to), m, that hold the bound; None where the proof is
-            complete, and among candidates.
-        seconds: taken.
+        placement: the placement.
+        lower_bound: of W_R under the limits.
+        cells: number examined.
+        complete: whether the requested gap is proven; the bound holds in either case.
+        better: places met in the search that improve on the placement by more than the gap; None where there are none.
+        cell: (n_actuators, 2) intervals of places (from, to), m, of the cell with the lowest bound; None where the
+            proof is complete, and among candidates.
+        seconds: computing time.
     """
 
     placement: Placement
@@ -60,7 +60,7 @@ class Certificate:
 
     @property
     def gap(self) -> float:
-        """By what share W_R could at most be lower."""
+        """Optimality gap: the largest share of W_R by which another placement may be better."""
         return 1.0 - self.lower_bound / self.placement.residual_work
 
     def __str__(self) -> str:
@@ -72,7 +72,7 @@ class Certificate:
         if self.cell is None:
             return text
         where = "; ".join(f"{low:.4g} to {high:.4g}" for low, high in self.cell)
-        return f"{text}; the bound is that of actuators at {where} m"
+        return f"{text}; the lowest bound is that of actuators at {where} m"
 
 
 def _listed(places: np.ndarray) -> str:
@@ -93,20 +93,21 @@ def certify(
     max_cells: int = 200_000_000,
     progress: Progress | None = None,
 ) -> Certificate:
-    """A certificate that no placement under the limits has less residual work by more than a gap, by branch and bound.
+    """A certificate that no placement under the limits is better by more than a gap, by branch and bound.
 
-    A limit of the condition alone leaves actuators beside the supports, where B vanishes and no bound holds: give a
-    distance from the edges with it.
+    A limit of the condition alone allows actuators beside the supports, where B vanishes and the bounds fail: give a
+    distance from the edges too.
 
     Args:
-        placement: that of `place` unless given.
+        task, limits: as for `place_actuators`.
+        placement: by default that of `place_actuators`.
         gap: share of W_R to be proven.
-        seconds, max_cells: after which the search stops with the bound that it has reached. The first search on a
-            machine compiles for about a minute before, which does not count.
-        progress: called with the bound, W_R of the placement and the cells bounded so far.
+        seconds, max_cells: limits of the search, which then returns the bound reached. The first search on a machine
+            compiles for about a minute before, which does not count.
+        progress: called with the bound, W_R of the placement and the number of cells bounded so far.
 
     Raises:
-        DesignError: none of the limits that keep B from being singular, or a gap that is not between 0 and 1.
+        DesignError: no limit that excludes a singular B, or a gap that is not between 0 and 1.
     """
     if not 0 < gap < 1:
         raise DesignError(f"the gap to be proven is a share between 0 and 1; got {gap:g}")
@@ -115,7 +116,7 @@ def certify(
         limits = replace(limits, candidates=tuple(listed(allowed_places(task, limits, 0))))
     if limits.candidates is None and not limits.regular:
         raise DesignError(
-            "without a limit B may come as near to singular as it likes; give one of effort, peak force or condition"
+            "without a limit B may be arbitrarily near to singular; give a limit of effort, peak force or condition"
         )
     if isinstance(domain, Rectangle) and limits.candidates is None:
         raise DesignError("a proof on a rectangle is among candidate places; give limits candidates, on a grid say")
@@ -123,14 +124,14 @@ def certify(
     best = place_actuators(task, limits) if placement is None else placement
     if limits.candidates is not None and comb(len(limits.candidates), task.n_controlled) <= MOST_TRIED:
         least, tried = scan(task, limits)
-        found = least.positions if least.residual_work < best.residual_work * (1.0 - gap) else None
+        better = least.positions if least.residual_work < best.residual_work * (1.0 - gap) else None
         bound = min(least.residual_work, best.residual_work)
-        return Certificate(best, bound, tried, True, found, seconds=time.monotonic() - began)
+        return Certificate(best, bound, tried, True, better, seconds=time.monotonic() - began)
     return _Search(task, limits, best, gap).run(seconds, max_cells, progress)
 
 
 class _Search:
-    """Branch and bound: shelves of open cells, ordered by their bound of √W_R."""
+    """Branch and bound, with open cells grouped on shelves by their lower bound of √W_R."""
 
     def __init__(self, task: PlacementTask, limits: Limits, best: Placement, gap: float) -> None:
         self._task, self._limits, self._best = task, limits, best
@@ -138,7 +139,7 @@ class _Search:
         self._tree = CellTree.of(task, limits)
         self._bounds = CellBounds(task, limits, self._tree.table, self._wanted)
         self._shelves: list[list[np.ndarray]] = [[] for _ in range(SHELVES)]
-        self._stuck = np.inf  # least bound of a cell that is as small as the table has them
+        self._stuck = np.inf  # lowest bound of a cell of the smallest size
         self._stuck_cell: np.ndarray | None = None
         self.cells = 0
 
@@ -147,11 +148,11 @@ class _Search:
         level = range(2**START_LEVEL - 1, 2 ** (START_LEVEL + 1) - 1)
         cells = np.array(list(combinations_with_replacement(level, n)), np.int64).reshape(-1, n)
         workers = min(cores(), 8)
-        self._bounds(cells[:1])  # compiles them, the first time on a machine: half a minute that is no search
+        self._bounds(cells[:1])  # compiles, the first time on a machine, for half a minute that does not count
         began = time.monotonic()
         with ThreadPoolExecutor(workers) as pool:
             while len(cells):
-                better = self._shelve(self._kept(cells), pool, workers)
+                better = self._shelve(self._feasible(cells), pool, workers)
                 spent = time.monotonic() - began
                 if better is not None:
                     return Certificate(self._best, 0.0, self.cells, False, better, seconds=spent)
@@ -167,18 +168,22 @@ class _Search:
             return Certificate(self._best, float(self._wanted**2), self.cells, True, seconds=spent)
         return Certificate(self._best, float(bound**2), self.cells, False, None, cell, spent)
 
-    def _kept(self, cells: Integers) -> Integers:
-        """Cells in order in which all actuators have room, and each interval a place to stand."""
+    def _feasible(self, cells: Integers) -> Integers:
+        """Cells in which all actuators find allowed places in order, at the least distance or more."""
         tree = self._tree
         room, first = tree.stands[cells].all(axis=1), np.full(len(cells), -np.inf)
         for node in cells.T:
             first = np.maximum(tree.low[node], first + tree.apart)
             room &= tree.high[node] >= first
-        kept: Integers = cells[room]
-        return kept
+        feasible: Integers = cells[room]
+        return feasible
 
     def _halved(self, rows: np.ndarray) -> np.ndarray:
-        """Both halves of each cell along its axis, the last column; (n_cells, n_actuators + 2) with the bound."""
+        """Both halves of each cell along its axis.
+
+        Args:
+            rows: (n_cells, n_actuators + 2) nodes, lower bound, and axis to halve.
+        """
         cells, axis = rows[:, :-2], rows[:, -1].astype(np.int64)
         left, right = cells.astype(np.int64), cells.astype(np.int64)
         each = np.arange(len(cells))
@@ -187,18 +192,18 @@ class _Search:
         return np.concatenate([left, right])
 
     def _shelve(self, cells: np.ndarray, pool: ThreadPoolExecutor, workers: int) -> np.ndarray | None:
-        """Bound the cells and shelve those still open; places that beat the placement, where some are met."""
+        """Bound the cells and shelve the open ones; return places that improve on the placement, where some are met."""
         if not len(cells):
             return None
         self.cells += len(cells)
         parts = np.array_split(cells, min(workers, 1 + len(cells) // 1000))
-        lower, work, axis = (np.concatenate(found) for found in zip(*pool.map(self._bounds, parts), strict=True))
+        lower, work, axis = (np.concatenate(part) for part in zip(*pool.map(self._bounds, parts), strict=True))
         better = self._better(cells, work)
         if better is not None:
             return better
         open_ = lower < self._wanted
         cells, lower, axis = cells[open_], lower[open_], axis[open_]
-        # an axis that cannot be halved further gives way to the widest
+        # where the axis cannot be halved further, halve the widest
         smallest = 2**self._tree.levels - 1
         at_end = cells[np.arange(len(cells)), axis] >= smallest
         axis[at_end] = cells[at_end].argmin(axis=1)
@@ -219,6 +224,7 @@ class _Search:
         return None
 
     def _better(self, cells: Integers, work: Floats) -> Floats | None:
+        """Places at the centre of a cell that improve on the placement by more than the gap; None where none do."""
         for i in np.argsort(work)[:TRIED]:
             if not work[i] < self._wanted:
                 break
@@ -231,7 +237,7 @@ class _Search:
         return None
 
     def _lowest(self) -> tuple[float, np.ndarray | None]:
-        """The least bound of √W_R of any open cell, and the intervals of that cell."""
+        """The lowest bound of √W_R of any open cell, and the intervals of that cell."""
         bound, cell = min(self._wanted, self._stuck), self._stuck_cell
         shelf = next((s for s in self._shelves if s), [])
         for rows in shelf:
@@ -244,7 +250,7 @@ class _Search:
 
 
 def _taken(shelf: list[np.ndarray]) -> np.ndarray:
-    """About a batch of cells from a shelf, the last put there first."""
+    """About a batch of cells from a shelf, last in first out."""
     taken, count = [], 0
     while shelf and count < BATCH:
         rows = shelf.pop()

@@ -1,7 +1,7 @@
-"""Where the actuators of coupled LQR should stand: its forces depend on the places, so every place is a new design.
+"""Placement of actuators for coupled LQR, whose forces depend on the places, so that every placement is a new design.
 
-W_R = ½ Σ_r |b_rᵀ F(iω_r)|² with F(s) = -K (s - A + B K)⁻¹ x0. Of many designs at once, the stable half (X1, X2, Λ) of
-the Hamiltonian's eigenvectors is the closed loop itself: F(t) = -R⁻¹ Bᵀ X2 e^{Λt} X1⁻¹ x0.
+W_R = ½ Σ_r |b_rᵀ F(iω_r)|² with F(s) = -K (s - A + B K)⁻¹ x0. Many designs are computed at once from the stable
+eigenvectors and eigenvalues (X1, X2, Λ) of the Hamiltonian: F(t) = -R⁻¹ Bᵀ X2 e^{Λt} X1⁻¹ x0.
 """
 
 from dataclasses import replace
@@ -22,8 +22,8 @@ from workbench.structure.modes import Modes, modal_state_matrix
 from workbench.structure.printed import counted
 from workbench.threads import one_blas_thread
 
-DRAWN, LOOKED_AT = 2_000, 300
-ON_THE_AXIS = 1e-7  # of the largest |pole|: nearer, a loop does not count as stable
+DRAWN, LOOKED_AT = 2_000, 300  # random placements, and how many of the best are tried as starts
+ON_THE_AXIS = 1e-7  # of the largest |pole|: a loop whose poles are nearer to the axis does not count as stable
 
 
 @one_blas_thread
@@ -38,17 +38,17 @@ def place_coupled(
     starts: int = 5,
     seed: int = 0,
 ) -> Placement:
-    """Places of least W_R for coupled LQR under limits: the best of many draws, each polished by Nelder and Mead.
+    """Places of least W_R for coupled LQR under limits, by Nelder-Mead searches from the best of random placements.
 
     Args:
         modes, n_controlled, impulse_at, weight: as for `coupled_costs`.
         n_actuators: any number.
-        limits: to keep to.
-        starts: best draws to polish.
-        seed: of the draws.
+        limits: of the placement.
+        starts: number of searches.
+        seed: of the random placements.
 
     Raises:
-        DesignError: fewer actuators than rigid modes controlled, or limits that no draw can meet.
+        DesignError: fewer actuators than rigid modes controlled, or limits that no random placement meets.
     """
     if not 1 <= n_controlled < modes.n_modes:
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
@@ -57,24 +57,24 @@ def place_coupled(
     rigid = int((modes.omega[:n_controlled] == 0).sum())
     if n_actuators < rigid:
         raise DesignError(
-            f"{rigid} rigid-body modes are controlled, and {counted(n_actuators, 'actuator')} cannot move them one by"
-            " one, wherever placed; place as many actuators"
+            f"{rigid} rigid-body modes are controlled, and {counted(n_actuators, 'actuator')} cannot control them"
+            f" independently; place at least {rigid} actuators"
         )
     stretches = limits.intervals(n_actuators, modes.length)
 
-    def look(positions: np.ndarray) -> tuple[float, Placement | None]:
-        """log W_R and a wall where a limit is broken."""
+    def objective(positions: np.ndarray) -> float:
+        """log W_R; inf where a limit is exceeded."""
         at = np.sort(positions)
-        standing = all(any(low <= x <= high for low, high in stretches) for x in at)
-        if not standing or (np.diff(at) < limits.spacing).any():
-            return np.inf, None
-        found = coupled_costs(modes, n_controlled, at, impulse_at=impulse_at, weight=weight)
+        allowed = all(any(low <= x <= high for low, high in stretches) for x in at)
+        if not allowed or (np.diff(at) < limits.spacing).any():
+            return np.inf
+        placement = coupled_costs(modes, n_controlled, at, impulse_at=impulse_at, weight=weight)
         within = (
-            found.effort <= limits.effort
-            and found.peak_force <= limits.peak_force
-            and found.condition <= limits.condition
+            placement.effort <= limits.effort
+            and placement.peak_force <= limits.peak_force
+            and placement.condition <= limits.condition
         )
-        return (np.log(found.residual_work) if within and found.residual_work > 0 else np.inf), found
+        return float(np.log(placement.residual_work)) if within and placement.residual_work > 0 else np.inf
 
     rng = np.random.default_rng(seed)
     draws = [modes.length * np.arange(1, n_actuators + 1) / (n_actuators + 1)]
@@ -82,29 +82,29 @@ def place_coupled(
     work, effort = coupled_batch(modes, n_controlled, np.array(draws), impulse_at=impulse_at, weight=weight)
     ends: list[OptimizeResult] = []
     for i in np.argsort(np.where(effort <= limits.effort, work, np.inf))[:LOOKED_AT]:
-        if len(ends) < starts and effort[i] <= limits.effort and np.isfinite(look(draws[i])[0]):
+        if len(ends) < starts and effort[i] <= limits.effort and np.isfinite(objective(draws[i])):
             options = {"maxfev": 250 * n_actuators, "xatol": 1e-6 * modes.length, "fatol": 1e-9}
-            ends.append(minimize(lambda x: look(x)[0], draws[i], method="Nelder-Mead", options=options))
+            ends.append(minimize(objective, draws[i], method="Nelder-Mead", options=options))
     if not ends:
         lower = " or lower the spacing" * (limits.spacing > 0)
-        raise DesignError(f"no place drawn keeps the limits of coupled LQR; raise them{lower}")
+        raise DesignError(f"no random placement meets the limits with coupled LQR; raise the limits{lower}")
     best = min(ends, key=lambda end: end.fun)
-    found = coupled_costs(modes, n_controlled, best.x, impulse_at=impulse_at, weight=weight)
+    placement = coupled_costs(modes, n_controlled, best.x, impulse_at=impulse_at, weight=weight)
     optima = tuple(sorted(((np.sort(e.x), float(np.exp(e.fun))) for e in ends), key=lambda pair: pair[1]))
-    return replace(found, status=str(best.message), local_optima=optima)
+    return replace(placement, status=str(best.message), local_optima=optima)
 
 
 def coupled_costs(
     modes: Modes, n_controlled: int, positions: ArrayLike, *, impulse_at: float, weight: float, impulse: float = 1.0
 ) -> Placement:
-    """Residual work and effort of coupled LQR with force actuators at the positions; infinite where it is unstable.
+    """The placement of coupled LQR with force actuators at the positions, and its costs; infinite where it is unstable.
 
-    Effort and peak force are those of the law, the modes' own damping included; W_R is the work on residual modes as if
-    these had none.
+    Effort and peak force include the damping of the controlled modes; W_R is that of undamped residual modes.
 
     Args:
-        modes: controlled first, then residual, which are at rest at first.
-        n_controlled: how many; any number of actuators.
+        modes: controlled first, then residual, at rest initially.
+        n_controlled: number of controlled modes.
+        positions: (n_actuators,) m; any number.
         impulse_at: place of the impulse (N s).
         weight: R of the actuator forces.
 
@@ -114,39 +114,39 @@ def coupled_costs(
     positions = np.sort(np.asarray(positions, float))
     n, m = n_controlled, positions.size
     shapes = modes.phi(positions).T
-    states, a, scale = _weighed(modes, n)
+    states, a, scale = _scaled_states(modes, n)
     b = np.vstack([np.zeros((n, m)), shapes[:n]])[states]
     start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]][states]
     try:
         p = solve_continuous_are(a, b, np.eye(len(a)), weight * np.eye(m))
     except (LinAlgError, ValueError):
-        return _impossible(positions, modes.n_modes - n)
-    gain, whole = b.T @ p / weight, np.zeros((m, 2 * n))
-    whole[:, states] = gain * scale
+        return _infeasible(positions, modes.n_modes - n)
+    gain, full_gain = b.T @ p / weight, np.zeros((m, 2 * n))
+    full_gain[:, states] = gain * scale
     loop = a - b @ gain
     values, vectors = np.linalg.eig(loop)
     if not values.real.max() < -ON_THE_AXIS * np.abs(values).max():
-        return _impossible(positions, modes.n_modes - n)
-    held = np.linalg.solve(vectors, start.astype(complex))
-    force = -(gain @ vectors) * held @ (1.0 / (1j * modes.omega[None, n:] - values[:, None]))
+        return _infeasible(positions, modes.n_modes - n)
+    coefficients = np.linalg.solve(vectors, start.astype(complex))
+    force = -(gain @ vectors) * coefficients @ (1.0 / (1j * modes.omega[None, n:] - values[:, None]))
     by_mode = 0.5 * np.abs(np.einsum("rj,jr->r", shapes[n:], force)) ** 2
     gramian = settled_moments(loop, start)
     return Placement(
         positions=positions,
-        law=Law(whole, tuple(range(n)), forces_at(positions), "coupled LQR"),
+        law=Law(full_gain, tuple(range(n)), forces_at(positions), "coupled LQR"),
         residual_work=float(by_mode.sum()),
         by_mode=by_mode,
         effort=float(np.trace(gain @ gramian @ gain.T)),
-        peak_force=largest(values, (gain @ vectors) * held, np.inf),
+        peak_force=largest(values, (gain @ vectors) * coefficients, np.inf),
         condition=float(np.linalg.norm(np.linalg.pinv(shapes[:n])) * np.linalg.norm(shapes[:n])),
         status="coupled LQR",
     )
 
 
-def _weighed(modes: Modes, n: int) -> tuple[Integers, Floats, Floats]:
-    """The states whose motion costs anything, A of ω q and q' of these, and what takes the states to them.
+def _scaled_states(modes: Modes, n: int) -> tuple[Integers, Floats, Floats]:
+    """Indices of the states that cost anything, A of the scaled states ω q and q', and the scale of each.
 
-    Their squares are the cost, and they are of like size at any frequency. A rigid mode's displacement costs nothing.
+    The squares of the scaled states are the cost. The displacement of a rigid mode costs nothing and is left out.
     """
     check_uncoupled(modes)
     omega = modes.omega[:n]
@@ -160,7 +160,7 @@ def forces_at(positions: np.ndarray) -> tuple[Actuator, ...]:
     return tuple(Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(positions))
 
 
-def _impossible(positions: np.ndarray, n_residual: int) -> Placement:
+def _infeasible(positions: np.ndarray, n_residual: int) -> Placement:
     inf = np.inf
     return Placement(positions, None, inf, np.full(n_residual, inf), inf, inf, inf, "no regulator stabilises from here")
 
@@ -168,16 +168,16 @@ def _impossible(positions: np.ndarray, n_residual: int) -> Placement:
 def coupled_batch(
     modes: Modes, n_controlled: int, positions: np.ndarray, *, impulse_at: float, weight: float, impulse: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """W_R and effort (n_placements,) of coupled LQR at many placements (n_placements, n_actuators).
+    """W_R and effort (n_placements,) of coupled LQR at many placements (n_placements, n_actuators), m.
 
-    Infinite where no regulator stabilises.
+    Both are infinite where no regulator stabilises.
 
     Raises:
         DesignError: damping that couples the modes.
     """
     n, count = n_controlled, len(positions)
     shapes = modes.phi(positions.ravel()).reshape(*positions.shape, modes.n_modes)
-    states, a, _ = _weighed(modes, n)
+    states, a, _ = _scaled_states(modes, n)
     size = len(states)
     b = np.zeros((count, size, positions.shape[1]))
     b[:, size - n :] = shapes[:, :, :n].transpose(0, 2, 1)
@@ -190,12 +190,12 @@ def coupled_batch(
     poles = np.take_along_axis(values, stable, axis=1)
     vectors = np.take_along_axis(vectors, stable[:, None, :], axis=2)
     start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]][states].astype(complex)
-    works = poles.real.max(axis=1) < -ON_THE_AXIS * modes.omega[n - 1]
-    upper = np.where(works[:, None, None], vectors[:, :size], np.eye(size))
-    held = np.linalg.solve(upper, np.broadcast_to(start[:, None], (count, size, 1)))[:, :, 0]
-    amplitudes = -(b.transpose(0, 2, 1) @ vectors[:, size:]) * held[:, None, :] / weight
+    stabilised = poles.real.max(axis=1) < -ON_THE_AXIS * modes.omega[n - 1]
+    upper = np.where(stabilised[:, None, None], vectors[:, :size], np.eye(size))
+    coefficients = np.linalg.solve(upper, np.broadcast_to(start[:, None], (count, size, 1)))[:, :, 0]
+    amplitudes = -(b.transpose(0, 2, 1) @ vectors[:, size:]) * coefficients[:, None, :] / weight
     force = amplitudes @ (1.0 / (1j * modes.omega[n:] - poles[:, :, None]))
     work = 0.5 * (np.abs(np.einsum("par,par->pr", shapes[:, :, n:], force)) ** 2).sum(axis=1)
-    decay = np.where(works[:, None, None], -(poles.conj()[:, :, None] + poles[:, None, :]), 1.0)
+    decay = np.where(stabilised[:, None, None], -(poles.conj()[:, :, None] + poles[:, None, :]), 1.0)
     effort = np.einsum("pak,pkl,pal->p", amplitudes.conj(), 1.0 / decay, amplitudes, optimize=True).real
-    return np.where(works, work, np.inf), np.where(works, effort, np.inf)
+    return np.where(stabilised, work, np.inf), np.where(stabilised, effort, np.inf)

@@ -1,17 +1,17 @@
-"""Bounds of the spillover work on cells of places by duality, however near B is to singular in the cell.
+"""Bounds of the spillover work on cells of places by duality; B may be singular in the cell.
 
 With f_j the rows of F = B⁻¹, b_j = b(x_j) the columns of B, Σ_j b_j f_j = I. A limit is Σ_j ‖f_j S^½‖² <= L². For V of
-unit size and any Λ, with g(x) = Σ_r φ_r(x) V_rᵀ T_rᵀ,
+unit norm and any Λ, with g(x) = Σ_r φ_r(x) V_rᵀ T_rᵀ,
 
     ‖Y‖ >= ⟨V, Y⟩ = tr Λ + Σ_j f_j (g(x_j) - Λᵀ b(x_j)) >= tr Λ - L (Σ_j max_x ‖S^-½ (g(x) - Λᵀ b(x))‖²)^½
 
-(a semi-infinite Lagrange dual), where each maximum is over one interval alone. Without g the same says that a cell in
+(a semi-infinite Lagrange dual), where each maximum is over one interval alone. With g = 0 it follows that a cell in
 which tr Λ > L (...)^½ holds no placement within the limit.
 
-V and Λ only decide how good the bound is. They are optimal for cells with the two ends of each interval in place of all
-of it: with c the shapes at the centres above their changes to the ends, D = cᵀ c and T = tr D⁻¹ S, the least square
-that is limited, Λ = D⁻¹ cᵀ g + t D⁻¹ S with t² (L² - T) = ‖(g - c D⁻¹ cᵀ g) S^-½‖². V is Y of the least ‖Y‖ of all F
-within the limit, by the method of Frank and Wolfe.
+The bound holds for any V and Λ. Those used here are optimal if each interval is replaced by its two ends: with c the
+shapes at the centres above their changes to the ends, D = cᵀ c and T = tr D⁻¹ S, the least value of the limited square,
+Λ = D⁻¹ cᵀ g + t D⁻¹ S with t² (L² - T) = ‖(g - c D⁻¹ cᵀ g) S^-½‖². V is along the Y of least norm of all F within the
+limit, by the Frank-Wolfe method.
 """
 
 import numpy as np
@@ -20,41 +20,39 @@ from numba import njit
 from workbench.arrays import Floats, Integers
 from workbench.design.placement.small_matrices import inner, inverse_of, multiply, multiply_transposed
 
-STEPS = 4  # of Frank and Wolfe
-BARELY = 1e-6  # share of L² that T leaves at least, for the sake of t
-ROUND_OFF = 1e-8  # share of g that no Λ can be said to leave: a cell of one place leaves nothing
+STEPS = 4  # of the Frank-Wolfe method
+BARELY = 1e-6  # of L²: least value of L² - T, so that t stays finite
+ROUND_OFF = 1e-8  # of g: a smaller residual g - c D⁻¹ cᵀ g is round-off, as in a cell of one place
 
-
-Tables = tuple[
-    Floats, Floats, Floats, Floats, Floats
-]  # value, slope, bend, most bend and most rate, (n_nodes, n_modes)
+# value, slope, bend, most bend and most rate, (n_nodes, n_modes)
+Tables = tuple[Floats, Floats, Floats, Floats, Floats]
 
 
 @njit(cache=True, nogil=True)
-def _responses(residual: Floats, transforms: Floats, forces: Floats, found: Floats) -> None:
-    """T_rᵀ Σ_j φ_r(x_j) f_j of each residual mode, (n_residual, n_columns), into `found`."""
+def _responses(residual: Floats, transforms: Floats, forces: Floats, y: Floats) -> None:
+    """Write Y_r = T_rᵀ Σ_j φ_r(x_j) f_j of each residual mode into `y`, (n_residual, n_columns)."""
     n_residual, n, n_columns = transforms.shape
     for r in range(n_residual):
         for q in range(n_columns):
-            found[r, q] = 0.0
+            y[r, q] = 0.0
         for i in range(n):
             total = 0.0
             for k in range(residual.shape[0]):
                 total += residual[k, r] * forces[k, i]
             for q in range(n_columns):
-                found[r, q] += transforms[r, i, q] * total
+                y[r, q] += transforms[r, i, q] * total
 
 
 @njit(cache=True, nogil=True)
-def _rest_of(node: Integers, h: Floats, tables: Tables, both: Floats, root: Floats, score: Floats) -> float:
-    """(Σ_j max_x ‖S^-½ (g(x) - Λᵀ b(x))‖²)^½, for φ(x) over all modes times `both`, (-Λ, then the weights).
+def _largest_residual(node: Integers, h: Floats, tables: Tables, both: Floats, root: Floats, score: Floats) -> float:
+    """An upper bound of (Σ_j max_x ‖S^-½ (g(x) - Λᵀ b(x))‖²)^½ over the cell, where g(x) - Λᵀ b(x) = φ(x) `both`.
 
     Args:
         node, h: (n,) intervals and their half-widths.
         tables: of the shapes on all intervals.
-        both: (n_modes, n).
+        both: (n_modes, n) -Λ above the weights V_rᵀ T_rᵀ.
         root: (n, n) S^-½.
-        score: (n,) set to what each interval adds by its width.
+        score: (n,) set to the increase by each interval's width.
     """
     value, slope, bend, most_bend, most_rate = tables
     n_modes, n = both.shape
@@ -80,7 +78,7 @@ def _rest_of(node: Integers, h: Floats, tables: Tables, both: Floats, root: Floa
             low += (centre - h[j] * steep) ** 2
             high += (centre + h[j] * steep) ** 2
             beyond += min(abs(bent) + h[j] * rate, most) ** 2
-        # the linear part is largest at an end: a norm is convex
+        # the linear part is largest at an end, since a norm is convex
         largest = (np.sqrt(max(low, high)) + 0.5 * h[j] ** 2 * np.sqrt(beyond)) ** 2
         score[j] = largest - at
         total += largest
@@ -99,15 +97,15 @@ def dual_bound(
     singular: float,
     score: Floats,
 ) -> float:
-    """Lower bound of √W_R in a cell under one limit; inf where none in it keeps the limit, -inf if none is found.
+    """Lower bound of √W_R in a cell under one limit; inf if no placement meets the limit, -inf if no bound is found.
 
     Args:
         node, h: (n,) intervals and their half-widths.
         tables: of the shapes on all intervals.
         transforms: T (n_residual, n, n_columns).
         square, root, limit: S (n, n), S^-½ and L.
-        singular: pivot of D over its largest entry.
-        score: (n,) set to how much each interval weakens the bound.
+        singular: least pivot of D over its largest entry.
+        score: (n,) set to how much the width of each interval weakens the bound.
     """
     value, slope = tables[0], tables[1]
     n, n_modes = h.size, value.shape[1]
@@ -122,9 +120,9 @@ def dual_bound(
     multiply_transposed(c, c, gram)
     pivot = 0.0
     for i in range(n):
-        pivot = max(pivot, singular * gram[i, i])  # of a Gramian, the largest entry is on the diagonal
+        pivot = max(pivot, singular * gram[i, i])  # the largest entry of a Gramian is on the diagonal
     exact = inverse_of(gram.copy(), d, pivot)
-    if not exact:  # any D refuses a cell: where D⁻¹ is singular to round-off, as beside a support, a ridge makes one
+    if not exact:  # singular to round-off, as beside a support: a ridge is added, since any D may exclude a cell
         for i in range(n):
             gram[i, i] += 2.0 * pivot
         if not inverse_of(gram, d, pivot):
@@ -135,7 +133,7 @@ def dual_bound(
         t += least[i, i]
         for k in range(n):
             both[i, k] = -least[i, k]
-    if t >= limit**2 and t > limit * _rest_of(node, h, tables, both, root, score):
+    if t >= limit**2 and t > limit * _largest_residual(node, h, tables, both, root, score):
         return np.inf
     if not exact:
         return -np.inf
@@ -192,4 +190,4 @@ def dual_bound(
     for r in range(n_residual):
         for i in range(n):
             both[n + r, i] = weights[r, i]
-    return float((trace - limit * _rest_of(node, h, tables, both, root, score)) / np.sqrt(2.0))
+    return float((trace - limit * _largest_residual(node, h, tables, both, root, score)) / np.sqrt(2.0))

@@ -1,24 +1,23 @@
-"""Whether a cell of places can hold a better placement, by the hulls of the modal shapes on its intervals.
+"""Exclusion of a cell of places without a better placement, by convex hulls of the modal shapes on its intervals.
 
 With f_j the rows of B⁻¹, any linear T = Σ_j f_j w(x_j) is G / D for D = det B and G = d/dε det(B + εW) at ε = 0. Both
-are affine in the column of each actuator. Where each column (b(x_j), w(x_j)) stays in the convex hull of a few points,
-G and D are at every place the same mean of their values G_k, D_k at all choices k of one point an actuator, so
+are affine in the column of each actuator. If each column (b(x_j), w(x_j)) stays in the convex hull of a few points, G
+and D are at every place the same mean of their values G_k, D_k at all choices k of one point per actuator, so
 
     G_k >= t |D_k| for every k   implies   |T| >= t at every place where B is regular,
 
-though B be singular in the cell. T = α ⟨V, Y⟩ + β ⟨A, B⁻¹ S^½⟩ with V and A of unit size is at most α ‖Y‖ + β L under
-a limit ‖B⁻¹ S^½‖ <= L: where t = α y + β L, none that keeps the limit has a ‖Y‖ below y. This follows the true change
-of the forces over the cell, where duality (`dual_bound.py`) allows any forces within the limit, and needs no
-convergent series (`cell_bounds.py`).
+even if B is singular in the cell. T = α ⟨V, Y⟩ + β ⟨A, B⁻¹ S^½⟩ with V and A of unit norm is at most α ‖Y‖ + β L under
+a limit ‖B⁻¹ S^½‖ <= L. With t = α y + β L, no placement within the limit has a ‖Y‖ below y. This includes how the
+forces change over the cell, where duality (`dual_bound.py`) allows any forces within the limit, and needs no convergent
+series (`cell_bounds.py`).
 
-On an interval the shapes follow the cubic through Chebyshev's points to within h⁴/192 max |φ''''|, and a cubic lies in
-the hull of its four Bernstein points. The remainder e of the columns b, and e_w of w - Λᵀb, change T by at most
+On an interval the shapes differ from the cubic through the Chebyshev points by at most h⁴/192 max |φ''''|, and a cubic
+lies in the hull of its four Bernstein points. The remainders e of the columns b and e_w of w - Λᵀb change T by at most
 
     L ‖S^-½ (e_w - Λᵀe)‖ + L η / (1 - η) ‖S^-½ (w - Λᵀb)‖,   η = L ‖S^-½ e‖ < 1,
 
-for any Λ, with ‖a‖² = Σ_j max_x ‖a(x_j)‖²; that of the centre makes w - Λᵀb vanish there. V and A only decide whether
-the test succeeds: they separate the values of (Y, B⁻¹ S^½) at the choices from all that the limits leave, by the method
-of Frank and Wolfe.
+for any Λ, with ‖a‖² = Σ_j max_x ‖a(x_j)‖². Here Λ makes w - Λᵀb vanish at the centre. The test holds for any V and A;
+those used separate the values of (Y, B⁻¹ S^½) at the choices from those within the limits, by the Frank-Wolfe method.
 """
 
 import numpy as np
@@ -28,14 +27,14 @@ from workbench.arrays import Floats, Integers
 from workbench.design.placement.small_matrices import inner, inverse_of, multiply
 from workbench.design.placement.task import PlacementTask
 
-STEPS = 4  # of Frank and Wolfe: sixteen prove no more cells
-SINGULAR = 1e-9  # pivot over the largest entry of B: below, determinants are not trusted
-ROUND_OFF = 1e-6  # of ratios of determinants whose pivots are above
-LINE = 12  # steps of the search along a line
+STEPS = 4  # of the Frank-Wolfe method: sixteen exclude no more cells
+SINGULAR = 1e-9  # least pivot over the largest entry of B for reliable determinants
+ROUND_OFF = 1e-6  # of ratios of such determinants
+LINE = 12  # steps of the line search
 
 
 class HullBound:
-    """Excludes cells (n_cells, n_actuators) of intervals that hold no placement as good as wanted within the limits."""
+    """A test that excludes cells (n_cells, n_actuators) of intervals without a placement better than wanted."""
 
     def __init__(
         self,
@@ -46,11 +45,13 @@ class HullBound:
         limits: Floats,
         condition: float,
     ) -> None:
-        """Tables of the shapes on intervals.
+        """Tabulate the shapes on the intervals.
 
         Args:
+            task: of the placement.
             measures: centre and half-width (n_intervals,), largest fourth derivative (n_intervals, n_modes).
             roots, inverses, limits: S^½ and S^-½ (n_limits, n, n) and L (n_limits,), inf for that of the condition.
+            condition: limit of the condition of B.
         """
         n = task.n_controlled
         centre, half, most_fourth = measures
@@ -61,15 +62,15 @@ class HullBound:
         c = a[0] - a[2], a[1] - 3.0 * a[3], 2.0 * a[2], 4.0 * a[3]  # c_0 + c_1 s + c_2 s² + c_3 s³
         inner, outer = (c[0] - c[2] / 3.0, c[1] / 3.0 - c[3]), (c[0] + c[2], c[1] + c[3])
         points = np.stack([p + side * q for p, q in (outer, inner) for side in (-1.0, 1.0)], axis=1)
-        # of the columns of B on each interval: the least size, and the remainder weighted by each S^-½
-        spread = np.abs(a[1]) + 2.0 * np.abs(a[2]) + np.abs(a[3]) + remainder
-        sizes = np.linalg.norm(c[0][:, :n], axis=1) - np.linalg.norm(spread[:, :n], axis=1)
-        doubts = remainder[:, :n] @ np.abs(inverses).transpose(0, 2, 1)
+        # of the columns of B on each interval: the least norm, and the remainder weighted by each S^-½
+        variation = np.abs(a[1]) + 2.0 * np.abs(a[2]) + np.abs(a[3]) + remainder
+        norms = np.linalg.norm(c[0][:, :n], axis=1) - np.linalg.norm(variation[:, :n], axis=1)
+        errors = remainder[:, :n] @ np.abs(inverses).transpose(0, 2, 1)
         self._arguments = (
             points,
             remainder,
-            np.maximum(sizes, 0.0) ** 2,
-            (doubts**2).sum(axis=2),
+            np.maximum(norms, 0.0) ** 2,
+            (errors**2).sum(axis=2),
             np.array(task.roots, order="C"),
             roots,
             inverses,
@@ -78,7 +79,7 @@ class HullBound:
         )
 
     def raise_to(self, wanted: float, cells: Integers, lower: Floats) -> None:
-        """Raise lower bounds (n_cells,) of √W_R that are below to what is wanted, where that is proven."""
+        """Raise lower bounds (n_cells,) of √W_R to `wanted` where that is proven, in place."""
         _raise_to(wanted, cells, *self._arguments, lower)
 
 
@@ -88,8 +89,8 @@ def _raise_to(
     cells: Integers,
     points: Floats,
     remainder: Floats,
-    squared_sizes: Floats,
-    squared_doubts: Floats,
+    squared_norms: Floats,
+    squared_errors: Floats,
     transforms: Floats,
     roots: Floats,
     inverses: Floats,
@@ -101,18 +102,18 @@ def _raise_to(
     for cell in range(len(cells)):
         node = cells[cell]
         tried = lower[cell] < wanted
-        for j in range(1, n):  # two in one interval: B is singular at the centre
+        for j in range(1, n):  # with two actuators in one interval, B is singular at the centre
             tried = tried and node[j] != node[j - 1]
         if not tried:
             continue
         for s in range(len(roots)):
-            limit, size, doubt = limits[s], 0.0, 0.0
+            limit, norm, error = limits[s], 0.0, 0.0
             for j in range(n):
-                size += squared_sizes[node[j]]
-                doubt += squared_doubts[s, node[j]]
-            if np.isinf(limit) and size > 0.0:
-                limit = condition / np.sqrt(size)
-            eta = limit * np.sqrt(doubt)
+                norm += squared_norms[node[j]]
+                error += squared_errors[s, node[j]]
+            if np.isinf(limit) and norm > 0.0:
+                limit = condition / np.sqrt(norm)
+            eta = limit * np.sqrt(error)
             least = np.sqrt(2.0) * wanted
             if eta < 1.0 and is_excluded(node, points, remainder, transforms, roots[s], inverses[s], limit, eta, least):
                 lower[cell] = wanted
@@ -123,17 +124,17 @@ def _raise_to(
 def least_ratio(
     b: Floats, w: Floats, n_points: int, sign: float, stop: float, singular: float, chosen: Integers
 ) -> tuple[float, float]:
-    """Least sign G_k / |D_k| over all choices of one of the first points an actuator, and the sign of that D_k.
+    """The least sign G_k / |D_k| over all choices of one point per actuator, and the sign of D_k of that choice.
 
-    By Gauss's elimination in dual numbers, a column at a time, so that choices share what they have in common.
+    By Gaussian elimination in dual numbers, column by column, so that choices share their common columns.
 
     Args:
         b, w: (n, n_points or more, n) columns of B and of W.
-        n_points: how many of an actuator are chosen from.
+        n_points: points per actuator, the first ones.
         sign: of D at the centre.
-        stop: the first ratio below ends the search.
-        singular: a first pivot of this size or less ends it too, with -inf; later ones likewise, by as much more as the
-            round-off has grown.
+        stop: the search ends at the first ratio below.
+        singular: the search ends with -inf at a first pivot of this size or less; the threshold of later pivots grows
+            as the round-off does.
         chosen: (n,) set to the choice.
     """
     n = len(b)
@@ -152,7 +153,7 @@ def least_ratio(
             depth -= 1
             continue
         own = at[depth]
-        if depth == n - 2:  # the last two columns at once: most of the choices differ in these alone
+        if depth == n - 2:  # the last two columns together, as most choices differ in these alone
             first, second = bs[depth, depth, own, n - 2], bs[depth, depth, own, n - 1]
             first_w, second_w = ws[depth, depth, own, n - 2], ws[depth, depth, own, n - 1]
             pivot = max(abs(first), abs(second))
@@ -182,9 +183,9 @@ def least_ratio(
         pivot, pivot_w = bs[depth, depth, own, p], ws[depth, depth, own, p]
         if not abs(pivot) > least_pivot[depth]:
             return -np.inf, 0.0
-        turn = 1.0 if p == depth else -1.0
-        d[depth + 1] = turn * d[depth] * pivot
-        g[depth + 1] = turn * (g[depth] * pivot + d[depth] * pivot_w)
+        parity = 1.0 if p == depth else -1.0
+        d[depth + 1] = parity * d[depth] * pivot
+        g[depth + 1] = parity * (g[depth] * pivot + d[depth] * pivot_w)
         most = 0.0
         for j in range(depth + 1, n):
             for k in range(n_points):
@@ -196,15 +197,15 @@ def least_ratio(
                     column, other = bs[depth, depth, own, row], ws[depth, depth, own, row]
                     bs[depth + 1, j, k, i] = bs[depth, j, k, row] - factor * column
                     ws[depth + 1, j, k, i] = ws[depth, j, k, row] - factor * other - factor_w * column
-        least_pivot[depth + 1] = (1.0 + most) * least_pivot[depth]  # as the round-off does
+        least_pivot[depth + 1] = (1.0 + most) * least_pivot[depth]  # grows as the round-off
         depth += 1
         at[depth] = -1
     return least, of_least
 
 
 @njit(cache=True, nogil=True)
-def _distance(a: float, b: float, c: float, t: float, limit: float) -> float:
-    """Square of how far ‖(1 - t) u + t v‖ is beyond a limit, over it; of ‖u‖², ⟨u, v⟩, ‖v‖²."""
+def _squared_excess(a: float, b: float, c: float, t: float, limit: float) -> float:
+    """Squared relative excess of ‖(1 - t) u + t v‖ over a limit, from a = ‖u‖², b = ⟨u, v⟩, c = ‖v‖²."""
     s = 1.0 - t
     size = np.sqrt(max(s * s * a + 2.0 * s * t * b + t * t * c, 0.0)) / limit
     return float(max(size - 1.0, 0.0) ** 2)
@@ -212,15 +213,15 @@ def _distance(a: float, b: float, c: float, t: float, limit: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _step(y: Floats, new_y: Floats, f: Floats, new_f: Floats, least: float, limit: float) -> float:
-    """Share of the way to the new point at which the distance to what the limits leave is least."""
+    """The step in (0, 1) to the new point (new_y, new_f) of least excess over both limits."""
     a, b, c = inner(y, y), inner(y, new_y), inner(new_y, new_y)
     p, q, r = inner(f, f), inner(f, new_f), inner(new_f, new_f)
     low, high = 0.0, 1.0
     for _ in range(LINE):
         first, second = low + (high - low) * 0.4, low + (high - low) * 0.6
-        near = _distance(a, b, c, first, least) + _distance(p, q, r, first, limit)
-        far = _distance(a, b, c, second, least) + _distance(p, q, r, second, limit)
-        if near < far:
+        at_first = _squared_excess(a, b, c, first, least) + _squared_excess(p, q, r, first, limit)
+        at_second = _squared_excess(a, b, c, second, least) + _squared_excess(p, q, r, second, limit)
+        if at_first < at_second:
             high = second
         else:
             low = first
@@ -238,7 +239,7 @@ def _evaluate(
     y: Floats,
     f: Floats,
 ) -> bool:
-    """B⁻¹ of columns (n, n_modes), and by the sign Y (n_residual, n_columns) and B⁻¹ S^½; whether B is regular."""
+    """Fill B⁻¹, ±Y (n_residual, n_columns) and ±B⁻¹ S^½ of columns (n, n_modes); False where B is singular."""
     n_residual, n, n_columns = transforms.shape
     matrix = np.empty((n, n))
     for i in range(n):
@@ -263,7 +264,7 @@ def _evaluate(
 
 
 @njit(cache=True, nogil=True)
-def _left_of(
+def _residuals(
     node: Integers,
     points: Floats,
     remainder: Floats,
@@ -272,7 +273,7 @@ def _left_of(
     weights: Floats,
     multiplier: Floats,
 ) -> tuple[float, float]:
-    """Sizes of S^-½ (w - Λᵀ b) at the points, and of S^-½ (e_w - Λᵀ e), for Λ the multiplier."""
+    """Norms of S^-½ (w - Λᵀ b) at the points, and of S^-½ (e_w - Λᵀ e), for Λ the multiplier."""
     n, n_points, n_residual = len(node), points.shape[1], len(weights)
     v, at_points, of_remainder = np.empty(n), 0.0, 0.0
     for j in range(n):
@@ -316,14 +317,15 @@ def is_excluded(
     eta: float,
     least: float,
 ) -> bool:
-    """Whether no placement in the cell that keeps the limit has a ‖Y‖ below the least.
+    """Whether no placement in the cell within the limit has a ‖Y‖ below `least`.
 
     Args:
         node: (n,) intervals.
-        points: (n_intervals, 4, n_modes) of Bernstein, of the cubics.
-        remainder: (n_intervals, n_modes) by how much the shapes differ from the cubics at most.
+        points: (n_intervals, 4, n_modes) Bernstein points of the cubics.
+        remainder: (n_intervals, n_modes) largest difference of the shapes from the cubics.
         transforms: T (n_residual, n, n_columns).
         root, inverse_root, limit, eta: S^½ and S^-½ (n, n), L, and η < 1.
+        least: y.
     """
     n_points, n_modes = points.shape[1:]
     n_residual, n, n_columns = transforms.shape
@@ -361,7 +363,7 @@ def is_excluded(
         size_y, size_f = np.sqrt(inner(y, y)), np.sqrt(inner(f, f))
         alpha, beta = max(size_y / least - 1.0, 0.0) / least, max(size_f / limit - 1.0, 0.0) / limit
         if alpha == 0.0 and beta == 0.0:
-            return False  # a mean of choices is where a better placement might be
+            return False  # a mean of choices is within both limits, so the cell cannot be excluded
         for r in range(n_residual):
             for i in range(n):
                 weights[r, i] = 0.0
@@ -379,7 +381,7 @@ def is_excluded(
                     for r in range(n_residual):
                         w[j, k, c] += points[node[j], k, n + r] * weights[r, c]
         needed = (1.0 + ROUND_OFF) * (alpha * least + beta * limit)
-        # at the ends of the intervals alone first, the former half of the points, which takes little time
+        # first with the first half of the points alone, the ends of the intervals, which is cheap
         ratio, of_choice = least_ratio(b, w, n_points // 2, sign, -np.inf, singular, chosen)
         if ratio >= needed:
             for i in range(n):
@@ -393,7 +395,7 @@ def is_excluded(
                 for i in range(n):
                     for c in range(n):
                         multiplier[i, c] += inverse[j, i] * at_centre[c]
-            at_points, of_remainder = _left_of(node, points, remainder, inverse_root, w, weights, multiplier)
+            at_points, of_remainder = _residuals(node, points, remainder, inverse_root, w, weights, multiplier)
             needed += limit * (of_remainder + eta / (1.0 - eta) * at_points)
             ratio, of_choice = least_ratio(b, w, n_points, sign, needed, singular, chosen)
             if ratio >= needed:

@@ -1,4 +1,4 @@
-"""What a placement must keep to, and which limit is to blame where none can."""
+"""Limits of a placement, and the limits in conflict where no placement meets them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ from workbench.design.placement.task import Placement, PlacementTask, batch_cost
 from workbench.renamed import Renamed, former_arguments
 from workbench.structure.domain import SLACK, Interval, NamedPoints, Place, Rectangle, position, reach, same_place
 
-TOLERANCE = 2e-6
-APART = 1e-6  # of the length: actuators closer than this stand at one place
-DRAWS = 20_000
-SAMPLES = 40  # of every box
+TOLERANCE = 2e-6  # relative, of a limit
+APART = 1e-6  # of the length: least distance of two actuators
+DRAWS = 20_000  # random placements, to find which limits conflict
+SAMPLES = 40  # places of these in every box
 
 Zone = tuple[Place, Place]
 
@@ -38,10 +38,10 @@ class Limits:
         condition: of B, largest ‖B‖‖B⁻¹‖ in the Frobenius norm (n where B is orthogonal).
         spacing: least distance between neighbours, m; of the middles of patches, which overlap where it is small.
         edge_distance: least distance from the ends or edges, m.
-        forbidden: zones where no actuator can stand, m: intervals (from, to), or on a rectangle boxes between two
-            corners ((x, y), (x, y)). All of a patch keeps out of them.
-        candidates: the only places there are; None where an actuator may stand anywhere else. Of named points all that
-            are displacements (for moments, rotations), unless given.
+        forbidden: zones without actuators, m: intervals (from, to), or on a rectangle boxes between two corners
+            ((x, y), (x, y)). No part of a patch may overlap them.
+        candidates: the only allowed places; None for any place. At named points the default is every displacement
+            (for moments, every rotation).
     """
 
     effort: float = np.inf
@@ -74,7 +74,7 @@ class Limits:
 
     @property
     def regular(self) -> bool:
-        """Whether a limit keeps B away from singular."""
+        """Whether a limit excludes a singular B."""
         return bool(np.isfinite([self.effort, self.peak_force, self.condition]).any())
 
     def allowed(self, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
@@ -85,7 +85,7 @@ class Limits:
             clear: half the extent of an actuator, m.
 
         Raises:
-            DesignError: none is left, or a zone that lies outside.
+            DesignError: no allowed interval, or a zone outside the structure.
         """
         margin = max(self.edge_distance, clear)
         at, intervals = margin, []
@@ -95,7 +95,7 @@ class Limits:
             if low - clear > at:
                 intervals.append((at, min(low - clear, length - margin)))
             at = max(at, high + clear)
-        if not self.forbidden or length - margin - at > SLACK * length:  # no end that a zone reaches up to
+        if not self.forbidden or length - margin - at > SLACK * length:  # the last zone does not reach the end
             intervals.append((at, length - margin))
         intervals = [(low, high) for low, high in intervals if low <= high]
         if not intervals:
@@ -103,10 +103,10 @@ class Limits:
         return intervals
 
     def boxes(self, task: PlacementTask) -> list[Box]:
-        """Where actuators may stand, as boxes (low, high) of coordinates, m; none for named points.
+        """Allowed boxes (low, high) of coordinates, m; none for named points.
 
         Raises:
-            DesignError: no room for all of them, or zones of another domain.
+            DesignError: no room for all actuators, or zones of another domain.
         """
         domain = task.modes.domain
         if isinstance(domain, Interval):
@@ -114,7 +114,7 @@ class Limits:
             return [(np.array([low]), np.array([high])) for low, high in stretches]
         if isinstance(domain, NamedPoints):
             if self.forbidden or self.edge_distance:
-                raise DesignError("named points have no zones or edges; give the candidates that are allowed")
+                raise DesignError("named points have no zones or edges; give the allowed points as candidates")
             if self.spacing and domain.positions is None:
                 raise DesignError("the positions of the points are not known, so no spacing can be kept; give them")
             return []
@@ -127,10 +127,10 @@ class Limits:
         return free_boxes(domain, np.maximum(self.edge_distance, half), zones)
 
     def intervals(self, n: int, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
-        """The same, where n actuators find room at all.
+        """The intervals of `allowed`, checked to have room for n actuators.
 
         Raises:
-            DesignError: distances that n actuators cannot keep on this length.
+            DesignError: spacing and edge distance without room for n actuators.
         """
         margin = max(self.edge_distance, clear)
         needed = 2 * margin + (n - 1) * self.spacing
@@ -140,24 +140,25 @@ class Limits:
                 f" structure has {length:g}: lower spacing or edge_distance"
             )
         intervals = self.allowed(length, clear)
-        apart, at, fit = max(self.spacing, APART * length), -np.inf, 0
+        spacing, at, fit = max(self.spacing, APART * length), -np.inf, 0
         for low, high in intervals:
-            at = max(low, at + apart)
+            at = max(low, at + spacing)
             while at <= high * (1 + APART) and fit < n:
-                fit, at = fit + 1, at + apart
-            at -= apart
+                fit, at = fit + 1, at + spacing
+            at -= spacing
         if fit < n:
             raise DesignError(
-                f"{n} actuators {self.spacing:g} apart find room for {fit} on the intervals left,"
+                f"of {n} actuators {self.spacing:g} apart only {fit} find room on the allowed intervals,"
                 f" {', '.join(f'{low:g} to {high:g}' for low, high in intervals)} m: forbid less or lower the spacing"
             )
         return intervals
 
     def violations(self, at: np.ndarray, costs: Any) -> dict[str, np.ndarray]:
-        """By name, by how much each of many placements exceeds a limit, relative; <= 0 if kept.
+        """Relative excess (n_placements,) over each limit by name; <= 0 where it is met.
 
         Args:
             at: coordinates of the actuators, (n_placements, n) or (n_placements, n, n_coordinates), m.
+            costs: effort, peak_force and condition of the placements, (n_placements,) each.
         """
         return self._exceeded(least_distances(at), costs)
 
@@ -170,7 +171,7 @@ class Limits:
         }
 
     def satisfied_by(self, placement: Placement) -> bool:
-        """Whether a placement keeps all of them, its peak force that of all time; its places are taken as allowed."""
+        """Whether a placement at allowed places meets all limits, with its peak force in continuous time."""
         costs = {name: np.array([getattr(placement, name)]) for name in ("effort", "peak_force", "condition")}
         violations = self._exceeded(np.array([placement.spacing]), SimpleNamespace(**costs))
         return all(excess[0] <= TOLERANCE for excess in violations.values())
@@ -183,7 +184,7 @@ FORMER |= {"margin": "edge_distance", **{name: name for name in ("spacing", "for
 
 
 def takes_former_limits(function: Callable[P, R]) -> Callable[P, R]:
-    """The function of (task, limits) with the limits as keywords too, and the placement second, as they were."""
+    """The function of (task, limits) that also accepts its former arguments: limits as keywords, placement second."""
 
     @wraps(function)
     def with_former(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -214,10 +215,10 @@ def _excess(values: np.ndarray, limit: float) -> np.ndarray:
 
 
 def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None) -> str:
-    """Which limit cannot be met, or which two not together, and what could be: the words of a refusal.
+    """The message on limits that cannot be met: the one, or the two in conflict, and the least value found.
 
     Args:
-        grid: places to draw from; such as the limits allow unless given.
+        grid: places to draw from; by default those that the limits allow.
     """
     n, domain = task.n_controlled, task.modes.domain
     if grid is None:
@@ -229,30 +230,31 @@ def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None
     violations = limits.violations(coordinates(domain, grid)[draws], costs)
     within = {name: excess <= TOLERANCE for name, excess in violations.items()}
     measured = {"effort": costs.effort, "peak force": costs.peak_force, "condition": costs.condition}
-    asked = {"effort": limits.effort, "peak force": limits.peak_force, "condition": limits.condition}
+    given = {"effort": limits.effort, "peak force": limits.peak_force, "condition": limits.condition}
     head = f"no placement of {n} actuators meets the limits"
-    spaced, apart, lower = within["spacing"], "", ""
+    spaced, with_spacing, lower = within["spacing"], "", ""
     if limits.spacing > 0:
-        apart, lower = f" with spacing {limits.spacing:g}", " or lower the spacing"
+        with_spacing, lower = f" with spacing {limits.spacing:g}", " or lower the spacing"
     if not spaced.any():
         return f"{head}: spacing {limits.spacing:g} leaves no room; lower it"
     for name, values in measured.items():
         if not (within[name] & spaced).any():
             least = values[spaced].min()
             return (
-                f"{head}: {name} limit {asked[name]:.4g}{apart}; the least met was {least:.4g}: raise the limit{lower}"
+                f"{head}: {name} limit {given[name]:.4g}{with_spacing}; the least found was {least:.4g}: raise the"
+                f" limit{lower}"
             )
     for one, other in combinations(measured, 2):
         if not (within[one] & within[other] & spaced).any():
             least = measured[other][within[one] & spaced].min()
             return (
-                f"{head}: {one} {asked[one]:.4g} and {other} {asked[other]:.4g} conflict; with the first the least"
-                f" {other} met was {least:.4g}: raise one of them"
+                f"{head}: {one} {given[one]:.4g} and {other} {given[other]:.4g} conflict; with the first the least"
+                f" {other} found was {least:.4g}: raise one of them"
             )
     return f"{head} together, though any two can be met; raise one of them"
 
 
 def _samples(low: np.ndarray, high: np.ndarray, per_side: int) -> np.ndarray:
-    """Even places over a box: (n_samples,) along an interval, (n_samples, 2) on a rectangle."""
+    """Uniform places over a box: (n_samples,) along an interval, (n_samples, 2) on a rectangle."""
     along = np.meshgrid(*(np.linspace(*ends, per_side) for ends in zip(low, high, strict=True)), indexing="ij")
     return np.squeeze(np.stack(along, axis=-1).reshape(-1, low.size), axis=1 if low.size == 1 else ())

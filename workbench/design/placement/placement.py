@@ -1,7 +1,7 @@
-"""Where actuators should stand: the nodes of mode n+1, and CasADi against the spillover work W_R.
+"""Placement of actuators: the nodes of mode n+1, and the minimum of the spillover work W_R by CasADi and IPOPT.
 
 W_R alone has no useful minimum: the optimiser drives the outer actuators onto the supports, where B is singular and the
-forces grow without bound. So a placement here is sought under limits on what the actuators must do.
+forces grow without bound. Placements are therefore optimised under limits of effort, peak force or condition.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,28 +28,28 @@ __all__ = ["Limits", "Placement", "PlacementTask", "nodes_of_mode", "place_actua
 Solver = Callable[[np.ndarray, Sequence[Box], float], tuple[np.ndarray, str]]
 
 SPLINE_DEGREE = 7
-PEAK_ROUNDS = 4
+PEAK_ROUNDS = 4  # of lowering the limit of the sampled forces
 DRAWN = 4000  # random placements on a surface, of which the best are starts
 MOVES = 4  # of actuators from box to box around forbidden zones
-SAME = 1e-4  # of the size: optima that are one
-INSIDE = 0.02  # of the length: random starts keep so far from the ends of their reach
-POINTS = 40  # a half wave, where nodes are bracketed
-SPLINE_POINTS = {"interval": (15, 120), "side": (10, 30)}  # a mode or half wave, and besides: of the shapes' splines
-DIRECTIONS = 400  # a force, by which the instants of its peaks are chosen
+SAME = 1e-4  # of the size: optima nearer to each other are one
+INSIDE = 0.02  # of the length: least distance of random starts from the ends of their range
+POINTS = 40  # per half wave, to bracket nodes
+SPLINE_POINTS = {"interval": (15, 120), "side": (10, 30)}  # of the shapes' splines: per mode or half wave, and added
+DIRECTIONS = 400  # per modal force, to select the instants of possible peaks
 IPOPT = {"ipopt.max_iter": 200, "ipopt.tol": 1e-9}
 IPOPT_SAYS = {
     "Solve_Succeeded": "converged",
     "Solved_To_Acceptable_Level": "converged, to IPOPT's acceptable tolerance",
 }
-OFF_ENDS = 1e-3  # of a side: IPOPT's places keep so far inside
-ON_EDGE = 1e-6  # of a side: so near, an actuator stands on the edge of its box
+OFF_ENDS = 1e-3  # of a side: least distance of IPOPT's places from the ends
+ON_EDGE = 1e-6  # of a side: an actuator nearer to the edge of its box stands on the edge
 
 
 def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
     """Interior nodes (n_nodes,) of a mode (zero-based), m: zeros of its shape away from the held ends (5.6).
 
     Raises:
-        DesignError: a mode that is not at hand.
+        DesignError: an index without a mode.
     """
     if mode >= modes.n_modes:
         raise DesignError(f"the nodes of mode {mode + 1} are not known from {modes.n_modes} modes; ask for more modes")
@@ -63,20 +63,20 @@ def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
 @takes_former_limits
 @one_blas_thread
 def place_actuators(task: PlacementTask, limits: Limits, *, starts: int = 12, seed: int = 0) -> Placement:
-    """The law with its actuators at the places of least spillover work W_R, by CasADi and IPOPT from many starts.
+    """The placement of least spillover work W_R under limits, by CasADi and IPOPT from many starts.
 
-    Where the limits name candidate places, and at named points, every choice of these is evaluated instead; where they
-    are too many, one is exchanged for another until that helps no more, and `certify` says how far it is from the best.
+    Among candidate places, and at named points, every choice is evaluated instead. If choices are too many, single
+    places are exchanged until no exchange improves W_R; `certify` then bounds the optimality gap.
 
     Args:
         task: from `placement_task`.
-        limits: to keep.
-        starts: random starts besides the evenly spaced places and the nodes of mode n+1; on a surface the best of many
-            random placements.
+        limits: of the placement.
+        starts: random starts, in addition to evenly spaced places and the nodes of mode n+1; on a surface the best of
+            many random placements.
         seed: of the random starts.
 
     Raises:
-        DesignError: limits that no start can meet, with the one that conflicts.
+        DesignError: limits that no start meets; the message names the conflict.
     """
     domain = task.modes.domain
     if limits.candidates is not None or isinstance(domain, NamedPoints):
@@ -89,25 +89,25 @@ def place_actuators(task: PlacementTask, limits: Limits, *, starts: int = 12, se
     optima: list[tuple[np.ndarray, float]] = []
     status = "no start ended inside the limits"
     for guess in guesses:
-        # each actuator keeps to the box nearest its start, and then goes to one that it leads to
-        homes = [min(boxes, key=partial(_apart, x)) for x in guess]
-        positions, message, found = _solved(task, limits, solver, guess, homes)
+        # each actuator stays in the box nearest to its start; one that ends on the edge moves to the adjacent box
+        homes = [min(boxes, key=partial(_distance_to_box, x)) for x in guess]
+        positions, message, placement = _solved(task, limits, solver, guess, homes)
         for _ in range(MOVES if len(boxes) > 1 and isinstance(domain, Rectangle) else 0):
             moved = _next_homes(positions, homes, boxes, size)
             if moved is None:
                 break
             homes = moved
-            beyond = _solved(task, limits, solver, positions, homes)
-            if not (limits.satisfied_by(beyond[2]) and beyond[2].residual_work < found.residual_work):
+            candidate = _solved(task, limits, solver, positions, homes)
+            if not (limits.satisfied_by(candidate[2]) and candidate[2].residual_work < placement.residual_work):
                 break
-            positions, message, found = beyond
-        if not np.isfinite(found.residual_work) or not limits.satisfied_by(found):
+            positions, message, placement = candidate
+        if not np.isfinite(placement.residual_work) or not limits.satisfied_by(placement):
             continue
-        positions = found.positions
+        positions = placement.positions
         if not any(np.abs(positions - p).max() < SAME * size for p, _ in optima):
-            if found.residual_work <= min((work for _, work in optima), default=np.inf):
+            if placement.residual_work <= min((work for _, work in optima), default=np.inf):
                 status = message
-            optima.append((positions, found.residual_work))
+            optima.append((positions, placement.residual_work))
     if not optima:
         raise DesignError(conflict(task, limits))
     optima.sort(key=lambda optimum: optimum[1])
@@ -117,8 +117,10 @@ def place_actuators(task: PlacementTask, limits: Limits, *, starts: int = 12, se
 def _guesses(
     task: PlacementTask, limits: Limits, boxes: Sequence[Box], starts: int, rng: np.random.Generator
 ) -> list[np.ndarray]:
-    """Where to start from, (n_actuators, n_coordinates) m each: even places, nodes and random ones along an interval;
-    the best of many random ones on a surface."""
+    """Starts of the optimisation, (n_actuators, n_coordinates) m each.
+
+    Along an interval: evenly spaced places, nodes and random ones; on a surface: the best of many random placements.
+    """
     n, domain = task.n_controlled, task.modes.domain
     if not isinstance(domain, Interval):
         share = np.array([np.prod(high - low) for low, high in boxes])
@@ -145,47 +147,47 @@ def _guesses(
 def _solved(
     task: PlacementTask, limits: Limits, solver: Solver, guess: np.ndarray, homes: Sequence[Box]
 ) -> tuple[np.ndarray, str, Placement]:
-    """IPOPT from a guess, its sampled forces held lower by what the peak rises between the samples."""
+    """IPOPT's result from a start; the limit of the sampled forces is lowered until the true peak meets the limit."""
     share = 1.0
     for _ in range(PEAK_ROUNDS):
         positions, message = solver(guess, homes, share)
-        alone = isinstance(task.modes.domain, Interval)
-        found = task.placed(positions[:, 0] if alone else _in_order(positions), message)
-        if not limits.peak_force < found.peak_force < np.inf:
+        one_coordinate = isinstance(task.modes.domain, Interval)
+        placement = task.placed(positions[:, 0] if one_coordinate else _in_order(positions), message)
+        if not limits.peak_force < placement.peak_force < np.inf:
             break
-        guess, share = positions, share * limits.peak_force / found.peak_force
-    return positions, message, found
+        guess, share = positions, share * limits.peak_force / placement.peak_force
+    return positions, message, placement
 
 
 def _in_order(pairs: np.ndarray) -> np.ndarray:
-    """Actuators are alike: those on a surface from left to right."""
+    """Places of identical actuators on a surface, from left to right."""
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
-def _apart(at: np.ndarray, box: Box) -> float:
+def _distance_to_box(at: np.ndarray, box: Box) -> float:
     return float(np.maximum(np.maximum(box[0] - at, at - box[1]), 0.0).max())
 
 
 def _next_homes(positions: np.ndarray, homes: Sequence[Box], boxes: Sequence[Box], size: float) -> list[Box] | None:
-    """The homes with those on whose edge an actuator came to stand left for another that holds it; None where none."""
+    """The boxes of the actuators; one on the edge of its box gets another that contains it. None without a change."""
 
     def room(at: np.ndarray, box: Box) -> float:
         return float(np.minimum(at - box[0], box[1] - at).min())
 
-    found = []
+    next_homes = []
     for at, home in zip(positions, homes, strict=True):
         widest = max(boxes, key=partial(room, at))
         at_edge = room(at, home) < ON_EDGE * size
-        found.append(widest if at_edge and room(at, widest) > ON_EDGE * size else home)
-    changed = any(one is not other for one, other in zip(found, homes, strict=True))
-    return found if changed else None
+        next_homes.append(widest if at_edge and room(at, widest) > ON_EDGE * size else home)
+    changed = any(one is not other for one, other in zip(next_homes, homes, strict=True))
+    return next_homes if changed else None
 
 
 # --- CasADi
 
 
 def symbolic_work(task: PlacementTask) -> ca.Function:
-    """CasADi function positions -> (W_R, effort, B⁻¹, ‖B‖²), derivatives exact: shapes as splines of degree seven.
+    """CasADi function positions -> (W_R, effort, B⁻¹, ‖B‖²) with exact derivatives; shapes are splines of degree seven.
 
     Positions are x_1, ..., x_n along an interval; x_1, y_1, ..., x_n, y_n on a rectangle.
     """
@@ -207,13 +209,13 @@ def symbolic_work(task: PlacementTask) -> ca.Function:
 
 
 def _spline(task: PlacementTask) -> tuple[list[list[float]], ca.DM]:
-    """Knots along each coordinate, and coefficients as CasADi orders them: modes first, then x, then y."""
+    """Knots along each coordinate, and coefficients in CasADi's order: modes first, then x, then y."""
     modes, domain = task.modes, task.modes.domain
     if isinstance(domain, Rectangle):
         waves = np.sqrt(modes.n_modes) * np.array(domain.length) / np.sqrt(np.prod(domain.length))
-        each, besides = SPLINE_POINTS["side"]
+        per_wave, added = SPLINE_POINTS["side"]
         grids = [
-            np.linspace(low, high, round(each * n) + besides)
+            np.linspace(low, high, round(per_wave * n) + added)
             for low, high, n in zip(*reach(domain, task.actuator.at), waves, strict=True)
         ]
         values = task.shapes(np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1))
@@ -222,13 +224,14 @@ def _spline(task: PlacementTask) -> tuple[list[list[float]], ca.DM]:
         knots = [list(along_x.t), list(along_y.t)]
         # SciPy puts the axis of the last interpolation first: y, then x, then the modes
         return knots, ca.DM(along_y.c.ravel())
-    each, besides = SPLINE_POINTS["interval"]
-    grid = np.linspace(*task.reach, each * modes.n_modes + besides)
+    per_mode, added = SPLINE_POINTS["interval"]
+    grid = np.linspace(*task.reach, per_mode * modes.n_modes + added)
     spline = make_interp_spline(grid, task.shapes(grid), k=SPLINE_DEGREE)
     return [list(spline.t)], ca.DM(spline.c.ravel())
 
 
 def _solver(task: PlacementTask, limits: Limits) -> Solver:
+    """IPOPT on the task: (start, box of each actuator, factor of the peak force limit) → (positions, status)."""
     n, domain = task.n_controlled, task.modes.domain
     sides = np.atleast_1d(np.asarray(domain.length, float))  # type: ignore[union-attr]
     units = np.tile(sides, n)
@@ -239,7 +242,7 @@ def _solver(task: PlacementTask, limits: Limits) -> Solver:
     work, effort, inverse, size = function(ca.DM(units) * z)
 
     # objective and constraints, each of order one; those without a limit are left out
-    scale = _usual_work(task)
+    scale = _typical_work(task)
     bounded = [effort / float(limits.effort)] if np.isfinite(limits.effort) else []
     first_force = len(bounded)
     if np.isfinite(limits.peak_force):
@@ -267,16 +270,18 @@ def _solver(task: PlacementTask, limits: Limits) -> Solver:
             lbg=np.r_[np.full(count, -np.inf), np.full(n_gaps, least_gap)],
             ubg=np.r_[np.where(is_force, share, 1.0), np.full(n_gaps, np.inf)],
         )
-        # IPOPT keeps its bounds but for 1e-8 of their size
-        found = units * np.clip(result["x"].full().ravel(), low, high)
+        # IPOPT may exceed its bounds by 1e-8 of their size
+        positions = units * np.clip(result["x"].full().ravel(), low, high)
         status = str(solver.stats()["return_status"])
-        return found.reshape(n, sides.size), IPOPT_SAYS.get(status, status.replace("_", " ").lower())
+        return positions.reshape(n, sides.size), IPOPT_SAYS.get(status, status.replace("_", " ").lower())
 
     return solve
 
 
 def _gaps(z: ca.MX, sides: np.ndarray, spacing: float) -> tuple[ca.MX, float]:
-    """What must be at least the number beside it: distances over the length in order, or squared distances of any two.
+    """The constraint of spacing: expressions, and their least value.
+
+    Along an interval these are distances of neighbours over the length; else squared distances over spacing², of pairs.
 
     Args:
         z: coordinates of the actuators, one after another, in units of the sides.
@@ -289,8 +294,8 @@ def _gaps(z: ca.MX, sides: np.ndarray, spacing: float) -> tuple[ca.MX, float]:
     return ca.vertcat(*squares) if squares else ca.MX(0, 1), 1.0
 
 
-def _usual_work(task: PlacementTask) -> float:
-    """W_R of even places along an interval, or the median of random ones on a surface: what is of order one."""
+def _typical_work(task: PlacementTask) -> float:
+    """W_R that scales the objective: of evenly spaced places along an interval, or the median of random ones."""
     domain = task.modes.domain
     if isinstance(domain, Interval):
         first, last = task.reach
@@ -305,6 +310,10 @@ def _usual_work(task: PlacementTask) -> float:
 
 
 def _extreme_instants(forces: np.ndarray) -> np.ndarray:
-    """The instants that can decide the peak of any combination B⁻¹f: those on the hull of ±f, as directions see it."""
+    """The forces at instants that can be the peak of a combination B⁻¹f: the hull of ±f, found by random directions.
+
+    Args:
+        forces: (n, n_instants).
+    """
     directions = np.random.default_rng(0).standard_normal((DIRECTIONS * forces.shape[0], forces.shape[0]))
     return forces[:, np.unique(np.abs(directions @ forces).argmax(axis=1))]

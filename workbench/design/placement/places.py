@@ -1,4 +1,4 @@
-"""Where actuators may stand, on any domain: places as arrays, how far apart, and boxes free of forbidden zones."""
+"""Places on any domain: as arrays, their least distances, and boxes free of forbidden zones."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ def as_places(domain: Domain, places: Any) -> np.ndarray:
     """Places as an array: (...,) positions in m, (..., 2) pairs in m, or (...,) names.
 
     Raises:
-        PlaceError: names that no point has, pairs that are none.
+        PlaceError: unknown names, or places that are not pairs.
     """
     if isinstance(domain, NamedPoints):
         names = np.atleast_1d(np.asarray(places, object))
@@ -28,7 +28,7 @@ def as_places(domain: Domain, places: Any) -> np.ndarray:
 
 
 def coordinates(domain: Domain, places: np.ndarray) -> np.ndarray:
-    """Of an array of places: the positions or pairs themselves, or (..., 3) of named points; zeros where not known."""
+    """Coordinates of an array of places, m: positions, pairs, or (..., 3) of named points; zeros where not known."""
     if not isinstance(domain, NamedPoints):
         return places
     if domain.positions is None:
@@ -37,13 +37,10 @@ def coordinates(domain: Domain, places: np.ndarray) -> np.ndarray:
 
 
 def least_distances(at: np.ndarray) -> np.ndarray:
-    """Between any two of the places of each placement, m: inf where there is one alone.
+    """The least distance (n_placements,) between two places of each placement, m; inf of a single place.
 
     Args:
         at: (n_placements, n), increasing, or (n_placements, n, n_coordinates), m.
-
-    Returns:
-        (n_placements,)
     """
     if at.ndim == 2:
         return np.asarray(np.diff(at, axis=1).min(axis=1, initial=np.inf))
@@ -54,13 +51,15 @@ def least_distances(at: np.ndarray) -> np.ndarray:
 def free_boxes(domain: Rectangle, margin: np.ndarray, zones: tuple[Box, ...]) -> list[Box]:
     """The largest boxes (low, high), m, within the margin of a rectangle, that overlap no forbidden zone.
 
-    Together they hold every place that is left; they overlap one another.
+    The boxes overlap one another; together they cover every allowed place.
 
     Args:
+        domain: the rectangle.
         margin: (2,) from the edges along x and along y, m.
+        zones: forbidden boxes, m.
 
     Raises:
-        DesignError: none is left.
+        DesignError: no box.
     """
     slack = SLACK * domain.size
     free: list[Box] = [(margin, np.array(domain.length) - margin)]
@@ -70,7 +69,7 @@ def free_boxes(domain: Rectangle, margin: np.ndarray, zones: tuple[Box, ...]) ->
             if (zone_low >= high).any() or (zone_high <= low).any():
                 parts.append((low, high))
                 continue
-            for axis in range(2):  # left and right of the zone, below and above it, but for what its own edge leaves
+            for axis in range(2):  # left and right of the zone, below and above it; strips thinner than slack are none
                 before, after = high.copy(), low.copy()
                 before[axis], after[axis] = zone_low[axis], zone_high[axis]
                 parts += [part for part in ((low, before), (after, high)) if part[1][axis] - part[0][axis] > slack]
@@ -89,7 +88,7 @@ def _inside(one: Box, other: Box) -> bool:
 
 
 def free_places(domain: Domain, places: np.ndarray, boxes: list[Box]) -> np.ndarray:
-    """Which of an array of places (n_places,) lie in one of the boxes; of named points all."""
+    """Mask (n_places,) of the places that lie in one of the boxes; of named points, all."""
     if isinstance(domain, NamedPoints):
         return np.ones(len(places), bool)
     at = places.reshape(len(places), -1)

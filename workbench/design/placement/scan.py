@@ -1,4 +1,4 @@
-"""Every placement on a grid or on candidate places, the best of them."""
+"""Exhaustive search of placements on a grid or on candidate places, and search by exchange where they are too many."""
 
 from itertools import combinations, islice
 from math import comb
@@ -14,27 +14,28 @@ from workbench.threads import one_blas_thread
 
 BATCH = 20_000
 MOST_TRIED = 5_000_000
-DRAWN, STARTS = 2000, 12  # choices drawn at random, and how many of them, best first, exchanges start from
+DRAWN, STARTS = 2000, 12  # random choices, and how many of the best are starts of the exchange
 
 
 @takes_former_limits
 @one_blas_thread
 def scan(task: PlacementTask, limits: Limits, *, n_places: int = 60) -> tuple[Placement, int]:
-    """The best of all placements on the limits' candidate places, or on a grid, and how many were tried.
+    """The best of all placements on the limits' candidate places, or on a grid, and the number of placements tried.
 
     Args:
+        task, limits: as for `place_actuators`.
         n_places: of the grid, along the longer side, where the limits name no candidates.
 
     Raises:
-        DesignError: fewer places than actuators, more choices of them than can be tried, or limits that none meets,
-            with the one that conflicts.
+        DesignError: fewer places than actuators, too many choices, or limits that no placement meets; the message
+            names the conflict.
     """
     n, domain = task.n_controlled, task.modes.domain
     grid = allowed_places(task, limits, n_places)
     if comb(len(grid), n) > MOST_TRIED:
         raise DesignError(
             f"{n} actuators at {len(grid)} places make {comb(len(grid), n):.2g} choices; at most {MOST_TRIED:.0e} are"
-            " tried: name fewer places, or let the actuators stand anywhere"
+            " tried: name fewer candidates, or allow any place"
         )
     shapes, at = task.shapes(grid), coordinates(domain, grid)
     best, best_at, tried = np.inf, None, 0
@@ -48,7 +49,7 @@ def scan(task: PlacementTask, limits: Limits, *, n_places: int = 60) -> tuple[Pl
         costs = batch_costs(task, shapes[index])
         violations = limits.violations(at[index], costs)
         work = np.where(np.all([v <= TOLERANCE for v in violations.values()], axis=0), costs.work, np.inf)
-        # the forces of many are sampled in time; what would win must keep its peak between the samples too
+        # batch costs sample the forces in time; the best must meet the limit of the peak between samples too
         while work[i := int(np.argmin(work))] < best:
             if limits.satisfied_by(task.placed(grid[index[i]], "")):
                 best, best_at = work[i], grid[index[i]]
@@ -59,10 +60,10 @@ def scan(task: PlacementTask, limits: Limits, *, n_places: int = 60) -> tuple[Pl
 
 
 def best_of_candidates(task: PlacementTask, limits: Limits) -> Placement:
-    """The best of all choices of candidate places; where they are too many, the best that exchanges come to.
+    """The best of all choices of candidate places; where there are too many, the best found by exchange.
 
     Raises:
-        DesignError: limits that no choice met keeps, with the one that conflicts.
+        DesignError: limits that no choice meets; the message names the conflict.
     """
     grid = allowed_places(task, limits, 0)
     n = task.n_controlled
@@ -72,8 +73,8 @@ def best_of_candidates(task: PlacementTask, limits: Limits) -> Placement:
     rng = np.random.default_rng(0)
     drawn = np.sort(rng.random((DRAWN, len(grid))).argpartition(n, axis=1)[:, :n], axis=1)
     first = drawn[np.argsort(rated(task, limits, shapes, at, drawn), kind="stable")[:STARTS]]
-    found = [_exchanged(task, limits, shapes, at, choice) for choice in first]
-    for rating, choice in sorted(found, key=lambda pair: pair[0]):
+    improved = [_exchanged(task, limits, shapes, at, choice) for choice in first]
+    for rating, choice in sorted(improved, key=lambda pair: pair[0]):
         placement = task.placed(grid[choice], f"best of exchanges from {STARTS} choices")
         if np.isfinite(rating) and limits.satisfied_by(placement):
             return placement
@@ -83,14 +84,14 @@ def best_of_candidates(task: PlacementTask, limits: Limits) -> Placement:
 def rated(task: PlacementTask, limits: Limits, shapes: np.ndarray, at: np.ndarray, index: np.ndarray) -> np.ndarray:
     """W_R of choices (n_choices, n) of places; inf where a limit is exceeded or B singular."""
     costs = batch_costs(task, shapes[index])
-    kept = np.all([excess <= TOLERANCE for excess in limits.violations(at[index], costs).values()], axis=0)
-    return np.asarray(np.where(kept, costs.work, np.inf))
+    met = np.all([excess <= TOLERANCE for excess in limits.violations(at[index], costs).values()], axis=0)
+    return np.asarray(np.where(met, costs.work, np.inf))
 
 
 def _exchanged(
     task: PlacementTask, limits: Limits, shapes: np.ndarray, at: np.ndarray, choice: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """W_R and the choice after every exchange of one place for another that helps."""
+    """W_R and the choice of places after exchanging single places, the best exchange first, until none improves W_R."""
     best = float(rated(task, limits, shapes, at, choice[None])[0])
     while True:
         others = np.setdiff1d(np.arange(len(shapes)), choice)
@@ -108,7 +109,7 @@ def allowed_places(task: PlacementTask, limits: Limits, n_places: int) -> np.nda
     """The limits' candidate places, or a grid, without those in forbidden zones: (n_places,) or (n_places, 2).
 
     Raises:
-        DesignError: fewer than actuators.
+        DesignError: fewer places than actuators.
         PlaceError: a candidate that the structure does not have.
     """
     n, domain = task.n_controlled, task.modes.domain
@@ -125,5 +126,5 @@ def allowed_places(task: PlacementTask, limits: Limits, n_places: int) -> np.nda
         grid = as_places(domain, domain.grid(n_places))
     allowed: np.ndarray = grid[free_places(domain, grid, boxes)]
     if len(allowed) < n:
-        raise DesignError(f"{n} actuators need as many places; the limits leave {len(allowed)}: allow more")
+        raise DesignError(f"{n} actuators need as many places; the limits allow {len(allowed)}: allow more")
     return allowed

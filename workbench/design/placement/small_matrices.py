@@ -1,6 +1,6 @@
-"""Inverses and products of small matrices, compiled: a call of BLAS takes longer than they do.
+"""Compiled inverses and products of small matrices, for which a call of BLAS takes longer than the operation.
 
-Plain loops: expressions of whole arrays take the compiler ten times as long.
+Plain loops, because array expressions take the compiler ten times as long.
 """
 
 from numba import njit
@@ -10,7 +10,7 @@ from workbench.arrays import Floats
 
 @njit(cache=True, nogil=True)
 def inverse_of(matrix: Floats, inverse: Floats, least: float) -> bool:
-    """Gauss-Jordan with pivots; whether every pivot is above the least. The matrix is destroyed."""
+    """Write the inverse by Gauss-Jordan elimination; False where a pivot is not above `least`. Destroys the matrix."""
     n = matrix.shape[0]
     for i in range(n):
         for j in range(n):
@@ -40,30 +40,30 @@ def inverse_of(matrix: Floats, inverse: Floats, least: float) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def multiply(a: Floats, b: Floats, found: Floats) -> None:
-    """A B, into `found`."""
+def multiply(a: Floats, b: Floats, product: Floats) -> None:
+    """Write A B into `product`."""
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
             total = 0.0
             for k in range(a.shape[1]):
                 total += a[i, k] * b[k, j]
-            found[i, j] = total
+            product[i, j] = total
 
 
 @njit(cache=True, nogil=True)
-def multiply_transposed(a: Floats, b: Floats, found: Floats) -> None:
-    """Aᵀ B, into `found`; a transposed view would be another type, for which all that takes it is compiled anew."""
+def multiply_transposed(a: Floats, b: Floats, product: Floats) -> None:
+    """Write Aᵀ B into `product`; numba would compile `multiply` and its callers again for a transposed view."""
     for i in range(a.shape[1]):
         for j in range(b.shape[1]):
             total = 0.0
             for k in range(a.shape[0]):
                 total += a[k, i] * b[k, j]
-            found[i, j] = total
+            product[i, j] = total
 
 
 @njit(cache=True, nogil=True)
 def inner(a: Floats, b: Floats) -> float:
-    """Σ A_ij B_ij."""
+    """Inner product Σ A_ij B_ij."""
     total = 0.0
     for i in range(a.shape[0]):
         for j in range(a.shape[1]):

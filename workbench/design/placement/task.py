@@ -1,7 +1,7 @@
-"""What is asked of a placement: modes, disturbance and weight, all that does not depend on the places.
+"""The task of a placement: modes, disturbance and weight, all that does not depend on the places.
 
-With IMSC the modal forces do not depend on the places, so W_R = ½ Σ_r E|φ_r(x)ᵀ B(x)⁻¹ f̂_r|² with the modal forces'
-transforms f̂_r = f̂(iω_r) known once and for all, in the mean over the disturbances that may come.
+With IMSC the modal forces do not depend on the places, so W_R = ½ Σ_r E|φ_r(x)ᵀ B(x)⁻¹ f̂_r|², where the transforms of
+the modal forces f̂_r = f̂(iω_r) are computed once. E is the mean over the possible disturbances.
 """
 
 from collections.abc import Sequence
@@ -36,33 +36,32 @@ from workbench.structure.domain import (
 from workbench.structure.modes import Modes, freeze, frozen, modal_state_matrix
 from workbench.structure.printed import Printed, place_text
 
-SINGULAR_SHARE = 1e-14
-SHOWN_INSTANTS = 240
-SETTLED = 1e-3
-NOTHING = 1e-7
-MOST_FORCES = 10_000_000
-APART = 1e-6  # of the size of a patch: what overlaps less than this touches
-SPREAD = "their length, on a plate their diagonal, as least spacing keeps them apart"
+SINGULAR_SHARE = 1e-14  # of the product of B's row lengths: |det B| below which B counts as singular
+SHOWN_INSTANTS = 240  # at which modal forces are sampled
+SETTLED = 1e-3  # of its start: the slowest decay at the last of these instants
+NOTHING = 1e-7  # of the largest entry: columns of a root with smaller entries are left out
+MOST_FORCES = 10_000_000  # computed at once, to bound the memory
+APART = 1e-6  # of the size of a patch: patches that overlap by less only touch
+SPREAD = "a spacing of their length, on a plate of their diagonal, prevents this"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Placement(Printed):
-    """A control law with its actuators placed, and what it costs.
+    """A control law with its actuators placed, and its costs.
 
     Attributes:
-        positions: of the actuators: along an interval (n_actuators,) m, increasing, the middles of those that act
-            between two places; over a rectangle (n_actuators, 2) m, the middles of patches; names of points
-            (n_actuators,).
+        positions: of the actuators, for patches of their middles: along an interval (n_actuators,) m, increasing; over
+            a rectangle (n_actuators, 2) m; at named points (n_actuators,) names.
         law: with the actuators there; None where B is singular.
         residual_work: W_R.
         by_mode: (n_residual,) W_r.
         effort: ∫ FᵀF dt.
-        peak_force: largest force of any actuator at any time, to a millionth.
-        condition: of B, in the Frobenius norm ‖B‖‖B⁻¹‖, which bounds the spectral one.
+        peak_force: largest force of any actuator in continuous time, to a millionth.
+        condition: of B in the Frobenius norm, ‖B‖‖B⁻¹‖, an upper bound of the spectral condition number.
         status: why the search stopped.
-        local_optima: distinct local optima met from all starts, (positions, W_R), best first.
+        local_optima: distinct local optima of all starts, (positions, W_R), best first.
         spacing: least distance between two actuators, m; 0 where positions of named points are not known.
-        overlapping: whether two patches lie over each other: keep their middles farther apart by `Limits.spacing`.
+        overlapping: whether two patches overlap; `Limits.spacing` prevents it.
     """
 
     positions: np.ndarray
@@ -102,20 +101,20 @@ class Placement(Printed):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlacementTask(Printed):
-    """The task; n modes controlled by as many actuators.
+    """The task of placing n actuators that control n modes by IMSC.
 
     Attributes:
         modes: controlled first, then residual.
         n_controlled: n.
         roots: (n_residual, n, n_columns) real T_r with T_r T_rᵀ = E Re f̂ f̂ᴴ at the residual frequency.
         force_gramian: (n, n) E ∫ f fᵀ dt.
-        forces: (n, n_instants) modal forces at instants of every disturbance, for their peak.
-        poles: (n_poles,) of the controlled modes, rad/s: two of each, of a rigid one that of its velocity.
+        forces: (n, n_instants) sampled modal forces of every disturbance, for their peak.
+        poles: (n_poles,) of the controlled modes, rad/s: two per mode, one per rigid mode (that of its velocity).
         amplitudes: (n_places, n, n_poles) of the modal forces after an impulse at each place, f = Re Σ_k a_k e^{λ_k t}.
-        span: s, over which their peak is sought.
+        span: s, over which the peak is computed.
         envelope: (n,) C_j of ω√E|f̂_j(iω)|² <= C_j above the last frequency; inf where there is no such bound.
         weight: R of IMSC, (n,).
-        actuator: what is to be placed; its own place and name do not matter.
+        actuator: to be placed; its own place and name do not matter.
     """
 
     modes: Modes
@@ -138,35 +137,35 @@ class PlacementTask(Printed):
     def shapes(self, positions: Any, derivative: int = 0) -> np.ndarray:
         """Participation (..., n_modes) of an actuator at places: (...) m, (..., 2) m or (...) names.
 
-        Along an interval, its derivatives with the place too.
+        Along an interval also its derivative with respect to the place, of order `derivative`.
         """
         domain, actuator = self.modes.domain, self.actuator
         if isinstance(domain, Interval):
             positions = np.asarray(positions, float)
-            found = participation_along(self.modes, actuator, positions.ravel(), derivative)
-            return found.reshape(*positions.shape, self.modes.n_modes)
+            values = participation_along(self.modes, actuator, positions.ravel(), derivative)
+            return values.reshape(*positions.shape, self.modes.n_modes)
         places = as_places(domain, positions)
         shape = places.shape[:-1] if isinstance(domain, Rectangle) else places.shape
         flat = places.reshape(-1, *places.shape[len(shape) :])
         if isinstance(actuator.at, Patch):
             patches = np.hstack([flat, np.broadcast_to(actuator.at[2:], flat.shape)])
-            found = actuator.gain * self.modes.edge_slopes(patches, direction=actuator.direction)
+            values = actuator.gain * self.modes.edge_slopes(patches, direction=actuator.direction)
         else:
             order = int(actuator.kind == "moment")
-            found = actuator.gain * self.modes.phi(list(flat), order, direction=actuator.direction)
-        return found.reshape(*shape, self.modes.n_modes)
+            values = actuator.gain * self.modes.phi(list(flat), order, direction=actuator.direction)
+        return values.reshape(*shape, self.modes.n_modes)
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Where the middle of an actuator can stand at most along an interval, (from, to) m."""
+        """Range of the middle of an actuator along an interval, (from, to) m."""
         half = 0.5 * extent(self.actuator)
         return half, self.modes.length - half
 
     def law(self, positions: Any) -> Law:
-        """The IMSC law with actuators at the places, one each.
+        """The IMSC law with one actuator at each of the places.
 
         Raises:
-            DesignError: places from which the modes cannot be controlled one by one.
+            DesignError: places with a singular B.
         """
         places = listed(as_places(self.modes.domain, positions))
         actuators = [
@@ -176,10 +175,10 @@ class PlacementTask(Printed):
         return imsc(self.modes, self.n_controlled, actuators, weight=self.weight)
 
     def placed(self, positions: Any, status: str, optima: Sequence[tuple[np.ndarray, float]] = ()) -> Placement:
-        """A `Placement` of given positions; infinite work where B is singular.
+        """The `Placement` of given positions; infinite work where B is singular.
 
         Raises:
-            DesignError: more places than controlled modes, or fewer.
+            DesignError: not as many places as controlled modes.
         """
         domain = self.modes.domain
         positions = as_places(domain, positions)
@@ -195,7 +194,7 @@ class PlacementTask(Printed):
         if np.isfinite(costs.work[0]):
             forces = np.linalg.inv(shapes[:, : self.n_controlled].T) @ self.amplitudes
             peak = largest(self.poles, forces.reshape(-1, self.poles.size), self.span)
-            with suppress(ValueError):  # B of a condition that no law could be built on
+            with suppress(ValueError):  # B too ill-conditioned for a law
                 law = self.law(positions)
         return Placement(
             positions=positions,
@@ -212,29 +211,31 @@ class PlacementTask(Printed):
         )
 
     def tail_bound(self, positions: ArrayLike, *, growth: float) -> float:
-        """A bound on the work in all modes beyond those at hand, for frequencies that grow as ω_r >= ω_N (r/N)^growth.
+        """An upper bound of the work in all modes above the N of the task, if ω_r >= ω_N (r/N)^growth.
 
-        With ω|f̂_j| <= C_j beyond ω_N, W_tail <= ½ (Σ_ij |B⁻¹|_ij C_j)² Σ_{r>N} max b_r² / ω_r². A force takes part in a
-        mode by its shape, whose maximum does not grow; a moment by the slope, which grows with the number of waves as
-        ω^(1/growth), s = 1: max b_r <= S ω_r^(s/growth), S from the modes at hand, twice that of what acts between two
-        places. Then Σ_{r>N} (N/r)^{2 (growth - s)} <= N / (2 (growth - s) - 1). Growth is 2 for a beam in bending, 1
-        for a bar.
+        With ω|f̂_j| <= C_j above ω_N, W_tail <= ½ (Σ_ij |B⁻¹|_ij C_j)² Σ_{r>N} max b_r² / ω_r². The participation of a
+        force is the shape, whose maximum does not grow (s = 0); that of a moment is the slope, which grows with the
+        number of waves as ω^(1/growth) (s = 1). So max b_r <= S ω_r^(s/growth), with S from the N modes, twice for
+        actuators between two places. Then Σ_{r>N} (N/r)^{2 (growth - s)} <= N / (2 (growth - s) - 1). Growth is 2 for a
+        beam in bending, 1 for a bar.
 
         Raises:
-            DesignError: frequencies that grow too slowly for the sum to have a bound, a finite time, or modes that are
-                not along an interval.
+            DesignError: frequencies that grow too slowly for a bounded sum, a finite time, or modes that are not along
+                an interval.
         """
         domain, moment = self.modes.domain, int(self.actuator.kind == "moment")
         if not isinstance(domain, Interval):
-            raise DesignError(f"the bound on the tail is along an interval; these modes are of {domain}")
+            raise DesignError(f"the bound of higher modes is for an interval; these modes are of {domain}")
         power = 2 * (growth - moment)
         if not power > 1:
             raise DesignError(
-                "the frequencies must grow faster than the root of their number, and for moments faster than its power"
-                f" 3/2; got growth {growth:g}"
+                "the growth of the frequencies with the mode number must exceed 1/2, and 3/2 for moments; got"
+                f" {growth:g}"
             )
         if not np.isfinite(self.envelope).all():
-            raise DesignError("the bound on the tail is for t_f to infinity and frequencies above the closed loop's")
+            raise DesignError(
+                "the bound of higher modes is for t_f to infinity and frequencies above the closed loop's"
+            )
         n, modes = self.n_controlled, self.modes
         inverse = np.abs(np.linalg.inv(self.shapes(positions)[:, :n].T))
         elastic = modes.select(np.flatnonzero(modes.omega > 0).tolist())
@@ -259,25 +260,26 @@ def placement_task(
     final_time: float = np.inf,
     actuator: Actuator | None = None,
 ) -> PlacementTask:
-    """The task for an impulse (N s) at a place, or at any of several, IMSC with control weight R (5.43).
+    """The task of placement for an impulse (N s) at a place, or at any of several, under IMSC of weight R (5.43).
 
-    Effort and peak force are those of the law that a placement has, its modes' own damping included; W_R is the work on
-    residual modes as if these had none.
+    Effort and peak force include the damping of the controlled modes; W_R is that of undamped residual modes.
 
-    White-noise forces of intensity s at those places, given in place of probabilities, are impulses of √s N s at every
-    instant: W_R and effort are then powers.
+    For white-noise forces at these places, give their intensities instead of probabilities: a force of intensity s acts
+    as an impulse of √s N s at every instant, and W_R and effort are powers.
 
     Args:
+        modes: controlled first, then residual.
+        n_controlled: number of controlled modes, and of actuators.
         impulse_at: a place of the domain, or several: x or (n_places,) m, (x, y) or (n_places, 2) m, names.
-        weight: R, scalar or one a controlled mode.
+        weight: R, scalar or one per controlled mode.
         impulse: N s.
-        probabilities: (n_places,) of each place; even unless given.
-        final_time: t_f; work is counted up to it.
-        actuator: what is to be placed, a point force unless given; a `piezo_patch` or a moment, with its gain.
+        probabilities: (n_places,) of each place; equal by default.
+        final_time: t_f up to which work counts, s.
+        actuator: to be placed, by default a point force; a `piezo_patch` or a moment, with its gain.
 
     Raises:
-        DesignError: no residual mode, damping that couples the modes, an impulse that moves nothing, probabilities that
-            are none, a time that is not positive, or an actuator with a delay or a lag.
+        DesignError: no residual mode, damping that couples the modes, an impulse at a held place, negative
+            probabilities, a time that is not positive, or an actuator with a delay or a lag.
     """
     if not 1 <= n_controlled < modes.n_modes:
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
@@ -294,14 +296,14 @@ def placement_task(
         raise DesignError(f"{len(places)} places need as many probabilities, none negative; got {shares}")
     if actuator is not None and isinstance(actuator.at, Between) and not isinstance(modes.domain, Interval):
         raise DesignError(
-            f"actuator {actuator.name} acts between two places; such are placed along an interval only: place forces or"
-            " moments, or compare pairs of points one by one"
+            f"actuator {actuator.name} acts between two places; such actuators are placed along an interval only: place"
+            " forces or moments, or compare pairs of points one by one"
         )
     if actuator is not None and (actuator.delay or actuator.time_constant):
-        late = "delay" if actuator.delay else "time_constant"
+        lag = "delay" if actuator.delay else "time_constant"
         raise DesignError(
-            f"actuator {actuator.name} has {late} = {getattr(actuator, late):g}, and the best places are known for"
-            " forces that follow at once: place it without, and see by close_loop or export what the law does with it"
+            f"actuator {actuator.name} has {lag} = {getattr(actuator, lag):g}, and placement is for forces without lag:"
+            " place it without, and check the law with it by close_loop or export"
         )
     n = n_controlled
     omega = modes.omega[:n]
@@ -315,31 +317,31 @@ def placement_task(
     gains = np.hstack([np.diag(g1), np.diag(g2)])[:, states]
     slowest = -np.linalg.eigvals(a).real.max()
     if np.isfinite(final_time):
-        # what is left of the loop at t_f answers no more
+        # subtract the transform of the forces after t_f
         end = expm(a * final_time)
-        left = np.array([-gains @ np.linalg.solve(si * np.eye(len(a)) - a, end[:, -n:]) for si in s[:, 0]])
-        unit = unit[:, :, None] * np.eye(n) - left * np.exp(-s * final_time)[:, :, None]
+        after = np.array([-gains @ np.linalg.solve(si * np.eye(len(a)) - a, end[:, -n:]) for si in s[:, 0]])
+        unit = unit[:, :, None] * np.eye(n) - after * np.exp(-s * final_time)[:, :, None]
     else:
         unit = unit[:, :, None] * np.eye(n)
     transforms = unit @ rates.T
     roots = np.array([symmetric_root((t @ t.conj().T).real) for t in transforms])
-    # one impulse has a root of two columns; columns without weight only cost time
+    # the root for one impulse has rank two; negligible columns are left out to save time
     weights = np.abs(roots).max(axis=(0, 1))
     roots = roots[:, :, weights > NOTHING * weights.max()]
-    share = (omega**2 + g1) / modes.omega[-1] ** 2
+    ratio = (omega**2 + g1) / modes.omega[-1] ** 2
     envelope = np.full(n, np.inf)
-    if np.isinf(final_time) and (share < 1).all():
-        envelope = np.linalg.norm(rates, axis=0) * np.sqrt(g2**2 + (g1 / modes.omega[-1]) ** 2) / (1 - share)
+    if np.isinf(final_time) and (ratio < 1).all():
+        envelope = np.linalg.norm(rates, axis=0) * np.sqrt(g2**2 + (g1 / modes.omega[-1]) ** 2) / (1 - ratio)
     span = min(final_time, -np.log(SETTLED) / slowest)
-    # the rate jumps at the impulse and the forces with it: instants lie close at first
+    # instants are denser at the start, where the forces jump with the rates
     instants = span * np.linspace(0.0, 1.0, SHOWN_INSTANTS) ** 2
     starts = np.vstack([np.zeros((len(a) - n, len(places))), (rates / np.sqrt(np.maximum(shares, 1e-300))[:, None]).T])
     values, vectors = np.linalg.eig(a)
-    held = np.linalg.solve(vectors, starts[:, shares > 0].astype(complex))
-    motion = np.einsum("ik,kt,kp->ipt", vectors, np.exp(np.outer(values, instants)), held).real
+    coefficients = np.linalg.solve(vectors, starts[:, shares > 0].astype(complex))
+    motion = np.einsum("ik,kt,kp->ipt", vectors, np.exp(np.outer(values, instants)), coefficients).real
     forces = -(gains @ motion.reshape(len(a), -1))
     gramian = _force_gramian(a, gains, rates, final_time)
-    amplitudes = -(gains @ vectors) * held.T[:, None, :]
+    amplitudes = -(gains @ vectors) * coefficients.T[:, None, :]
     amplitudes.flags.writeable = values.flags.writeable = False
     return PlacementTask(
         modes=modes,
@@ -357,20 +359,20 @@ def placement_task(
 
 
 def check_uncoupled(modes: Modes) -> None:
-    """Refuse damping that couples the modes: what is placed by would leave its work out.
+    """Refuse damping that couples the modes: the spillover work of a placement would not include its effect.
 
     Raises:
         DesignError: such damping.
     """
     if not modes.proportional:
         raise DesignError(
-            "damping couples the modes, and places are compared mode by mode; neglect its coupling terms by"
+            "damping couples the modes, and placement sums the work of uncoupled modes; neglect the coupling terms by"
             " replace(modes, damping=np.diag(np.diag(modes.damping))), and check the design by finite_spillover"
         )
 
 
 def patch_of(rig: Rig) -> Actuator | None:
-    """The piezo patch that the actuators of a rig are, all of one size; None where they are point forces.
+    """One of the piezo patches of a rig, whose actuators are all alike; None where they are point forces.
 
     Raises:
         DesignError: actuators that differ in more than their place.
@@ -384,14 +386,14 @@ def patch_of(rig: Rig) -> Actuator | None:
         alike = (other.kind, other.direction) == (patch.kind, patch.direction)
         if not (alike and np.allclose(reach(domain, other.at)[0], half)):
             raise DesignError(
-                f"actuators of one kind are placed, and {other.name} is no patch like {patch.name}: give them one size"
-                " and axis, or describe point forces"
+                f"placement is of identical actuators, and {other.name} is not a patch like {patch.name}: give all the"
+                " same size and axis, or describe point forces"
             )
     return patch
 
 
 def overlap(domain: Domain, actuator: Actuator, positions: np.ndarray) -> bool:
-    """Whether two of the actuators with their middles at positions (n_actuators, ...) lie over each other."""
+    """Whether two of the actuators, with their middles at positions (n_actuators, ...), overlap."""
     if isinstance(domain, NamedPoints):
         return False
     size, at = 2.0 * reach(domain, actuator.at)[0], positions.reshape(len(positions), -1)
@@ -400,12 +402,12 @@ def overlap(domain: Domain, actuator: Actuator, positions: np.ndarray) -> bool:
 
 
 def extent(actuator: Actuator) -> float:
-    """Length of an actuator along an interval, m: from the first to the second of two places, else 0."""
+    """Length of an actuator between two places along an interval, m; 0 of others."""
     return float(actuator.at.first - actuator.at.second) if isinstance(actuator.at, Between) else 0.0  # type: ignore
 
 
 def participation_along(modes: Modes, actuator: Actuator, x: Floats, derivative: int = 0) -> Floats:
-    """Modal forces (n_places, n_modes) per unit command of an actuator at x (n_places,), m; derivatives with x."""
+    """Participation (n_places, n_modes) of an actuator with its middle at x (n_places,), m, or its derivative in x."""
     half, order = 0.5 * extent(actuator), derivative + (actuator.kind == "moment")
     if half == 0:
         return actuator.gain * modes.phi(x, order)
@@ -424,9 +426,9 @@ def _force_gramian(a: Floats, gains: Floats, rates: Floats, final_time: float) -
 
 @dataclass(frozen=True, eq=False)
 class Costs:
-    """What many placements cost: each (n_placements,), inf where B is singular; by_mode (n_placements, n_residual).
+    """Costs of many placements, (n_placements,) each, inf where B is singular; by_mode (n_placements, n_residual).
 
-    The peak force is that at the task's instants: never more than the true one, and a little less.
+    The peak force is that at the task's instants, slightly below the true one.
     """
 
     work: np.ndarray
@@ -437,15 +439,15 @@ class Costs:
 
 
 def batch_costs(task: PlacementTask, shapes: np.ndarray) -> Costs:
-    """All that is asked of many placements at once, from `shapes` (n_placements, n_actuators, n_modes)."""
+    """The costs of many placements at once, from the participations `shapes` (n_placements, n_actuators, n_modes)."""
     inverse, singular = _inverses(task, shapes)
     n = task.n_controlled
-    spread = shapes[:, :, n:].transpose(0, 2, 1) @ inverse
-    by_mode = 0.5 * (np.einsum("prk,rkj->prj", spread, task.roots, optimize=True) ** 2).sum(axis=2)
+    residual = shapes[:, :, n:].transpose(0, 2, 1) @ inverse
+    by_mode = 0.5 * (np.einsum("prk,rkj->prj", residual, task.roots, optimize=True) ** 2).sum(axis=2)
     effort = np.einsum("pik,kl,pil->p", inverse, task.force_gramian, inverse, optimize=True)
-    few = max(1, MOST_FORCES // task.forces.size)
+    batch = max(1, MOST_FORCES // task.forces.size)
     peak = np.concatenate(
-        [np.abs(inverse[i : i + few] @ task.forces).max(axis=(1, 2)) for i in range(0, len(inverse), few)]
+        [np.abs(inverse[i : i + batch] @ task.forces).max(axis=(1, 2)) for i in range(0, len(inverse), batch)]
     )
     condition = np.linalg.norm(inverse, axis=(1, 2)) * np.linalg.norm(shapes[:, :, :n], axis=(1, 2))
     by_mode[singular] = np.inf
@@ -476,8 +478,8 @@ def batch_work(task: PlacementTask, shapes: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _inverses(task: PlacementTask, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """B⁻¹ of each placement, and where B is singular."""
+    """B⁻¹ (n_placements, n, n) of each placement, and where B is singular (n_placements,)."""
     b = shapes[:, :, : task.n_controlled].transpose(0, 2, 1)
-    # Hadamard: |det B| against the product of its row lengths, so that mass and units do not matter
+    # |det B| over the product of its row lengths (Hadamard's inequality) does not depend on mass and units
     singular = np.abs(np.linalg.det(b)) <= SINGULAR_SHARE * np.linalg.norm(b, axis=2).prod(axis=1)
     return np.linalg.inv(np.where(singular[:, None, None], np.eye(task.n_controlled), b)), singular

@@ -1,10 +1,10 @@
-"""Where collocated pairs of actuator and rate sensor should stand for direct velocity feedback, and a proof of it.
+"""Placement of collocated pairs of actuator and rate sensor for direct velocity feedback, with a proof of optimality.
 
-A force u = -H y is fed back from the rates y = Bᵀ q' that the pairs sense, so that C(x) = C + B(x) H B(x)ᵀ damps the
-modes. After an initial state x_0 the motion leaves E(x) = ∫ Σ (q_r'² + ω_r² q_r²) dt = x_0ᵀ P x_0, Aᵀ P + P A = -Q.
+The force u = -H y is fed back from the rates y = Bᵀ q' of the pairs, so that the damping of the modes is
+C(x) = C + B(x) H B(x)ᵀ. From an initial state x_0, E(x) = ∫ Σ (q_r'² + ω_r² q_r²) dt = x_0ᵀ P x_0, Aᵀ P + P A = -Q.
 
-A lower bound on a cell of places: for S = P_0 + Σ_j δ_j P_j - η P_0, P_j the derivative of P at the centre,
-A(x)ᵀ S + S A(x) + Q is of second order in δ but for η Q; where it is not negative, E(x) >= x_0ᵀ S x_0.
+A lower bound on a cell of places: for S = P_0 + Σ_j δ_j P_j - η P_0, with P_j the derivatives of P at the centre,
+A(x)ᵀ S + S A(x) + Q is η Q plus terms of second order in δ; if it is positive semidefinite, E(x) >= x_0ᵀ S x_0.
 """
 
 from collections.abc import Sequence
@@ -23,20 +23,20 @@ from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import Printed
 
-GRID = 4_001  # places at which the largest curvature of the participation is looked for
+GRID = 4_001  # places at which derivatives of the participation are evaluated
 BATCH = 2_000  # cells bounded at once
-MOST_CELLS = 2_000_000  # after which the proof stops with the bound that it has reached
-TOLERANCE = 1e-9  # of the length: how near to the spacing an optimum may come
+MOST_CELLS = 2_000_000  # after which the proof stops with the bound reached
+TOLERANCE = 1e-9  # of the length: tolerance of the spacing
 
 
 @dataclass(frozen=True, eq=False)
 class FeedbackTask:
-    """Pairs to be placed.
+    """The task of placing pairs of actuator and rate sensor along a structure.
 
     Attributes:
         modes: all of them controlled, with their damping.
         actuator: of a pair; its own place and name do not matter.
-        gain: (n_pairs, n_pairs) H, force per rate; positive definite in its symmetric part where it can only damp.
+        gain: (n_pairs, n_pairs) H, force per rate; if its symmetric part is positive definite, it damps every mode.
         state: (2 n_modes,) x_0.
         spacing: least distance between the middles of neighbours, m.
     """
@@ -60,7 +60,7 @@ class FeedbackTask:
         first, last = self.reach
         if first + (self.n_pairs - 1) * self.spacing > last:
             raise DesignError(
-                f"{self.n_pairs} pairs {self.spacing:g} m apart find no room on {self.modes.length:g} m;"
+                f"{self.n_pairs} pairs {self.spacing:g} m apart do not fit on {self.modes.length:g} m;"
                 " lower the spacing"
             )
 
@@ -70,29 +70,29 @@ class FeedbackTask:
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Where the middle of a pair can stand, (from, to) m."""
+        """Range of the middle of a pair, (from, to) m."""
         half = 0.5 * extent(self.actuator)
         return half, self.modes.length - half
 
     @cached_property
-    def _course(self) -> tuple[Floats, Floats, Floats]:
-        """Places (n,); of a pair's participation the largest second derivative (n_modes,), and what the jumps of its
-        slope sum to up to each place, (n, n_modes)."""
+    def _derivatives(self) -> tuple[Floats, Floats, Floats]:
+        """Places (n,), and of the participation of a pair there: the largest second derivative (n_modes,), and the
+        cumulative sum of the jumps of its slope (n, n_modes)."""
         grid = np.linspace(*self.reach, GRID)
         slope, bend = (participation_along(self.modes, self.actuator, grid, order) for order in (1, 2))
         varied, half_step = np.abs(np.diff(bend, axis=0)), 0.5 * (grid[1] - grid[0])
         jumps = np.abs(np.diff(slope, axis=0) - half_step * (bend[:-1] + bend[1:])) + half_step * varied
-        kinks = np.concatenate([np.zeros((1, self.modes.n_modes)), np.cumsum(jumps, axis=0)])
-        return grid, np.abs(bend).max(axis=0) + varied.max(axis=0), kinks
+        total_jumps = np.concatenate([np.zeros((1, self.modes.n_modes)), np.cumsum(jumps, axis=0)])
+        return grid, np.abs(bend).max(axis=0) + varied.max(axis=0), total_jumps
 
-    def curved(self, centres: Floats, halves: Floats) -> Floats:
-        """What the participation differs by at most from its tangent at the centre, (..., n_modes), within (...,) m.
+    def tangent_error(self, centres: Floats, halves: Floats) -> Floats:
+        """Largest difference (..., n_modes) of the participation from its tangent at `centres` (...,), m.
 
-        Where the stiffness has a step, the slope of a patch's participation jumps.
+        It bounds the difference within `halves` (...,) m, with the jumps of a patch's slope at steps of the stiffness.
         """
-        grid, bend, kinks = self._course
+        grid, bend, total_jumps = self._derivatives
         first, last = grid.searchsorted(centres - halves, "right"), grid.searchsorted(centres + halves)
-        jumps = kinks[np.minimum(last, grid.size - 1)] - kinks[np.maximum(first - 1, 0)]
+        jumps = total_jumps[np.minimum(last, grid.size - 1)] - total_jumps[np.maximum(first - 1, 0)]
         return halves[..., None] * (0.5 * halves[..., None] * bend + jumps)
 
     def index(self, positions: ArrayLike) -> np.ndarray:
@@ -105,13 +105,13 @@ class FeedbackTask:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FeedbackPlacement(Printed):
-    """Pairs placed for direct velocity feedback, and what is proven of them.
+    """Pairs placed for direct velocity feedback, with a proven bound of their performance index E.
 
     Attributes:
         positions: (n_pairs,) of the middles, m, in the order of the gain.
         index: E.
-        lower_bound: no placement has a smaller E.
-        cells: examined for the proof.
+        lower_bound: of E over all placements.
+        cells: number examined for the proof.
     """
 
     positions: np.ndarray
@@ -121,7 +121,7 @@ class FeedbackPlacement(Printed):
 
     @property
     def gap(self) -> float:
-        """By what share E could at most be lower."""
+        """Optimality gap: the largest share of E by which another placement may be better."""
         return 1.0 - self.lower_bound / self.index
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
@@ -136,44 +136,45 @@ class FeedbackPlacement(Printed):
 
 
 def place_pairs(task: FeedbackTask, *, gap: float = 0.01, starts: int = 12, seed: int = 0) -> FeedbackPlacement:
-    """The pairs in order along the structure that leave the least E, by SLSQP from many starts, with a proof.
+    """The pairs, in order along the structure, of least E, by SLSQP from many starts, with a proof by branch and bound.
 
     Args:
-        gap: share of E to be proven by branch and bound.
-        starts: random ones.
+        task: the pairs to place.
+        gap: share of E to be proven.
+        starts: number of random starts.
         seed: of the starts.
 
     Raises:
-        DesignError: no start ended at a stable loop.
+        DesignError: no start ended at a stable loop, or branch and bound met a better placement.
     """
     n, (first, last) = task.n_pairs, task.reach
     rng = np.random.default_rng(seed)
     free = last - first - (n - 1) * task.spacing
-    apart = [{"type": "ineq", "fun": lambda x: np.diff(x) - task.spacing}] if n > 1 else []
+    spaced = [{"type": "ineq", "fun": lambda x: np.diff(x) - task.spacing}] if n > 1 else []
     best, least = None, np.inf
     for _ in range(starts):
         start = first + np.sort(rng.uniform(0.0, free, n)) + task.spacing * np.arange(n)
-        found = minimize(
+        result = minimize(
             lambda x: float(task.index(x)),
             start,
             method="SLSQP",
             bounds=[(first, last)] * n,
-            constraints=apart,
+            constraints=spaced,
             options={"ftol": 1e-12},
         )
-        kept = n == 1 or np.diff(found.x).min() >= task.spacing - TOLERANCE * task.modes.length
-        if kept and found.fun < least:
-            best, least = found.x, float(found.fun)
+        feasible = n == 1 or np.diff(result.x).min() >= task.spacing - TOLERANCE * task.modes.length
+        if feasible and result.fun < least:
+            best, least = result.x, float(result.fun)
     if best is None:
         raise DesignError("no places of these pairs make a stable loop; change the gain")
     bound, cells, better = _proven(task, least * (1.0 - gap))
     if better is not None:
-        raise DesignError(f"the search missed pairs at {better}, which leave less; take more starts")
+        raise DesignError(f"the search missed a better placement, pairs at {better}; take more starts")
     return FeedbackPlacement(frozen(best), least, bound, cells)
 
 
 def _proven(task: FeedbackTask, wanted: float) -> tuple[float, int, np.ndarray | None]:
-    """A bound of E, up to the one wanted, the cells examined, and places that are below it where some are met."""
+    """A lower bound of E, at most `wanted`, the number of cells examined, and places with a lower E if any are met."""
     n, (first, last) = task.n_pairs, task.reach
     half = np.full(n, (last - first) / 16)
     axis = first + half[0] * (2 * np.arange(8) + 1)
@@ -181,8 +182,8 @@ def _proven(task: FeedbackTask, wanted: float) -> tuple[float, int, np.ndarray |
     halves = np.broadcast_to(half, cells.shape).copy()
     count, bound = 0, np.inf
     while len(cells):
-        near = (np.diff(cells, axis=1) + halves[:, 1:] + halves[:, :-1] >= task.spacing).all(axis=1)
-        cells, halves = cells[near], halves[near]
+        feasible = (np.diff(cells, axis=1) + halves[:, 1:] + halves[:, :-1] >= task.spacing).all(axis=1)
+        cells, halves = cells[feasible], halves[feasible]
         parts = max(1, len(cells) // BATCH)
         bounds, indices, weights = [], [], []
         for centre, h in zip(np.array_split(cells, parts), np.array_split(halves, parts)):
@@ -193,15 +194,15 @@ def _proven(task: FeedbackTask, wanted: float) -> tuple[float, int, np.ndarray |
             indices.append(np.where(expansion.stable, expansion.index, np.inf))
         count += len(cells)
         lower, index, weight = (np.concatenate(part) for part in (bounds, indices, weights))
-        stands = (np.diff(cells, axis=1) >= task.spacing).all(axis=1)
-        below = np.flatnonzero(stands & (index < wanted))
+        spaced = (np.diff(cells, axis=1) >= task.spacing).all(axis=1)
+        below = np.flatnonzero(spaced & (index < wanted))
         if below.size:
             return 0.0, count, cells[below[0]]
         open_ = lower < wanted
         if count > MOST_CELLS:
             bound = min(bound, float(lower[open_].min(initial=np.inf)))
             break
-        # the axis along which the bound is loosest is halved
+        # halve the axis along which the bound is loosest
         cells, halves, widest = cells[open_], halves[open_].copy(), weight[open_].argmax(axis=1)
         each = np.arange(len(cells))
         halves[each, widest] *= 0.5
@@ -212,7 +213,7 @@ def _proven(task: FeedbackTask, wanted: float) -> tuple[float, int, np.ndarray |
 
 
 class _Expansion:
-    """E and its derivatives at centres (n_cells, n_pairs), by Lyapunov equations of all of them together."""
+    """E and its derivatives at centres (n_cells, n_pairs), by Lyapunov equations solved together."""
 
     def __init__(self, task: FeedbackTask, centres: np.ndarray) -> None:
         self._task, self._centres = task, centres
@@ -221,13 +222,13 @@ class _Expansion:
         b, slope = (self._participation(centres, derivative) for derivative in (0, 1))
         self._b, self._slope = b, slope
         damping = modes.damping + np.einsum("ij,pir,pjs->prs", h, b, b)
-        # displacements as rates, ω q, so that Q is the identity
+        # states ω q and q', so that Q is the identity
         omega = np.diag(modes.omega)
         a = np.zeros((len(centres), 2 * n, 2 * n))
         a[:, :n, n:], a[:, n:, :n], a[:, n:, n:] = omega, -omega, -damping
         self.stable = np.linalg.eigvals(a).real.max(axis=1) < 0
         eye = np.eye(2 * n)
-        # Aᵀ P + P A with P in a row of 4n² entries
+        # P → Aᵀ P + P A as a matrix on the 4n² entries of P
         self._operator = (np.einsum("pki,jl->pijkl", a, eye) + np.einsum("plj,ik->pijkl", a, eye)).reshape(
             len(centres), 4 * n * n, 4 * n * n
         )
@@ -237,8 +238,8 @@ class _Expansion:
 
     def _participation(self, places: np.ndarray, derivative: int) -> np.ndarray:
         task = self._task
-        found = participation_along(task.modes, task.actuator, places.ravel(), derivative)
-        return found.reshape(*places.shape, task.modes.n_modes)
+        values = participation_along(task.modes, task.actuator, places.ravel(), derivative)
+        return values.reshape(*places.shape, task.modes.n_modes)
 
     def _solved(self, right: np.ndarray) -> np.ndarray:
         """P (n_cells, n_right, 2n, 2n) with Aᵀ P + P A = right."""
@@ -247,7 +248,7 @@ class _Expansion:
         return np.linalg.solve(self._operator, flat).transpose(0, 2, 1).reshape(right.shape)
 
     def lower(self, halves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lower bounds of E (n_cells,) on cells of half-widths (n_cells, n_pairs), and what each axis costs of them."""
+        """Lower bounds of E (n_cells,) on cells of half-widths (n_cells, n_pairs), and their looseness by axis."""
         task, n = self._task, self._task.modes.n_modes
         gain, b, slope = task.gain, self._b, self._slope
         # A depends on the place of pair j through C: ∂C/∂x_j
@@ -258,18 +259,18 @@ class _Expansion:
         right = right + right.swapaxes(2, 3)
         derivatives = self._solved(right)
         gradient = np.einsum("i,pjik,k->pj", self._start, derivatives, self._start)
-        curved = task.curved(self._centres, halves)
-        moved = np.abs(slope) * halves[:, :, None] + curved
+        error = task.tangent_error(self._centres, halves)
+        moved = np.abs(slope) * halves[:, :, None] + error
         size, strength = np.abs(b), np.abs(gain)
 
         def products(one: Floats, other: Floats) -> Floats:
             return np.asarray(np.einsum("ij,pir,pjs->prs", strength, one, other))
 
-        second = products(curved, size) + products(size, curved) + products(moved, moved)
+        second = products(error, size) + products(size, error) + products(moved, moved)
         change = products(moved, size) + products(size, moved) + products(moved, moved)
 
         def norm(p: Floats, c: Floats) -> Floats:
-            """Of ΔAᵀ P + P ΔA, at most, with |ΔC| <= c."""
+            """Upper bound of the norm of ΔAᵀ P + P ΔA for |ΔC| <= c."""
             size: Floats = np.linalg.norm(np.abs(p[..., n:]) @ c, axis=(-2, -1))
             return 2.0 * size
 

@@ -1,4 +1,4 @@
-"""Several laws on the same structure after the same impulse: cost, effort, spillover and poles side by side."""
+"""Comparison of laws on one structure after the same impulse: cost, effort, spillover and poles."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,16 +25,16 @@ from workbench.threads import one_blas_thread
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """What one law does and costs.
+    """Cost, effort, spillover and stability of one law.
 
     Attributes:
-        law: it.
+        law: the law.
         cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt of the controlled modes, over all time.
         effort: ∫ FᵀF dt over all time.
-        peak_force: largest |F| of any actuator up to the final time, at any instant, to a millionth.
-        work: in every mode up to the final time.
-        poles: (n_states,) of the loop through exact modal coordinates, rad/s.
-        stability: of that loop, as of a `ClosedLoop`.
+        peak_force: largest |F| of any actuator in continuous time up to the final time, to a millionth.
+        work: of the actuators in every mode up to the final time.
+        poles: (n_states,) of the loop with exact modal coordinates, rad/s.
+        stability: of that loop, see `ClosedLoop.stability`.
     """
 
     law: Law
@@ -58,12 +58,14 @@ class Compared:
 def laws_of(
     modes: Modes, controlled: int, actuators: Sequence[Actuator], *, weight: float, damping: float | None = None
 ) -> tuple[list[Law], list[str]]:
-    """The laws to be had, IMSC and coupled LQR, and by poles of a damping ratio where one is given; why others are not.
+    """The laws that can be designed, IMSC and coupled LQR, and why others cannot.
+
+    With a damping ratio, the same two by pole assignment too.
 
     Raises:
-        DesignError: no law is to be had.
+        DesignError: no law can be designed.
     """
-    makers: list[Callable[[], Law]] = [lambda: imsc(modes, controlled, actuators, weight=weight)]
+    independent: list[Callable[[], Law]] = [lambda: imsc(modes, controlled, actuators, weight=weight)]
     coupled: list[Callable[[], Law]] = [lambda: coupled_lqr(modes, controlled, actuators, weight=weight)]
     refused: list[str] = []
     if damping is not None and not 0 < damping < 1:
@@ -72,29 +74,29 @@ def laws_of(
     rigid = numbered(np.flatnonzero(omega == 0).tolist())
     if damping is not None and rigid:
         refused.append(
-            f"no law by poles, for what is rigid (mode {rigid}) has no damping ratio; design by the weight, or give"
-            " poles of its own to coupled_poles"
+            f"no pole assignment: the rigid mode(s) {rigid} have no damping ratio; design by the weight, or give poles"
+            " for all modes to coupled_poles"
         )
     elif damping is not None:
         poles = omega * (-damping + 1j * np.sqrt(1 - damping**2))
-        makers.append(lambda: imsc_poles(modes, controlled, actuators, poles=poles))
+        independent.append(lambda: imsc_poles(modes, controlled, actuators, poles=poles))
         coupled.append(lambda: coupled_poles(modes, controlled, actuators, poles=poles))
     if controlled <= len(actuators):
-        return [make() for make in (*makers, *coupled)], refused
+        return [design() for design in (*independent, *coupled)], refused
     why = f"IMSC needs as many actuators as controlled modes, {controlled}; there are {len(actuators)}: add actuators"
-    return [make() for make in coupled], [why, *refused]
+    return [design() for design in coupled], [why, *refused]
 
 
 @one_blas_thread
 def compare(
     modes: Modes, laws: Sequence[Law], state: np.ndarray, *, weight: float, final_time: float
 ) -> tuple[Compared, ...]:
-    """Each law's cost, effort, peak force, work by mode and poles, from the same state (2 n_modes,).
+    """Cost, effort, peak force, work by mode and poles of each law, from the same initial state.
 
     Args:
         modes: controlled and residual.
-        laws: to compare; all control the same modes if the costs are to mean the same.
-        state: at t = 0; residual modes at rest make W_r what control alone puts there.
+        laws: to compare; their costs are comparable if they control the same modes.
+        state: (2 n_modes,) at t = 0; with residual modes at rest, W_R is due to control alone.
         weight: R of the cost.
         final_time: s, of work and peak force.
     """
@@ -119,26 +121,26 @@ def compare(
 def through_sensors(
     modes: Modes, laws: Sequence[Law], places: Sequence[Place], structure: Structure | Plate | Membrane | None
 ) -> tuple[tuple[Controller | None, Explanation | None, str], ...]:
-    """Each law on what sensors of displacement and velocity at the places read: a modal filter, a Luenberger observer.
+    """Each law with each estimator that sensors at the places allow: a modal filter and a Luenberger observer.
 
     Args:
         modes: controlled and residual.
         laws: to try.
-        places: of the sensors.
-        structure: whose mass the filters need, but at named points; none are tried where it is needed and not known.
+        places: of the sensors: displacement for an observer, displacement and velocity for a filter.
+        structure: gives the mass for the filters; without it filters are tried at named points alone.
 
     Returns:
-        Controller, explanation on the full plant, and where it cannot be, (None, None, why).
+        (controller, explanation on the full plant, "") each, or (None, None, reason) where the design fails.
     """
-    stands = sorted(dict.fromkeys(places))
+    sensor_places = sorted(dict.fromkeys(places))
     tried: list[tuple[Controller | None, Explanation | None, str]] = []
-    ways = (True, False) if structure is not None or isinstance(modes.domain, NamedPoints) else (False,)
+    estimators = (True, False) if structure is not None or isinstance(modes.domain, NamedPoints) else (False,)
     for law in laws:
-        sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(stands)]
-        for by_filter in ways:
+        sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensor_places)]
+        for by_filter in estimators:
             try:
                 if by_filter:
-                    controller = filtered(law, filter_on(structure, modes, law.controlled, stands))
+                    controller = filtered(law, filter_on(structure, modes, law.controlled, sensor_places))
                 else:
                     controller = luenberger(modes, law, sensors, poles=usual_poles(modes, law.controlled))
                 tried.append((controller, explain_spillover(modes, controller), ""))

@@ -1,14 +1,16 @@
-"""Which residual mode a design destabilises on the full plant, and by which path from sensor to actuator.
+"""Explanation of spillover: the residual mode that a design destabilises, and the path from sensor to actuator.
 
-Without mode r the rest of the loop answers readings y with forces T(s) y. Mode r closes that loop at s = λ + Δ:
+Let T(s) be the transfer function from readings to forces of the loop without mode r, of open-loop pole λ. With mode r
+the loop has a pole s = λ + Δ where
 
     (s - λ) E(s) = b_r(s)ᵀ T(s) c_r(s),   so   Δ = Σ_ji b_rj T_ji c_ir / E(s),
 
-one term for each actuator j and sensor i. E(s) = s - λ', the mode's other pole, λ* where it oscillates. Damping that
-couples mode r and the others, of dynamic stiffness Z(s), by the row d and the column e of s C, has it move through
-these: b_r - d Z⁻¹ B stands for b_r, c_r - c Z⁻¹ e for c_r, and (s - λ) E(s) = s² + s c_rr + ω_r² - d Z⁻¹ e, λ a pole
-of the structure with all its damping. At s = λ this is the perturbation of the eigenvalue to first order; at the pole
-of the full loop it is exact. Either spillover at zero, b_r or c_r, leaves the mode where it was (Balas 1978).
+one term for each actuator j and sensor i. E(s) = s - λ', the mode's other pole, λ* where it oscillates. If damping
+couples mode r to the others, of dynamic stiffness Z(s), by the row d and the column e of s C, then b_r - d Z⁻¹ B
+replaces b_r, c_r - c Z⁻¹ e replaces c_r, and (s - λ) E(s) = s² + s c_rr + ω_r² - d Z⁻¹ e, with λ a pole of the
+structure with all its damping. Evaluated at s = λ, Δ is the first-order perturbation of the eigenvalue; at the pole of
+the full loop it is exact. The pole does not move if either control spillover b_r or observation spillover c_r is zero
+(Balas 1978).
 """
 
 from collections.abc import Sequence
@@ -29,20 +31,20 @@ from workbench.structure.domain import Place
 from workbench.structure.modes import Modes
 from workbench.structure.printed import Printed, counted, place_text
 
-TWIN = 1e-12
-DOUBLE = 1e-7  # of their size: nearer, both poles of a mode are one, whose shift has no first order
-SUSPECTS = 12  # residual modes, the most shifts, whose absence is tried
+TWIN = 1e-12  # relative to ω²: dynamic stiffness of a mode at the undamped pole of an equal mode, instead of zero
+DOUBLE = 1e-7  # of the pole: two poles of a mode nearer to each other are a double pole, without first-order shift
+SUSPECTS = 12  # residual modes, those of the largest shifts, that are left out one by one
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """How far one actuator, driven by the sensors at one place, shifts a mode's pole.
+    """The shift of a mode's pole by one actuator driven by the sensors at one place.
 
     Attributes:
         actuator: name.
-        sensor_at: place of the sensors; all the channels read there count together.
-        shift: its share of the exact shift, rad/s; the real part is what it adds to the growth.
-        first_order: the same from the open-loop pole; nan of a mode whose two poles are one, rigid or of ζ = 1.
+        sensor_at: place of the sensors; all channels there count together.
+        shift: its term of the exact shift, rad/s; the real part adds to the growth rate.
+        first_order: its term of the first-order shift, rad/s; nan for a double pole (a rigid mode, or ζ = 1).
     """
 
     actuator: str
@@ -52,7 +54,7 @@ class Path:
 
     @property
     def text(self) -> str:
-        """From where to where, in words."""
+        """The path in words: sensor place to actuator."""
         return f"{place_text(self.sensor_at)} to {self.actuator}"
 
 
@@ -63,8 +65,8 @@ class PoleShift:
     Attributes:
         mode: zero-based index.
         pole: open loop, upper half plane, rad/s; the slower one of a mode that does not oscillate.
-        closed_pole: of the full closed loop; the least stable one that is the mode's.
-        paths: the most destabilising first; their shifts add up to that of the pole.
+        closed_pole: of the full closed loop, rad/s; the less stable one of the mode.
+        paths: the most destabilising first; their shifts add up to the shift of the pole.
     """
 
     mode: int
@@ -79,7 +81,7 @@ class PoleShift:
 
     @property
     def dominant(self) -> Path:
-        """The path that shifts the pole most the way that it goes, to the left or to the right."""
+        """The path of the largest shift in the direction of the pole's own, to the left or to the right."""
         return max(self.paths, key=lambda path: path.shift.real * np.sign(self.shift.real))
 
     @property
@@ -90,15 +92,15 @@ class PoleShift:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Explanation(Printed):
-    """A controller on the full plant.
+    """The closed loop of a controller on the full plant, with the pole shift of each residual mode.
 
     Attributes:
         loop: of all modes.
-        shifts: every residual mode, the least stable first.
-        reduced_margin: of the loop of the controlled modes alone, 1/s.
-        destabilising: the residual mode that makes the loop unstable: one that grows, else the one without which the
-            loop is stable (a residual mode can stay stable itself and make a controlled one grow). None where the loop
-            is stable, and where no single mode accounts for it, as when the reduced model fails already.
+        shifts: of every residual mode, the least stable first.
+        reduced_margin: stability margin of the loop of the controlled modes alone, 1/s.
+        destabilising: the residual mode that makes the loop unstable: one whose pole is unstable, else the one without
+            which the loop is stable (a stable residual mode can destabilise a controlled one). None where the loop is
+            stable, and where no single mode accounts for it, as when the loop of the controlled modes is unstable.
     """
 
     loop: ClosedLoop
@@ -125,10 +127,10 @@ class Explanation(Printed):
             )
             for each in self.shifts
         ]
-        behind = self.destabilising
+        cause = self.destabilising
         remarks = (
             f"controlled modes alone: margin {self.reduced_margin:.3g} 1/s",
-            *((f"mode {behind.mode + 1} makes the loop unstable",) if behind else ()),
+            *((f"mode {cause.mode + 1} makes the loop unstable",) if cause else ()),
         )
         headings = (
             "residual mode",
@@ -141,7 +143,7 @@ class Explanation(Printed):
 
     @property
     def poles(self) -> np.ndarray:
-        """Of the whole closed loop, rad/s."""
+        """Poles (n_states,) of the closed loop of all modes, rad/s."""
         return self.loop.poles
 
     @property
@@ -151,10 +153,10 @@ class Explanation(Printed):
 
 
 def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
-    """The poles of the full closed loop, and what shifts that of each residual mode, by path.
+    """The poles of the full closed loop, and the shift of each residual mode's pole, by path.
 
     Args:
-        modes: of the fuller plant; those that the law does not control are residual.
+        modes: of the full plant; those that the law does not control are residual.
         controller: from `filtered`, `luenberger` or `kalman`.
 
     Raises:
@@ -166,18 +168,19 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
             " an observer (luenberger, kalman) or through a modal filter, and give the controller"
         )
     loop = close_with(modes, controller)
-    rest = _Rest(modes, controller)
+    rest = _LoopWithoutOne(modes, controller)
     residual = [r for r in range(modes.n_modes) if r not in controller.law.controlled]
-    free = _free_poles(modes)
-    closed = [_as_of(loop, pole) for pole in _poles_of(loop.matrix, modes.n_modes, residual)]
-    shifts = [_OneMode(rest, r, free[r]).shifted(pole) for r, pole in zip(residual, closed, strict=True)]
+    open_loop = _open_loop_poles(modes)
+    closed = [_nearest_pole(loop, pole) for pole in _poles_of(loop.matrix, modes.n_modes, residual)]
+    shifts = [_ResidualMode(rest, r, open_loop[r]).shifted(pole) for r, pole in zip(residual, closed, strict=True)]
     shifts.sort(key=lambda m: -m.closed_pole.real)
-    alone = close_with(modes.select(controller.law.controlled), controller)
-    return Explanation(loop, tuple(shifts), alone.margin, _behind(modes, controller, loop, shifts, alone.stable))
+    reduced = close_with(modes.select(controller.law.controlled), controller)
+    cause = _destabilising(modes, controller, loop, shifts, reduced.stable)
+    return Explanation(loop, tuple(shifts), reduced.margin, cause)
 
 
-def _free_poles(modes: Modes) -> list[complex]:
-    """The pole of each mode without control, upper half plane; the slower one of a mode that does not oscillate."""
+def _open_loop_poles(modes: Modes) -> list[complex]:
+    """The open-loop pole of each mode, upper half plane; the slower one of a mode that does not oscillate."""
     if modes.proportional:
         c = np.diag(modes.damping)
         return [complex(pole) for pole in -0.5 * c + np.sqrt(0.25 * c**2 - modes.omega**2 + 0j)]
@@ -185,33 +188,34 @@ def _free_poles(modes: Modes) -> list[complex]:
 
 
 def _poles_of(matrix: Floats, n: int, wanted: Sequence[int]) -> list[complex]:
-    """The pole of each mode wanted, of n, upper half plane: of the two that are its own, the less stable.
+    """The pole of each wanted mode (zero-based, of n) in the upper half plane: the less stable of its two.
 
-    Modes share out the poles by |w_k,r' v_k,r|, left and right eigenvectors: how much a stiffer mode r moves pole k.
+    Each mode is assigned two poles by the participation factors |w_k,r' v_k,r| of left and right eigenvectors: the
+    sensitivity of pole k to the stiffness of mode r.
     """
     if not len(wanted):
         return []
     poles, left, right = eig(matrix, left=True, right=True)
-    share = np.abs(left[n : 2 * n] * right[:n])
-    share /= np.maximum(share.sum(axis=0), np.finfo(float).tiny)
-    _, own = linear_sum_assignment(share[np.repeat(wanted, 2)], maximize=True)
-    found = (max(pair, key=lambda p: float(p.real)) for pair in poles[own].reshape(-1, 2))
-    return [complex(pole.real, abs(pole.imag)) for pole in found]
+    participation = np.abs(left[n : 2 * n] * right[:n])
+    participation /= np.maximum(participation.sum(axis=0), np.finfo(float).tiny)
+    _, own = linear_sum_assignment(participation[np.repeat(wanted, 2)], maximize=True)
+    less_stable = (max(pair, key=lambda p: float(p.real)) for pair in poles[own].reshape(-1, 2))
+    return [complex(pole.real, abs(pole.imag)) for pole in less_stable]
 
 
-def _as_of(loop: ClosedLoop, pole: complex) -> complex:
-    """The same pole to the last digit as the loop has it."""
-    found = loop.poles[np.abs(loop.poles - pole).argmin()]
-    return complex(found.real, abs(found.imag))
+def _nearest_pole(loop: ClosedLoop, pole: complex) -> complex:
+    """The nearest of `loop.poles`, so that two computations of one pole agree to the last digit."""
+    nearest = loop.poles[np.abs(loop.poles - pole).argmin()]
+    return complex(nearest.real, abs(nearest.imag))
 
 
-def _behind(
-    modes: Modes, controller: Controller, loop: ClosedLoop, shifts: list[PoleShift], stable_alone: bool
+def _destabilising(
+    modes: Modes, controller: Controller, loop: ClosedLoop, shifts: list[PoleShift], reduced_stable: bool
 ) -> PoleShift | None:
-    """The residual mode that destabilises a loop: one that grows, else one without which the loop is stable."""
+    """The residual mode that destabilises a loop: an unstable one, else one without which the loop is stable."""
     if loop.stable or not shifts:
         return None
-    if stable_alone and shifts[0].closed_pole.real > rounding(loop.poles):
+    if reduced_stable and shifts[0].closed_pole.real > rounding(loop.poles):
         return shifts[0]
 
     def without(one: PoleShift) -> ClosedLoop:
@@ -223,78 +227,78 @@ def _behind(
     return suspects[best] if loops[best].stable else None
 
 
-class _Rest:
-    """A loop from which one mode at a time is taken out: T = (I - C G)⁻¹ C, C the controller and G all other modes."""
+class _LoopWithoutOne:
+    """A loop without one of its modes: T = (I - C G)⁻¹ C, C the controller and G all other modes."""
 
     def __init__(self, modes: Modes, controller: Controller) -> None:
-        self.modes, self.controller, self._apart = modes, controller, modes.proportional
+        self.modes, self.controller = modes, controller
         self.slowest = modes.omega[modes.omega > 0].min() if modes.omega.any() else 1.0
-        self.pushed = input_matrix(modes, controller.law.actuators)
-        self.seen = reading(modes, controller.sensors)
+        self.inputs = input_matrix(modes, controller.law.actuators)
+        self.outputs = reading(modes, controller.sensors)
 
     def forces(self, r: int, s: complex) -> np.ndarray:
         """T(s) (n_actuators, n_channels) without mode r."""
         c, others = self.controller, np.arange(self.modes.n_modes) != r
-        plant = self.read(s)[:, others] @ self.moved(others, s, self.pushed[others])
+        plant = self.output(s)[:, others] @ self.displacements(others, s, self.inputs[others])
         own = c.direct + c.commands @ np.linalg.solve(s * np.eye(len(c.state)) - c.state, c.reads)
-        own = self._late(c.law.actuators, s)[:, None] * own * self._late(c.sensors, s)
-        # least squares: where the rest has this pole too, as of several rigid modes that one sensor reads, no one
-        # solution is the mode's share of it
+        own = self._lags(c.law.actuators, s)[:, None] * own * self._lags(c.sensors, s)
+        # least squares, because the matrix is singular where the loop without mode r has the pole s too, as with
+        # several rigid modes that one sensor reads
         return np.asarray(np.linalg.lstsq(np.eye(len(own)) - own @ plant, own, rcond=None)[0])
 
-    def read(self, s: complex) -> Complexes:
-        """(n_channels, n_modes): what the sensors read of each mode, before their own lags and delays."""
+    def output(self, s: complex) -> Complexes:
+        """C_q + s C_v (n_channels, n_modes): readings per modal displacement, without lags and delays of sensors."""
         n = self.modes.n_modes
-        return np.asarray(self.seen[:, :n] + s * self.seen[:, n:])
+        return np.asarray(self.outputs[:, :n] + s * self.outputs[:, n:])
 
-    def moved(self, others: Flags, s: complex, forces: np.ndarray) -> Complexes:
-        """Z(s)⁻¹ forces: how modal forces (n_others, n) on some modes move these."""
+    def displacements(self, others: Flags, s: complex, forces: np.ndarray) -> Complexes:
+        """Z(s)⁻¹ F: modal displacements (n_others, n) of some modes under modal forces F (n_others, n) on them."""
         diagonal = s**2 + s * np.diag(self.modes.damping)[others] + self.modes.omega[others] ** 2
-        # an undamped twin of the mode answers without bound at their pole: a hair beside it
+        # an undamped mode equal to mode r has an infinite response at their pole: a small stiffness bounds it
         diagonal = np.where(diagonal == 0, TWIN * max(abs(s), self.slowest) ** 2, diagonal)
-        if self._apart:
+        if self.modes.proportional:
             return np.asarray(forces / diagonal[:, None])
-        stiff = s * self.modes.damping[np.ix_(others, others)]
-        np.fill_diagonal(stiff, diagonal)
-        return np.asarray(np.linalg.solve(stiff, forces))
+        stiffness = s * self.modes.damping[np.ix_(others, others)]
+        np.fill_diagonal(stiffness, diagonal)
+        return np.asarray(np.linalg.solve(stiffness, forces))
 
-    def _late(self, parts: Sequence[Actuator | Sensor], s: complex) -> Complexes:
-        """What lag and delay of each part make of a signal at s, (n_parts,)."""
-        found = np.ones(len(parts), complex)
+    def _lags(self, parts: Sequence[Actuator | Sensor], s: complex) -> Complexes:
+        """Transfer functions (n_parts,) of the lag and delay of each actuator or sensor at s."""
+        transfer = np.ones(len(parts), complex)
         for j, part in enumerate(parts):
             for _, (a, b, c) in lateness(part, self.modes):
-                found[j] *= c @ np.linalg.solve(s * np.eye(len(b)) - a, b)
-        return found
+                transfer[j] *= c @ np.linalg.solve(s * np.eye(len(b)) - a, b)
+        return transfer
 
 
-class _OneMode:
-    """One residual mode in the loop of all the rest."""
+class _ResidualMode:
+    """Residual mode r, of open-loop pole λ, in the loop of all the others."""
 
-    def __init__(self, rest: _Rest, r: int, pole: complex) -> None:
+    def __init__(self, rest: _LoopWithoutOne, r: int, pole: complex) -> None:
         self._rest, self._r, self.pole = rest, r, pole
         damping, self._others = rest.modes.damping, np.arange(rest.modes.n_modes) != r
         coupled = not rest.modes.proportional
-        self._by, self._on = coupled * damping[r, self._others], coupled * damping[self._others, r]
+        self._row, self._column = coupled * damping[r, self._others], coupled * damping[self._others, r]
 
     def _slope(self, s: complex) -> complex:
-        """E(s), without the difference of what is nearly equal: Z(s)⁻¹ - Z(λ)⁻¹ by the resolvent identity."""
+        """E(s), without cancellation: Z(s)⁻¹ - Z(λ)⁻¹ by the resolvent identity."""
         rest, others, own = self._rest, self._others, s + self.pole
-        alone = complex(own + rest.modes.damping[self._r, self._r])
+        uncoupled = complex(own + rest.modes.damping[self._r, self._r])
         if rest.modes.proportional:
-            return alone
-        answer = rest.moved(others, self.pole, self._on[:, None])
-        between = own * answer + rest.modes.damping[np.ix_(others, others)] @ answer
-        inner = rest.moved(others, s, own * self._on[:, None] - self.pole**2 * between)
-        return alone - complex(self._by @ inner[:, 0])
+            return uncoupled
+        response = rest.displacements(others, self.pole, self._column[:, None])
+        between = own * response + rest.modes.damping[np.ix_(others, others)] @ response
+        inner = rest.displacements(others, s, own * self._column[:, None] - self.pole**2 * between)
+        return uncoupled - complex(self._row @ inner[:, 0])
 
     def _terms(self, s: complex) -> Complexes:
-        """Shares (n_actuators, n_channels) of the movement that s would be."""
+        """Terms (n_actuators, n_channels) of the shift Δ, evaluated at s."""
         rest, others = self._rest, self._others
-        read, slope = rest.read(s), self._slope(s)
-        pushed = rest.pushed[self._r] - s * self._by @ rest.moved(others, s, rest.pushed[others])
-        seen = read[:, self._r] - s * read[:, others] @ rest.moved(others, s, self._on[:, None])[:, 0]
-        terms: Complexes = pushed[:, None] * rest.forces(self._r, s) * seen
-        # of a double pole one may stay, that of a rigid mode whose velocity alone is read say: nothing moves it
+        output, slope = rest.output(s), self._slope(s)
+        b = rest.inputs[self._r] - s * self._row @ rest.displacements(others, s, rest.inputs[others])
+        c = output[:, self._r] - s * output[:, others] @ rest.displacements(others, s, self._column[:, None])[:, 0]
+        terms: Complexes = b[:, None] * rest.forces(self._r, s) * c
+        # one of a double pole may not move, as that of a rigid mode whose velocity alone is read
         return 0.0 * terms if abs(slope) <= DOUBLE * rest.slowest else terms / slope
 
     def shifted(self, closed: complex) -> PoleShift:
@@ -305,9 +309,9 @@ class _OneMode:
         double = abs(self._slope(self.pole)) <= DOUBLE * abs(self.pole)
         first = np.full_like(exact, complex(np.nan, np.nan)) if double else self._terms(self.pole)
         sensors = self._rest.controller.sensors
-        found = []
+        paths = []
         for j, actuator in enumerate(self._rest.controller.law.actuators):
             for place in self._rest.controller.places:
                 here = [sensor.at == place for sensor in sensors]
-                found.append(Path(actuator.name, place, complex(exact[j, here].sum()), complex(first[j, here].sum())))
-        return tuple(sorted(found, key=lambda path: -path.shift.real))
+                paths.append(Path(actuator.name, place, complex(exact[j, here].sum()), complex(first[j, here].sum())))
+        return tuple(sorted(paths, key=lambda path: -path.shift.real))

@@ -1,4 +1,4 @@
-"""Performance of a design on the full plant: cost, effort, spillover and stability margin, with any estimator."""
+"""Performance of a design on the full plant: cost, effort, spillover and stability margin."""
 
 from dataclasses import dataclass
 
@@ -16,13 +16,13 @@ from workbench.structure.modes import Modes
 
 @dataclass(frozen=True)
 class Performance:
-    """What a design does up to the final time; cost, effort and W_R are infinite where the loop is unstable.
+    """Performance of a design up to the final time; cost, effort and W_R are infinite where the loop is unstable.
 
     Attributes:
-        cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt, Σ over the controlled modes as they are, not as they are estimated.
+        cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt, Σ over the controlled modes, by their true coordinates.
         effort: ∫ FᵀF dt.
         spillover: W_R, work in the residual modes.
-        margin: distance of the rightmost pole from the axis, 1/s; nan where a loop has no poles.
+        margin: distance of the rightmost pole from the axis, 1/s; nan for on-off control, which has no poles.
     """
 
     cost: float
@@ -34,7 +34,7 @@ class Performance:
 
 
 def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: float) -> Performance:
-    """A linear loop, exactly: every figure is a quadratic form of the state, its integral one matrix.
+    """The performance of a linear loop, exact: integrals of quadratic forms of the state by one matrix exponential.
 
     Args:
         loop: from `close_loop` or `close_with`.
@@ -62,7 +62,7 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
 def on_off_performance(
     modes: Modes, law: OnOffLaw, state: np.ndarray, *, weight: float, final_time: float
 ) -> Performance:
-    """The same of on-off control, whose motion is exact, by integrals from switching to switching.
+    """The performance of on-off control, from its exact motion, integrated from switching to switching.
 
     Raises:
         DesignError: an actuator that `respond_on_off` refuses.

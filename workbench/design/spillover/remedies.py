@@ -1,6 +1,6 @@
-"""The smallest change that stabilises a loop that spillover destabilises: a lower gain, a place moved, added sensors.
+"""The smallest change that stabilises a loop unstable by spillover: a lower gain, a place moved, or added sensors.
 
-Every change is a new design, and every margin is that of the new loop on the full plant, recomputed.
+Every change is a new design, and every margin is that of its loop on the full plant.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,13 +20,13 @@ from workbench.structure.modes import Modes
 from workbench.structure.printed import counted
 from workbench.threads import one_blas_thread
 
-# redesign(actuators, places of the sensors, share of the gain) gives the controller anew
+# redesign(actuators, places of the sensors, factor of the gain) gives a controller
 Redesign = Callable[[Sequence[Actuator], Sequence[Any], float], Controller]
 
-STEPS = 50
-HALVINGS = 14
+STEPS = 50  # of the scan of sizes of a change; also places along a structure where a sensor may be added
+HALVINGS = 14  # of the bisection of the smallest size
 PER_SIDE = 12  # places along the longer side of a plate where a sensor may be added
-APART = 1e-3  # of the size: nearer to another, a sensor reads the same
+APART = 1e-3  # of the size of the structure: least distance of an added sensor from others
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Remedy:
     Attributes:
         kind: "gain", "actuator", "sensor" or "sensors added".
         change: in words.
-        size: share of the gain given up, m moved, or number of sensors added.
+        size: relative reduction of the gain, distance moved in m, or number of sensors added.
         margin: of the loop with the change, 1/s.
         controller: with the change.
     """
@@ -50,6 +50,8 @@ class Remedy:
 
 @dataclass(frozen=True)
 class _Setting:
+    """Arguments of a redesign: actuators, places of the sensors, and the factor of the gain."""
+
     actuators: tuple[Actuator, ...]
     sensors: tuple[Place, ...]
     share: float = 1.0
@@ -66,17 +68,17 @@ def spillover_remedies(
     margin: float = 0.0,
     max_added: int = 6,
 ) -> tuple[Remedy, ...]:
-    """One remedy of each kind that has one, each verified on the full plant; none where the loop needs none.
+    """The smallest remedy of each kind, each verified on the full plant; empty where the loop has the margin already.
 
     A place is moved along the structure, on a rectangle along one of its sides, and among named points to another point
-    of its direction. What acts between two points or pairs is not moved, nor is anything where positions are not known.
+    of the same direction. Actuators between two points or pairs, and points of unknown position, are not moved.
 
     Args:
         modes: of the full plant.
-        redesign: the way the controller was designed.
-        actuators, sensors: as they stand; sensors by place: x or (x, y) in m, or names of points.
-        margin: wanted of the rightmost pole, 1/s; 0 for no growth, which a marginally stable loop has too.
-        max_added: sensors to try.
+        redesign: repeats the design of the controller for other actuators, sensors and gain.
+        actuators, sensors: of the design; sensors by place: x or (x, y) in m, or names of points.
+        margin: wanted distance of the rightmost pole from the axis, 1/s; with 0 marginal stability is enough.
+        max_added: largest number of sensors to add.
 
     Raises:
         PlaceError: a sensor where the structure has no place.
@@ -86,42 +88,42 @@ def spillover_remedies(
         domain.locate(at)
     start = _Setting(tuple(actuators), tuple(sorted(same_place(at) for at in sensors)))
 
-    def met(setting: _Setting) -> float:
-        """How far the margin exceeds what is wanted, and more than by rounding; -inf where there is no such design."""
-        found, by = _margin(modes, redesign, setting)
-        return found - by - margin
+    def excess(setting: _Setting) -> float:
+        """Margin less rounding less the wanted margin, 1/s; -inf where the design fails."""
+        achieved, tolerance = _margin(modes, redesign, setting)
+        return achieved - tolerance - margin
 
     def remedy(kind: str, change: str, size: float, setting: _Setting) -> Remedy:
         controller = redesign(setting.actuators, setting.sensors, setting.share)
         return Remedy(kind, change, size, close_with(modes, controller).margin, controller)
 
-    # a marginally stable loop does not grow: no change of rounding alone is a remedy
+    # a marginally stable loop needs no remedy where the wanted margin is 0
     if sum(_margin(modes, redesign, start)) >= margin:
         return ()
-    found = []
-    given_up = _least(lambda size: met(replace(start, share=1.0 - size)), 1.0)
-    if given_up is not None:
-        setting = replace(start, share=1.0 - given_up)
-        found.append(remedy("gain", f"gain lowered to {setting.share:.3f} of itself", given_up, setting))
+    remedies = []
+    reduction = _smallest(lambda size: excess(replace(start, share=1.0 - size)), 1.0)
+    if reduction is not None:
+        setting = replace(start, share=1.0 - reduction)
+        remedies.append(remedy("gain", f"gain lowered to {setting.share:.3f} of itself", reduction, setting))
     for kind, movable in (("actuator", _actuators(start)), ("sensor", _sensors(start, domain))):
         best: tuple[float, str, _Setting] | None = None
         for name, where, put in movable:
 
-            def met_at(at: Where, put: Callable[[Any], _Setting] = put) -> float:
-                return met(put(at))
+            def excess_at(at: Where, put: Callable[[Any], _Setting] = put) -> float:
+                return excess(put(at))
 
-            moved = _least_move(domain, where, met_at, best[0] if best else np.inf)
+            moved = _smallest_move(domain, where, excess_at, best[0] if best else np.inf)
             if moved is not None:
                 text = domain.text(middle(moved[1]), digits=4)
                 best = moved[0], f"{name} moved to {text}", put(moved[1])
         if best is not None:
-            found.append(remedy(kind, best[1], best[0], best[2]))
-    added = _added(start, met, domain, max_added)
+            remedies.append(remedy(kind, best[1], best[0], best[2]))
+    added = _added(start, excess, domain, max_added)
     if added is not None:
         new = [at for at in added.sensors if at not in start.sensors]
         where = ", ".join(domain.text(at, digits=4) for at in new)
-        found.append(remedy("sensors added", f"{counted(len(new), 'sensor')} more, at {where}", len(new), added))
-    return tuple(found)
+        remedies.append(remedy("sensors added", f"{counted(len(new), 'sensor')} more, at {where}", len(new), added))
+    return tuple(remedies)
 
 
 def sufficient_sensors(
@@ -131,21 +133,21 @@ def sufficient_sensors(
     *,
     most: int = 60,
 ) -> tuple[int | None, np.ndarray]:
-    """The least number of evenly spaced sensors from which on the loop is stable, and the margin with 1, 2, … sensors.
+    """The least number of evenly spaced sensors that stabilises the loop, and the margins with 1, 2, … sensors, 1/s.
 
-    Three further numbers of sensors must do too, lest one count be lucky.
+    The next three numbers of sensors must stabilise it too. The number is None where up to `most` sensors do not.
     """
-    margins, enough = np.full(most, -np.inf), np.zeros(most)
+    margins, tolerances = np.full(most, -np.inf), np.zeros(most)
     for k in range(1, most + 1):
         places = modes.length * np.arange(1, k + 1) / (k + 1)
-        margins[k - 1], enough[k - 1] = _margin(modes, redesign, _Setting(tuple(actuators), tuple(places)))
-        if k > 3 and (margins[k - 4 : k] > enough[k - 4 : k]).all():
+        margins[k - 1], tolerances[k - 1] = _margin(modes, redesign, _Setting(tuple(actuators), tuple(places)))
+        if k > 3 and (margins[k - 4 : k] > tolerances[k - 4 : k]).all():
             return k - 3, margins[:k]
     return None, margins
 
 
 def _margin(modes: Modes, redesign: Redesign, setting: _Setting) -> tuple[float, float]:
-    """The margin of a design and what rounding may make of it; -inf where there is no such design."""
+    """The margin of a design and its rounding error, 1/s; -inf where the design fails."""
     try:
         loop = close_with(modes, redesign(setting.actuators, setting.sensors, setting.share))
     except (DesignError, ValueError):
@@ -153,45 +155,47 @@ def _margin(modes: Modes, redesign: Redesign, setting: _Setting) -> tuple[float,
     return loop.margin, rounding(loop.poles)
 
 
-def _least(met: Callable[[float], float], most: float) -> float | None:
-    """The least size in (0, most) from which on `met` is positive, to a hair: steps outwards, then halvings."""
+def _smallest(excess: Callable[[float], float], most: float) -> float | None:
+    """The smallest size in (0, most) with a positive excess, by a scan and bisection; None if the scan meets none."""
     below = 0.0
     for step in range(1, STEPS):
         size = most * step / STEPS
-        if met(size) > 0:
+        if excess(size) > 0:
             above = size
             for _ in range(HALVINGS):
                 middle = 0.5 * (below + above)
-                below, above = (below, middle) if met(middle) > 0 else (middle, above)
+                below, above = (below, middle) if excess(middle) > 0 else (middle, above)
             return above
         below = size
     return None
 
 
-def _least_move(domain: Domain, where: Where, met: Callable[[Where], float], most: float) -> tuple[float, Where] | None:
-    """The least distance, m, less than a bound, by which a place is to be moved, and where it is then."""
+def _smallest_move(
+    domain: Domain, where: Where, excess: Callable[[Where], float], most: float
+) -> tuple[float, Where] | None:
+    """The smallest move of a place with a positive excess: its distance, below `most`, m, and the new place."""
     if isinstance(domain, NamedPoints):
         near = (other for other in _others(domain, where) if other[0] < most)
-        return next(((distance, name) for distance, name in near if met(name) > 0), None)
+        return next(((distance, name) for distance, name in near if excess(name) > 0), None)
     best = None
-    for room, moved in _ways(domain, where):
-        size = _least(lambda distance, moved=moved: met(moved(distance)), min(room, best[0] if best else most))  # type: ignore[misc]
+    for room, moved in _directions(domain, where):
+        size = _smallest(lambda distance, moved=moved: excess(moved(distance)), min(room, best[0] if best else most))  # type: ignore[misc]
         if size is not None:
             best = size, moved(size)
     return best
 
 
-def _ways(domain: Domain, where: Where) -> Iterator[tuple[float, Callable[[float], Where]]]:
-    """How far a place can be moved each way along each coordinate, m, and where it is then."""
+def _directions(domain: Domain, where: Where) -> Iterator[tuple[float, Callable[[float], Where]]]:
+    """For each direction along each coordinate: the largest distance of a move, m, and the new place by distance."""
     if isinstance(domain, NamedPoints) or (isinstance(where, Between) and len(domain.coordinates) > 1):
         return
     at, (low, high) = np.atleast_1d(np.asarray(middle(where), float)), reach(domain, where)
-    for axis, way in product(range(at.size), (-1.0, 1.0)):
+    for axis, sign in product(range(at.size), (-1.0, 1.0)):
 
-        def moved(distance: float, axis: int = axis, way: float = way) -> Where:
-            return centred_at(where, same_place(at + way * distance * (np.arange(at.size) == axis)))
+        def moved(distance: float, axis: int = axis, sign: float = sign) -> Where:
+            return centred_at(where, same_place(at + sign * distance * (np.arange(at.size) == axis)))
 
-        yield float(at[axis] - low[axis] if way < 0 else high[axis] - at[axis]), moved
+        yield float(at[axis] - low[axis] if sign < 0 else high[axis] - at[axis]), moved
 
 
 def _others(domain: NamedPoints, where: Where) -> list[tuple[float, str]]:
@@ -199,13 +203,13 @@ def _others(domain: NamedPoints, where: Where) -> list[tuple[float, str]]:
     if domain.positions is None or not isinstance(where, str):
         return []
     (own,) = domain.locate(where)
-    far = np.linalg.norm(domain.positions - domain.positions[own], axis=1)
-    alike = [i for i, way in enumerate(domain.directions) if way == domain.directions[own] and i != own]
-    return sorted((float(far[i]), domain.names[i]) for i in alike)
+    distances = np.linalg.norm(domain.positions - domain.positions[own], axis=1)
+    parallel = [i for i, way in enumerate(domain.directions) if way == domain.directions[own] and i != own]
+    return sorted((float(distances[i]), domain.names[i]) for i in parallel)
 
 
 def _actuators(start: _Setting) -> Iterator[tuple[str, Where, Callable[[Any], _Setting]]]:
-    """Each actuator, where it stands, and the setting with it elsewhere."""
+    """Of each actuator: its name, its place, and the setting as a function of another place."""
     for j, actuator in enumerate(start.actuators):
 
         def put(at: Where, j: int = j, actuator: Actuator = actuator) -> _Setting:
@@ -215,7 +219,7 @@ def _actuators(start: _Setting) -> Iterator[tuple[str, Where, Callable[[Any], _S
 
 
 def _sensors(start: _Setting, domain: Domain) -> Iterator[tuple[str, Where, Callable[[Any], _Setting]]]:
-    """The same of each sensor."""
+    """Of each sensor: its name, its place, and the setting as a function of another place."""
     for i, at in enumerate(start.sensors):
 
         def put(there: Place, i: int = i) -> _Setting:
@@ -224,8 +228,8 @@ def _sensors(start: _Setting, domain: Domain) -> Iterator[tuple[str, Where, Call
         yield f"sensor at {domain.text(at, digits=4)}", at, put
 
 
-def _added(start: _Setting, met: Callable[[_Setting], float], domain: Domain, most: int) -> _Setting | None:
-    """Sensors added one by one, each where it serves best."""
+def _added(start: _Setting, excess: Callable[[_Setting], float], domain: Domain, most: int) -> _Setting | None:
+    """The setting with sensors added one by one, each at the place of the largest margin; None where `most` fail."""
     setting = start
     grid = domain.grid(STEPS if len(domain.coordinates) == 1 else PER_SIDE)
     for _ in range(most):
@@ -237,7 +241,7 @@ def _added(start: _Setting, met: Callable[[_Setting], float], domain: Domain, mo
         ]
         if not candidates:
             return None
-        setting = max(candidates, key=met)
-        if met(setting) > 0:
+        setting = max(candidates, key=excess)
+        if excess(setting) > 0:
             return setting
     return None

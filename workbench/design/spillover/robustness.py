@@ -1,7 +1,7 @@
-"""Robustness of a design to the errors of identification: the share of perturbed models that stay stable.
+"""Robustness of a design to errors of identification: the share of perturbed models that stay stable.
 
-Frequencies and damping ratios are drawn from their covariance, shapes from theirs at the sensors, carried everywhere by
-the modes themselves: φ_r + Σ_s e_rs φ_s.
+Frequencies and damping ratios are drawn from their covariance. Shapes are drawn from their covariance at the sensors;
+the modes themselves interpolate the error, φ_r + Σ_s e_rs φ_s.
 """
 
 from collections.abc import Mapping
@@ -18,12 +18,12 @@ from workbench.design.spillover.spillover import finite_spillover
 from workbench.structure.modes import Modes, freeze
 from workbench.threads import one_blas_thread
 
-LEAST_OMEGA = 1e-3
+LEAST_OMEGA = 1e-3  # of the frequency: lower bound of a drawn one
 
 
 @dataclass(frozen=True, eq=False)
 class Robustness:
-    """A design on many perturbed models.
+    """Stability margins and spillover of a design on many perturbed models.
 
     Attributes:
         margins: (n_draws,) stability margin of each, 1/s; ± rounding where the loop is marginally stable.
@@ -43,16 +43,16 @@ class Robustness:
 
     @property
     def standard_error(self) -> float:
-        """Of the share, from the number of draws."""
+        """Standard error of the share, for the number of draws."""
         return float(np.sqrt(self.share * (1 - self.share) / self.margins.size))
 
     def spread(self, level: float = 0.9) -> tuple[float, float, float]:
-        """W_R of the stable draws: lower end of the interval, median, upper end; nan where none is stable."""
-        there = self.work[np.isfinite(self.work)]
-        if not there.size:
+        """W_R of the stable draws: lower end of the central interval, median, upper end; nan where none is stable."""
+        stable = self.work[np.isfinite(self.work)]
+        if not stable.size:
             return np.nan, np.nan, np.nan
-        low, middle, high = np.quantile(there, (0.5 - 0.5 * level, 0.5, 0.5 + 0.5 * level))
-        return float(low), float(middle), float(high)
+        low, median, high = np.quantile(stable, (0.5 - 0.5 * level, 0.5, 0.5 + 0.5 * level))
+        return float(low), float(median), float(high)
 
 
 def draw_modes(
@@ -64,13 +64,13 @@ def draw_modes(
     shape_covariance: ArrayLike | None = None,
     positions: ArrayLike | None = None,
 ) -> list[Modes]:
-    """Structures that the identification leaves possible.
+    """Models drawn from the identified modes and their covariance.
 
     Args:
         modes: identified, with the covariance of (ω, ζ).
-        count: how many.
+        count: number of draws.
         seed: of the draws.
-        scale: of all standard errors; 1 as identified.
+        scale: factor of all standard errors.
         shape_covariance: (n_modes, n_sensors, n_sensors) of the shapes, relative to the largest entry of each.
         positions: (n_sensors,) of the sensors, m.
 
@@ -88,18 +88,19 @@ def draw_modes(
     mixing = np.zeros((count, n, n))
     if shape_covariance is not None and positions is not None:
         at = modes.phi(positions)
-        known = np.linalg.pinv(at)
+        inverse = np.linalg.pinv(at)
         for r, covariance in enumerate(np.asarray(shape_covariance, float)):
             largest = np.abs(at[:, r]).max()
             error = largest * rng.standard_normal((count, len(at))) @ symmetric_root(covariance).T
-            mixing[:, :, r] = scale * error @ known.T
-    return [_possible(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
+            mixing[:, :, r] = scale * error @ inverse.T
+    return [_perturbed(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
 
 
-def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:
+def _perturbed(modes: Modes, values: np.ndarray, mixing: np.ndarray) -> Modes:
+    """Modes of given ω and ζ, `values` (2 n_modes,), and the shapes φ (I + mixing), mixing (n_modes, n_modes)."""
     n = modes.n_modes
-    omega = np.maximum(figures[:n], LEAST_OMEGA * modes.omega)
-    c = np.diag(2.0 * figures[n:] * omega)
+    omega = np.maximum(values[:n], LEAST_OMEGA * modes.omega)
+    c = np.diag(2.0 * values[n:] * omega)
     blend = np.eye(n) + mixing
     return Modes(omega, c, lambda x, d: modes.shapes(x, d) @ blend, modes.domain, modes.essential, masses=modes.masses)
 
@@ -107,8 +108,7 @@ def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:
 def perturbed_modes(modes: Modes, error: float, *, count: int = 100, seed: int = 0) -> list[Modes]:
     """Models perturbed by a relative standard error, where no identification gives their covariance.
 
-    Frequencies and damping ratios are off by it each; every shape has some of all others in it, in mean square this
-    share of its own size.
+    The error is that of each frequency and damping ratio, and the root mean square of all modes mixed into a shape.
 
     Raises:
         DesignError: an error that is not positive.
@@ -119,11 +119,11 @@ def perturbed_modes(modes: Modes, error: float, *, count: int = 100, seed: int =
     centre = np.r_[modes.omega, modes.zeta]
     drawn = centre * (1.0 + error * rng.standard_normal((count, 2 * n)))
     mixing = error / np.sqrt(n) * rng.standard_normal((count, n, n))
-    return [_possible(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
+    return [_perturbed(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
 
 
 def stable_share(possible: list[Modes], design: Controller | Law) -> float:
-    """Share of the structures on which a design is stable."""
+    """Share of the models on which a design is stable."""
     return float(np.mean([close_with(modes, design).stable for modes in possible]))
 
 
@@ -131,7 +131,7 @@ def stable_share(possible: list[Modes], design: Controller | Law) -> float:
 def robustness(
     possible: list[Modes], designs: Mapping[str, Controller | Law], *, state: np.ndarray, final_time: float
 ) -> dict[str, Robustness]:
-    """Each design on each possible structure.
+    """The robustness of each design, evaluated on each of the models.
 
     Args:
         possible: from `draw_modes`.
@@ -139,7 +139,7 @@ def robustness(
         state: (2 n_modes,) at t = 0.
         final_time: s, of W_R.
     """
-    found = {}
+    results = {}
     for name, controller in designs.items():
         margins, work = np.empty(len(possible)), np.full(len(possible), np.nan)
         for i, modes in enumerate(possible):
@@ -147,5 +147,5 @@ def robustness(
             margins[i] = loop.margin
             if loop.stable:
                 work[i] = finite_spillover(loop, state, final_time).residual_total
-        found[name] = Robustness(margins, work)
-    return found
+        results[name] = Robustness(margins, work)
+    return results

@@ -1,11 +1,11 @@
-"""The work of the actuators in every mode: taken from the controlled ones, and given to the residual ones (spillover).
+"""The work of the actuators in every mode: negative in the controlled ones, spillover in the residual ones.
 
 Dissertation (5.18)-(5.44). With W_r the work of all actuators in mode r, W_C sums the controlled modes and W_R the
 residual ones. For an undamped residual mode at rest and t_f to infinity the double integral (5.43) is
 
     W_r = ½ |b_rᵀ F(iω_r)|²,   F(s) = -K (s I - A_C)⁻¹ x_C(0),
 
-the energy that the actuators' forces leave in it.
+the energy that the actuators' forces leave in the mode.
 """
 
 from collections.abc import Sequence
@@ -27,12 +27,12 @@ from workbench.structure.domain import gauss_between
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed
 
-GAUSS_POINTS = 12
+GAUSS_POINTS = 12  # per radian of the fastest mode between switchings
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Spillover(Printed):
-    """Work by mode, J (or the consistent unit).
+    """Work of the actuators by mode, J (or the consistent unit).
 
     Attributes:
         by_mode: (n_modes,) W of every mode.
@@ -82,10 +82,10 @@ class Spillover(Printed):
 
 
 def force_transform(modes: Modes, law: Law, state: Floats, s: Complexes) -> Complexes:
-    """Laplace transforms (n_actuators, n_s) of the actuator forces, exact modal coordinates fed back.
+    """Laplace transforms (n_actuators, n_s) of the actuator forces of a law on exact modal coordinates.
 
     Args:
-        state: (2 n_modes,) at t = 0, all modes; only the controlled ones matter.
+        state: (2 n_modes,) at t = 0; only the controlled modes matter.
         s: (n_s,) complex, rad/s.
     """
     loop, start, feedback, _ = _controlled_loop(modes, law, state)
@@ -98,19 +98,19 @@ def force_transform(modes: Modes, law: Law, state: Floats, s: Complexes) -> Comp
 
 
 def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
-    """Work in every mode for t_f to infinity, in closed form, exact modal coordinates fed back.
+    """Work in every mode for t_f to infinity, in closed form, of a law on exact modal coordinates.
 
-    The controlled modes give all their energy: W_r = -E_r(0). A residual mode must be undamped; at rest at first it
-    gains ½|b_rᵀF(iω_r)|², and one already moving also Re(conj(q_r'(0) + iω_r q_r(0)) b_rᵀ F(iω_r)).
+    The controlled modes lose all their energy: W_r = -E_r(0). A residual mode must be undamped; from rest it gains
+    ½|b_rᵀF(iω_r)|², and from another state also Re(conj(q_r'(0) + iω_r q_r(0)) b_rᵀ F(iω_r)).
 
     Raises:
-        DesignError: damping, gyroscopic terms among it (take a finite time), or a loop that does not settle.
+        DesignError: damping or gyroscopic terms (take a finite time), or a loop that does not settle.
     """
     n, index = modes.n_modes, list(law.controlled)
     residual = [r for r in range(n) if r not in law.controlled]
     if modes.damping.any():
         raise DesignError(
-            "damping shares the work or carries it from mode to mode: use"
+            "with damping the actuators' work is no longer the energy left in a mode: use"
             " workbench.design.spillover.spillover.finite_spillover(close_loop(modes, law), state, final_time)"
         )
     if np.linalg.eigvals(_controlled_loop(modes, law, state)[0]).real.max() >= 0:
@@ -128,21 +128,24 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
 
 
 def _controlled_loop(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats, Floats, Flags]:
-    """A of the controlled modes and of all that moves them, their part of a state, the forces' rows, which states.
+    """The closed loop of the states that the actuator forces depend on.
 
-    Others move them where damping couples them. The displacement of a rigid mode to which no gain answers moves
-    nothing, and is left out.
+    These are the controlled modes, and others where damping couples them. The displacement of a rigid mode without a
+    gain is not among them.
+
+    Returns:
+        A of these states, their initial values, the matrix from them to the forces, and the mask (n_states,) of them.
     """
     loop, index = close_loop(modes, law), np.array(law.controlled)
     own = np.asarray(loop.feedback.any(axis=0))
     own[np.r_[index[modes.omega[index] > 0], modes.n_modes + index]] = True
-    kept = loop.behind(own)
-    start = np.r_[state, np.zeros(kept.size - np.size(state))]
-    return loop.matrix[np.ix_(kept, kept)], start[kept], loop.feedback[:, kept], kept
+    needed = loop.behind(own)
+    start = np.r_[state, np.zeros(needed.size - np.size(state))]
+    return loop.matrix[np.ix_(needed, needed)], start[needed], loop.feedback[:, needed], needed
 
 
 def check_final_time(final_time: float) -> None:
-    """Refuse a time until which nothing can be summed.
+    """Refuse a final time that is not positive and finite.
 
     Raises:
         DesignError: a time that is not positive and finite.
@@ -152,9 +155,9 @@ def check_final_time(final_time: float) -> None:
 
 
 def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> Spillover:
-    """Work of the actuators in every mode up to a finite time, exactly, damping and filters included.
+    """Work of the actuators in every mode up to a finite time, exact, with damping and estimators.
 
-    W_r = ∫ b_rᵀF q_r' dt is the integral of a quadratic form of the state, taken from one matrix exponential.
+    W_r = ∫ b_rᵀF q_r' dt is the integral of a quadratic form of the state, by one matrix exponential.
     """
     check_final_time(final_time)
     n = loop.modes.n_modes
@@ -177,7 +180,7 @@ def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: floa
 
 
 def on_off_motion(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> tuple[Response, Floats]:
-    """The motion at instants (n_times,) up to a final time, and their weights (n_times,) in integrals over time, s."""
+    """The motion at quadrature instants (n_times,) up to a final time, and the quadrature weights (n_times,), s."""
     stretches = switchings(modes, law, state, final_time)
     events = np.unique(np.r_[0.0, [s.end for mode in stretches for s in mode], final_time])
     pieces = np.maximum(1, np.ceil(np.diff(events) * modes.omega.max())).astype(int)
@@ -189,12 +192,15 @@ def on_off_motion(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: fl
 
 
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
-    """∫ Fᵀ F dt over all time, exact modal coordinates fed back, by a Lyapunov equation; inf where they do not fade."""
+    """∫ Fᵀ F dt over all time, of a law on exact modal coordinates; inf where the loop does not settle."""
     return _integral(modes, law, state, 0.0, 1.0)
 
 
 def _integral(modes: Modes, law: Law, state: Floats, energies: float, weight: float | Floats) -> float:
-    """∫ (energies Σ (q_r'² + ω_r² q_r²) + Fᵀ R F) dt over all time, the sum over the controlled modes."""
+    """∫ (energies Σ (q_r'² + ω_r² q_r²) + Fᵀ R F) dt over all time, Σ over the controlled modes, R `weight`.
+
+    By a Lyapunov equation; inf where the loop does not settle.
+    """
     loop, start, feedback, kept = _controlled_loop(modes, law, state)
     poles = np.linalg.eigvals(loop)
     if poles.real.max() >= -ON_AXIS * np.abs(poles).max():
@@ -207,10 +213,10 @@ def _integral(modes: Modes, law: Law, state: Floats, energies: float, weight: fl
 
 
 def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np.ndarray) -> float:
-    """∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt of the controlled modes over all time; inf where they do not fade.
+    """∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt of the controlled modes over all time; inf where the loop does not settle.
 
     Args:
-        weight: R, a number or (n_actuators, n_actuators); R BᵀB weighs modal forces, R fᵀf.
+        weight: R, a number or (n_actuators, n_actuators).
     """
     return _integral(modes, law, state, 1.0, weight)
 
@@ -222,9 +228,10 @@ def modal_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> floa
 
 
 def distributed_cost(modes: Modes, controlled: int | Sequence[int], state: np.ndarray, weight: float) -> float:
-    """The least `modal_cost` of any law: that of distributed control, f(x, t) = Σ m φ_r f_r (5.5), with W_R = 0.
+    """The lowest `modal_cost` of any law: that of distributed control, f(x, t) = Σ m φ_r f_r (5.5), with W_R = 0.
 
-    Modal forces are then at will, one per mode, so the cost is Σ x_rᵀ P_r x_r of the closed-form Riccati equations.
+    Distributed control has a free force in every mode, so its cost is Σ x_rᵀ P_r x_r of the closed-form Riccati
+    equations.
     """
     index = list(controlled_indices(modes, controlled))
     p = riccati_matrices(modes.omega[index], weight, np.diag(modes.damping)[index])
@@ -238,7 +245,7 @@ def _energies(modes: Modes, state: Floats) -> Floats:
 
 
 def energy_gained(loop: ClosedLoop, state: np.ndarray, final_time: float) -> np.ndarray:
-    """Energy of each mode at the final time less that at the start, (n_modes,), from the motion itself."""
+    """Energy gained by each mode (n_modes,) from t = 0 to the final time, from the motion itself."""
     start = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
     end = expm(loop.matrix * final_time) @ start
     return _energies(loop.modes, end) - _energies(loop.modes, start)

@@ -113,7 +113,7 @@ class Verdict:
         place = self.where.place
         at = place_in_words(place.at, dict.fromkeys(COORDINATES, place.at_std))
         if self.is_located:
-            return f"{at}, of the unmodelled point force, no law assumed"
+            return f"{at}, of the unmodelled point force, without a force law"
         if place.is_single_force is not False:
             return ""
         return f"no single point force explains all of the gap; the best, {at}, explains {_percent(place.share)} of it"

@@ -1,4 +1,4 @@
-// The bench: each move asks the server for the design's answer, one question at a time, the last move never lost.
+// The bench: each change of the design is sent to the server, one request at a time; the last change is always sent.
 "use strict";
 (function () {
   var setting = JSON.parse(document.getElementById("setting").textContent), design = setting.design;
@@ -32,7 +32,7 @@
       .then(function () { busy = false; if (waiting) ask(); });
   }
 
-  // what the marks stand for
+  // legend of the marks
   var TRIANGLE = "M0,-10L8,6H-8Z", RING = "M0,-6A6,6 0 1 1 -0.01,-6Z", HAMMER = "M-9,-6H9V3H2V12H-2V3H-9Z";
   (function () {
     var box = document.querySelector(".key"), LINE = "M-11,0H11", BLOCK = "M-9,-6H9V6H-9Z", thin = { fill: "none", stroke: "var(--soft)", "stroke-width": 1.4 };
@@ -94,7 +94,7 @@
       });
     });
   }
-  // the middle of the widest gap between those that stand already; on a plate the spot farthest from them and the rim
+  // the middle of the widest gap between the present places; on a plate the point farthest from these and the edges
   function gap(places) {
     if (frame) {
       var taken = places.map(spotOf), away = function (name) { var p = spotOf(name); return Math.min.apply(null, taken.map(function (q) { return Math.hypot(p[0] - q[0], p[1] - q[1]); })); };
@@ -109,7 +109,7 @@
     for (var i = 1; i < all.length - 1; i++) if (all[i + 1] - all[i] > all[best + 1] - all[best]) best = i;
     return 0.5 * (all[best] + all[best + 1]);
   }
-  // where a named point is taken hold of, beside its node in its direction, and the point nearest to a spot, px
+  // the handle of a named point, beside its node in its direction, and the point nearest to a position, px
   function spotOf(name) {
     var i = frame.names.indexOf(name), p = frame.spots[i], way = frame.ways[i];
     return [X(p[0]) + frame.apart * way[0], Y(p[1]) - frame.apart * way[1]];
@@ -135,7 +135,7 @@
     })(r);
   }
 
-  // the structure with what stands on it: a line seen from the side, or a plate seen from above
+  // the structure with its actuators and sensors: a line seen from the side, or a plate seen from above
   var X, Y, line, still, free, beamY, reach = 1, INSET = 0.3, BESIDE_NODE = 18;
   function layout() {
     var width = stand.clientWidth;
@@ -169,7 +169,7 @@
     X = workbench.scale([0, sides[0]], false, left, left + w);
     Y = workbench.scale([0, sides[1]], false, pad + h, pad);
     frame.sway = 0.07 * Math.max(w, h);
-    var near = Infinity;  // the shortest way from one node to the next, px
+    var near = Infinity;  // the least distance of two nodes, px
     frame.lines.forEach(function (ends) {
       var a = frame.rest[ends[0]], b = frame.rest[ends[1]];
       near = Math.min(near, scale * Math.hypot(a[0] - b[0], a[1] - b[1]));
@@ -187,7 +187,7 @@
     var size = frame.sway / reach, spot = function (i) { return (X(frame.rest[i][0]) + size * values[2 * i]).toFixed(1) + "," + (Y(frame.rest[i][1]) - size * values[2 * i + 1]).toFixed(1); };
     return frame.lines.map(function (ends) { return "M" + spot(ends[0]) + "L" + spot(ends[1]); }).join("");
   }
-  // the plate as it is controlled, and small beside it as it is without control
+  // the plate under control, and a smaller one without control
   function above(width) {
     var left = 34, small = width > 640, most = (small ? 1 - INSET : 1) * width - left - 16;
     var scale = Math.min(most / sides[0], 420 / sides[1]), w = scale * sides[0], h = scale * sides[1];
@@ -209,7 +209,7 @@
     return image;
   }
   var canvas = document.createElement("canvas"), paint = canvas.getContext("2d");
-  // red up and blue down, the stronger the farther; a cell of the plate is a spot of the picture
+  // red up and blue down, more intense for larger displacements; one pixel per cell of the plate
   function painted(values) {
     var nx = setting.cells[0], ny = setting.cells[1];
     canvas.width = nx;
@@ -222,14 +222,14 @@
     paint.putImageData(spots, 0, 0);
     return canvas.toDataURL();
   }
-  // beside each handle its place, where it covers no other one, no other label and no member at rest
+  // a label with the place of each handle, where it covers no other handle, no label and no member at rest
   var tags = [], BESIDE = [[13, 4, "start"], [-13, 4, "end"], [0, 24, "middle"], [0, -15, "middle"], [12, 19, "start"], [-12, 19, "end"], [12, -10, "start"], [-12, -10, "end"]];
   function boxOf(spot, way, width) {
     var x = spot[0] + way[0] - (way[2] === "middle" ? width / 2 : way[2] === "end" ? width : 0), y = spot[1] + way[1];
     return [x - 1, y - 11, x + width + 1, y + 3];
   }
   function shared(a, b) { return Math.max(0, Math.min(a[2], b[2]) - Math.max(a[0], b[0])) * Math.max(0, Math.min(a[3], b[3]) - Math.max(a[1], b[1])); }
-  // how much of a segment lies in a box (Liang and Barsky 1984)
+  // length of the part of a segment inside a box (Liang and Barsky 1984)
   function inside(box, s) {
     var t = [0, 1], d = [s[2] - s[0], s[3] - s[1]];
     for (var k = 0; k < 2; k++) {
@@ -271,7 +271,7 @@
     handle("impulse_at", null, 20, HAMMER, flat ? "var(--ink)" : "var(--soft)", "hammer");
     settle();
   }
-  // a place inside, all of a patch on the structure
+  // the nearest place at which the whole patch is on the structure
   function held(kind, place) {
     if (frame) return nearest(place);
     var inside = [].concat(place).map(function (v, d) {
@@ -288,7 +288,7 @@
     }
     svg("circle", { class: "halo", r: 20 }, g);
     svg("path", { d: path, fill: fill, stroke: flat && kind !== "sensors" ? "var(--paper)" : "var(--ink)", "stroke-width": kind === "sensors" ? 1.5 : flat ? 1 : 0 }, g);
-    // along a member actuators and sensors keep their lane, and their labels stand below in rows
+    // along a member actuators and sensors have their own rows, with labels below
     var rows = [20, 33].map(function (y) { return [0, y, "middle"]; }), ways = flat ? BESIDE : kind === "impulse_at" ? [[14, 5, "start"], [-14, 5, "end"]] : rows;
     var tag = { label: svg("text", { class: "tag" }, g), spot: [0, 0], ways: ways };
     tags.push(tag);
@@ -329,7 +329,7 @@
     put();
   }
 
-  // what is found
+  // results
   function present() {
     ["residual", "effort", "peak_force"].forEach(function (name) { cards[name].textContent = figures(answer[name]); });
     var undamped = answer.stable && answer.undamped > 0;
@@ -409,7 +409,7 @@
     }).catch(function () { by("saved").textContent = "The bench no longer answers."; });
   });
   build();
-  var wide = 0;  // only a new width lays the stand out anew: a handle that is being dragged must live on
+  var wide = 0;  // the layout is made again only for a new width, so that a dragged handle persists
   new ResizeObserver(function () { if (stand.clientWidth !== wide) { wide = stand.clientWidth; layout(); } }).observe(stand.parentNode);
   requestAnimationFrame(step);
   ask();

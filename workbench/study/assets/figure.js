@@ -43,7 +43,7 @@ var workbench = (function () {
     if (axis.log && high / low > 12) {
       var first = Math.ceil(Math.log10(low) - 1e-9), last = Math.floor(Math.log10(high) + 1e-9);
       var every = Math.max(1, Math.ceil((last - first + 1) / wanted));
-      // of few decades their halves and fifths too
+      // with few decades, ticks at 2 and 5 too
       var parts = every > 1 || last - first >= 2 ? [1] : 3 * Math.log10(high / low) > 1.5 * wanted ? [1, 3] : [1, 2, 5];
       for (var e = parts.length > 1 ? first - 1 : first; e <= last; e += every) parts.forEach(function (part) {
         v = part * Math.pow(10, e);
@@ -59,7 +59,7 @@ var workbench = (function () {
     }
     return found.length < 2 && wanted < 9 ? ticks(axis, limits, wanted + 1) : found;
   }
-  // how long a word of an axis is, px
+  // width of a text of an axis, px
   var pen = document.createElement("canvas").getContext("2d");
   function textWidth(text) {
     pen.font = "12px " + getComputedStyle(document.body).fontFamily;
@@ -123,14 +123,14 @@ var workbench = (function () {
       paintAll();
       reset.hidden = !panel;
     }
-    // of an axis, or of those it is shared with
+    // the label of an axis, or of the first axis it is shared with
     function labelled(panel, axis) {
       var all = panels.filter(function (other) { return other.spec[axis].group === panel.spec[axis].group; });
       return all.map(function (other) { return other.spec[axis].label; }).filter(Boolean)[0] || "";
     }
     function sized(panel) {
       var p = panel.spec, width = panel.svg.clientWidth || panel.root.clientWidth, narrow = grid.clientWidth < 600;
-      // on a phone panels side by side stand below each other, away from the one that has the label
+      // on a narrow screen panels are stacked, and one without a label gets that of its row or column
       var apart = narrow && spec.columns > 1, x = apart ? labelled(panel, "x") : p.x.label, y = apart ? labelled(panel, "y") : p.y.label;
       var height = Math.max(150, Math.min(narrow ? 300 : 620, p.height * (narrow ? 1 : Math.min(1, grid.clientWidth / spec.width)) + 34));
       if (narrow) height = Math.max(height, 0.5 * width);
@@ -151,18 +151,18 @@ var workbench = (function () {
       while (node.firstChild) node.removeChild(node.firstChild);
       node.setAttribute("viewBox", "0 0 " + width + " " + height);
       node.setAttribute("height", height);
-      // panels above each other that share x begin at one place
+      // stacked panels that share x are aligned
       var left = Math.max.apply(null, panels.filter(function (other) {
         return other === panel || (other.spec.x.group === p.x.group && other.size.width === width);
       }).map(function (other) { return other.size.left; }));
       var field = p.marks.filter(function (m) { return m.kind === "field"; })[0];
       if (field) right -= 58;
-      p.marks.forEach(function (m) {  // room for words that begin at the right edge
+      p.marks.forEach(function (m) {  // room for texts at the right edge
         var out = m.kind === "text" && m.frame === "data" && m.across === "left" && m.x >= p.x.limits[1] - 0.01 * (p.x.limits[1] - p.x.limits[0]);
         if (out) right = Math.min(right, width - 6 - 6.6 * m.text.length);
       });
       var X = scale(panel.x, p.x.log, left, right), Y = scale(panel.y, p.y.log, bottom, top), wanted = Math.max(2, Math.round((right - left) / 75));
-      // room for the half of the last number that stands beyond its tick
+      // room for half the width of the last number
       var over = ticks(p.x, panel.x, wanted).map(function (t) { return X(t[0]) + 0.5 * textWidth(t[1]) - width; });
       right -= Math.max(0, Math.max.apply(null, over.concat([0])));
       X = scale(panel.x, p.x.log, left, right);
@@ -195,7 +195,7 @@ var workbench = (function () {
       var size = 6.2 * text.textContent.length;
       if (size > room) { text.setAttribute("textLength", room); text.setAttribute("lengthAdjust", "spacingAndGlyphs"); }
     }
-    // names of categories that would overlap: only every so many
+    // category names that would overlap: only every nth
     function spread(all, X) {
       var room = Math.abs(all.length > 1 ? X(all[1][0]) - X(all[0][0]) : 1e9);
       var need = 8 + 6.6 * Math.max.apply(null, all.map(function (t) { return t[1].length; }).concat([1]));

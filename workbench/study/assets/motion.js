@@ -1,4 +1,4 @@
-// Motion: a structure that vibrates in one of its modes, or moves as it did over time, without and with control.
+// Motion: animation of a structure in one of its modes, or of its responses over time.
 "use strict";
 workbench.COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"];
 workbench.move = function (root, spec) {
@@ -50,7 +50,7 @@ workbench.move = function (root, spec) {
   if (!modes && !spec.net) reach = largest();
 
   var X, Y, height = 240;
-  // a net: spots of a plate or a frame, moved in the plane of the picture; responses side by side, modes over each other
+  // a net: nodes of a plate or a frame, moved in the plane of the picture; responses side by side, modes superposed
   var net = spec.net;
   function spun(track, phase, frame) {
     var c = Math.cos(phase), s = Math.sin(phase), moves = track.moves, behind = track.imaginary;

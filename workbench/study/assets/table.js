@@ -1,4 +1,4 @@
-// Tables that sort by the column whose head is pressed, and the switch between light and dark.
+// Tables that sort by the column whose head is clicked, and the switch between light and dark.
 "use strict";
 document.querySelectorAll("table").forEach(function (table) {
   var heads = Array.from(table.tHead.rows[0].cells);
@@ -11,7 +11,7 @@ document.querySelectorAll("table").forEach(function (table) {
       function number(text) { return parseFloat(text.replace(/^[≤≥±]\s*/, "").replace("−", "-")); }
       Array.from(body.rows).sort(function (a, b) {
         var s = a.cells[column].textContent, t = b.cells[column].textContent, p = number(s), q = number(t);
-        if (isNaN(p) !== isNaN(q)) return isNaN(p) ? 1 : -1;  // what is no number stays below
+        if (isNaN(p) !== isNaN(q)) return isNaN(p) ? 1 : -1;  // values that are not numbers are last
         var order = isNaN(p) ? s.localeCompare(t) : p - q;
         return up ? order : -order;
       }).forEach(function (row) { body.appendChild(row); });

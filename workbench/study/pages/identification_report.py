@@ -1,4 +1,4 @@
-"""Identified modes as a table, remarks and JSON: what `workbench identify` reports."""
+"""The report of `workbench identify`: identified modes as a table, remarks and JSON."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,22 +20,22 @@ from workbench.structure.printed import counted
 
 TURN = 2.0 * np.pi
 UNLIKELY, MOST_MODES = 0.01, 40
-BROAD = 0.1  # damping ratio
+IMPLAUSIBLE_DAMPING = 0.1  # damping ratio above which a mode of transfer functions is doubtful
 MAINS_HZ, SURE = (50.0, 60.0), 3.0
-AGREED = 0.8  # phase collinearity below which points do not move in phase
+COLLINEAR = 0.8  # modal phase collinearity below which a shape counts as complex
 
 
 @dataclass(frozen=True)
 class IdentificationReport:
-    """A report.
+    """The report of an identification.
 
     Attributes:
-        heading: what was identified.
-        rows: one per mode, under `HEADINGS`; figures to the second digit of their standard errors.
+        heading: describes the data.
+        rows: one per mode, under `HEADINGS`; numbers to the second digit of their standard errors.
         lines: remarks.
         content: for JSON.
-        decays: free decays that the modes are of, or correlation functions that decay alike; none of other data.
-        fitted: the model of transfer functions at the lines that were fitted; None of other data.
+        decays: the free decays, or the correlation functions, that were fitted; empty for other data.
+        fitted: the model of transfer functions at the fitted lines; None for other data.
     """
 
     heading: str
@@ -56,27 +56,28 @@ def identification_report(
     seconds: float = SECONDS,
     progress: Progress | None = None,
 ) -> IdentificationReport:
-    """The modes of transfer functions, or of records: driven where inputs move, by unknown forces with `ambient`, else
-    free decays.
+    """The report of the modes of transfer functions or records.
+
+    Records with inputs other than zero are driven; others are ambient with `ambient`, else free decays.
 
     Args:
-        measured: records of the same sensors at one rate; or transfer functions, alone.
-        start: read from then on, s.
-        n_modes: number of modes; in driven records and transfer functions, at most.
-        ambient: whether unknown broadband forces drive the record all along.
+        measured: records of the same sensors at one sample rate, or one set of transfer functions.
+        start: time from which records are used, s.
+        n_modes: number of modes; the largest number for driven records and transfer functions.
+        ambient: whether unknown broadband forces drive the whole record.
         band_hz: lowest and highest line to fit, of transfer functions.
-        seconds: of processor time, after which the best so far is reported.
+        seconds: limit of processor time, after which the best result so far is reported.
         progress: as in `identify_driven`.
 
     Raises:
-        ValueError: as `ring_down`, `identify_driven`, `identify_ambient`, `identify_transfer`; ambient records that are
-            two or have inputs; options that belong to the other kind.
+        ValueError: as `ring_down`, `identify_driven`, `identify_ambient`, `identify_transfer`; two ambient records, or
+            one with inputs; options of the other kind of data.
     """
     on: dict[str, Any] = {"seconds": seconds, "progress": progress}
     transfer = [one for one in measured if isinstance(one, TransferFunctions)]
     if transfer:
         if len(measured) > 1:
-            raise ValueError(f"transfer functions are identified alone; got {len(measured)} files: give one")
+            raise ValueError(f"transfer functions are identified from one file; got {len(measured)} files")
         if start is not None or ambient:
             raise ValueError("transfer functions have no time: leave --start and --ambient out; --band-hz sets a band")
         one, most = transfer[0], MOST_MODES if n_modes is None else n_modes
@@ -85,7 +86,7 @@ def identification_report(
         )
         return of_transfer(found, one)
     if band_hz is not None:
-        raise ValueError("--band-hz is for transfer functions; a record has none: resample it, or take all its modes")
+        raise ValueError("--band-hz is for transfer functions; for a record, resample it or identify all its modes")
     records = [one for one in measured if isinstance(one, Record)]
     if not ambient and not any(record.inputs.any() for record in records):
         return of_ring_down(ring_down(records, start=start, n_modes=n_modes, **on))
@@ -98,20 +99,20 @@ def identification_report(
         return of_driven(identify_driven(records, max_modes=most, **on), records)
     if len(records) > 1 or records[0].n_inputs:
         raise ValueError(
-            f"ambient forces are unknown and act all along one record; got {len(records)} records with"
-            f" {records[0].n_inputs} inputs: give one record, no inputs"
+            f"ambient identification needs one record without inputs; got {len(records)} records with"
+            f" {records[0].n_inputs} inputs"
         )
     return of_ambient(identify_ambient(records[0], n_modes=n_modes, **on), records[0])
 
 
 def of_ring_down(decay: RingDown) -> IdentificationReport:
-    """Free decays."""
+    """The report of free decays."""
     found = decay.refined
     lines = [f"mode {r + 1}: {remark}" for r, remark in enumerate(decay.remarks) if remark]
     lines += [*decay.notes, *_proportional(decay.proportional), *decay.by_amplitude.remarks]
     if decay.noise_modes.n_modes:
         rejected = ", ".join(f"{f:.4g}" for f in decay.noise_modes.frequencies_hz)
-        lines.append(f"rejected as noise or as parts of another mode: {rejected} Hz")
+        lines.append(f"rejected as noise or as part of another mode: {rejected} Hz")
     lines += _on_convergence(found.converged, lines, "try other --modes, or a later --start")
     damping = decay.proportional
     content = {
@@ -135,7 +136,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
 
 
 def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
-    """Records with their inputs."""
+    """The report of driven records."""
     lines = [*found.remarks, *_on_convergence(found.converged, found.remarks, "try other --modes")]
     a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
     content = {
@@ -150,55 +151,60 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
 
 
 def _on_convergence(converged: bool, remarks: Sequence[str], remedy: str) -> list[str]:
-    """A line where a search ended before its steps were small, but for want of time, which has a remark of its own."""
+    """A line if a search did not converge; none if it reached its time limit, which has a remark of its own."""
     stopped = any(remark.startswith(STOPPED) for remark in remarks)
     return [] if converged or stopped else [f"the search did not converge: {remedy}"]
 
 
 def of_ambient(found: AmbientModes, record: Record) -> IdentificationReport:
-    """A record under unknown broadband forces."""
-    lines = ["poles by canonical variate analysis, standard errors by leaving out parts of the record", *found.remarks]
+    """The report of a record under unknown broadband forces."""
+    lines = ["poles by canonical variate analysis, standard errors by jackknife over parts of the record"]
+    lines += found.remarks
     return _report([record], found, lines, _content(record.output_channels, found), found.correlations)
 
 
 def of_transfer(found: TransferModes, measured: TransferFunctions) -> IdentificationReport:
-    """Transfer functions."""
+    """The report of transfer functions."""
     remedy = "try other --modes, or a narrower --band-hz"
     lines = [*found.remarks, *_on_convergence(found.converged, found.remarks, remedy)]
-    broad = np.flatnonzero(found.modes.zeta > BROAD)
+    broad = np.flatnonzero(found.modes.zeta > IMPLAUSIBLE_DAMPING)
     if broad.size:
         which = ", ".join(str(r + 1) for r in broad)
         lines.append(f"modes {which}: implausibly damped; they may fit the residual, not the structure")
-    at, apart = found.modes.frequencies_hz, found.modes.phase_collinearity < AGREED
+    at, complex_shape = found.modes.frequencies_hz, found.modes.phase_collinearity < COLLINEAR
     doubtful = np.zeros(at.size, bool)
     for low, high in found.order_limited_hz:
         here = (at >= low) & (at <= high)
-        doubtful |= here & apart
+        doubtful |= here & complex_shape
         lines.append(
             f"between {low:.6g} and {high:.6g} Hz the search reached its limit of modes, the residual above the"
-            f" noise: of {here.sum()} modes there {(here & apart).sum()} are not reported, their shapes are complex"
-            " (low phase collinearity). Roving sensors or hammers, or a structure that changes, make data inconsistent"
-            " like that: leave that band out by --band-hz, or allow more --modes"
+            f" noise: of {here.sum()} modes there {(here & complex_shape).sum()} are not reported, as their shapes are"
+            " complex (low phase collinearity). Roving sensors or hammers, or a structure that changes, make the data"
+            " inconsistent: exclude the band by --band-hz, or allow more --modes"
         )
     for r, parts in enumerate(found.cluster_hz):
         if parts:
             others = ", ".join(f"{f:.4g}" for f in parts)
             lines.append(
-                f"mode {r + 1} is a cluster, its other members at {others} Hz: data of roving sensors or hammers are"
-                " inconsistent there, or it drifts or depends on amplitude; closer modes are not resolved"
+                f"mode {r + 1} is a cluster, with other members at {others} Hz: data of roving sensors or hammers are"
+                " inconsistent there, or the mode drifts or depends on amplitude; closer modes are not resolved"
             )
     doubt = SURE * found.omega_std / TURN + float(np.diff(found.frequencies_hz).min())
     hums = np.zeros(at.size, bool)
     for mains in MAINS_HZ:
-        hum = apart & (at > 0.5 * mains) & (np.abs(at - mains * np.round(at / mains)) < np.minimum(doubt, 0.02 * mains))
+        hum = (
+            complex_shape
+            & (at > 0.5 * mains)
+            & (np.abs(at - mains * np.round(at / mains)) < np.minimum(doubt, 0.02 * mains))
+        )
         lines += [f"mode {r + 1}: a multiple of {mains:g} Hz: mains hum?" for r in np.flatnonzero(hum)]
         hums |= hum
-    uneasy = np.flatnonzero(apart & ~doubtful & ~hums)
-    if uneasy.size:
+    unexplained = np.flatnonzero(complex_shape & ~doubtful & ~hums)
+    if unexplained.size:
         lines.append(
-            f"modes {', '.join(str(r + 1) for r in uneasy)}: complex shapes (low phase collinearity); either damping"
-            " couples close modes, or data of roving sensors or hammers are inconsistent, and several of these are one"
-            " mode"
+            f"modes {', '.join(str(r + 1) for r in unexplained)}: complex shapes (low phase collinearity); either"
+            " damping couples close modes, or data of roving sensors or hammers are inconsistent, and several of these"
+            " modes are the same"
         )
     band = found.frequencies_hz
     outputs, inputs = found.modes.n_outputs, len(measured.references)
@@ -257,17 +263,17 @@ def _proportional(fit: ProportionalFit | None) -> list[str]:
     if fit.probability < UNLIKELY:
         worst = float(np.abs(fit.standardised_residuals).max())
         return [
-            f"damping is not of Rayleigh's form: ζ deviates from (g1 ω + g2/ω)/2 by up to {worst:.0f} standard errors"
+            f"damping is not Rayleigh damping: ζ deviates from (g1 ω + g2/ω)/2 by up to {worst:.0f} standard errors"
         ]
     (g1, g1_std), (g2, g2_std) = (
         rounded(value, error)
         for value, error in zip((fit.damping.g1, fit.damping.g2), fit.standard_errors, strict=True)
     )
-    return [f"damping may be of Rayleigh's form: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
+    return [f"damping may be Rayleigh damping: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
 
 
 def _by_amplitude(segments: AmplitudeDependence) -> dict[str, Any]:
-    """The modes that depend on amplitude, segment by segment."""
+    """Estimates by segment of the modes that depend on amplitude, for JSON, by number of the mode."""
     content = {}
     for r in np.flatnonzero(segments.depends):
         seen = np.flatnonzero(np.isfinite(segments.omega[:, r]))

@@ -1,4 +1,4 @@
-"""What a measured file holds, before anything is identified: channels, levels, spectrum, faults, and how to go on."""
+"""The report of `workbench look` on a measured file: channels, levels, spectra, faults, and the next command."""
 
 import re
 import shlex
@@ -21,23 +21,23 @@ from workbench.study.pages.page import PageContent, block
 HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strongest at [Hz]")
 FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)
 DECAYED = 0.1  # rms of the last tenth over the largest of any tenth, below which a record is a free decay
-FALLING = 6  # tenths, each quieter than the one before: by chance in one stationary record of 720
-PEAKS = 4  # shown of each channel
-PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of its surroundings; these as a part of the lines
+FALLING = 6  # tenths of decreasing level that make a free decay: by chance in 1 of 720 stationary records
+PEAKS = 4  # per channel
+PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of 1/8 of all lines around the peak
 MOST_ROWS = 100  # of the table
-MOST_FAULTS = 24  # said one by one; of more of a kind, only how many there are
+MOST_FAULTS = 24  # messages per kind of fault; further faults are counted
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a file holds.
+    """The report of a measured file.
 
     Attributes:
-        heading: number of channels and samples, rate, length.
+        heading: number of channels and samples, sample rate, length.
         rows: one per channel, under `HEADINGS`.
-        remarks: faults of the data and what else to know.
-        command: the command to go on with.
-        page_content: the page of it.
+        remarks: faults of the data and other remarks.
+        command: the suggested next command.
+        page_content: the content of the page.
     """
 
     heading: str
@@ -48,7 +48,7 @@ class Look:
 
 
 def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
-    """What a measured file holds, and the command to go on with."""
+    """The report of a record or of transfer functions read from `path`."""
     if isinstance(measured, TransferFunctions):
         return _transfer(measured, path)
     return _record(measured, path)
@@ -59,7 +59,7 @@ def _record(record: Record, path: Path) -> Look:
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
     applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
     forces = [] if record.n_inputs else [name for name in record.output_names if name in applied]
-    # a force rests at zero for long, and may be held from sample to sample
+    # constant stretches are no fault of a force: it may be zero for long, or held from sample to sample
     faults = [fault for fault in faults if fault.outputs[-1] not in forces]
     faulty |= {fault.outputs[-1] for fault in faults if fault.kind == "unstated"}
     kept = [name for name in record.output_names if name not in faulty | set(forces)]
@@ -75,7 +75,7 @@ def _record(record: Record, path: Path) -> Look:
         f"{outputs} output{'s' * (outputs != 1)} and {inputs} input{'s' * (inputs != 1)}, {record.n_samples} samples at"
         f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
     )
-    remarks = [*record.remarks, *_said([*faults, *input_faults(record)])]
+    remarks = [*record.remarks, *_messages([*faults, *input_faults(record)])]
     if len(channels) > MOST_ROWS:
         remarks.append(f"the first {MOST_ROWS} of {len(channels)} channels are shown")
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
@@ -83,7 +83,7 @@ def _record(record: Record, path: Path) -> Look:
         remarks.append(f"the file states no quantity for {', '.join(unstated)}: their units are as recorded")
     options = ["--inputs", ",".join(forces or record.input_names)] if forces or inputs else []
     if forces:
-        remarks.append(f"{', '.join(forces)}: an input by its name or unit; leave --inputs out if it is not")
+        remarks.append(f"{', '.join(forces)}: taken as input by name or unit; leave --inputs out if this is wrong")
     if not options:
         decays = _decays(record.select_outputs(kept)) if kept else False
         start = decay_start(record.select_outputs(kept)) if decays else record.start_time
@@ -113,19 +113,19 @@ def _record(record: Record, path: Path) -> Look:
     return Look(heading, rows, tuple(remarks), _command(path, options), page_content)
 
 
-def _said(faults: Sequence[DataFault]) -> list[str]:
-    """The messages of faults, of many of a kind the first and the number of the others."""
-    said = []
+def _messages(faults: Sequence[DataFault]) -> list[str]:
+    """The messages of faults; of each kind at most `MOST_FAULTS`, then the number of the others."""
+    messages = []
     for kind in dict.fromkeys(fault.kind for fault in faults):
         each = [fault for fault in faults if fault.kind == kind]
-        said += [fault.message for fault in each[:MOST_FAULTS]]
+        messages += [fault.message for fault in each[:MOST_FAULTS]]
         if len(each) > MOST_FAULTS:
-            said.append(f"{len(each) - MOST_FAULTS} more channels are {kind}")
-    return said
+            messages.append(f"{len(each) - MOST_FAULTS} more channels are {kind}")
+    return messages
 
 
 def _with_inputs(record: Record, names: Sequence[str]) -> Record:
-    """The record with these outputs as its inputs."""
+    """The record with these outputs as inputs."""
     at = [record.output_names.index(name) for name in names]
     applied = tuple(record.output_channels[i] for i in at)
     rest = record.select_outputs([name for name in record.output_names if name not in names])
@@ -167,7 +167,7 @@ def _row(channel: Channel, row: np.ndarray, rate_hz: float) -> tuple[str, ...]:
 
 
 def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:
-    """Frequencies of the highest peaks that stand out, in rising order."""
+    """Frequencies of the highest prominent peaks, in rising order."""
     if lines.size < 3 or not power.max() > 0:
         return []
     about = median_filter(power, size=max(lines.size // SURROUNDINGS, 3), mode="nearest")
@@ -178,7 +178,7 @@ def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:
 
 
 def _decays(record: Record) -> bool:
-    """Whether the outputs die away towards the end, or are quieter and quieter."""
+    """Whether the outputs are a free decay: small in the last tenth, or with a level that only falls from its peak."""
     about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
     tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
     falling = tenths[int(np.argmax(tenths)) :]

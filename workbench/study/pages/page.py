@@ -1,4 +1,4 @@
-"""One self-contained page per study or diagnosis: figures that zoom, motion that moves, text escaped, no network."""
+"""Self-contained HTML pages of studies and diagnoses: interactive figures and motion, escaped text, no network."""
 
 import json
 import math
@@ -27,16 +27,16 @@ Table = tuple[str, Sequence[str], Sequence[Sequence[object]]]  # title, heads, r
 
 @dataclass(frozen=True)
 class PageContent:
-    """All that a page shows, as plain values: the page can be made again from it.
+    """The content of a page, as plain values from which the page can be made again.
 
     Attributes:
-        title, lead, lines: what was asked, what was found in a sentence, and what else was found.
+        title, lead, lines: the question, the result in a sentence, and further results.
         blocks: figures ("figure"), motion ("motion") or pictures ("picture", PNG in base64), each with a "caption".
         tables: (title, heads, rows); a cell of True or False reads "holds" or "does not hold".
-        inputs: what the page was made from, text by name.
-        made_by: the command that makes it again.
-        standing: of the lead: one of `STANDINGS`, "" where it is neither good nor bad.
-        versions: of what computed it.
+        inputs: the data that the page was made from, text by name.
+        made_by: the command that makes the page again.
+        standing: of the lead: one of `STANDINGS`, "" for neither good nor bad.
+        versions: of the software.
     """
 
     title: str
@@ -50,15 +50,15 @@ class PageContent:
     versions: Mapping[str, str] = field(default_factory=versions)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON, marked by its "format"."""
+        """The content as JSON, with the entry "format"."""
         return {"format": FORMAT, **asdict(self)}
 
 
 def page_content_of(content: dict[str, Any]) -> PageContent:
-    """The content that `PageContent.to_json` wrote.
+    """The content from the JSON of `PageContent.to_json`.
 
     Raises:
-        StudyError: a file of another format, or one that has been damaged.
+        StudyError: another format, or damaged content.
     """
     shape = {"title": str, "lead": str, "lines": list, "blocks": list, "tables": list, "inputs": dict, "made_by": str}
     shape["versions"] = dict
@@ -66,7 +66,7 @@ def page_content_of(content: dict[str, Any]) -> PageContent:
     bad += ["tables"] * (not bad and not all(_is_table(table) for table in content["tables"]))
     bad += ["blocks"] * (not bad and not all(isinstance(block, dict) for block in content["blocks"]))
     if content.get("format") != FORMAT or bad:
-        raise StudyError(f"this is no {FORMAT!r}: its {bad[0] if bad else 'format'} is missing or damaged")
+        raise StudyError(f"this is not a {FORMAT!r}: its {bad[0] if bad else 'format'} is missing or damaged")
     standing = content.get("standing", "")  # pages of earlier versions have none
     return PageContent(**{name: content[name] for name in shape}, standing=standing if standing in STANDINGS else "")
 
@@ -79,12 +79,12 @@ def _is_table(table: object) -> bool:
 
 
 def block(shown: Shown, caption: str) -> dict[str, Any]:
-    """A figure, or the motion that `draw.motion` describes, with its caption."""
+    """The block of a figure, or of the motion that `draw.motion` describes, with its caption."""
     return {**({"motion": dict(shown)} if isinstance(shown, Mapping) else drawable(shown)), "caption": caption}
 
 
 def write_page(path: Path, page_content: PageContent) -> Path:
-    """Write content as a page, and as JSON beside it (.page.json); every text is escaped."""
+    """Write content as an HTML page with escaped text, and as JSON beside the page (.page.json)."""
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((ASSETS / "page.html").read_text(encoding="utf-8"))
     moving = [{key: one[key] for key in ("figure", "motion") if key in one} for one in page_content.blocks]
@@ -106,12 +106,12 @@ def write_page(path: Path, page_content: PageContent) -> Path:
 
 
 def asset(name: str) -> Markup:
-    """One of the files that pages are made of."""
+    """The text of one of the files that pages are made of."""
     return Markup((ASSETS / name).read_text(encoding="utf-8"))
 
 
 def in_script(content: object) -> Markup:
-    """JSON that may stand in a script element: nothing in it can end the element."""
+    """JSON for a script element, escaped so that it cannot end the element."""
     text = json.dumps(content, separators=(",", ":"), allow_nan=False)
     for sign in "<>&\u2028\u2029":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
@@ -119,7 +119,7 @@ def in_script(content: object) -> Markup:
 
 
 def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | None = None, made_by: str = "") -> Path:
-    """The page of a study: what it found, its figures, its checks, the tables of its runs."""
+    """Write the page of a study: results, figures, checks, and tables of its runs."""
     checks = [
         (c["name"], _cell(c["value"]), ("≥ " if c["at_least"] else "≤ ") + str(_cell(c["limit"])), c["holds"])
         for c in outcome.checks
@@ -141,7 +141,7 @@ def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | No
 
 
 def tables_of(content: Mapping[str, Any]) -> list[Table]:
-    """Those tables that are rows of named figures; what else there is stays in the JSON."""
+    """The tables that are lists of rows of named numbers; other content is in the JSON only."""
     return [
         (name.replace("_", " "), *_table_of(table))
         for name, table in content.items()
@@ -156,7 +156,7 @@ def _table_of(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], list[
 
 
 def to_its_error(value: object, error: object) -> tuple[str | bool, str | bool]:
-    """A value and its standard error, both to the second digit of the error; "" where there is no error."""
+    """A value and its standard error as text, both to the second digit of the error; "" if there is no error."""
     if not isinstance(value, int | float) or not isinstance(error, int | float) or not error > 0:
         return _cell(value), "" if error is None else _cell(error)
     digits = 1 - math.floor(math.log10(error))

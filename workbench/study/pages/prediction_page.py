@@ -1,4 +1,4 @@
-"""The page of a prediction, and of the test that it was made for."""
+"""The page of a prediction, and of its check by a test."""
 
 from pathlib import Path
 
@@ -26,12 +26,12 @@ def prediction_page(
         prediction: of the test.
         path: of the HTML file.
         name: of the case.
-        folder: that the case was read from.
-        check, measured: the test and how it came out, where it was made.
-        made_by: the command that makes the page again; of the case and the record alone unless given.
+        folder: of the case.
+        check, measured: the check of the prediction and the record of the test, if the test was made.
+        made_by: the command that makes the page again; derived from the case and the record unless given.
     """
     draws = prediction.expected.shape[0]
-    caption = f"Bands that hold {100 * LEVEL:g} % of the readings of each sensor, from {draws} draws."
+    caption = f"{100 * LEVEL:g} % prediction bands of the readings of each sensor, from {draws} draws."
     if len(prediction.channels) > MOST_SENSORS:
         caption += f" The first {MOST_SENSORS} of {len(prediction.channels)} sensors are drawn."
     shown = prediction if check is None else check

@@ -1,4 +1,4 @@
-"""The page of a redesign: which controller is better on the real structure, and how sure that is."""
+"""The page of a redesign: the better controller for the real structure, with its uncertainty."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +20,9 @@ from workbench.study.pages.page import PageContent, Table, block, write_page
 from workbench.study.pages.verdict_page import case_inputs
 from workbench.study.runs.outcome import Shown
 
-MOST = 3000  # samples of a record that are replayed
-RUNS_AWAY = 4.0  # times the redesigned loop's largest modal displacement, at which the present one's is cut off
-NOTHING = 1e-4  # of the vibration and effort: a loss that no step need make up for
+MOST = 3000  # samples of a record that are simulated again
+DRAWN_LIMIT = 4.0  # largest drawn modal displacement of the present loop, over that of the redesigned one
+NEGLIGIBLE = 1e-4  # loss, relative to vibration and effort, up to which the figure of steps is omitted
 
 
 def redesign_page(
@@ -40,9 +40,9 @@ def redesign_page(
         found: the redesign.
         path: of the HTML file.
         name: of the case.
-        record: measured, whose inputs are then replayed as forces on both loops.
-        folder: that the case was read from.
-        made_by: the command that makes the page again; of the case alone unless given.
+        record: a measured record, whose inputs are applied as forces to both loops.
+        folder: of the case.
+        made_by: the command that makes the page again; derived from the case unless given.
     """
     blocks = []
     if record is not None:
@@ -52,17 +52,17 @@ def redesign_page(
     blocks += [
         block(
             plot_redesign(found),
-            "Both controllers after the impulse of the test, on the same samples of the uncertain model; every dead"
-            " zone, delay, friction and noise is in. The lower curve is the better controller; a wide band says"
+            "Both controllers after the impulse of the test, on the same samples of the uncertain model, including all"
+            " dead zones, delays, friction and noise. The controller with the lower curve is better; a wide band means"
             " that the records leave much uncertain.",
         )
     ]
-    if max(s.loss for s in found.steps) > NOTHING:
+    if max(s.loss for s in found.steps) > NEGLIGIBLE:
         blocks.append(
             block(
                 plot_steps(found),
-                "From the present controller to the redesigned one, one step after the other: how much more vibration"
-                " and effort each takes than the redesigned law would with perfect actuators and sensors.",
+                "From the present controller to the redesigned one, step by step: the excess of vibration and effort"
+                " over the redesigned law with perfect actuators and sensors.",
             )
         )
     tables: list[Table] = [
@@ -104,7 +104,7 @@ def _figures(found: Redesign) -> list[tuple[str, ...]]:
         ("effort", "effort, ∫ FᵀF dt [N² s]", 1.0),
     )
     for name, words, scale in each:
-        # what a motion that grows comes to is a matter of the length of the test
+        # for a growing motion the value depends on the length of the test
         known = [name == "worst_damping" or p.share_stable >= 0.5 for p in (old, new)]
         cells = [
             _rounded(scale * getattr(p, name)) if k else "diverges" for p, k in zip((old, new), known, strict=True)
@@ -128,7 +128,7 @@ def _margin(verification: Verification) -> str:
 
 
 def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
-    """Both loops on the corrected rig under the inputs of a measured record, as forces at the same places."""
+    """Blocks of both loops on the corrected rig, with the inputs of a measured record as forces at the same places."""
     rig = found.uncertain_rig.rig
     step = found.test.sample_time
     if abs(record.sample_time / step - 1.0) > 1e-6:
@@ -144,28 +144,28 @@ def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
     if _drawn(found) and old.bounded and new.bounded:
         shown.append(_moving(found, old.response, new.response, caption))
     read = any(s.quantity == "displacement" for s in rig.sensors)
-    where = "the sensor that reads the most, beside what was measured there without control" if read else "an actuator"
+    where = "the sensor with the largest reading, and that measured without control" if read else "an actuator"
     readings = _readings(found, record, {"present": old.response, "redesigned": new.response})
     shown.append(block(readings, f"{caption}: the displacement at {where}."))
     return shown
 
 
 def _drawn(found: Redesign) -> bool:
-    """Whether it is known where the structure stands."""
+    """Whether the positions of the structure are known, so that it can be drawn."""
     domain = found.uncertain_rig.rig.modes.domain
     return not (isinstance(domain, NamedPoints) and domain.positions is None)
 
 
 def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict[str, Any]:
     scale = np.abs(new.modal[: new.modes.n_modes]).max()
-    limit = RUNS_AWAY * scale
+    limit = DRAWN_LIMIT * scale
     limited = replace(old, modal=np.clip(np.nan_to_num(old.modal), -limit, limit))
     actuators = [a for a in found.uncertain_rig.rig.actuators if a.name in found.redesigned.actuators]
     sensors = [s for s in found.uncertain_rig.rig.sensors if s.name in found.redesigned.sensors]
     both, colours = {"present": limited, "redesigned": new}, {"present": OLD, "redesigned": NEW}
     motion = response_motion(both, actuators=actuators, sensors=sensors, colours=colours, length=found.units.length)
     grown = np.abs(old.modal[: old.modes.n_modes]).max() > limit
-    cut = f" The present one diverges; its motion is cut off at {RUNS_AWAY:g} times the other's." if grown else ""
+    cut = f" The present one diverges; its motion is clipped at {DRAWN_LIMIT:g} times the other's." if grown else ""
     return block(motion, f"{caption}: the corrected structure under the present and the redesigned controller.{cut}")
 
 

@@ -31,21 +31,21 @@ STANDING_OF = {"none": "good", "explained": "good", "part": "part", "unknown": "
 
 
 def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | None = None, made_by: str = "") -> Path:
-    """Write the page: the verdict, measured beside nominal and corrected, where, the unmodelled force, the rivals.
+    """Write the page: verdict, responses, localisation, unmodelled force, alternatives.
 
     Args:
         verdict: of the diagnosis.
-        case: that was diagnosed.
+        case: the diagnosed case.
         path: of the HTML file.
-        folder: that the case was read from, so that the page can say what it was.
-        made_by: the command that makes the page again; of the case alone unless given.
+        folder: of the case, whose files are then listed on the page.
+        made_by: the command that makes the page again; derived from the case unless given.
     """
     nominal, corrected = verdict.nominal.modes, verdict.corrected.modes
     changed = nominal.n_modes != corrected.n_modes or not np.allclose(nominal.omega, corrected.omega, rtol=1e-6)
     records = (*case.fit, *case.validation)
     better = verdict.shrinkage is None or verdict.shrinkage.overall > 0
     rigs, fitted = {"nominal": verdict.nominal}, "corrected" if verdict.outcome == "explained" else "nearest"
-    if verdict.outcome != "none" and better:  # what makes the gap larger corrects nothing
+    if verdict.outcome != "none" and better:  # a model that makes the gap larger is not a correction
         rigs[fitted] = verdict.corrected
     figures = [
         (
@@ -59,25 +59,25 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             " to the validation records.",
         ),
     ]
-    if verdict.shows_gap:  # there is nothing to take apart in noise
+    if verdict.shows_gap:  # without a gap the residual is noise, and has no place
         figures += [
             (
                 plot_where(verdict),
                 "Where the gap is: its power above the noise, by sensor, mode and record; and the likelihood of a"
-                " single unknown force at each place, no law assumed.",
+                " single unknown force at each place, without an assumed law.",
             ),
         ]
         acting = any(effect.at is not None and effect.kind.path == "structure" for effect in verdict.effects)
-        if acting or verdict.where.place.is_single_force is not False:  # else a force there is what no force is
+        if acting or verdict.where.place.is_single_force is not False:  # else a single force explains nothing
             made = "The unmodelled force reconstructed from the records, over the motion at its place."
             figures.append((plot_unmodelled_force(verdict), made))
-        if verdict.attribution.singles:  # none were tried where errors of the model were fitted from the first
-            each = "Residual with each effect alone, without errors of the model: at the noise floor, it explains all."
+        if verdict.attribution.singles:  # single effects are not fitted if model errors were fitted from the start
+            each = "Residual with each effect alone, without model errors; an effect at the noise floor explains all."
             figures.append((plot_single_effects(verdict), each))
     distortions = _of_lowest_and_highest(records)
     if distortions:
         seen = (
-            "Spectra before any model: excited lines, odd and even ones that are not excited, and noise."
+            "Spectra of the records: excited lines, odd and even lines that are not excited, and noise."
             + " Only odd lines are excited, so even ones reveal an even nonlinearity."
             * all(d.parity_resolved for d in distortions)
         )
@@ -104,7 +104,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
 
 
 def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
-    """Effects, gaps and rivals of a verdict as JSON: those of these tables that have a row."""
+    """The tables of effects, gaps and alternatives of a verdict as JSON; tables without rows are omitted."""
     nearest = content.get("nearest", [])
     beyond = {kind.name for kind in BEYOND}.issuperset(effect["kind"] for effect in nearest)
     title = "Effects" if beyond else "Nearest effects: they do not explain the gap"
@@ -139,22 +139,22 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
 
 
 def _short(number: float | None) -> float | str:
-    """To four digits; "" where there is none."""
+    """The number to four significant digits; "" for None."""
     return "" if number is None else float(f"{number:.4g}")
 
 
 def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
-    """Distortion of the records of least and of largest excitation, where it repeats."""
+    """Distortion of the records with the least and the largest periodic excitation; empty if none is periodic."""
     found = []
     for record in records:
-        with suppress(ValueError):  # excitation that does not repeat shows none
+        with suppress(ValueError):  # not periodic
             found.append(distortion_of(record))
     found.sort(key=lambda each: each.input_rms)
     return found if len(found) < 2 else [found[0], found[-1]]
 
 
 def moving_modes(rig: Rig, modes: Mapping[str, Modes], *, length: str = "m") -> list[dict[str, Any]]:
-    """A block of modes that move, where they are known all over a structure or at points with positions."""
+    """A block of animated modes; none if their shapes are known only at points without positions."""
     domain = rig.modes.domain
     placed = isinstance(domain, NamedPoints) and domain.positions is not None and len(set(domain.nodes)) > 2
     if not placed and (rig.structure is None or isinstance(domain, NamedPoints)):
@@ -166,7 +166,7 @@ def moving_modes(rig: Rig, modes: Mapping[str, Modes], *, length: str = "m") -> 
 
 
 def case_inputs(folder: Path) -> dict[str, str]:
-    """What a case was read from: its description, and checksums of its records."""
+    """The text of case.toml and checksums of the other files of a case, by title."""
     files = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != "case.toml")
     digests = [f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder)}" for file in files]
     text = (folder / "case.toml").read_text(encoding="utf-8")
@@ -174,7 +174,7 @@ def case_inputs(folder: Path) -> dict[str, str]:
 
 
 def _could_show(verdict: Verdict) -> str:
-    """What the records can and cannot show, in a line."""
+    """A sentence on the effects that the records can and cannot show."""
     hidden, alike = verdict.detectability.undetectable, verdict.detectability.indistinguishable
     count = len(verdict.detectability.strengths)
     text = f"Before any fit: these records can show {f'all but {len(hidden)} of' if hidden else 'all'} {count} effects"

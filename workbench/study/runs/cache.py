@@ -1,4 +1,4 @@
-"""Results on disk, one JSON file per case: whole or not there, and never a pickle."""
+"""Results on disk, one JSON file per case, written atomically and without pickle."""
 
 import base64
 import hashlib
@@ -14,7 +14,7 @@ from workbench.study.runs.whole_file import write_whole
 
 try:
     import fcntl
-except ImportError:  # Windows has none: runs at once on one folder may there compute a case twice
+except ImportError:  # on Windows simultaneous runs in one folder may compute a case twice
     fcntl = None  # type: ignore[assignment]
 
 ARRAY, COMPLEX = "__array__", "__complex__"
@@ -22,10 +22,10 @@ KINDS = "biufc"  # of arrays: booleans, integers, floats, complex numbers
 
 
 def encoded(value: object, where: str = "the result") -> Any:
-    """A result as JSON holds it, arrays bit for bit.
+    """A result as JSON values, with exact arrays.
 
     Raises:
-        TypeError: naming what is neither number, text, list, dict nor array.
+        TypeError: a value is neither number, text, list, dict nor array.
     """
     if value is None or isinstance(value, bool | int | str):
         return value
@@ -47,7 +47,7 @@ def encoded(value: object, where: str = "the result") -> Any:
 
 
 def decoded(value: Any) -> Any:
-    """What `encoded` was given; tuples come back as lists."""
+    """The value given to `encoded`; tuples become lists."""
     if isinstance(value, list):
         return [decoded(item) for item in value]
     if not isinstance(value, dict):
@@ -61,13 +61,13 @@ def decoded(value: Any) -> Any:
 
 
 def write_record(path: Path, record: dict[str, Any]) -> None:
-    """Put a record in its place at once: a reader, or a run that resumes, sees all of it or nothing."""
+    """Write a record atomically, with a checksum."""
     text = json.dumps(record, separators=(",", ":"))
     write_whole(path, json.dumps({"sha256": _sum(text), "record": text}))
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
-    """A record; None where there is none, or where the disk has lost part of it."""
+    """The record of a file; None if the file does not exist or is damaged."""
     try:
         outer = json.loads(path.read_text(encoding="utf-8"))
         whole = outer["sha256"] == _sum(outer["record"])
@@ -79,11 +79,11 @@ def read_record(path: Path) -> dict[str, Any] | None:
 
 @contextmanager
 def held(path: Path, wait: bool) -> Iterator[bool]:
-    """Keep other processes from a record while it is made: whether it is held, at once or, with `wait`, in the end.
+    """Lock a record while it is computed; yields whether this process has the lock, which `wait` waits for.
 
-    A lock of the system on a file beside the record. It goes when its process ends, however it ends, and child
-    processes do not inherit it. Whoever gets it must look first whether the record is there by now. Where no file can
-    be made, nothing can be kept either, and nothing is held back.
+    A system lock on a file beside the record, released when the process ends in any way, and not inherited by child
+    processes. The process that gets the lock must first check whether the record exists by now. If the lock file
+    cannot be made, no record can be written either, and the lock is granted.
     """
     beside = path.with_suffix(".lock")
     try:

@@ -13,7 +13,7 @@ RESERVED = frozenset({"seconds", "error", "versions"})
 
 
 class StudyError(ValueError):
-    """A study that is not there, lacks what it needs, or asks for what cannot be run."""
+    """A study that does not exist, has missing or invalid input, or cannot be run."""
 
 
 def grid(**axes: Iterable[Any]) -> list[dict[str, Any]]:
@@ -41,16 +41,16 @@ def samples(n: int, /, *, seed: int = 0, **ranges: tuple[float, float]) -> list[
 
 
 def checked(case: Mapping[str, Any], number: int) -> dict[str, Any]:
-    """A case as plain Python values, so that it means the same in every process and on disk.
+    """A case as plain Python values, which are the same in every process and on disk.
 
     Raises:
-        StudyError: a name that the table needs for itself, or a value that is not plain.
+        StudyError: a reserved name, or a value that is not plain.
     """
     if not isinstance(case, Mapping) or not all(isinstance(name, str) for name in case):
         raise StudyError(f"case {number} must be a dict of parameters by name; got {case!r:.80}")
     taken = RESERVED & case.keys()
     if taken:
-        raise StudyError(f"case {number}: a parameter cannot be called {min(taken)!r}; the table has a column of it")
+        raise StudyError(f"case {number}: a parameter cannot be called {min(taken)!r}, a column of the results table")
     return {name: _plain(value, f"case {number}, parameter {name!r}") for name, value in case.items()}
 
 
@@ -70,9 +70,9 @@ def _plain(value: Any, where: str) -> Any:
 
 
 def key_of(case: Mapping[str, Any], fingerprint: str, seed: int | None) -> str:
-    """The name of a case's result: of the same function, versions, parameters and seed, and of no other.
+    """The key of a case's result, a digest of function, versions, parameters and seed.
 
-    A `Path` counts with what lies there, so that a changed file is a changed case.
+    A `Path` counts with the contents of the file or folder, so that a changed file is a changed case.
     """
     content = json.dumps([fingerprint, seed, _content(dict(case))], separators=(",", ":"))
     return hashlib.sha256(content.encode()).hexdigest()[:40]
@@ -88,11 +88,11 @@ def _content(value: object) -> Any:
         return [
             [str(file), hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None] for file in files
         ]
-    # 1, 1.0 and True are one in Python, and may not be one to the function
+    # 1, 1.0 and True are equal in Python, but a function may treat them differently
     return [type(value).__name__, value]
 
 
 def seed_of(case: Mapping[str, Any], root: int) -> int:
-    """A seed of this case's own, whatever the order of the cases and the others among them."""
+    """The seed of a case, independent of the other cases and their order."""
     text = json.dumps([root, _content({n: str(v) if isinstance(v, Path) else v for n, v in case.items()})])
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:6])

@@ -1,4 +1,4 @@
-"""Where cases are computed: in this process, in processes of this machine, or on a Dask cluster."""
+"""Computation of cases in this process, in processes of this machine, or on a Dask cluster."""
 
 import functools
 import sys
@@ -32,9 +32,9 @@ class Job:
     """One case to be computed.
 
     Attributes:
-        key: of its result.
+        key: of the result.
         arguments: of the function.
-        file: where a result is put by the process that found it; None where that is left to this one.
+        file: to which the computing process writes the result; None if this process does.
     """
 
     key: str
@@ -43,7 +43,7 @@ class Job:
 
 
 def work(function: Callable[..., Any], job: Job, running: Path | None = None) -> dict[str, Any]:
-    """Work one case; an error is part of the record, never raised."""
+    """Compute one case; an error is stored in the record, not raised."""
     if running is not None:
         (running / job.key).touch()
     start = time.perf_counter()
@@ -53,7 +53,7 @@ def work(function: Callable[..., Any], job: Job, running: Path | None = None) ->
         found = found if isinstance(found, dict) else {"result": found}
         taken = (RESERVED | {"seed"}) & found.keys()
         if taken:
-            raise TypeError(f"a result cannot be called {min(taken)!r}: the table has a column of it; rename it")
+            raise TypeError(f"a result cannot be called {min(taken)!r}, a column of the results table; rename it")
         record["result"] = encoded(found)
     except KeyboardInterrupt:
         raise
@@ -69,7 +69,7 @@ def work(function: Callable[..., Any], job: Job, running: Path | None = None) ->
 
 
 def once(function: Callable[..., Any], job: Job, running: Path | None = None, *, wait: bool) -> dict[str, Any] | None:
-    """Work one case unless another run has or does; its result is then awaited and taken, or None without `wait`."""
+    """The record of a case, computed unless it exists; if another run computes it, wait, or return None."""
     if job.file is None:
         return work(function, job, running)
     with held(job.file, wait) as ours:
@@ -77,18 +77,18 @@ def once(function: Callable[..., Any], job: Job, running: Path | None = None, *,
 
 
 def keep(file: Path, record: dict[str, Any]) -> str | None:
-    """Put a result away unless it is an error; why it could not be, where the disk refuses."""
+    """Write a result unless it is an error; the reason if writing fails, else None."""
     if record["error"] is not None:
         return None
     try:
         write_record(file, record)
-    except OSError as error:  # a full disk or a folder that cannot be written to loses no result of this run
+    except OSError as error:  # on a full disk or in a read-only folder the results of this run are not lost
         return str(error)
     return None
 
 
 def packed(function: Callable[..., Any]) -> bytes:
-    """A function on its way to another process of this run, with the user's own modules that it needs."""
+    """A function pickled for another process of this run, with the user's own modules that it needs."""
     own = [
         module
         for name, module in list(sys.modules.items())
@@ -109,7 +109,7 @@ def packed(function: Callable[..., Any]) -> bytes:
 
 @functools.lru_cache(maxsize=4)
 def unpacked(function: bytes) -> Callable[..., Any]:
-    """The function of `packed`, once a process."""
+    """The function of `packed`, unpickled once per process."""
     found: Callable[..., Any] = cloudpickle.loads(function)
     return found
 
@@ -117,7 +117,7 @@ def unpacked(function: bytes) -> Callable[..., Any]:
 def here(
     function: Callable[..., Any], jobs: list[Job], awaiting: Callable[[int], None]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """One after the other, in this process; last those that another run was at, with their number in a message."""
+    """Records computed in this process, those under way in another run last; `awaiting` gets the number of these."""
     for wait in (False, True):
         if wait and jobs:
             awaiting(len(jobs))
@@ -134,14 +134,14 @@ def here(
 def processes(
     function: Callable[..., Any], jobs: list[Job], workers: int, awaiting: Callable[[int], None]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """In processes of this machine, in the order in which they end.
+    """Records computed in processes of this machine, in order of completion.
 
-    A case whose process dies takes the others' processes with it. Those that were running then are computed again, each
-    on its own; what dies alone has only itself to blame. Cases that another run is at come last, with
-    their number in a message.
+    If a process dies, the pool ends all others. The cases that were running are then computed again, each alone; one
+    whose process dies again is recorded as an error. Cases under way in another run come last; `awaiting` gets their
+    number.
 
     Raises:
-        StudyError: processes die before they begin a case.
+        StudyError: the processes die before they begin a case.
     """
     waiting, sent = {job.key: job for job in jobs}, packed(function)
     elsewhere: set[str] = set()
@@ -173,13 +173,13 @@ def processes(
                 barren = barren + 1 if (len(waiting), len(elsewhere)) == before else 0
                 if barren == MOST_BARREN:
                     raise StudyError(
-                        f"the processes of this run died {barren} times before they began a case: what the function"
-                        " reaches cannot be sent to them; run it with workers=1"
+                        f"the processes of this run died {barren} times before they began a case: the function's data"
+                        " cannot be sent to them; run it with workers=1"
                     ) from None
 
 
 def _already_kept(jobs: Iterable[Job]) -> list[tuple[str, dict[str, Any]]]:
-    """Results that a process had put away before it could hand them over."""
+    """Records that a process had written before it could return them."""
     records = [(job.key, read_record(job.file)) for job in jobs if job.file is not None]
     return [(key, record) for key, record in records if record is not None]
 
@@ -199,7 +199,7 @@ def _keyed(function: bytes, job: Job, running: Path, wait: bool) -> tuple[str, d
 def _alone(function: bytes, job: Job, running: Path) -> dict[str, Any]:
     start = time.perf_counter()
     try:
-        # two processes, of which one idles: with one, joblib would work the case in this very process
+        # two processes, of which one idles: with one, joblib would compute the case in this process
         [(_, record)] = _parallel(function, [job], 2, running, wait=True)
     except TerminatedWorkerError:
         record = None
@@ -207,9 +207,9 @@ def _alone(function: bytes, job: Job, running: Path) -> dict[str, Any]:
 
 
 def cluster(function: Callable[..., Any], jobs: list[Job], address: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """On the workers of a Dask scheduler, in the order in which they end.
+    """Records computed on the workers of a Dask scheduler, in order of completion.
 
-    Dask works a case again whose worker is lost, and gives it up after the scheduler's `allowed-failures`.
+    Dask repeats a case whose worker is lost, up to the scheduler's `allowed-failures`.
 
     Raises:
         StudyError: Dask is not installed, no scheduler answers, it has no worker, or a worker runs another workbench.

@@ -1,4 +1,4 @@
-"""What a study found: lines, tables, checks and figures, kept as it goes and written as JSON and a page."""
+"""The outcome of a study: lines, tables, checks and figures, collected while it runs, written as JSON and a page."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -17,7 +17,7 @@ from workbench.study.runs.runner import CACHE, run
 from workbench.study.runs.whole_file import write_whole
 
 DIGITS = 10
-OWN = ("checks", "found")  # beside the tables in the JSON: what must hold, and the lines
+OWN = ("checks", "found")  # entries of the JSON besides the tables: checks and lines
 
 T = TypeVar("T")
 Shown = Figure | Mapping[str, Any]  # on a page: a figure, or the motion that `draw.motion` describes
@@ -25,16 +25,16 @@ Shown = Figure | Mapping[str, Any]  # on a page: a figure, or the motion that `d
 
 @dataclass
 class Outcome:
-    """Collects what a study finds; the only type that is filled in as it goes.
+    """The results of a study; a study adds to them while it runs.
 
     Attributes:
         name: of the study.
-        title: the question it answers.
-        figures_folder: where figures are saved.
+        title: the question of the study.
+        figures_folder: folder of the figures.
         on_say, on_track, on_report: called with each line, each iterable to show progress for, and the
             progress of a run.
-        cache: folder where results of cases are kept.
-        scheduler: address of a Dask scheduler that takes the cases of every run; None for processes here.
+        cache: folder of the results of cases.
+        scheduler: address of a Dask scheduler that computes the cases of every run; None for local processes.
     """
 
     name: str
@@ -53,19 +53,19 @@ class Outcome:
     runs: dict[str, Results] = field(default_factory=dict)
 
     def say(self, text: str) -> None:
-        """A line of what was found."""
+        """Add a line to the results."""
         self.lines.append(text)
         if self.on_say is not None:
             self.on_say(text)
 
     def table(self, name: str, values: object) -> None:
-        """A table under its name: anything of numbers, texts, lists and dicts.
+        """Add a table of numbers, texts, lists and dicts.
 
         Raises:
-            StudyError: a name that the results need for themselves, or values that JSON cannot hold.
+            StudyError: a reserved name, or values that JSON cannot represent.
         """
         if name in OWN:
-            raise StudyError(f"a table cannot be called {name!r}: the results have an entry of it; rename the table")
+            raise StudyError(f"a table cannot be called {name!r}, an entry of the results; rename the table")
         values = plain(values)
         try:
             json.dumps(values)
@@ -76,7 +76,7 @@ class Outcome:
         self.tables[name] = values
 
     def check(self, name: str, value: float, limit: float, at_least: bool = False) -> None:
-        """A figure that must hold: at most `limit`, or at least with `at_least`."""
+        """Add a check: `value` must be at most `limit`, or at least `limit` with `at_least`."""
         holds = bool(value >= limit if at_least else value <= limit)
         self.checks.append(
             {"name": name, "value": plain(value), "limit": plain(limit), "holds": holds, "at_least": at_least}
@@ -95,13 +95,13 @@ class Outcome:
         self.shown.append((motion, caption))
 
     def track(self, iterable: Iterable[T], what: str) -> Iterator[T]:
-        """The same iterable, with its progress shown."""
+        """An iterator over the iterable that shows its progress."""
         return iter(iterable) if self.on_track is None else self.on_track(iterable, what)
 
     def run(
         self, cases: Iterable[Mapping[str, Any]], function: Callable[..., Any], name: str = "cases", **options: Any
     ) -> Results:
-        """The function at every case, as `study.run` does it; the table is kept under its name, numbered if taken."""
+        """Run the function for every case by `study.run`, and add the table under `name`, numbered if taken."""
         options = {"cache": self.cache, "scheduler": self.scheduler, "report": self.on_report, **options}
         found = run(cases, function, **options)
         names = chain([name], (f"{name}-{i}" for i in count(2)))
@@ -113,7 +113,7 @@ class Outcome:
         return all(check["holds"] for check in self.checks)
 
     def to_json(self) -> dict[str, Any]:
-        """Tables under their names, and `checks`."""
+        """The tables by name, the checks and the lines."""
         return {**self.tables, "checks": self.checks, "found": self.lines}
 
     def write(self, folder: Path) -> Path:
@@ -127,7 +127,7 @@ class Outcome:
 
 
 def plain(value: object) -> Any:
-    """Numbers to ten digits, arrays to lists, keys to text: what JSON holds, the same from run to run."""
+    """The value for JSON, the same from run to run: numbers to ten digits, arrays as lists, keys as text."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

@@ -22,15 +22,15 @@ ENDINGS = (".csv", ".parquet", ".json")
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """One case and what came of it.
+    """The result of one case.
 
     Attributes:
         parameters: of the case.
-        seed: it was computed with; None where the function takes none.
-        values: by name; empty where the case failed.
-        error: what it raised, in a line; None where it did not.
-        trace: of the error, for the developer.
-        seconds: it took.
+        seed: of the case; None if the function takes no seed.
+        values: by name; empty if the case failed.
+        error: the exception of the case in one line; None if it succeeded.
+        trace: the traceback of the error.
+        seconds: time of the computation.
     """
 
     parameters: Mapping[str, Any]
@@ -44,7 +44,7 @@ class Result:
         """A value or a parameter by name.
 
         Raises:
-            KeyError: no such name, or the case failed, and how.
+            KeyError: no such name, or the case failed; the message states the error.
         """
         if name in self.values:
             return self.values[name]
@@ -76,21 +76,21 @@ class Results(Sequence[Result]):
 
     @property
     def failed(self) -> tuple[Result, ...]:
-        """Those that raised an error."""
+        """The results of the cases that failed."""
         return tuple(result for result in self.every if result.error is not None)
 
     @property
     def seconds(self) -> float:
-        """Work of all cases together, s."""
+        """Total computation time of all cases, s."""
         return sum(result.seconds for result in self.every)
 
     def rows(self) -> list[dict[str, Any]]:
-        """A dict a case, all with the same names: parameters, values, seed, error, seconds, versions.
+        """One dict per case, all with the same keys: parameters, values, seed, error, seconds, versions.
 
-        What a dict holds has a column of its own, `outer.inner`; a value that no case of this row has is None.
+        An entry of a dict has its own column, `outer.inner`; a value that a case does not have is None.
 
         Raises:
-            StudyError: two values of one name.
+            StudyError: two different values of the same name.
         """
         used = ", ".join(f"{name} {version}" for name, version in versions().items())
         parts = [(_flat(r.parameters), _flat(r.values)) for r in self.every]
@@ -100,20 +100,19 @@ class Results(Sequence[Result]):
             both = parameters.keys() & values.keys()
             twice = [n for n in both if json.dumps(_plain(parameters[n])) != json.dumps(_plain(values[n]))]
             if twice:
-                raise StudyError(f"{min(twice)!r} is a parameter and a result of another value; rename the result")
+                raise StudyError(f"{min(twice)!r} is a parameter and a result with different values; rename the result")
             row = {name: values.get(name, parameters.get(name)) for name in names}
             ending = {"error": result.error, "seconds": result.seconds, "versions": used}
             rows.append({**row, "seed": result.seed, **ending})
         return rows
 
     def write(self, path: str | Path) -> Path:
-        """Write the table: .csv, .parquet (with pyarrow) or .json, by its ending.
+        """Write the table as .csv, .parquet (with pyarrow) or .json, by its suffix.
 
-        In CSV, lists and arrays are written as JSON, and numbers so that they read back bit for bit. In JSON, which has
-        no other, a number that is not finite is null.
+        In CSV, lists and arrays are written as JSON, and numbers exactly. In JSON, a number that is not finite is null.
 
         Raises:
-            StudyError: another ending, or pyarrow is not installed.
+            StudyError: another suffix, or pyarrow is not installed.
         """
         path = Path(path)
         if path.suffix not in ENDINGS:
@@ -147,7 +146,7 @@ def _flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
         part = _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {before + name: value}
         twice = part.keys() & flat.keys()
         if twice:
-            raise StudyError(f"two values would stand in one column, {min(twice)!r}; rename one")
+            raise StudyError(f"two values have the same column name {min(twice)!r}; rename one")
         flat.update(part)
     return flat
 
@@ -187,5 +186,5 @@ def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
     try:
         columns = {name: pa.array([row[name] for row in rows]) for name in rows[0]}
     except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
-        raise StudyError(f"a column mixes kinds that Parquet keeps apart ({error}); write .csv") from error
+        raise StudyError(f"a column mixes types that Parquet distinguishes ({error}); write .csv") from error
     parquet.write_table(pa.table(columns), path)

@@ -1,4 +1,4 @@
-"""Many cases of a study: each computed once, kept as soon as it is done, and resumed after any interruption."""
+"""Runs of many cases: each is computed once and stored at once, so that an interrupted run can resume."""
 
 import inspect
 import warnings
@@ -26,27 +26,26 @@ def run(
     seed: int = 0,
     report: Callable[[str, float], None] | None = None,
 ) -> Results:
-    """The function at every case, in the order of the cases: `for result in study.run(cases, function): ...`.
+    """Results of a function for every case, in the order of the cases: `for result in study.run(cases, function): ...`.
 
-    A result is kept under a name made of the function (its code and all that reaches), the versions of what computes,
-    the case and its seed, so that a second run works only what is new, changed, failed, or was not finished. What a
-    case raises is kept beside the results of the others. Equal cases are computed once; of runs at once on one cache,
-    also in other processes, each takes what another has or awaits it. A file counts with what it holds only where a
+    A result is stored under a digest of the function (with all code and data it uses), the versions of the software,
+    the case and its seed, so that a second run computes only cases that are new, changed, failed or unfinished. The
+    exception of a case is stored with the results of the others. Equal cases are computed once; simultaneous runs on
+    one cache, also in other processes, share results and wait for each other's. The contents of a file count only if a
     case names it as a `Path`.
 
     Args:
         cases: dicts of plain parameters; `grid` and `samples` make them.
-        function: of a case's parameters by name; returns a dict of numbers, texts, lists and arrays, or one of these.
-            Where it has a parameter `seed` that the case does not give, it gets a seed of the case's own.
-        cache: folder where results are kept; None keeps none.
-        workers: processes; one for each core unless given. With one, cases are computed in this process.
-        scheduler: address of a Dask scheduler, such as tcp://10.0.0.5:8786, whose workers take the cases instead.
+        function: takes a case's parameters by name; returns a dict of numbers, texts, lists and arrays, or one of
+            these. A parameter `seed` that the case does not give gets a seed of the case.
+        cache: folder of the results; None to store none.
+        workers: number of processes; one for each core unless given. With one, cases are computed in this process.
+        scheduler: address of a Dask scheduler, such as tcp://10.0.0.5:8786, whose workers compute the cases instead.
         seed: root of the seeds.
-        report: called with what is done, or what other run is waited for, and the share of it.
+        report: called with a text and the share done.
 
     Raises:
-        StudyError: no cases; a case or function whose result could not be distinguished from another's; a cluster
-            that does not answer.
+        StudyError: no cases; a case or function that does not have a unique digest; a cluster that does not answer.
     """
     checked_cases = [checked(case, number) for number, case in enumerate(cases, 1)]
     if not checked_cases:
@@ -70,7 +69,7 @@ def run(
 
     def awaiting(n: int) -> None:
         if report is not None:
-            report(f"waiting for what another run is at: {n} of the cases", len(records) / len(set(keys)))
+            report(f"waiting for {n} cases of another run", len(records) / len(set(keys)))
 
     for key, record in _computed(function, list(jobs.values()), workers, scheduler, awaiting):
         records[key] = record
@@ -80,7 +79,7 @@ def run(
         _report(report, len(records), len(set(keys)))
     if unkept:
         warnings.warn(
-            f"{len(unkept)} of {len(set(keys))} results could not be kept in {folder} and would be computed again:"
+            f"{len(unkept)} of {len(set(keys))} results could not be written to {folder} and would be computed again:"
             f" {unkept[0]}",
             stacklevel=2,
         )

@@ -1,4 +1,4 @@
-"""Text that stands in its place whole or not at all."""
+"""Atomic writing of text files."""
 
 import os
 import tempfile
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def write_whole(path: Path, text: str) -> Path:
-    """Write a text beside its place and then move it there: an interruption leaves no half of it."""
+    """Write a text to a temporary file in the same folder and move it to `path`, so that no partial file remains."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".writing-")
     try:
@@ -14,7 +14,7 @@ def write_whole(path: Path, text: str) -> Path:
             file.write(text)
         mask = os.umask(0)
         os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)  # a temporary file is its owner's alone
+        os.chmod(temporary, 0o666 & ~mask)  # mkstemp makes a file only its owner can read
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
