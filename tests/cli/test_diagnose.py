@@ -129,4 +129,4 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
     options = ("--nominal", tmp_path / "low.csv", "--inputs", "F1", "--quantity", "displacement", "--uncorrected")
     run("diagnose", *options, *(part for file in days for part in ("--records", file)))
     assert [record.name for record in seen[1:]] == ["monday/sweep", "tuesday/sweep"]
-    assert "give it once" in run("diagnose", *options, "--records", days[0], "--records", days[0]).output
+    assert "give each record once" in run("diagnose", *options, "--records", days[0], "--records", days[0]).output

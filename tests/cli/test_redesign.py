@@ -93,7 +93,7 @@ def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda told: told.pop("effects"), "it has no 'effects'; diagnose it again"),
+        (lambda told: told.pop("effects"), "it has no 'effects'; diagnose the case again"),
         (lambda told: told["effects"][0].update(values={}), "needs a number 'delay'; got None"),
         (lambda told: told["effects"][0].update(values={"delay": "x"}), "needs a number 'delay'; got 'x'"),
         (lambda told: told["effects"][0].update(target="F9"), "acts on 'F9', which the rig does not have"),

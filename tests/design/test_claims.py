@@ -121,7 +121,7 @@ def test_the_one_sensor_of_the_first_mode_of_a_plate_stands_at_its_centre():
     squares = [1.0, 100.0, 100.0]
     placed = place_sensors(plate.modes(3), 1, 1, 8.0, mean_squares=squares, candidates=candidates)
     assert placed.places == [(0.45, 0.3)] and placed.exhaustive
-    with pytest.raises(DesignError, match=r"no choice of 2 candidate places makes a filter: .* its mass"):
+    with pytest.raises(DesignError, match=r"no choice of 2 candidate places makes a filter: .* needs the mass"):
         place_sensors(plate.modes(3), 1, 2, mean_squares=squares, candidates=candidates)
 
 

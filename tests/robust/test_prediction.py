@@ -112,7 +112,7 @@ def test_a_model_holds_where_its_worst_sensor_has_what_is_expected_of_it(n):
         assert check.holds is bool(share >= check.expected_least) is bool(share > n // 100 / n)
         assert ("The model holds" in check.sentence) is check.holds
         assert not replace(check, allowed=1.15).holds
-    assert "no test of the model: 115 %" in replace(check, allowed=1.15).sentence
+    assert "no test of the model: its bands allow for an error of 115 %" in replace(check, allowed=1.15).sentence
 
 
 def test_coloured_noise_of_the_same_size_is_seen_in_the_spectrum_alone(plain):
@@ -215,7 +215,7 @@ def test_what_cannot_be_predicted_or_checked_is_named(plain):
     with pytest.raises(TypeError, match="must be a DigitalController; got str"):
         predict_loop(one, "controller", LoopTest(50, 0.01, 0.3))
     unknown = predict(replace(one, outcome="unknown", unexplained=0.2), new, draws=60)
-    assert "leaves the gap unexplained: 20 %" in str(unknown)
+    assert "leaves the gap unexplained: the bands allow for an error of 20 %" in str(unknown)
 
 
 def test_a_figure_of_a_check_shows_the_stretch_of_the_worst_reading(plain):

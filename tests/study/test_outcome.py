@@ -50,7 +50,7 @@ def test_results_are_plain_json_with_checks(tmp_path):
 @pytest.mark.parametrize(
     ("name", "values", "words"),
     [
-        ("found", {"W_R": 3.0}, "a table cannot be called 'found': .* rename the table"),
+        ("found", {"W_R": 3.0}, "a table cannot be called 'found', .* rename the table"),
         ("checks", 1.0, "a table cannot be called 'checks'"),
         ("poles", {"first": [1j]}, "table 'poles': .* complex .* by its parts"),
     ],

@@ -153,5 +153,5 @@ def test_patches_that_lie_over_each_other_are_told():
         task.placed(at, "")
         for at in ([(0.198, 0.205), (0.368, 0.075)], [(0.15, 0.2), (0.35, 0.22)], [(0.2, 0.1), (0.3, 0.26)])
     )
-    assert over.overlapping and "patches overlap; their length" in str(over)
+    assert over.overlapping and "patches overlap; a spacing of their length" in str(over)
     assert not beside.overlapping and not above.overlapping and "overlap" not in str(beside)

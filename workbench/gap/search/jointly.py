@@ -372,8 +372,8 @@ def _points_of(rig: Rig, effects: Sequence[Effect]) -> tuple[str, ...]:
     """The named points at which effects act; none of a structure that is known all over."""
     if not isinstance(rig.modes.domain, NamedPoints):
         return ()
-    places = (e.at if isinstance(e.at, Between) else (e.at,) for e in effects if e.at is not None)
-    return tuple(dict.fromkeys(point for place in places for point in place))
+    each = (e.at if isinstance(e.at, Between) else (e.at,) for e in effects if e.at is not None)
+    return tuple(dict.fromkeys(str(point) for points in each for point in points))
 
 
 def surely_late(errors: Effect) -> Effect:
