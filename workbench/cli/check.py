@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, tell, write_json
+from workbench.cli.terminal import as_typed, check_target, guarded, print_result, reporting, say, short, write_json
 from workbench.cli.uncertain import predicted, record_of
 
 LOG = "tests.csv"
@@ -47,7 +47,7 @@ def check(
     with reporting("reading") as report:
         prediction = predicted(found, measured, verdict, draws=draws, seed=seed, workers=workers, report=report)
     result = check_prediction(prediction, measured)
-    tell(result)
+    print_result(result)
     for note in prediction.notes:
         say(note)
     log_test(log, result)

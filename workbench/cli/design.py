@@ -65,8 +65,8 @@ def design(
         numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
         shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, row.stability))
-    struck, unit = modes.domain.text(at, 6), command_unit(actuators)
-    say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {struck}, R = {weight:g}", bold=True)
+    where, unit = modes.domain.text(at, 6), command_unit(actuators)
+    say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {where}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
     headings = map(units.named, (*command_headings(unit), "W_C [J]", "W_R [J]"))

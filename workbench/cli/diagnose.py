@@ -21,12 +21,12 @@ def diagnose(
     ] = None,
     records: Annotated[list[Path] | None, typer.Option(help="With --nominal: a record to diagnose; repeat.")] = None,
     validation: Annotated[
-        list[Path] | None, typer.Option(help="With --nominal: a record that only measures the gap; repeat.")
+        list[Path] | None, typer.Option(help="With --nominal: a record that is not fitted, to validate on; repeat.")
     ] = None,
     inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="With --nominal: channels that are inputs.")] = "",
     input_hold: options.InputHold = None,
     quantity: Annotated[
-        str, typer.Option(help="With --nominal: of outputs that state none: displacement, velocity, acceleration.")
+        str, typer.Option(help="With --nominal: displacement, velocity or acceleration, of outputs without one.")
     ] = "",
     driving_point: Annotated[
         str,
@@ -39,17 +39,17 @@ def diagnose(
         typer.Option("--uncertain-nominal", help="Re-estimate the nominal frequencies and damping with every effect."),
     ] = False,
     correct: Annotated[
-        bool, typer.Option("--correct", help="Correct the faults of wiring and units that are found, and go on.")
+        bool, typer.Option("--correct", help="Correct detected faults of wiring and units, and go on.")
     ] = False,
     uncorrected: Annotated[
         bool,
         typer.Option("--uncorrected", help="Go on in spite of faults of wiring and units, without correcting them."),
     ] = False,
     settle: Annotated[
-        float, typer.Option(help="Time at the start of each record that is not counted, where it starts in motion, s.")
+        float, typer.Option(help="Time at the start of each record that is left out, where it starts in motion, s.")
     ] = 0.0,
     workers: Annotated[int | None, typer.Option(help="Processes sharing the work; one per core unless given.")] = None,
-    seconds: Annotated[float, typer.Option(help="Processor time to search for, s; twice as long on one core.")] = 120.0,
+    seconds: Annotated[float, typer.Option(help="Processor time of the search, s; twice as long on one core.")] = 120.0,
 ) -> None:
     """Locate the gap between a simulation and a test, name the missing effect, and measure how far the gap closes.
 

@@ -8,13 +8,13 @@ import typer
 from workbench.cli import options
 from workbench.cli.control import check_rate, count_of, damping_by, law_from, observed
 from workbench.cli.rig_file import toml_of
-from workbench.cli.terminal import check_target, guarded, say, short, tell
+from workbench.cli.terminal import check_target, guarded, print_result, say, short
 
 
 @guarded
 def export(
     rig: options.RigPath,
-    rate_hz: Annotated[float, typer.Option(help="Sampling rate at which the controller is to run.")],
+    rate_hz: Annotated[float, typer.Option(help="Sampling rate of the controller, Hz.")],
     to: Annotated[
         Path,
         typer.Option(
@@ -30,7 +30,8 @@ def export(
     ] = options.ESTIMATORS[0],
     disturbance: options.Disturbance = 1.0,
     computing_delay_ms: Annotated[
-        float, typer.Option(help="Computation delay from a reading to its command, ms, beside the actuators' delays.")
+        float,
+        typer.Option(help="Computation delay from a reading to its command, ms, in addition to the actuators' delays."),
     ] = 0.0,
 ) -> None:
     """Write a controller as a step function in C or Python, or as a MAT file, at the rate of its computer.
@@ -40,7 +41,7 @@ def export(
     Example: workbench export case.toml --control 2 --damping 0.05 --rate-hz 500 --to controller.c
     """
     from workbench.cases.case import read_rig, read_units
-    from workbench.design.export.export import export as hand_over
+    from workbench.design.export.export import export as export_controller
     from workbench.rig.sensors import MEASURED
 
     check_target(to)
@@ -49,11 +50,11 @@ def export(
     chosen = law_from(found, law, count_of(found, control), weight, damping)
     unread = [s.name for s in found.sensors if MEASURED[s.quantity][1] > 1]
     observer = observed(found, chosen, estimator, disturbance=disturbance, sample_time=1.0 / rate_hz)
-    design = hand_over(
+    design = export_controller(
         found.modes, observer, to,
         sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms, units=read_units(toml_of(rig)),
     )  # fmt: skip
-    tell(design)
+    print_result(design)
     say(f"  {damping_by(found.modes, chosen)}")
     if unread:
         say(f"  not read, as accelerations: {', '.join(unread)}")

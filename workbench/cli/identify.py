@@ -43,7 +43,7 @@ def identify(
         tuple[float, float] | None,
         typer.Option(metavar="LOW HIGH", help="Frequency band of transfer functions to fit."),
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Processor time to search for, s.")] = 30.0,
+    seconds: Annotated[float, typer.Option(help="Processor time of the search, s.")] = 30.0,
     memory: options.Memory = 1.0,
     page: Annotated[
         Path | None,

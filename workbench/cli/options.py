@@ -10,7 +10,7 @@ ESTIMATORS = ("luenberger", "kalman", "modal-filter")
 
 JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the results to this file as JSON.")]
 Memory = Annotated[float, typer.Option(help="Memory that reading a file may take, GiB.")]
-SampleRate = Annotated[float | None, typer.Option(help="Sampling rate, where the file has no time axis.")]
+SampleRate = Annotated[float | None, typer.Option(help="Sampling rate, Hz, where the file has no time axis.")]
 InputHold = Annotated[
     str | None,
     typer.Option(
@@ -27,7 +27,7 @@ VerdictPath = Annotated[
 Workers = Annotated[int | None, typer.Option(help="Processes that share the diagnosis; one per core unless given.")]
 # a bracket that opens a word would be taken for markup of the help text
 RigPath = Annotated[
-    Path, typer.Argument(help=r"Case folder, or TOML file with \[structure], \[\[input]] and \[\[output]] as in one.")
+    Path, typer.Argument(help=r"Case folder, or TOML file with \[structure], \[\[input]] and \[\[output]].")
 ]
 ImpulseAt = Annotated[
     str | None,
@@ -45,20 +45,20 @@ Control = Annotated[
 ]
 LawWeight = Annotated[
     float | None,
-    typer.Option("--weight", help="Control weight R, of forces (imsc: modal forces); in place of --damping."),
+    typer.Option("--weight", help="Control weight R of forces (imsc: of modal forces), in place of --damping."),
 ]
 Damping = Annotated[
     float | None,
     typer.Option(
-        help=f"Damping ratio wanted of the controlled modes, {DAMPING:g} unless given: exact by poles; imsc and coupled"
-        " take weights that come near it where it is small, and the output says which they give; not for on-off."
+        help=f"Damping ratio of the controlled modes, {DAMPING:g} unless given: exact for poles; approximate for imsc"
+        " and coupled, where it is small, and the output says which ratios result; not for on-off."
     ),
 ]
 Disturbance = Annotated[
     float,
     typer.Option(
-        help="For the Kalman filter: intensity of white modal forces; less makes it slower. The sensors' noise is"
-        " noise_std of the outputs."
+        help="For the Kalman filter: intensity of white modal forces; a smaller one makes it slower. The sensors' noise"
+        " is noise_std of the outputs."
     ),
 ]
 RecordName = Annotated[

@@ -31,13 +31,14 @@ def place(
     weight: options.Weight = 1.0,
     impulse_at: options.ImpulseAt = None,
     effort: Annotated[
-        float, typer.Option(help="Effort limit, times that of evenly spaced actuators (beam), or of the rig's own.")
+        float,
+        typer.Option(help="Effort limit, as a multiple of that of even places (beam) or of the rig's own actuators."),
     ] = 1.5,
     spacing: Annotated[
         float | None,
         typer.Option(
-            help="Least distance between middles of actuators, m; unless given 1/20 of the size, and of patches on a"
-            " beam their length. On a plate patches may overlap, which is headings; their diagonal keeps them apart."
+            help="Least distance between the centres of actuators, m; default 1/20 of the structure's size, for patches"
+            " on a beam their length. Patches on a plate may overlap, which is reported; their diagonal prevents it."
         ),
     ] = None,
     peak_force: Annotated[
@@ -48,7 +49,7 @@ def place(
         list[str] | None, typer.Option(metavar="FROM:TO", help="Zone without actuators, m; X,Y:X,Y on a plate.")
     ] = None,
     at: Annotated[
-        str | None, typer.Option(metavar="PLACES", help="Candidates, m (X,Y;X,Y on a plate) or names.")
+        str | None, typer.Option(metavar="PLACES", help="Candidate places, m (X,Y;X,Y on a plate) or names.")
     ] = None,
     grid: Annotated[
         float | None, typer.Option(metavar="M", help="Spacing of a grid of candidates over a plate, m.")
@@ -64,7 +65,7 @@ def place(
     ] = None,
     json_path: options.JsonPath = None,
 ) -> None:
-    """Place actuators for the least spillover work, within the limits of a rig; its piezo patches, where it has some.
+    """Place actuators, or the piezo patches of a rig, for the least spillover work within given limits.
 
     Example: workbench place case.toml --control 3 --weight 20 --effort 1.2 --forbid 0.2:0.3 --certify 0.05
     """
@@ -83,7 +84,7 @@ def place(
     if certified_gap is not None and not 0 < certified_gap < 1:
         raise ValueError(f"--certify is a share between 0 and 1; got {certified_gap:g}")
     found, units = read_structure_rig(rig), read_units(toml_of(rig))
-    modes, struck = found.modes, impulse_place(found, impulse_at)
+    modes, impulse_point = found.modes, impulse_place(found, impulse_at)
     if not modes.proportional:
         say("damping couples the modes: placements are compared without its coupling terms")
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
@@ -92,7 +93,7 @@ def place(
     if certified_gap is not None and isinstance(domain, Rectangle) and candidates is None:
         raise ValueError("--certify on a plate needs candidate places; give their spacing by --grid M, or --at PLACES")
     with reporting("placing actuators") as report:
-        task = placement_task(modes, control, impulse_at=struck, weight=weight, actuator=patch_of(found))
+        task = placement_task(modes, control, impulse_at=impulse_point, weight=weight, actuator=patch_of(found))
         if isinstance(domain, Interval):
             standard = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
         else:
@@ -137,10 +138,8 @@ def place(
         where = ("; " if isinstance(domain, Rectangle) else ", ").join(map(place_text, listed(row.positions)))
         numbers = (row.residual_work, row.effort, row.peak_force, row.condition)
         shown.append((where, *(f"{value:.5g}" for value in numbers), row.status))
-    say(
-        f"{control} of {modes.n_modes} modes controlled, unit impulse at {domain.text(struck, 6)}, R = {weight:g}",
-        bold=True,
-    )
+    where = domain.text(impulse_point, 6)
+    say(f"{control} of {modes.n_modes} modes controlled, unit impulse at {where}, R = {weight:g}", bold=True)
     where = "points" if isinstance(domain, NamedPoints) else "places [m]"
     unit = command_unit([task.actuator])
     headings = map(units.named, (where, "W_R [J]", *command_headings(unit)))
@@ -151,12 +150,12 @@ def place(
     if certificate is not None:
         say(f"  {certificate}")
     if picture is not None:
-        _draw(picture, task, {"least work": best, standard.status: standard}, limits, struck, units)
+        _draw(picture, task, {"least work": best, standard.status: standard}, limits, impulse_point, units)
     write_json(
         json_path,
         {
             "length": None if isinstance(domain, NamedPoints) else domain.length,
-            "impulse_at": struck,
+            "impulse_at": impulse_point,
             "weight": weight,
             "command_unit": unit,
             "controlled": list(range(1, control + 1)),
@@ -218,7 +217,7 @@ def _draw(
     task: "PlacementTask",
     placements: "dict[str, Placement]",
     limits: "Limits",
-    struck: Place,
+    impulse_point: Place,
     units: "Units",
 ) -> None:
     """Draw the placements along a member or over the nodal lines of a plate; at points, the best one's work by mode."""
@@ -228,9 +227,9 @@ def _draw(
 
     domain = task.modes.domain
     if isinstance(domain, Rectangle):
-        figure = plot_surface_placement(task, placements, limits=limits, impulse_at=struck)  # type: ignore[arg-type]
+        figure = plot_surface_placement(task, placements, limits=limits, impulse_at=impulse_point)  # type: ignore[arg-type]
     elif isinstance(domain, Interval):
-        figure = plot_member_placement(task, placements, limits=limits, impulse_at=struck, units=units)  # type: ignore[arg-type]
+        figure = plot_member_placement(task, placements, limits=limits, impulse_at=impulse_point, units=units)  # type: ignore[arg-type]
     else:
         figure = plot(next(iter(placements.values())))
         figure.axes[0].set_ylabel(units.named(figure.axes[0].get_ylabel()))

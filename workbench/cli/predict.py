@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from workbench.cli import options
-from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, tell, write_json
+from workbench.cli.terminal import as_typed, check_target, guarded, print_result, reporting, say, short, write_json
 from workbench.cli.uncertain import predicted, record_of
 
 
@@ -31,7 +31,7 @@ def predict(
     planned = record_of(found, record, sample_rate_hz)
     with reporting("reading") as report:
         prediction = predicted(found, planned, verdict, draws=draws, seed=seed, workers=workers, report=report)
-    tell(prediction)
+    print_result(prediction)
     write_json(
         json_path,
         {

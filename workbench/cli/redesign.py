@@ -23,7 +23,8 @@ def redesign(
     estimator: Annotated[
         str | None,
         typer.Option(
-            metavar="|".join(options.ESTIMATORS), help="Estimator in use; a Kalman filter tuned to it unless given."
+            metavar="|".join(options.ESTIMATORS),
+            help="Estimator in use; a Kalman filter tuned to the law unless given.",
         ),
     ] = None,
     disturbance: options.Disturbance = 1.0,
@@ -37,7 +38,7 @@ def redesign(
             "--criterion",
             "--aim",
             metavar="cost|settling",
-            help="What the controllers are judged by: the cost of the LQR, or settling and effort; by the law's kind"
+            help="Criterion of the comparison: the cost of the LQR, or settling time and effort; by the law's kind"
             " unless given.",
         ),
     ] = None,
@@ -45,7 +46,7 @@ def redesign(
         float, typer.Option(help="Share by which a new controller that settles sooner may cost more than the present.")
     ] = 0.01,
     more_work: Annotated[
-        float, typer.Option(help="Share by which it may do more work; as much as it takes unless given.")
+        float, typer.Option(help="Share by which that controller may do more work; unlimited unless given.")
     ] = float("inf"),
     draws: Annotated[
         int,
@@ -86,10 +87,10 @@ def redesign(
     rig, records = found.rig, (*found.fit, *found.validation)
     count = count_of(rig, control)
     controlled = controlled_indices(rig.modes, count)
-    struck = None if impulse_at is None else impulse_place(rig, impulse_at)
+    impulse_point = None if impulse_at is None else impulse_place(rig, impulse_at)
     sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
     level = np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0)
-    test = impulse_test(rig, controlled, sample_time, struck, level=level, seed=seed)
+    test = impulse_test(rig, controlled, sample_time, impulse_point, level=level, seed=seed)
     own = law_from(rig, law, count, weight, damping, impulse_at=test.impulse_at, impulse=test.impulse)
     in_use: Design = own
     if estimator is not None:

@@ -115,7 +115,7 @@ def reporting(first: str) -> Iterator[Callable[[str, float], None]]:
         yield report
 
 
-def tell(result: object) -> None:
+def print_result(result: object) -> None:
     """Print a result, its first line bold."""
     head, *rest = str(result).splitlines()
     say(head, bold=True)

@@ -37,18 +37,19 @@ def uncertain_rig(
     if verdict is not None:
         return read_verdict(verdict, case.rig)
     check_disjoint(case.fit, case.validation)
-    kept = Path("out") / f"{case.name}-verdict.json"
+    verdict_path = Path("out") / f"{case.name}-verdict.json"
     for fault in setup_faults(case.rig, case.fit, case.validation):
         if fault.certain:
             raise ValueError(
                 f"{fault.sentence.rstrip('.')}; correct the case, or ignore the fault by `workbench diagnose CASE"
-                f" --uncorrected --json {kept.name}` and give that file as --verdict"
+                f" --uncorrected --json {verdict_path.name}` and give that file as --verdict"
             )
     errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
     found = diagnose_case(case, workers=workers, progress=report)
-    write_verdict(found, kept)
+    write_verdict(found, verdict_path)
     errors.print(f"  {found.sentence}")
-    errors.print(f"  verdict    {short(kept)}: give --verdict {short(kept)} to the next command to skip the diagnosis")
+    shown = short(verdict_path)
+    errors.print(f"  verdict    {shown}: give --verdict {shown} to the next command to skip the diagnosis")
     return UncertainRig.of(found), found.budget.noise_found or None
 
 
