@@ -77,7 +77,7 @@ def design(
     tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
-    heads += [] if errors is None else [f"stable with models {errors:.2g} off"]
+    heads += [] if errors is None else [f"stable share, {errors:.2g} model error"]
     sensed, written = [], []
     for controller, explained, why in tried:
         if controller is None or explained is None:
@@ -134,9 +134,9 @@ def _limit(explained: "Explanation") -> tuple[str, str]:
     if worst is None and explained.loop.stable:
         return "none", ""
     if worst is None:
-        return "none: unstable without them" if explained.reduced_margin <= 0 else "no single mode", ""
+        return "none: unstable without residual modes" if explained.reduced_margin <= 0 else "no single mode", ""
     grows = explained.loop.stable or worst.closed_pole.real > 0
-    pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without it"
+    pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without this mode"
     return (
         f"mode {worst.mode + 1}: {pole}",
         f"sensor at {worst.dominant.text}",
