@@ -31,9 +31,9 @@ Starts = Callable[[Evidence, Any], Iterable[dict[str, Any]]]
 Apply = Callable[[Rig, Any, dict[str, Any]], Rig]
 
 SLOW_ENTRY = 0.1  # of the rms step between samples: a reading that reaches its top in a larger step is cut off there
-# ratio of steps to their decrease: three times as long as motion at constant deceleration takes up and back
+# stay at the top, in units of the time to stop at the deceleration before it: three times as long as up and back
 LONG_STAY = 6.0
-TURNING_SAMPLES = 2  # a motion that reverses slowly is at its top no longer
+TURNING_SAMPLES = 2  # longest stay of a motion that reverses slowly
 
 # --- targets and changes
 
@@ -44,7 +44,7 @@ def each_actuator(rig: Rig) -> tuple[str, ...]:
 
 
 def actuators_or_all(rig: Rig) -> tuple[str, ...]:
-    """Every actuator alone, and all of them together where there are several."""
+    """Every actuator alone, and all of them together if there are several."""
     names = each_actuator(rig)
     return ((ALL, *names) if len(names) > 1 else names) if names else ()
 
@@ -558,7 +558,7 @@ def _comes_to_rest(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
         rows: readings (n_samples,) of each record.
         at_top: (n_samples,) of each record, whether the reading is at its top.
     """
-    entering, long_stays = [], []
+    entering, at_rest = [], []
     for row, flags in zip(rows, at_top, strict=True):
         ends = np.flatnonzero(np.diff(np.r_[False, flags, False]))
         for first, last in zip(ends[::2], ends[1::2], strict=True):
@@ -566,9 +566,9 @@ def _comes_to_rest(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
                 before, step, into = np.abs(np.diff(row[first - 3 : first + 1]))
                 entering.append(into)
                 stayed = last - first
-                long_stays.append(stayed <= TURNING_SAMPLES or stayed * abs(before - step) > LONG_STAY * step)
+                at_rest.append(stayed <= TURNING_SAMPLES or stayed * abs(before - step) > LONG_STAY * step)
     typical = np.sqrt(np.mean(np.concatenate([np.diff(row) for row in rows]) ** 2))
-    return bool(entering) and float(np.median(entering)) < SLOW_ENTRY * typical and float(np.mean(long_stays)) > 0.5
+    return bool(entering) and float(np.median(entering)) < SLOW_ENTRY * typical and float(np.mean(at_rest)) > 0.5
 
 
 def step_of(readings: np.ndarray) -> float | None:

@@ -114,7 +114,7 @@ def _closed(before: float, after: float, floor: float) -> float:
 
 
 def block_length(rig: Rig, record: Record) -> int:
-    """Samples of a block of a record: three decay times of the slowest elastic mode, within 1/20 and 1/8 of the record.
+    """Samples of a block of a record: three decay times of the slowest elastic mode, 1/20 to 1/8 of the record.
 
     Residuals of such blocks are nearly independent.
     """
@@ -138,7 +138,7 @@ class Budget:
             from record to record is among them, as "stiffness_record_to_record".
         nominal: share that small errors of the nominal model remove beyond the effects, and that noise of the logged
             inputs causes.
-        unexplained: share of the remaining residual that is not noise.
+        unexplained: share that remains and is not noise.
         noise: share of the sensors' noise.
         by_record: the same shares (n_shares,) of each record by name: effects, nominal, unexplained, noise.
         errors: root mean squares of the small errors: "frequencies_percent", "inputs_percent", "delays_ms" and so on;
@@ -244,10 +244,10 @@ def budget_of(
         return np.array([residual_power(rig, chosen, record, settle) for record in records])
 
     labels, causes = labels_of(effects, rig.modes.domain), list(effects)
-    common, by_record_errors = (None, None) if errors is None else parted(errors)
-    if by_record_errors is not None:
-        labels.append(label_of(by_record_errors.target.figure))
-        causes.append(by_record_errors)
+    common, varying = (None, None) if errors is None else parted(errors)
+    if varying is not None:
+        labels.append(label_of(varying.target.figure))
+        causes.append(varying)
     causes += [] if common is None else [common]
     nominal, left = powers_with(()), powers_with(causes)
     without = [powers_with([c for c in causes if c is not cause]) for cause in causes]

@@ -44,9 +44,8 @@ def _in_motion(rig: Rig, record: Record) -> list[str]:
         off = min(abs(first), abs(first - float(y.mean())), abs(first - float(jump)))
         if abs(float(jump)) < sensor.noise_std:
             jump = 0.0
-        if off > max(
-            NOISE_MULTIPLE * sensor.noise_std, SIGNAL_SHARE * float(y.std()), JUMP_MULTIPLE * abs(float(jump))
-        ):
+        least = max(NOISE_MULTIPLE * sensor.noise_std, SIGNAL_SHARE * float(y.std()), JUMP_MULTIPLE * abs(float(jump)))
+        if off > least:
             return [
                 f"Record {record.name!r} does not start from rest ({sensor.name} reads {first:.3g}, where at rest it"
                 f" would read {jump:.3g}): cut it where nothing moves, or set `settle` to a few decay times of the"

@@ -22,7 +22,7 @@ LEAST_DECREASE = 0.4
 UNCORRELATED = 0.9  # largest mean misfit that may remain there: uncorrelated signals have at least 1
 LEAST_SHARE = 0.5  # of the mean misfit there, which must go: the changes by a missing effect stay
 LEAST_BANDS = 0.8  # share of these bands in which the misfit must decrease
-MARGIN = 0.25  # mean misfit by which it must be better than any rival, where they differ: of 2π and 9.81 it is 0.44
+MARGIN = 0.25  # mean misfit by which it must be better than any rival, where they differ: 2π and 9.81 differ by 0.44
 LEAST_DIFFERING = 0.1  # share of the affected bands in which it must differ from any rival
 QUANTITIES = ("displacement", "velocity", "acceleration")
 

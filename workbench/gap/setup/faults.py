@@ -71,7 +71,7 @@ def setup_faults(
 
 
 def _in_rounds(gap: Comparison, detectors: Sequence[Detector]) -> list[SetupFault]:
-    """All faults, of one kind in each round: each is corrected before the next, which it may mask."""
+    """All faults, in rounds: those of one kind are corrected before the next round, since they may mask others."""
     found: list[SetupFault] = []
     for _ in range(MOST_ROUNDS):
         faults = _best(gap, detectors)

@@ -18,7 +18,12 @@ SAME_GAIN = 0.1
 GAIN_SHARE = 0.5
 GAIN_CHI2 = 25.0  # and differs from the factor by five standard errors, in white noise
 CALIBRATED = 1e-3  # relative: a gain closer to a factor is that factor (9.81 for 9.80665 is 3.4e-4)
-AMBIGUOUS = (G, 1.0 / G, TURN, 1.0 / TURN)  # factors that are no farther from one than gross errors of calibration
+AMBIGUOUS = (
+    G,
+    1.0 / G,
+    TURN,
+    1.0 / TURN,
+)  # factors that a wrong calibration may reach; the others are too far from one
 
 
 def factor_near(gain: float) -> float | None:
