@@ -24,12 +24,12 @@ from workbench.gap.report.budget import (
     Shrinkage,
     are_small,
     budget_of,
-    left_with,
     mean_square,
     measure,
     noise_power,
-    power_in,
     power_of_inputs,
+    residual_power,
+    signal_power,
     sizes_of,
     with_held_out,
 )
@@ -293,7 +293,7 @@ def _errors_are_plausible(effects: Sequence[Effect]) -> bool:
 
 def _residual_power(rig: Rig, effects: Sequence[Effect], held_out: Sequence[Record], settle: float) -> float:
     """Mean square residual of a rig with effects, summed over records, each sensor scaled by its standard deviation."""
-    return sum(left_with(rig, effects, record, settle) for record in held_out)
+    return sum(residual_power(rig, effects, record, settle) for record in held_out)
 
 
 def _power_of_difference(
@@ -303,7 +303,7 @@ def _power_of_difference(
     if not can_be(rig, others):
         return np.inf
     one, other = apply_all(rig, effects), apply_all(rig, others)
-    return sum(power_in(record, predict(one, record) - predict(other, record), settle) for record in held_out)
+    return sum(signal_power(record, predict(one, record) - predict(other, record), settle) for record in held_out)
 
 
 def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray, disagreeing: Sequence[str]) -> str:

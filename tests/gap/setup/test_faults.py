@@ -8,7 +8,7 @@ from scipy.linalg import sqrtm
 from scipy.signal import butter, cont2discrete, dlsim, lfilter
 
 from workbench.gap.diagnose import diagnose
-from workbench.gap.setup import compared
+from workbench.gap.setup import comparison
 from workbench.gap.setup.corrections import SetupFault, without_faults
 from workbench.gap.setup.faults import setup_faults
 from workbench.gap.setup.repeats import check_disjoint
@@ -70,7 +70,9 @@ def test_nothing_is_wrong_with_a_case_wired_rightly(case):
 
 def test_a_case_wired_rightly_is_simulated_once_a_record(case, monkeypatch):
     simulated = []
-    monkeypatch.setattr(compared, "predict", lambda rig, record: simulated.append(record.name) or predict(rig, record))
+    monkeypatch.setattr(
+        comparison, "predict", lambda rig, record: simulated.append(record.name) or predict(rig, record)
+    )
     assert setup_faults(case.rig, case.fit, case.validation) == ()
     assert simulated == [record.name for record in (*case.fit, *case.validation)]
 
@@ -202,7 +204,7 @@ def test_a_gain_that_is_near_a_unit_and_differs_beyond_its_error_is_said_and_not
     assert not fault.certain
     assert fault.sentence == (
         "The output a3 may look like g where m/s² is meant; but the gain differs from that by +1 %, more than its"
-        " error: taken for an error of calibration."
+        " uncertainty: treated as an error of calibration."
     )
     rig, kept = without_faults([fault], case.rig, records)
     assert rig is case.rig and all(np.array_equal(a.outputs, b.outputs) for a, b in zip(kept, records, strict=True))
@@ -233,7 +235,7 @@ def test_a_validation_record_is_corrected_by_what_it_shows_itself(case):
     crossed = exchanged(7, 1, 4)
     fit = change(case.fit, outputs=crossed)
     (fault,) = setup_faults(case.rig, fit, held)
-    assert fault.sentence == f"The outputs a2 and a5 are exchanged: swap them; not in {kept.name}."
+    assert fault.sentence == f"The outputs a2 and a5 are exchanged: swap them, except in {kept.name}."
     assert without_faults([fault], case.rig, held)[1] == held
     (fault,) = setup_faults(case.rig, fit, change(held, outputs=crossed))
     assert fault.sentence == "The outputs a2 and a5 are exchanged: swap them."

@@ -1,4 +1,4 @@
-"""Effects on the way in and on the way out: actuators and sensors."""
+"""Kinds of effects of actuators and sensors."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -23,15 +23,17 @@ from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Interval, NamedPoints, Where, centred_at, reach
 
-OF_THE_CHANNEL = "sensor_quantisation"  # what stays where it is when wires are exchanged
-OF_THE_SENSOR = "unit of the sensor"
-ALIKE = 0.05  # of a residual's mean square: what another sensor's reading explains of it, to be tried as cross-talk
+OF_CHANNEL = "sensor_quantisation"  # kind that belongs to the channel, not to the sensor on its wire
+SENSOR_UNIT = "unit of the sensor"
+# of a residual's mean square: cross-talk is tried where another sensor's reading explains more of it
+LEAST_CROSSTALK = 0.05
 Starts = Callable[[Evidence, Any], Iterable[dict[str, Any]]]
 Apply = Callable[[Rig, Any, dict[str, Any]], Rig]
 
-SLOW = 0.1  # of the rms step between samples: faster, a reading does not come to rest
-OVERSTAYED = 6.0  # steps over their decrease: three times as long as free flight up and back
-TURNING = 2  # samples: a motion that turns round slowly is no longer at its top
+SLOW_ENTRY = 0.1  # of the rms step between samples: a reading that reaches its top in a larger step is cut off there
+# stay at the top, in units of the time to stop at the deceleration before it: three times as long as up and back
+LONG_STAY = 6.0
+TURNING_SAMPLES = 2  # longest stay of a motion that reverses slowly
 
 # --- targets and changes
 
@@ -42,7 +44,7 @@ def each_actuator(rig: Rig) -> tuple[str, ...]:
 
 
 def actuators_or_all(rig: Rig) -> tuple[str, ...]:
-    """Every actuator alone, and all of them together where there are several."""
+    """Every actuator alone, and all of them together if there are several."""
     names = each_actuator(rig)
     return ((ALL, *names) if len(names) > 1 else names) if names else ()
 
@@ -67,40 +69,39 @@ def _change_sensors(rig: Rig, target: str, **changes: Any) -> Rig:
     return replace(rig, sensors=tuple(replace(s, **changes) if target in (s.name, ALL) else s for s in rig.sensors))
 
 
-def _amplify(rig: Rig, side: str, target: str, gain: float) -> Rig:
-    """An actuator or a sensor with so many times the gain that it has: a calibration may be a little off besides."""
-    ports = (replace(p, gain=gain * p.gain) if p.name == target else p for p in getattr(rig, side))
-    changes: Any = {side: tuple(ports)}
-    return replace(rig, **changes)
+def _with_gain(rig: Rig, side: str, target: str, gain: float) -> Rig:
+    """The rig with the gain of one actuator or sensor multiplied: nominal errors may have changed it already."""
+    ports: Any = tuple(replace(p, gain=gain * p.gain) if p.name == target else p for p in getattr(rig, side))
+    return replace(rig, **{side: ports})
 
 
-def _change_swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
-    """Two actuators or two sensors on each other's wires: a channel keeps its name, its noise and its rounding."""
+def _swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
+    """The rig with two actuators or sensors exchanged; each channel keeps its name, its noise and its quantisation."""
     by_name = {port.name: port for port in getattr(rig, side)}
-    elsewhere = {pair[0]: by_name[pair[1]], pair[1]: by_name[pair[0]]}
+    exchanged = {pair[0]: by_name[pair[1]], pair[1]: by_name[pair[0]]}
     kept = ("name", "noise_std", "step") if side == "sensors" else ("name",)
     ports: Any = tuple(
-        replace(elsewhere.get(name, port), **{field: getattr(port, field) for field in kept})
+        replace(exchanged.get(name, port), **{field: getattr(port, field) for field in kept})
         for name, port in by_name.items()
     )
     return replace(rig, **{side: ports})
 
 
 def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The same effects with exchanged wires last, but for errors of the nominal model.
+    """An equivalent sequence of effects in which exchanges come last, followed only by errors of the nominal model.
 
-    What comes after an exchange speaks of channels, what comes before it of the actuators and sensors where they stand:
-    a gain of channel F2 after F1 and F2 are exchanged is one of actuator F1 before.
+    An effect after an exchange names a channel; an effect before it names an actuator or sensor by its place. A gain of
+    channel F2 after F1 and F2 are exchanged equals a gain of actuator F1 before it.
     """
     ordered = list(effects)
     for exchange in [e for e in effects if e.kind in (SWAPPED_INPUTS, SWAPPED_OUTPUTS)]:
         at, (one, other) = ordered.index(exchange), exchange.target
         names = {one: other, other: one}
         later = [e for e in ordered[at + 1 :] if e.kind.path == exchange.kind.path and not e.kind.applied_first]
-        if any(isinstance(e.target, tuple) for e in later):  # each of two channels may be a part of what they do
+        if any(isinstance(e.target, tuple) for e in later):  # such an effect may involve both channels, so it stays
             continue
         moved = [
-            replace(e, target=names.get(e.target, e.target)) if e in later and e.kind.name != OF_THE_CHANNEL else e
+            replace(e, target=names.get(e.target, e.target)) if e in later and e.kind.name != OF_CHANNEL else e
             for e in ordered[at + 1 :]
         ]
         errors = sum(e.kind.applied_first for e in moved)
@@ -109,7 +110,7 @@ def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
 
 
 def _commands(evidence: Evidence, target: str, *, changes: bool = False) -> np.ndarray:
-    """Sizes of all commands to the target, or of their changes from sample to sample, joined; zeros left out."""
+    """Magnitudes (n,) of all non-zero commands to the target in all records, or of their changes between samples."""
     names = each_actuator(evidence.rig) if target == ALL else (target,)
     rows = [
         np.diff(row) if changes else row
@@ -126,15 +127,15 @@ def _sample_time(evidence: Evidence) -> float:
     return evidence.data.records[0].sample_time
 
 
-def _time(rig: Rig) -> float:
+def _time_scale(rig: Rig) -> float:
     return Scales.of(rig).time
 
 
-def _force(rig: Rig) -> float:
+def _force_scale(rig: Rig) -> float:
     return Scales.of(rig).force
 
 
-def _of_one_number(
+def _one_parameter_kind(
     path: str,
     name: str,
     field: str,
@@ -152,16 +153,30 @@ def _of_one_number(
     apply: Apply | None = None,
     **options: Any,
 ) -> Kind:
-    """A kind with one number of an actuator or a sensor; it sets the attribute of that name unless another is given.
+    """A kind with one parameter, which sets an attribute of an actuator or a sensor.
 
-    Its bounds are times a size that the rig has of itself.
+    Args:
+        path: "actuator" or "sensor".
+        name: of the kind.
+        field: name of the parameter.
+        unit: of the parameter.
+        phrase: name of the kind in a sentence.
+        starts: start values for a search.
+        targets: actuators or sensors that it applies to.
+        low, high: bounds, in units of `size`.
+        log: whether the parameter is fitted on a logarithmic scale.
+        attribute: that it sets; None for the one named `field`.
+        neutral: value at which it changes nothing.
+        size: scale of the bounds, from the rig.
+        apply: used instead of setting the attribute.
+        options: further fields of `Kind`.
     """
     attribute = attribute or field
     change = _change_actuators if path == "actuator" else _change_sensors
 
     def parameters(rig: Rig, target: str) -> tuple[Parameter, ...]:
         shown, scale = unit, 0.1
-        if unit == OF_THE_SENSOR:
+        if unit == SENSOR_UNIT:
             sensor = next(s for s in rig.sensors if s.name == target)
             shown, scale = QUANTITIES.get(sensor.quantity, ""), max(sensor.noise_std, 1e-300)
         bounds = low * size(rig), high * size(rig)
@@ -179,8 +194,8 @@ def _of_one_number(
     )
 
 
-_actuator = partial(_of_one_number, "actuator", log=True)
-_sensor = partial(_of_one_number, "sensor", targets=each_sensor)
+_actuator = partial(_one_parameter_kind, "actuator", log=True)
+_sensor = partial(_one_parameter_kind, "sensor", targets=each_sensor)
 
 ACTUATOR_GAIN = _actuator(
     "actuator_gain",
@@ -189,7 +204,7 @@ ACTUATOR_GAIN = _actuator(
     "a wrong actuator gain",
     neutral=1.0,
     targets=each_actuator,
-    apply=lambda rig, target, v: _amplify(rig, "actuators", target, v["gain"]),
+    apply=lambda rig, target, v: _with_gain(rig, "actuators", target, v["gain"]),
     low=-20.0,
     high=20.0,
     log=False,
@@ -206,7 +221,7 @@ ACTUATOR_LAG = _actuator(
     targets=actuators_or_all,
     low=1e-6,
     high=1e4,
-    size=_time,
+    size=_time_scale,
     starts=lambda evidence, _: [{"time_constant": s * _sample_time(evidence)} for s in (0.1, 0.4, 1.2, 4.0, 12.0)],
 )
 
@@ -219,7 +234,7 @@ ACTUATOR_DELAY = _actuator(
     targets=actuators_or_all,
     low=1e-9,
     high=1e4,
-    size=_time,
+    size=_time_scale,
     starts=lambda evidence, _: [
         {"delay": s * _sample_time(evidence)} for s in (0.1, 0.4, 0.8, 1.3, 1.8, 2.5, 3.5, 5.0, 8.0, 12.0)
     ],
@@ -233,7 +248,7 @@ ACTUATOR_SATURATION = _actuator(
     targets=actuators_or_all,
     low=1e-12,
     high=1e12,
-    size=_force,
+    size=_force_scale,
     nonlinear=True,
     starts=lambda evidence, target: [
         {"limit": float(q)} for q in np.quantile(_commands(evidence, target), (0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
@@ -250,7 +265,7 @@ ACTUATOR_DEAD_ZONE = _actuator(
     targets=actuators_or_all,
     low=1e-12,
     high=1e12,
-    size=_force,
+    size=_force_scale,
     nonlinear=True,
     starts=lambda evidence, target: [
         {"width": float(q)} for q in np.quantile(_commands(evidence, target), (0.03, 0.08, 0.15, 0.3, 0.5, 0.7))
@@ -262,7 +277,9 @@ ACTUATOR_BIAS = Kind(
     name="actuator_bias",
     path="actuator",
     parameters=lambda rig, _: (
-        Parameter("force", "N", -1e6 * _force(rig), 1e6 * _force(rig), scale=1e-3 * _force(rig), neutral=0.0),
+        Parameter(
+            "force", "N", -1e6 * _force_scale(rig), 1e6 * _force_scale(rig), scale=1e-3 * _force_scale(rig), neutral=0.0
+        ),
     ),
     apply=lambda rig, target, v: _change_actuators(rig, target, bias=v["force"]),
     starts=lambda evidence, target: [{"force": 0.1 * float(np.sqrt(np.mean(_commands(evidence, target) ** 2)))}],
@@ -273,7 +290,7 @@ ACTUATOR_BIAS = Kind(
 
 
 def _rate_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    """From slower than most changes of the command to as fast as its fastest."""
+    """Quantiles of the rates of change of the command."""
     steps = _commands(evidence, target, changes=True) / _sample_time(evidence)
     return [{"rate": float(q)} for q in np.quantile(steps, (0.1, 0.3, 0.5, 0.7, 0.9, 0.99))]
 
@@ -311,7 +328,7 @@ ACTUATOR_HYSTERESIS = Kind(
     starts=_hysteresis_starts,
     targets=actuators_or_all,
     nonlinear=True,
-    simpler=lambda effect, _: (  # of no width
+    simpler=lambda effect, _: (  # at zero width
         (Effect(ACTUATOR_GAIN, effect.target, {"gain": 1.0 - effect.values["share"]}),) if effect.target != ALL else ()
     ),
     phrase="hysteresis of the actuators",
@@ -321,7 +338,7 @@ SWAPPED_INPUTS = Kind(
     name="swapped_inputs",
     path="actuator",
     parameters=lambda rig, _: (),
-    apply=lambda rig, pair, _: _change_swapped(rig, "actuators", pair),
+    apply=lambda rig, pair, _: _swapped(rig, "actuators", pair),
     starts=lambda evidence, _: [{}],
     targets=lambda rig: tuple(combinations((a.name for a in rig.actuators), 2)),
     phrase="two inputs that are exchanged",
@@ -336,32 +353,32 @@ def _position_starts(evidence: Evidence, _: object) -> list[dict[str, Any]]:
 
 
 def _movable(targets: Callable[[Rig], tuple[str, ...]]) -> Callable[[Rig], tuple[str, ...]]:
-    """Targets that may stand elsewhere; where shapes are known at the inputs and outputs alone, none may."""
+    """Targets that may be misplaced: none if the mode shapes are known at the inputs and outputs only."""
 
-    def where_there_is_room(rig: Rig) -> tuple[str, ...]:
+    def movable(rig: Rig) -> tuple[str, ...]:
         domain = rig.modes.domain
         points_alone = isinstance(domain, NamedPoints) and len(domain.names) <= len(rig.actuators) + len(rig.sensors)
         return () if points_alone else targets(rig)
 
-    return where_there_is_room
+    return movable
 
 
-def _standing(rig: Rig, target: str) -> Where:
-    """Where an actuator stands in the nominal rig."""
+def _nominal_place(rig: Rig, target: str) -> Where:
+    """Place of an actuator in the nominal rig."""
     return next(a.at for a in rig.actuators if a.name == target)
 
 
-def _actuator_places(rig: Rig, target: str) -> tuple[Parameter, ...]:
-    """The coordinates of its middle, so far inside that all of it lies on the structure."""
+def _actuator_place_parameters(rig: Rig, target: str) -> tuple[Parameter, ...]:
+    """Coordinates of the centre of an actuator, bounded so that all of it stays on the structure."""
     domain = rig.modes.domain
     if isinstance(domain, NamedPoints):
         return place_parameters(rig)
-    ends = zip(place_parameters(rig), *reach(domain, _standing(rig, target)), strict=True)
+    ends = zip(place_parameters(rig), *reach(domain, _nominal_place(rig, target)), strict=True)
     return tuple(replace(p, low=float(low), high=float(high)) for p, low, high in ends)
 
 
 def _actuator_starts(evidence: Evidence, target: str) -> list[dict[str, Any]]:
-    bounds = {p.name: p for p in _actuator_places(evidence.rig, target)}
+    bounds = {p.name: p for p in _actuator_place_parameters(evidence.rig, target)}
     starts = _position_starts(evidence, target)
     return [v for v in starts if all(p.low <= v[name] <= p.high for name, p in bounds.items())]
 
@@ -369,8 +386,10 @@ def _actuator_starts(evidence: Evidence, target: str) -> list[dict[str, Any]]:
 ACTUATOR_MISPLACEMENT = Kind(
     name="actuator_misplacement",
     path="actuator",
-    parameters=_actuator_places,
-    apply=lambda rig, target, v: _change_actuators(rig, target, at=centred_at(_standing(rig, target), place_of(v))),
+    parameters=_actuator_place_parameters,
+    apply=lambda rig, target, v: _change_actuators(
+        rig, target, at=centred_at(_nominal_place(rig, target), place_of(v))
+    ),
     starts=_actuator_starts,
     targets=_movable(each_actuator),
     phrase="a misplaced actuator",
@@ -390,18 +409,13 @@ SENSOR_MISPLACEMENT = Kind(
 # --- sensors
 
 
-def _size(evidence: Evidence, target: str) -> float:
-    """Largest root mean square of an output among the records, in its unit."""
-    return float(max(np.sqrt(np.mean(row**2)) for row in _read(evidence, target)))
-
-
 SENSOR_GAIN = _sensor(
     "sensor_gain",
     "gain",
     "",
     "a wrong sensor gain",
     starts=lambda evidence, _: [{"gain": 0.9}],
-    apply=lambda rig, target, v: _amplify(rig, "sensors", target, v["gain"]),
+    apply=lambda rig, target, v: _with_gain(rig, "sensors", target, v["gain"]),
     low=-100.0,
     high=100.0,
     signed=True,
@@ -416,7 +430,7 @@ def _mean_residual(evidence: Evidence, target: str) -> float:
 SENSOR_BIAS = _sensor(
     "sensor_bias",
     "bias",
-    OF_THE_SENSOR,
+    SENSOR_UNIT,
     "a sensor bias",
     starts=lambda evidence, target: [{"bias": _mean_residual(evidence, target)}],
     signed=True,
@@ -425,7 +439,7 @@ SENSOR_BIAS = _sensor(
 SENSOR_DRIFT = _sensor(
     "sensor_drift",
     "drift_over_record",
-    OF_THE_SENSOR,
+    SENSOR_UNIT,
     "a sensor drift",
     starts=lambda evidence, target: [{"drift_over_record": 2.0 * _mean_residual(evidence, target)}],
     attribute="drift",
@@ -441,7 +455,7 @@ SENSOR_LAG = _sensor(
     log=True,
     low=1e-6,
     high=1e4,
-    size=_time,
+    size=_time_scale,
     neutral=0.0,
     targets=sensors_or_all,
 )
@@ -456,28 +470,30 @@ SENSOR_DELAY = _sensor(
     log=True,
     low=1e-9,
     high=1e4,
-    size=_time,
+    size=_time_scale,
     neutral=0.0,
 )
 
 
 def _predicted(evidence: Evidence, name: str) -> np.ndarray:
+    """Prediction (n_samples,) of a sensor's readings over all records, joined."""
     j = each_sensor(evidence.rig).index(name)
     records = zip(evidence.data.counted, evidence.residuals, strict=True)
     return np.concatenate([record.outputs[j] - residual[j] for record, residual in records])
 
 
 def _residual(evidence: Evidence, name: str) -> np.ndarray:
+    """Residual (n_samples,) of a sensor over all records, joined."""
     j = each_sensor(evidence.rig).index(name)
     return np.concatenate([residual[j] for residual in evidence.residuals])
 
 
 def _crosstalk_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
-    """The share of the other sensor's reading in this one's residual, where it is more than a little of it."""
+    """Share of the second sensor's prediction in the residual of the first, if that explains enough of it."""
     residual, source = _residual(evidence, pair[0]), _predicted(evidence, pair[1])
     size = float(source @ source)
     share = float(residual @ source) / size if size > 0 else 0.0
-    return [{"share": share}] if share**2 * size > ALIKE * float(residual @ residual) else []
+    return [{"share": share}] if share**2 * size > LEAST_CROSSTALK * float(residual @ residual) else []
 
 
 def _share_parameters(rig: Rig, pair: tuple[str, str]) -> tuple[Parameter, ...]:
@@ -500,8 +516,8 @@ SENSOR_CROSSTALK = Kind(
 )
 
 
-def _exchanged_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
-    """Where each of the two reads rather what the model predicts of the other."""
+def _swapped_output_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
+    """One start if the readings of the two sensors agree better with the predictions of each other; else none."""
     noise = {sensor.name: max(sensor.noise_std, 1e-300) for sensor in evidence.rig.sensors}
     own = crossed = 0.0
     for name, other in (pair, pair[::-1]):
@@ -516,29 +532,33 @@ SWAPPED_OUTPUTS = Kind(
     name="swapped_outputs",
     path="sensor",
     parameters=lambda rig, _: (),
-    apply=lambda rig, pair, _: _change_swapped(rig, "sensors", pair),
-    starts=_exchanged_starts,
+    apply=lambda rig, pair, _: _swapped(rig, "sensors", pair),
+    starts=_swapped_output_starts,
     targets=lambda rig: tuple(combinations(each_sensor(rig), 2)),
     phrase="two outputs that are exchanged",
 )
 
 
 def clipped_level(rows: list[np.ndarray]) -> float | None:
-    """The level that a sensor's readings stop at: its largest magnitude, met again and again, where it is cut off."""
+    """The level at which a sensor clips: its largest magnitude, if readings are cut off there; else None."""
     top = max(float(np.abs(row).max()) for row in rows)
     at_top = [np.abs(row) >= top * (1 - 1e-6) for row in rows]
     if not top > 0 or sum(int(flags.sum()) for flags in at_top) < 3:
         return None
-    return None if _rests(rows, at_top) else top
+    return None if _comes_to_rest(rows, at_top) else top
 
 
-def _rests(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
-    """Whether readings come to rest, or turn round, at the top rather than being cut off there.
+def _comes_to_rest(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
+    """Whether readings come to rest, or reverse, at their top instead of being cut off there.
 
-    What comes to rest slows down before it, and stays longer than its own deceleration would have let it fly on; a
-    motion that a controller repeats turns round at the same top, where it hardly stays.
+    A motion that comes to rest slows down first, and stays longer than its deceleration would have taken it up and
+    back. A motion that a controller repeats reverses at the same top and hardly stays there.
+
+    Args:
+        rows: readings (n_samples,) of each record.
+        at_top: (n_samples,) of each record, whether the reading is at its top.
     """
-    entering, overstayed = [], []
+    entering, at_rest = [], []
     for row, flags in zip(rows, at_top, strict=True):
         ends = np.flatnonzero(np.diff(np.r_[False, flags, False]))
         for first, last in zip(ends[::2], ends[1::2], strict=True):
@@ -546,13 +566,13 @@ def _rests(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
                 before, step, into = np.abs(np.diff(row[first - 3 : first + 1]))
                 entering.append(into)
                 stayed = last - first
-                overstayed.append(stayed <= TURNING or stayed * abs(before - step) > OVERSTAYED * step)
+                at_rest.append(stayed <= TURNING_SAMPLES or stayed * abs(before - step) > LONG_STAY * step)
     typical = np.sqrt(np.mean(np.concatenate([np.diff(row) for row in rows]) ** 2))
-    return bool(entering) and float(np.median(entering)) < SLOW * typical and float(np.mean(overstayed)) > 0.5
+    return bool(entering) and float(np.median(entering)) < SLOW_ENTRY * typical and float(np.mean(at_rest)) > 0.5
 
 
 def step_of(readings: np.ndarray) -> float | None:
-    """The step of which all readings are multiples, where there are far fewer levels than readings."""
+    """The quantisation step of which all readings (n_samples,) are multiples; None if there is none."""
     levels = np.unique(readings)
     if levels.size < 3 or levels.size > 0.5 * readings.size:
         return None
@@ -569,21 +589,21 @@ def step_of(readings: np.ndarray) -> float | None:
     return step if np.abs(inside - step * np.round(inside / step)).max() < 0.05 * step else None
 
 
-def _read(evidence: Evidence, target: str) -> list[np.ndarray]:
-    """The readings of a sensor, one row a record."""
+def _readings(evidence: Evidence, target: str) -> list[np.ndarray]:
+    """Readings (n_samples,) of a sensor in each record."""
     j = each_sensor(evidence.rig).index(target)
     return [record.outputs[j] for record in evidence.data.records]
 
 
 def _clipping_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    level = clipped_level(_read(evidence, target))
+    level = clipped_level(_readings(evidence, target))
     return [{"limit": level}] if level is not None else []
 
 
 SENSOR_CLIPPING = _sensor(
     "sensor_clipping",
     "limit",
-    OF_THE_SENSOR,
+    SENSOR_UNIT,
     "clipping of a sensor",
     starts=_clipping_starts,
     log=True,
@@ -594,14 +614,14 @@ SENSOR_CLIPPING = _sensor(
 
 
 def _rounding_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    step = step_of(np.concatenate(_read(evidence, target)))
+    step = step_of(np.concatenate(_readings(evidence, target)))
     return [{"step": step}] if step is not None else []
 
 
 SENSOR_QUANTISATION = _sensor(
     "sensor_quantisation",
     "step",
-    OF_THE_SENSOR,
+    SENSOR_UNIT,
     "rounding of a sensor",
     starts=_rounding_starts,
     log=True,

@@ -1,4 +1,4 @@
-"""The size of a gap: how far it shrinks on records kept out of the fit, and its budget, the share of each cause."""
+"""The size of a gap: how far it shrinks on held-out records, and its budget, the share of each cause."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,10 +18,10 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 from workbench.structure.domain import Domain
 
-AT_MOST = 0.99  # of the most that a search takes noise found for
-REMARKED = 1.3  # factor between stated and found noise from which on it is remarked
-# per cent, root mean square: a quarter to a half more than the worst models of trials have; in false valleys it is more
-MOST = (
+AT_BOUND = 0.99  # of the largest noise that a search accepts: estimates above it are at the bound
+REMARKED = 1.3  # ratio of estimated and stated noise from which a remark is made
+# per cent rms: a quarter to a half more than the worst models of trials have; false local minima have larger errors
+LARGEST_SMALL = (
     ("stiffness", 5.0),
     ("mass", 5.0),
     ("frequency", 2.5),
@@ -31,11 +31,11 @@ MOST = (
     ("place", 1.0),
     ("shape", 10.0),
 )
-MOSTLY = 0.5  # of the gap: where more is unexplained, errors that were fitted beside it have bent to that
-RUNAWAY = 1e30  # mean square of a motion that knows no bounds, in units of the signal's
-COMMON = 2.0  # times the scatter of delays: the mean from which on they are reported as one delay of all
-DRAWS = 400  # of blocks, for the interval of what is closed
-# errors that are reported in per cent, by group, as they are called
+MOSTLY = 0.5  # of the gap: if more is unexplained, the fitted nominal errors have over-fitted it
+RUNAWAY = 1e30  # mean square of a divergent residual, in units of the signal's
+COMMON = 2.0  # times the scatter of delays: a larger mean is reported as a common delay
+DRAWS = 400  # bootstrap draws, for the interval of the shrinkage
+# names in the plural of the groups of errors that are reported in per cent
 PLURAL = {
     "stiffness": "stiffness",
     "mass": "mass",
@@ -50,13 +50,13 @@ PLURAL = {
 
 @dataclass(frozen=True, eq=False)
 class Shrinkage:
-    """The gap of validation records before and after a correction.
+    """The gap of validation records before and after a correction, with the share of it that is closed.
 
     Attributes:
         before, after, floor: by record name; the gap of the case format.
         share: of the closable gap closed, by record name: 1 - sqrt(after² - floor²) / sqrt(before² - floor²).
-        overall: the same over all records together, each of which counts alike.
-        ci95: its 95 % interval by block bootstrap.
+        overall: the same over all records together, with equal weights.
+        ci95: 95 % interval of `overall`, by block bootstrap.
     """
 
     before: dict[str, float]
@@ -68,10 +68,9 @@ class Shrinkage:
 
 
 def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: float = 0.0) -> Shrinkage | None:
-    """Gaps of both rigs on validation records, with the interval from resampled blocks; None without records.
+    """The shrinkage of the gap on validation records, from the nominal to the corrected rig; None without records.
 
-    Blocks are three decay times of the slowest elastic mode long, or a twentieth of a record where that is shorter
-    than a tenth of it, so that what is resampled is nearly independent.
+    Its interval is from a bootstrap over the blocks of `block_length`.
     """
     if not records:
         return None
@@ -93,8 +92,8 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
     table, weights = np.array(blocks), np.array(lengths)  # the last block of a record may be short
     rng = np.random.default_rng(0)
 
-    def closed(chosen: np.ndarray) -> float:
-        return _closed(*np.average(table[chosen], axis=0, weights=weights[chosen]))
+    def closed(drawn: np.ndarray) -> float:
+        return _closed(*np.average(table[drawn], axis=0, weights=weights[drawn]))
 
     draws = [closed(rng.integers(0, len(table), len(table))) for _ in range(DRAWS)]
     return Shrinkage(
@@ -108,20 +107,24 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
 
 
 def _closed(before: float, after: float, floor: float) -> float:
+    """Share of the closable gap that is closed, from mean squares; 0 if there was none."""
     if before <= floor * 1.01:
         return 0.0
     return float(1.0 - np.sqrt(max(after - floor, 0.0) / (before - floor)))
 
 
 def block_length(rig: Rig, record: Record) -> int:
-    """Samples of a block of a record's residual, as long as it remembers, so that blocks are nearly independent."""
+    """Samples of a block of a record: three decay times of the slowest elastic mode, 1/20 to 1/8 of the record.
+
+    Residuals of such blocks are nearly independent.
+    """
     rates = (rig.modes.zeta * rig.modes.omega)[rig.modes.omega > 0]
-    memory = 3.0 / max(rates.min(), 1e-12) / record.sample_time if rates.size else record.n_samples
-    return int(np.clip(memory, record.n_samples // 20, max(record.n_samples // 8, 1)))
+    decay = 3.0 / max(rates.min(), 1e-12) / record.sample_time if rates.size else record.n_samples
+    return int(np.clip(decay, record.n_samples // 20, max(record.n_samples // 8, 1)))
 
 
 def scale_of(measured: np.ndarray) -> np.ndarray:
-    """What each sensor's readings (n_outputs, n_samples) count by: their standard deviation; 1 at rest."""
+    """Standard deviation (n_outputs, 1) of each sensor's readings (n_outputs, n_samples); 1 where they are constant."""
     scale = measured.std(axis=1, keepdims=True)
     return np.where(scale > 0, scale, 1.0)
 
@@ -131,16 +134,17 @@ class Budget:
     """Shares of the mean square of the nominal residual, which sum to one.
 
     Attributes:
-        effects: share that each named effect takes away, by label (`labels_of`), in the order in which they count; a
-            figure that differs from record to record stands among them, as "stiffness_record_to_record".
-        nominal: share that small errors of the nominal model take away beyond them, and that noise of the logged inputs
-            leaves.
-        unexplained: share that is left and is not noise.
+        effects: share that each named effect removes, by label (`labels_of`), largest first; a parameter that varies
+            from record to record is among them, as "stiffness_record_to_record".
+        nominal: share that small errors of the nominal model remove beyond the effects, and that noise of the logged
+            inputs causes.
+        unexplained: share that remains and is not noise.
         noise: share of the sensors' noise.
-        by_record: the same four shares (n_shares,) of each record by name, effects first.
+        by_record: the same shares (n_shares,) of each record by name: effects, nominal, unexplained, noise.
         errors: root mean squares of the small errors: "frequencies_percent", "inputs_percent", "delays_ms" and so on;
-            "common_delay_ms", what all sensors are late by.
-        noise_stated, noise_found: (n_outputs,) standard deviation of each sensor's noise, in its unit.
+            "common_delay_ms" is the delay of all sensors.
+        noise_stated, noise_found: (n_outputs,) stated and estimated standard deviation of each sensor's noise, in its
+            unit.
     """
 
     effects: Mapping[str, float]
@@ -154,27 +158,27 @@ class Budget:
 
     @property
     def noise_ratio(self) -> float:
-        """Noise found over noise stated, the median of all sensors."""
+        """Estimated over stated noise, the median over sensors."""
         return float(np.median(np.array(self.noise_found) / np.array(self.noise_stated)))
 
     @property
     def is_noise_at_bound(self) -> tuple[bool, ...]:
-        """Of each sensor, whether its noise was found as loud as any is taken for, or louder: it may be less."""
+        """Whether each sensor's estimated noise is at the bound of the search, or above it: then it may be lower."""
         ratios = np.array(self.noise_found) / np.array(self.noise_stated)
         bounds = JOINT.credible, JOINT.credible_guess
-        at_one = [np.abs(ratios / bound - 1.0) < 1.0 - AT_MOST for bound in bounds]
-        return tuple(bool(at) for at in np.any(at_one, axis=0) | (ratios > max(bounds)))
+        at_bound = [np.abs(ratios / bound - 1.0) < 1.0 - AT_BOUND for bound in bounds]
+        return tuple(bool(at) for at in np.any(at_bound, axis=0) | (ratios > max(bounds)))
 
     @property
     def noise_remark(self) -> str | None:
-        """A remark where the noise found and the noise stated disagree."""
+        """A remark that the estimated and the stated noise disagree; None if they agree."""
         ratio = self.noise_ratio
         if 1.0 / REMARKED < ratio < REMARKED:
             return None
-        if ratio > AT_MOST * JOINT.credible:
+        if ratio > AT_BOUND * JOINT.credible:
             return (
-                f"What is left is {ratio:.2g} times the stated noise_std or more: louder noise, or errors of the model"
-                " that no effect and no small error describes."
+                f"The residual is {ratio:.2g} times the stated noise_std or more: louder noise, or errors of the model"
+                " that neither effects nor small errors describe."
             )
         if self.leaves_more_than_noise:
             return f"What looks like noise is {ratio:.2g} times the stated noise_std; part of it may be of the model."
@@ -182,7 +186,7 @@ class Budget:
 
     @property
     def leaves_more_than_noise(self) -> bool:
-        """Whether more is unexplained than noise."""
+        """Whether the unexplained share is larger than that of noise."""
         return self.unexplained > self.noise > 0.0
 
     @property
@@ -192,11 +196,11 @@ class Budget:
 
     @property
     def errors_are_small(self) -> bool:
-        """Whether a careful laboratory could have a nominal model with these errors."""
+        """Whether the errors of the nominal model are as small as those of a careful laboratory."""
         return are_small(self.errors)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers, as the case format asks for them: effects by kind."""
+        """The shares as the case format writes them, effects by kind."""
         by_kind: dict[str, float] = {}
         for label, share in self.effects.items():
             kind = label.split("[")[0]
@@ -219,46 +223,46 @@ def budget_of(
     logged: float = 0.0,
     settle: float = 0.0,
 ) -> Budget:
-    """Take the mean square of the nominal residual apart.
+    """The budget: the mean square of the nominal residual, divided among its causes.
 
-    Each sensor counts by the standard deviation of its readings, as in the gap of a record. What effects and errors of
-    the nominal model take away together is shared in proportion to what is left without each of them alone; causes
-    that partly cancel one another would else take away nothing, or less.
+    Each sensor is scaled by the standard deviation of its readings, as in the gap of a record. What all causes remove
+    together is divided in proportion to how much the residual grows without each of them. Causes that partly cancel
+    one another would remove nothing one by one, or less.
 
     Args:
         rig: nominal.
         effects: that were named.
-        errors: of the nominal model, where they were fitted; see `with_held_out` for what differs by record.
-        records: held out of the fit, or those fitted where none were.
-        noise_found: (n_outputs,).
+        errors: of the nominal model; None if none were fitted; see `with_held_out` for those that vary by record.
+        records: held out of the fit, or the fitted ones if none were.
+        noise_found: (n_outputs,) estimated standard deviation of each sensor's noise.
         logged: noise of the logged inputs, as a share of their rms.
-        settle: seconds at the start of each record that do not count.
+        settle: seconds at the start of each record that are not compared.
     """
 
-    def squares(chosen: Sequence[Effect]) -> np.ndarray:
-        """Mean square (n_records,) of what is left with these effects."""
-        return np.array([left_with(rig, chosen, record, settle) for record in records])
+    def powers_with(chosen: Sequence[Effect]) -> np.ndarray:
+        """Mean square residual (n_records,) with these effects."""
+        return np.array([residual_power(rig, chosen, record, settle) for record in records])
 
     labels, causes = labels_of(effects, rig.modes.domain), list(effects)
-    alike, between = (None, None) if errors is None else parted(errors)
-    if between is not None:
-        labels.append(label_of(between.target.figure))
-        causes.append(between)
-    causes += [] if alike is None else [alike]
-    nominal, left = squares(()), squares(causes)
-    without = [squares([c for c in causes if c is not cause]) for cause in causes]
+    common, varying = (None, None) if errors is None else parted(errors)
+    if varying is not None:
+        labels.append(label_of(varying.target.figure))
+        causes.append(varying)
+    causes += [] if common is None else [common]
+    nominal, left = powers_with(()), powers_with(causes)
+    without = [powers_with([c for c in causes if c is not cause]) for cause in causes]
     weights = np.array([np.maximum(w - left, 0.0) for w in without]).reshape(len(causes), len(records))
     total = weights.sum(axis=0)
-    taken = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
-    by_size = sorted(range(len(labels)), key=lambda i: -taken[i].sum())
-    rows = [*taken[by_size], taken[-1] if alike is not None else np.zeros_like(left)]
+    removed = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
+    by_size = sorted(range(len(labels)), key=lambda i: -removed[i].sum())
+    rows = [*removed[by_size], removed[-1] if common is not None else np.zeros_like(left)]
     noise = np.minimum(np.array([noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
     by_inputs = np.zeros_like(left)
     if logged:
         by_inputs = np.minimum(logged**2 * power_of_inputs(rig, records, settle), rest)
     rows[-1], rest = rows[-1] + by_inputs, rest - by_inputs
-    for row, i in enumerate(by_size):  # what no model can predict is theirs
+    for row, i in enumerate(by_size):  # an unpredictable effect causes all of the remaining residual
         if causes[i].kind.unpredictable:
             rows[row], rest = rows[row] + rest, np.zeros_like(rest)
     shares = np.array([*rows, rest, noise])
@@ -271,14 +275,14 @@ def budget_of(
         unexplained=float(whole[-2]),
         noise=float(whole[-1]),
         by_record=by_record,
-        errors={**sizes_of(alike), **({"inputs_percent": 100.0 * logged} if by_inputs.sum() > 0 else {})},
+        errors={**sizes_of(common), **({"inputs_percent": 100.0 * logged} if by_inputs.sum() > 0 else {})},
         noise_stated=tuple(float(s.noise_std) for s in rig.sensors),
         noise_found=tuple(noise_found.tolist()),
     )
 
 
 def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
-    """What each effect is called in a budget; those of one kind, which differ in their places alone, by these too."""
+    """Labels of effects in a budget; effects of one kind and target have their places in the label."""
     labels = [effect.label for effect in effects]
     return [
         f"{label}[{domain.text(effect.at)}]" if labels.count(label) > 1 and effect.at is not None else label
@@ -286,8 +290,8 @@ def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
     ]
 
 
-def left_with(rig: Rig, effects: Sequence[Effect], record: Record, settle: float) -> float:
-    """Mean square of what a rig with effects leaves of a record; without bounds of one that cannot be."""
+def residual_power(rig: Rig, effects: Sequence[Effect], record: Record, settle: float) -> float:
+    """Mean square residual of a record by a rig with effects, as `mean_square`; `RUNAWAY` for an impossible rig."""
     try:
         corrected = apply_all(rig, effects)
     except (ValueError, np.linalg.LinAlgError):
@@ -296,47 +300,48 @@ def left_with(rig: Rig, effects: Sequence[Effect], record: Record, settle: float
 
 
 def mean_square(rig: Rig, record: Record, settle: float) -> float:
-    """Mean square of what a rig leaves of a record, each sensor by the standard deviation of its readings."""
-    with np.errstate(over="ignore", invalid="ignore"):  # one effect of two that balance each other may run away
-        left = power_in(record, record.outputs - predict(rig, record), settle)
+    """Mean square residual of a record by a rig, each sensor scaled by the standard deviation of its readings."""
+    # without one of two effects that balance each other, the response may diverge
+    with np.errstate(over="ignore", invalid="ignore"):
+        left = signal_power(record, record.outputs - predict(rig, record), settle)
     return left if left < RUNAWAY else RUNAWAY
 
 
-def power_in(record: Record, readings: np.ndarray, settle: float) -> float:
-    """Mean square of readings (n_outputs, n_samples), each sensor by the standard deviation of a record's."""
+def signal_power(record: Record, readings: np.ndarray, settle: float) -> float:
+    """Mean square of signals (n_outputs, n_samples), each sensor scaled by the standard deviation of its readings."""
     lead = lead_of(record, settle)
     return float(((readings[:, lead:] / scale_of(record.outputs[:, lead:])) ** 2).mean())
 
 
 def noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
-    """Mean square of noise (n_outputs,), each sensor by the standard deviation of a record's readings."""
+    """Mean square of noise (n_outputs,), each sensor scaled by the standard deviation of a record's readings."""
     measured = record.outputs[:, lead_of(record, settle) :]
     return float(((noise[:, None] / scale_of(measured)) ** 2).mean())
 
 
 def power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.ndarray:
-    """Mean square (n_records,) that noise of the logged inputs leaves by chance, were it as strong as they are."""
+    """Residual power (n_records,) due to input noise as large as the inputs, as `loudest_logging_noise`."""
     powers = loudest_logging_noise(rig, FitData(tuple(records), np.ones(len(rig.sensors)), settle=settle))
     scales = np.array([scale_of(record.outputs[:, lead_of(record, settle) :])[:, 0] for record in records])
     return np.asarray((powers / scales**2).mean(axis=1))
 
 
 def are_small(sizes: Mapping[str, float]) -> bool:
-    """Whether a careful laboratory could have a nominal model with errors of these sizes; see `sizes_of`."""
-    return all(sizes.get(f"{PLURAL[group]}_percent", 0.0) < most for group, most in MOST)
+    """Whether nominal errors of these sizes (`sizes_of`) are as small as those of a careful laboratory."""
+    return all(sizes.get(f"{PLURAL[group]}_percent", 0.0) < largest for group, largest in LARGEST_SMALL)
 
 
 def sizes_of(errors: Effect | None) -> dict[str, float]:
-    """Root mean squares of the errors of a nominal model, by group, and what delays have in common, ms.
+    """Root mean squares of the errors of a nominal model, by group, per cent; delays and their common part, ms.
 
-    Sensors that are all late, and actuators that are, read alike in open loop.
+    A common delay may be of the sensors or of the actuators: in open loop the readings are the same.
     """
     if errors is None:
         return {}
     values = {group: [v for n, v in errors.values.items() if group_of(n) == group] for group in (*PLURAL, "delay")}
     sizes = {
-        f"{words}_percent": 100.0 * float(np.sqrt(np.mean(np.square(values[group]))))
-        for group, words in PLURAL.items()
+        f"{name}_percent": 100.0 * float(np.sqrt(np.mean(np.square(values[group]))))
+        for group, name in PLURAL.items()
         if values[group]
     }
     if values["delay"]:
@@ -354,18 +359,18 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-REACH = 4.0  # standard deviations from record to record: no unseen record is farther from the common value
-SURELY = 1e-3  # of that reach: how exactly a record's own deviation is found
+REACH = 4.0  # standard deviations from record to record: bound of the deviation of a held-out record
+TOLERANCE = 1e-3  # of that bound: accuracy of the deviation
 
 
 @dataclass(frozen=True, eq=False)
 class RecordToRecord:
-    """A figure of the nominal model that differs from record to record, as it was fitted.
+    """A parameter of the nominal model that varies from record to record, as it was fitted.
 
     Attributes:
         figure: "stiffness" or "axial load".
-        values: by name of record, what it is there less the common value: relative, or a force.
-        force: name of its unit.
+        values: deviation from the common value, by name of record: relative, or a force.
+        force: name of the unit of force.
     """
 
     figure: str
@@ -374,17 +379,17 @@ class RecordToRecord:
 
     @classmethod
     def of(cls, rig: Rig, effects: Sequence[Effect]) -> "RecordToRecord | None":
-        """Of effects that were fitted to records of a nominal rig; None where nothing differs between records."""
-        between = next((found for found in (parted(e)[1] for e in effects) if found is not None), None)
-        if between is None:
+        """The parameter that varies among fitted effects of a nominal rig; None if none varies."""
+        errors = next((found for found in (parted(e)[1] for e in effects) if found is not None), None)
+        if errors is None:
             return None
-        figure = between.target.figure
+        figure = errors.target.figure
         unit = buckling_load(rig) if figure == TENSION else 1.0
-        return cls(figure, {name: unit * value for name, value in deviations_of(between.values).items()})
+        return cls(figure, {name: unit * value for name, value in deviations_of(errors.values).items()})
 
     @property
     def label(self) -> str:
-        """As in the budget."""
+        """Label in the budget."""
         return label_of(self.figure)
 
     @property
@@ -394,17 +399,17 @@ class RecordToRecord:
 
     @property
     def words(self) -> str:
-        """Such as: 0.8 %: record low is 1.1 % stiffer than record high."""
-        less, more = (pick(self.values, key=lambda name: self.values[name]) for pick in (min, max))
-        apart = self._written(self.values[more] - self.values[less])
-        how = f"has {apart} more than" if self.figure == TENSION else f"is {apart} stiffer than"
-        return f"{self._written(self.spread)}: record {more} {how} record {less}"
+        """The spread and the extreme records, such as: 0.8 %: record low is 1.1 % stiffer than record high."""
+        least, most = (pick(self.values, key=lambda name: self.values[name]) for pick in (min, max))
+        difference = self._in_unit(self.values[most] - self.values[least])
+        how = f"has {difference} more than" if self.figure == TENSION else f"is {difference} stiffer than"
+        return f"{self._in_unit(self.spread)}: record {most} {how} record {least}"
 
-    def _written(self, size: float) -> str:
+    def _in_unit(self, size: float) -> str:
         return f"{size:.2g} {self.force}" if self.figure == TENSION else f"{100.0 * size:.2g} %"
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers: relative, or N."""
+        """The parameter, its spread and its deviations as plain numbers: relative, or in the unit of force."""
         by_record = {name: float(f"{value:.4g}") for name, value in self.values.items()}
         return {"figure": self.figure, "std": float(f"{self.spread:.4g}"), "by_record": by_record}
 
@@ -412,26 +417,28 @@ class RecordToRecord:
 def with_held_out(
     rig: Rig, effects: Sequence[Effect], records: Sequence[Record], *, settle: float = 0.0
 ) -> tuple[Effect, ...]:
-    """The effects, and what a figure that differs from record to record deviates by in records that no fit has seen.
+    """The effects, with the deviations of a parameter that varies from record to record fitted to held-out records.
 
-    It is that which leaves least of them, within what it differs by between the records fitted: an account of what is
-    left of them, not a prediction. The effects as they are where nothing differs.
+    Each deviation minimises the residual of its record, within `REACH`. It serves the budget; it is no prediction. The
+    effects are returned unchanged if no parameter varies.
     """
     errors = next((e for e in effects if parted(e)[1] is not None), None)
     if errors is None:
         return tuple(effects)
     others = [e for e in effects if e is not errors]
-    reach = REACH * errors.target.record
+    bound = REACH * errors.target.record
     values = dict(errors.values)
     for record in records:
         name = f"record_{record.name}"
         if name in values:
             continue
 
-        def left(deviation: float, record: Record = record, name: str = name) -> float:
+        def objective(deviation: float, record: Record = record, name: str = name) -> float:
             own = replace(errors, values={**errors.values, name: deviation})
-            return left_with(rig, (*others, own), record, settle)
+            return residual_power(rig, (*others, own), record, settle)
 
-        found = minimize_scalar(left, bounds=(-reach, reach), method="bounded", options={"xatol": SURELY * reach})
+        found = minimize_scalar(
+            objective, bounds=(-bound, bound), method="bounded", options={"xatol": TOLERANCE * bound}
+        )
         values[name] = float(found.x)
     return (*others, replace(errors, values=values))

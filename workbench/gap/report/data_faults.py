@@ -1,4 +1,4 @@
-"""Faults of the records themselves, which no effect explains: reported with a verdict."""
+"""Faults of the records themselves: records that start in motion and channels that are stuck for a while."""
 
 from collections.abc import Sequence
 
@@ -9,15 +9,16 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 
-AT_REST = 10.0  # standard deviations of the noise, by which a first reading may be off zero and off its mean
-IN_MOTION = 0.3  # of the reading's own deviation: likewise
-UNSURE = 2.0  # of what the rig reads first from rest: by so much a wrong rig may be off it
-LONG, SHORTEST = 0.02, 20  # of a record, and samples: as long, equal readings are no chance
-MOVES = 0.1  # of its own deviation: what a sensor moves by meanwhile that is alive
+# a first reading farther than each of these from zero, from the mean and from the prediction shows motion
+NOISE_MULTIPLE = 10.0  # standard deviations of the noise
+SIGNAL_SHARE = 0.3  # standard deviations of the readings
+JUMP_MULTIPLE = 2.0  # times the first reading that the rig predicts from rest, which a wrong rig misjudges
+LONG, SHORTEST = 0.02, 20  # share of a record, and samples: longer runs of equal readings are not by chance
+MOVES = 0.1  # of its standard deviation over the record: a working sensor moves by more meanwhile
 
 
 def data_faults(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> tuple[str, ...]:
-    """Records that begin in motion, and channels that are stuck for a while: a sentence each, with the correction.
+    """One sentence for each record that starts in motion and each channel that is stuck, with the correction.
 
     Args:
         rig: nominal.
@@ -32,26 +33,29 @@ def data_faults(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> 
 
 
 def _in_motion(rig: Rig, record: Record) -> list[str]:
-    """A first reading that is no bias, no load that comes to stay, and not how accelerations jump with the first force.
+    """A sentence if a first reading shows that the record starts in motion; empty if none does.
 
-    Of that jump the rig knows the size but for errors of gains and masses, and a late sensor does not read it yet.
+    A bias and a constant load leave the first reading at the mean. An acceleration jumps with the first force: the rig
+    predicts that jump up to errors of gains and masses, and a late sensor reads zero instead.
     """
-    at_rest = predict(rig, record)[:, 0]
-    for sensor, y, jump in zip(rig.sensors, record.outputs, at_rest, strict=True):
+    from_rest = predict(rig, record)[:, 0]
+    for sensor, y, jump in zip(rig.sensors, record.outputs, from_rest, strict=True):
         first = float(y[0])
         off = min(abs(first), abs(first - float(y.mean())), abs(first - float(jump)))
         if abs(float(jump)) < sensor.noise_std:
             jump = 0.0
-        if off > max(AT_REST * sensor.noise_std, IN_MOTION * float(y.std()), UNSURE * abs(float(jump))):
+        least = max(NOISE_MULTIPLE * sensor.noise_std, SIGNAL_SHARE * float(y.std()), JUMP_MULTIPLE * abs(float(jump)))
+        if off > least:
             return [
                 f"Record {record.name!r} does not start from rest ({sensor.name} reads {first:.3g}, where at rest it"
-                f" would read {jump:.3g}): cut it where nothing moves, or give `settle`, a few decay times of the"
-                " slowest mode, which are not counted then."
+                f" would read {jump:.3g}): cut it where nothing moves, or set `settle` to a few decay times of the"
+                " slowest mode, which are then not compared."
             ]
     return []
 
 
 def _stuck(record: Record) -> list[str]:
+    """A sentence for each channel whose reading stays the same for long while others move."""
     names = [channel.name for channel in record.output_channels]
     deviations = record.outputs.std(axis=1)
     found = []
@@ -59,9 +63,9 @@ def _stuck(record: Record) -> list[str]:
         begin, end = _longest_run(y)
         others = [i for i in range(len(names)) if i != j]
         alive = [record.outputs[i, begin:end].std() > MOVES * deviations[i] for i in others]
-        at_end = abs(y[begin]) > 0.999 * np.abs(y).max()  # that is clipping
-        rounded = np.count_nonzero(y == y[begin]) > end - begin
-        if end - begin > max(LONG * y.size, SHORTEST) and any(alive) and not (at_end or rounded):
+        clipped = abs(y[begin]) > 0.999 * np.abs(y).max()
+        quantised = np.count_nonzero(y == y[begin]) > end - begin  # the same reading occurs elsewhere too
+        if end - begin > max(LONG * y.size, SHORTEST) and any(alive) and not (clipped or quantised):
             seconds = record.start_time + record.sample_time * np.array([begin, end])
             found.append(
                 f"Record {record.name!r}: {names[j]} reads {y[begin]:.4g} without change from {seconds[0]:.4g} s to"
@@ -71,7 +75,7 @@ def _stuck(record: Record) -> list[str]:
 
 
 def _longest_run(y: Floats) -> tuple[int, int]:
-    """Where the longest stretch of equal readings begins and ends."""
+    """First sample of the longest run of equal readings, and the first after it."""
     changes = np.flatnonzero(np.r_[True, np.diff(y) != 0, True])
     longest = int(np.argmax(np.diff(changes)))
     return int(changes[longest]), int(changes[longest + 1])

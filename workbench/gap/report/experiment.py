@@ -1,4 +1,4 @@
-"""What to measure next: the experiment that would separate two rival explanations best."""
+"""The next experiment: the one that would distinguish two rival explanations in the shortest time."""
 
 from dataclasses import dataclass, replace
 
@@ -13,10 +13,10 @@ from workbench.gap.search.fit import Fit
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
-LEVELS = (0.3, 1.0, 3.0)
-SEPARATED = 25.0
-PERIODS = 3.0  # of the first elastic mode: the shortest experiment, which a structure needs to answer
-LONGEST = 1e3  # times the length of the record: what would take longer is seen in rounding, not in a measurement
+LEVELS = (0.3, 1.0, 3.0)  # factors on the input of a record
+SEPARATED = 25.0  # squared difference over the noise variance: five standard deviations
+PERIODS = 3.0  # of the first elastic mode: shortest experiment, since a structure takes time to respond
+LONGEST = 1e3  # times the length of the record: a difference that takes longer to show is a rounding error
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,10 @@ class Experiment:
 
     Attributes:
         like: name of the record whose input it repeats.
-        inputs: names of the inputs that are driven; the others rest.
+        inputs: names of the inputs that are driven; the others are zero.
         level: factor on that record's input.
-        seconds: length at which the rivals differ by five standard deviations, no shorter than a record must be and
-            than three periods of the first elastic mode; inf where they never would, or would in a thousand times the
-            length of the record.
+        seconds: length at which the rivals differ by five standard deviations, at least 16 samples and three periods of
+            the first elastic mode; inf if that takes over a thousand times the length of the record.
         rivals: labels of the two explanations it separates.
         time: name of the unit of time.
     """
@@ -54,10 +53,10 @@ class Experiment:
 
 
 def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Workers) -> Experiment:
-    """The experiment among variations of the records that separates two fits in the shortest time.
+    """The experiment, among variations of the records, that distinguishes two fits in the shortest time.
 
-    For each variation both corrected rigs are simulated, and what small changes of either one's parameters could make
-    up for is projected out; what is left of their difference, in units of the noise, grows with time.
+    Both corrected rigs are simulated for each variation. The part of their difference that small changes of either
+    one's parameters could cancel is projected out; the rest, in units of the noise, grows with time.
     """
     names = (best.named, rival.named)
 
@@ -74,53 +73,55 @@ def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Wor
 
 
 def _shortest(rig: Rig, sample_time: float) -> float:
-    """Seconds that an experiment lasts at least."""
+    """Length in seconds of the shortest experiment."""
     elastic = rig.modes.frequencies_hz[rig.modes.frequencies_hz > 0]
     return float(max([LEAST_SAMPLES * sample_time, *PERIODS / elastic[:1]]))
 
 
 def _choices(record: Record) -> list[tuple[str, ...]]:
-    """All inputs that a record drives, and where they are several each alone."""
+    """The sets of inputs to drive: all that a record drives, and each of them alone if there are several."""
     driven = [name for name, row in zip(record.input_names, record.inputs, strict=True) if np.any(row)]
     return [tuple(driven)] + ([(name,) for name in driven] if len(driven) > 1 else [])
 
 
 def _varied(record: Record, inputs: tuple[str, ...], level: float) -> Record:
+    """The record with some of its inputs multiplied by `level` and the others zero."""
     keep = np.array([name in inputs for name in record.input_names])
     return replace(record, inputs=record.inputs * (level * keep[:, None]))
 
 
 def _separation(rig: Rig, best: Fit, rival: Fit, trial: FitData) -> float:
-    """Squared difference left between the two, per second."""
+    """Squared difference of two fits over the noise variance, per second, with their tangent spaces projected out."""
     with np.errstate(over="ignore", invalid="ignore"):
         try:
-            first, of_first = _response(rig, best.effects, trial)
-            second, of_second = _response(rig, rival.effects, trial)
+            first, first_slopes = _response(rig, best.effects, trial)
+            second, second_slopes = _response(rig, rival.effects, trial)
         except (ValueError, np.linalg.LinAlgError):
             return 0.0
     difference = first - second
-    tangent = np.column_stack([*of_first, *of_second]) if of_first or of_second else np.zeros((difference.size, 0))
+    slopes = [*first_slopes, *second_slopes]
+    tangent = np.column_stack(slopes) if slopes else np.zeros((difference.size, 0))
     if not (np.isfinite(difference).all() and np.isfinite(tangent).all()):
         return 0.0
     if tangent.shape[1]:
-        basis, sizes, _ = np.linalg.svd(tangent, full_matrices=False)
-        basis = basis[:, sizes > 1e-9 * sizes.max()]
+        basis, singular, _ = np.linalg.svd(tangent, full_matrices=False)
+        basis = basis[:, singular > 1e-9 * singular.max()]
         difference = difference - basis @ (basis.T @ difference)
     record = trial.records[0]
     return float(difference @ difference) / (record.n_samples * record.sample_time)
 
 
 def _response(rig: Rig, effects: tuple[Effect, ...], trial: FitData) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The residual under the effects, and its derivative by each of their parameters."""
+    """Residual (n,) with the effects, and its derivatives (n,) with respect to each of their parameters."""
     centre = trial.residual(apply_all(rig, effects))
     slopes = []
     for i, effect in enumerate(effects):
-        for parameter in (
-            () if effect.kind.applied_first else effect.parameters(rig)
-        ):  # errors of the model stay as they are
+        if effect.kind.applied_first:  # nominal errors are held fixed
+            continue
+        for parameter in effect.parameters(rig):
             step = 1e-4 * max(abs(effect.values[parameter.name]), 1e-6)
-            moved = dict(effect.values)
-            moved[parameter.name] += step
-            changed = (*effects[:i], replace(effect, values=moved), *effects[i + 1 :])
+            values = dict(effect.values)
+            values[parameter.name] += step
+            changed = (*effects[:i], replace(effect, values=values), *effects[i + 1 :])
             slopes.append((trial.residual(apply_all(rig, changed)) - centre) / step)
     return centre, slopes

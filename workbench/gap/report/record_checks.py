@@ -1,4 +1,4 @@
-"""Before a fit: do the records fit the model, which effects could they show, and which could they not distinguish?"""
+"""Checks before a fit: whether records and model agree in principle, and which effects the records can show."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -22,33 +22,35 @@ from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
 from workbench.structure.supports import PointMass
 
-ALIKE = 0.995
-SEEN = 25.0  # of chi-squared: five standard deviations
-TURNED = -0.95
-FAR_OFF, ABOVE_NOISE = 50.0, 5.0  # times the model: in other units; times the noise: worth comparing
-NO_EFFECT = 500.0  # times less than the model, of all outputs: no effect makes so much of it
-ALIKE_IN_SHAPE = 0.5  # correlation of a reading with the model's, whatever its unit
-STUCK = 0.5
+INDISTINGUISHABLE = 0.995  # correlation of two responses
+DETECTABLE = 25.0  # of chi-squared: five standard deviations
+WRONG_SIGN = -0.95  # correlation of a reading with the prediction
+WRONG_UNIT = 50.0  # ratio of a reading and the prediction, or its inverse
+NO_EFFECT = 500.0  # times smaller than the prediction, at all outputs: no effect reduces the response so much
+ABOVE_NOISE = 5.0  # times the noise: smaller signals are not compared
+CORRELATED = 0.5  # correlation of a reading with the prediction, whatever its unit
+SATURATED = 0.5  # share of the samples at the largest magnitude
 LEAST_SAMPLES = 16  # of a record, as in a case folder
-THINNING = 3
-COARSELY = 2  # substeps of a sample: whether an effect shows needs no more
-STRAY, MISJUDGED = 1e-3, 0.02  # of a frequency, of a damping: what solving a structure anew may differ by
-MISSCALED, QUADRATURE = 0.02, 200  # of a modal mass; points along a member that it is integrated by
-DECADES = (1e2, 1e-2, 1e4, 1e-4)
+THINNING = 3  # every third value of the residual is used
+SUBSTEPS = 2  # of a sample: detectability needs no more
+# relative tolerances of a natural frequency, a damping and a modal mass: solving a structure again changes them by less
+OFF_FREQUENCY, OFF_DAMPING, OFF_MASS = 1e-3, 0.02, 0.02
+QUADRATURE = 200  # points along a member for the integral of its modal mass
+DECADES = (1e2, 1e-2, 1e4, 1e-4)  # factors on a strength, tried one after the other
 
 
 class RecordsError(ValueError):
-    """Records that cannot be of the rig they came with."""
+    """Raised for records that cannot have been measured on their rig."""
 
 
 @dataclass(frozen=True, eq=False)
 class Detectability:
-    """Which effects the records can show, and which they can tell apart, before anything is fitted.
+    """Which effects the records can show and which they can distinguish, before any fit.
 
     Attributes:
-        strengths: label of an effect -> how far it would move the residual, in standard deviations, at the first
-            strength that these records show, or at the one they show most.
-        undetectable: labels of effects that these records show at no strength.
+        strengths: change of the residual by an effect, in standard deviations, by its label; at the first strength that
+            is detectable, or at the one with the largest change.
+        undetectable: labels of effects that are detectable at no strength.
         indistinguishable: pairs of labels whose responses are the same up to a factor, with their correlation.
     """
 
@@ -62,29 +64,29 @@ class Detectability:
 def check_records(
     rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0
 ) -> None:
-    """Refuse records whose channels cannot be what the rig says they are: those to be fitted, and those held out.
+    """Refuse records, to be fitted or held out, whose channels cannot be those of the rig.
 
     Args:
         settle: seconds at the start of each record that are not compared.
 
     Raises:
-        RecordsError: a sensor that reads with the wrong sign or in other units, a saturated or flat channel, a record
-            shorter than a period of the first mode, no inputs, inputs that are all at rest.
+        RecordsError: for a sensor with the wrong sign or in other units, a saturated or flat channel, a record shorter
+            than a period of the first mode, or no input that drives the rig.
     """
     if not rig.actuators:
         raise RecordsError("the rig has no actuators, so nothing drives its model; a free decay is for wb.identify")
     check_alive(rig, records, validation, settle=settle)
-    if not _compared(rig, records, "record", settle):
+    if not _check_signs_and_units(rig, records, "record", settle):
         raise RecordsError("every input of every record is at rest; there is nothing to compare")
-    _compared(rig, validation, "validation record", settle)
+    _check_signs_and_units(rig, validation, "validation record", settle)
 
 
 def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0) -> None:
-    """Refuse records of few samples and channels that are saturated or flat, which no model is needed to see.
+    """Refuse records of few samples and channels that are saturated or flat: checks that need no model.
 
     Args, Raises: as `check_records`.
     """
-    _check_not_stuck(rig, records)
+    _check_not_saturated(rig, records)
     for these, what in ((records, "record"), (validation, "validation record")):
         for record in these:
             counted = record.n_samples - lead_of(record, settle)
@@ -103,13 +105,18 @@ def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record
 
 
 def _is_driven(record: Record) -> bool:
+    """Whether any input of a record is not zero."""
     return bool(np.any(record.inputs))
 
 
-def _compared(rig: Rig, records: Sequence[Record], what: str, settle: float) -> bool:
-    """Whether there were records to compare with the model; refused where they cannot be of it."""
+def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settle: float) -> bool:
+    """Refuse records that are too short or disagree in sign or unit with the model; return whether any is driven.
+
+    Args:
+        what: name of such records in a message.
+    """
     elastic = rig.modes.omega[rig.modes.omega > 0]
-    signs, sizes = [], []
+    correlations, ratios = [], []
     for record in records:
         lead = lead_of(record, settle)
         if elastic.size and record.n_samples * record.sample_time < 2 * np.pi / elastic[0]:
@@ -123,88 +130,93 @@ def _compared(rig: Rig, records: Sequence[Record], what: str, settle: float) -> 
         outputs = record.outputs[:, lead:]
         pairs = zip(outputs, predicted, strict=True)
         row = [float(np.corrcoef(y, p)[0, 1]) if np.ptp(p) > 0 else 0.0 for y, p in pairs]
-        signs.append(row)
-        sizes.append(_sizes(rig, outputs, predicted, np.abs(row) > ALIKE_IN_SHAPE))
-    if not signs:
+        correlations.append(row)
+        ratios.append(_amplitude_ratios(rig, outputs, predicted, np.abs(row) > CORRELATED))
+    if not correlations:
         return False
-    _check_units(rig, records[0], np.array(sizes), np.abs(signs) > ALIKE_IN_SHAPE, what)
-    turned = np.flatnonzero((np.array(signs) < TURNED).all(axis=0))
-    if turned.size and turned.size < len(rig.sensors):
-        name = rig.sensors[turned[0]].name
+    _check_units(rig, records[0], np.array(ratios), np.abs(correlations) > CORRELATED, what)
+    inverted = np.flatnonzero((np.array(correlations) < WRONG_SIGN).all(axis=0))
+    if inverted.size and inverted.size < len(rig.sensors):
+        name = rig.sensors[inverted[0]].name
         raise RecordsError(
             f"output {name!r} reads with the wrong sign: its correlation with the model is"
-            f" {np.array(signs)[:, turned[0]].mean():.2f} in every {what}; reverse its sign"
+            f" {np.array(correlations)[:, inverted[0]].mean():.2f} in every {what}; reverse its sign"
         )
     return True
 
 
-def _sizes(rig: Rig, measured: np.ndarray, predicted: np.ndarray, alike: np.ndarray) -> np.ndarray:
-    """Each sensor's reading over the model's (n_sensors,); NaN where one of the two is lost in the noise.
+def _amplitude_ratios(rig: Rig, measured: np.ndarray, predicted: np.ndarray, is_correlated: np.ndarray) -> np.ndarray:
+    """Standard deviation (n_sensors,) of each reading over that of its prediction; NaN where one is below the noise.
 
     Args:
-        alike: (n_sensors,) whether the two go together: then the reading is more than noise.
+        measured, predicted: (n_sensors, n_samples).
+        is_correlated: (n_sensors,) whether the two are correlated, which shows that the reading is not just noise.
     """
     least = ABOVE_NOISE * np.array([sensor.noise_std for sensor in rig.sensors])
     expected, read = predicted.std(axis=1), measured.std(axis=1)
-    comparable = (expected > least) & ((read > least) | alike)
+    comparable = (expected > least) & ((read > least) | is_correlated)
     return np.where(comparable, read / np.where(comparable, expected, 1.0), np.nan)
 
 
-def _check_units(rig: Rig, record: Record, sizes: np.ndarray, alike: np.ndarray, what: str) -> None:
-    """A channel that goes as the model does, and reads fifty times too much or too little in every record.
+def _check_units(rig: Rig, record: Record, ratios: np.ndarray, is_correlated: np.ndarray, what: str) -> None:
+    """Refuse outputs that are correlated with the model but read fifty times too much or too little in every record.
 
-    What nobody modelled may be far stronger than the inputs, but does not go as their reply does. All outputs together
-    need not go as the model does where they read far less than it: an effect that bends them leaves more.
+    An unmodelled excitation may be far stronger than the inputs, but is not correlated with the response to them. If
+    all outputs read 500 times too little, no correlation is required: no effect reduces the response so much.
 
     Args:
         record: any, for its units.
-        sizes: (n_records, n_sensors) readings over the model's.
-        alike: (n_records, n_sensors) whether they go as those do.
-        what: such records are called.
+        ratios: (n_records, n_sensors) of `_amplitude_ratios`.
+        is_correlated: (n_records, n_sensors) whether readings and predictions are correlated.
+        what: name of such records in a message.
     """
 
-    def off(ratios: np.ndarray, by: float = FAR_OFF) -> int:
-        known = ratios[np.isfinite(ratios)]
-        return int((known > by).all()) - int((known < 1.0 / by).all()) if known.size else 0
+    def side(some: np.ndarray, factor: float = WRONG_UNIT) -> int:
+        """1 if all known ratios are above the factor, -1 if all are below its inverse, else 0."""
+        known = some[np.isfinite(some)]
+        return int((known > factor).all()) - int((known < 1.0 / factor).all()) if known.size else 0
 
-    far = [j for j, column in enumerate(np.where(alike, sizes, np.nan).T) if off(column)]
-    known = np.isfinite(sizes).any(axis=0).sum()
-    if known > 1 and (off(sizes, NO_EFFECT) < 0 or (far and off(sizes))):
+    correlated = np.where(is_correlated, ratios, np.nan)
+    wrong = [j for j, column in enumerate(correlated.T) if side(column)]
+    n_known = np.isfinite(ratios).any(axis=0).sum()
+    if n_known > 1 and (side(ratios, NO_EFFECT) < 0 or (wrong and side(ratios))):
         raise RecordsError(
-            f"the outputs read about {_about(sizes)} times the prediction of the model in every {what}: are outputs,"
-            f" inputs and model in consistent units, {_units(record)}?"
+            f"the outputs read about {_median_in_words(ratios)} times the prediction of the model in every {what}: are"
+            f" outputs, inputs and model in consistent units, {_units(record)}?"
         )
-    if not far:
+    if not wrong:
         return
-    name, unit = rig.sensors[far[0]].name, record.output_channels[far[0]].unit or "its unit"
+    name, unit = rig.sensors[wrong[0]].name, record.output_channels[wrong[0]].unit or "its unit"
     raise RecordsError(
-        f"output {name!r} reads about {_about(np.where(alike, sizes, np.nan)[:, far[0]])} times what the model predicts"
+        f"output {name!r} reads about {_median_in_words(correlated[:, wrong[0]])} times what the model predicts"
         f" in every {what}: is it in {unit}?"
     )
 
 
-def _about(ratios: np.ndarray) -> str:
+def _median_in_words(ratios: np.ndarray) -> str:
+    """The median of the known ratios, to two digits."""
     return f"{float(f'{np.nanmedian(ratios):.2g}'):g}"
 
 
 def _units(record: Record) -> str:
+    """The units of all channels of a record, each once."""
     units = (channel.unit for channel in (*record.input_channels, *record.output_channels))
     return ", ".join(dict.fromkeys(unit for unit in units if unit))
 
 
 def check_modes(rig: Rig) -> None:
-    """Refuse modes that are not those of the structure behind them.
+    """Refuse a rig whose modes are not those of its structure.
 
-    Effects of the structure are solved anew on it: what was changed on the modes alone would be lost in them.
+    Effects on the structure solve it again, so changes of the modes alone would be lost.
 
     Raises:
-        ValueError: a natural frequency, a damping or a modal mass that the structure does not have.
+        ValueError: for a natural frequency, a damping or a modal mass that the structure does not have.
     """
     if rig.structure is None:
         return
     modes, own = rig.modes, modes_of(rig.structure, rig.modes.n_modes)
     remedy = "; take the structure's own modes, or structure=None for modes of your own"
-    off = np.abs(modes.omega - own.omega) > STRAY * np.maximum(own.omega, own.omega[-1] / own.n_modes**2)
+    off = np.abs(modes.omega - own.omega) > OFF_FREQUENCY * np.maximum(own.omega, own.omega[-1] / own.n_modes**2)
     if off.any():
         r = int(np.argmax(off))
         raise ValueError(
@@ -212,7 +224,7 @@ def check_modes(rig: Rig) -> None:
             f" {own.frequencies_hz[r]:.6g} Hz{remedy}"
         )
     damping, expected = np.diag(modes.damping), np.diag(own.damping)
-    off = np.abs(damping - expected) > MISJUDGED * np.maximum(expected, expected.max() / own.n_modes**2)
+    off = np.abs(damping - expected) > OFF_DAMPING * np.maximum(expected, expected.max() / own.n_modes**2)
     if off.any():
         r = int(np.argmax(off))
         raise ValueError(
@@ -220,7 +232,7 @@ def check_modes(rig: Rig) -> None:
             f" {expected[r]:.4g} rad/s{remedy}"
         )
     masses = _modal_masses(modes, rig.structure)
-    off = np.abs(masses - 1.0) > MISSCALED
+    off = np.abs(masses - 1.0) > OFF_MASS
     if off.any():
         r = int(np.argmax(off))
         raise ValueError(
@@ -230,7 +242,7 @@ def check_modes(rig: Rig) -> None:
 
 
 def _modal_masses(modes: Modes, structure: Structure | Plate | Membrane) -> Floats:
-    """∫ m φ_r² over the structure with the masses attached to it, (n_modes,)."""
+    """Modal masses (n_modes,) ∫ m φ_r² over the structure and its attached masses."""
     if isinstance(modes.domain, NamedPoints):
         raise ValueError("modes at named points are not those of a structure with a length; give structure=None")
     places, weights = modes.domain.quadrature(QUADRATURE)
@@ -248,74 +260,74 @@ def _modal_masses(modes: Modes, structure: Structure | Plate | Membrane) -> Floa
     return masses
 
 
-def _check_not_stuck(rig: Rig, records: Sequence[Record]) -> None:
-    """A sensor that clips in some records is an effect to be named; one that clips most of the time shows nothing.
+def _check_not_saturated(rig: Rig, records: Sequence[Record]) -> None:
+    """Refuse a sensor that clips in most samples; one that clips less often is an effect to be identified.
 
-    Records held out may clip more: what was named predicts that.
+    Held-out records are not checked: they may clip more, as the identified effect predicts.
     """
     for j, sensor in enumerate(rig.sensors):
         top = max((float(np.abs(record.outputs[j]).max()) for record in records), default=0.0)
-        stuck = [np.abs(record.outputs[j]) >= top * (1 - 1e-9) for record in records]
-        share = np.concatenate(stuck).mean() if stuck else 0.0
-        if top > 0 and share > STUCK:
+        at_top = [np.abs(record.outputs[j]) >= top * (1 - 1e-9) for record in records]
+        share = np.concatenate(at_top).mean() if at_top else 0.0
+        if top > 0 and share > SATURATED:
             raise RecordsError(
-                f"record {records[int(np.argmax([s.mean() for s in stuck]))].name!r}: output {sensor.name!r} stands at"
+                f"record {records[int(np.argmax([s.mean() for s in at_top]))].name!r}: output {sensor.name!r} is at"
                 f" ±{top:g} for {100 * share:.0f} % of all its samples: it is saturated; lower the level or the gain"
             )
 
 
 def detectability(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Detectability:
-    """Simulate each effect at a strength that the records show, and compare the responses."""
-    rig, data = evidence.rig, evidence.data.stepped(COARSELY)
+    """The detectability of each kind of effect, from simulations at a strength that the records show."""
+    rig, data = evidence.rig, evidence.data.stepped(SUBSTEPS)
     base = data.residual(rig)
-    labels, signatures, strengths = [], [], {}
-    things = [(k, target) for k in catalogue if k.found_in != "residual" for target in k.targets(rig)]
-    for effect, change in evidence.workers.map(lambda thing: _first_seen(*thing, evidence, data, base), things):
+    labels, responses, strengths = [], [], {}
+    candidates = [(k, target) for k in catalogue if k.found_in != "residual" for target in k.targets(rig)]
+    for effect, change in evidence.workers.map(lambda each: _first_detectable(*each, evidence, data, base), candidates):
         if effect is None:
             continue
         size = float(np.linalg.norm(change))
         strengths[effect.label] = size * float(np.sqrt(THINNING))
-        if size**2 * THINNING > SEEN:
+        if size**2 * THINNING > DETECTABLE:
             labels.append(effect.label)
-            signatures.append((change / size).astype(np.float32))
-    correlation = np.abs(np.array(signatures) @ np.array(signatures).T) if signatures else np.zeros((0, 0))
-    alike = [
+            responses.append((change / size).astype(np.float32))
+    correlation = np.abs(np.array(responses) @ np.array(responses).T) if responses else np.zeros((0, 0))
+    same = [
         (labels[i], labels[j], float(correlation[i, j]))
         for i in range(len(labels))
         for j in range(i + 1, len(labels))
-        if correlation[i, j] > ALIKE and labels[i].split("[")[0] != labels[j].split("[")[0]
+        if correlation[i, j] > INDISTINGUISHABLE and labels[i].split("[")[0] != labels[j].split("[")[0]
     ]
     return Detectability(
         strengths=strengths,
-        undetectable=tuple(label for label, size in strengths.items() if size**2 <= SEEN),
-        indistinguishable=tuple(sorted(alike, key=lambda pair: -pair[2])),
+        undetectable=tuple(label for label, size in strengths.items() if size**2 <= DETECTABLE),
+        indistinguishable=tuple(sorted(same, key=lambda pair: -pair[2])),
     )
 
 
-def _first_seen(
+def _first_detectable(
     kind: Kind, target: Any, evidence: Evidence, data: FitData, base: Floats
 ) -> tuple[Effect | None, Floats]:
-    """The first strength of a kind that these records show, or the one that they show most; and what it changes."""
+    """An effect at the first detectable strength, or at that of largest change; and its change (n,) of the residual."""
     best, change, most = None, np.zeros(0), -1.0
-    for effect in _strengths(kind, target, evidence):
+    for effect in _at_strengths(kind, target, evidence):
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 moved = (data.residual(effect.apply(evidence.rig)) - base)[::THINNING]
-                size = float(moved @ moved) * THINNING
+                chi_squared = float(moved @ moved) * THINNING
             except (ValueError, np.linalg.LinAlgError):
                 continue
-        if np.isfinite(size) and size > most:
-            best, change, most = effect, moved, size
-        if most > SEEN:
+        if np.isfinite(chi_squared) and chi_squared > most:
+            best, change, most = effect, moved, chi_squared
+        if most > DETECTABLE:
             break
     return best, change
 
 
-def _strengths(kind: Kind, target: Any, evidence: Evidence) -> Iterator[Effect]:
-    """Where a search would start, and from the first and the last start each number by decades up and down.
+def _at_strengths(kind: Kind, target: Any, evidence: Evidence) -> Iterator[Effect]:
+    """An effect at the start values of a search, and with each parameter of the first and last changed by decades.
 
-    A search starts from the unmodelled force, and where there is none it starts from nothing, and anywhere: also by a
-    support, where nothing shows. So the last resort is where the structure moves most.
+    Start values follow from the unmodelled force. If there is none they are arbitrary: their place may be at a support,
+    where no effect shows. So the place of largest motion is tried last.
     """
     starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
     if starts:
@@ -324,21 +336,22 @@ def _strengths(kind: Kind, target: Any, evidence: Evidence) -> Iterator[Effect]:
         yield from starts[1:]
         yield from _by_decades(starts[-1], evidence.rig)
         if starts[0].at is not None:
-            liveliest = starts[0].moved_to(_liveliest(evidence))
-            yield liveliest
-            yield from _by_decades(liveliest, evidence.rig)
+            moved = starts[0].moved_to(_place_of_largest_motion(evidence))
+            yield moved
+            yield from _by_decades(moved, evidence.rig)
 
 
-def _liveliest(evidence: Evidence) -> Where:
-    """The place that moves most, of those where a force is looked for."""
+def _place_of_largest_motion(evidence: Evidence) -> Where:
+    """The place with the largest displacement, among those where a force is searched for."""
     power = sum(motion.displacement @ motion.displacement.T for motion in evidence.motions)
     places = [where for where in evidence.places if not isinstance(where, Between)]
     shapes = evidence.rig.modes.phi(places)
-    liveliest: Where = same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
-    return liveliest
+    largest: Where = same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
+    return largest
 
 
 def _by_decades(effect: Effect, rig: Rig) -> Iterator[Effect]:
+    """The effect with one parameter, but no coordinate, multiplied by each factor of `DECADES`."""
     for factor in DECADES:
         for parameter in effect.parameters(rig):
             if parameter.name not in COORDINATES:

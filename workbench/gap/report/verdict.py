@@ -1,4 +1,4 @@
-"""The verdict on a gap: where, which, how far, in a sentence and as JSON."""
+"""The verdict on a gap: where it acts, its causes and their shares, in a sentence and as JSON."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -20,35 +20,35 @@ from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.printed import joined_in_words, rounded
 
-NEAR = 0.05  # of the gap: a set that closes less is not near
-SHOWN = 0.005  # of the gap: what is less is not worth a word
-BESIDE = 0.02  # of the extent: as near as a place is asked for
+NEAR = 0.05  # of the gap: a set that closes less is not stated as the nearest
+SHOWN = 0.005  # of the gap: smaller shares are not stated
+SAME_PLACE = 0.02  # of the extent: places as close as this agree
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What a diagnosis says.
+    """The result of a diagnosis.
 
     Attributes:
-        case: its name.
+        case: name of the case.
         outcome: "none" (no gap beyond noise or a tolerance), "explained", "part" (explained in part) or "unknown".
-        effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown"; errors of
-            the nominal model among it, where they were fitted beside.
-        budget: of the gap: shares of each effect, of errors of the nominal model, of noise and of what is unexplained.
-        alternatives: (label of another set that the records do not exclude, probability), likeliest first; with
-            `probability`, that of the set named, these sum to one.
-        where: the gap taken apart.
-        shrinkage: on validation records; None without any.
-        corrected: the rig with the effects in it.
-        nominal: the rig as it was handed in.
-        attribution: the whole search.
-        detectability: what the records could show before anything was fitted.
-        experiment: what to measure next, where alternatives remain.
-        tolerance: of the signal's rms, below which a gap beyond the noise was not explained.
-        disagreeing: names of validation records that have a gap, where the fitted ones have none; the outcome is then
+        effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown"; includes
+            errors of the nominal model if they were fitted jointly.
+        budget: shares of the gap: of each effect, of errors of the nominal model, of noise, and the unexplained one.
+        alternatives: (label of another set that the records do not exclude, probability), most probable first; their
+            sum and `probability`, that of the named set, is one.
+        where: the gap by path, mode, frequency band, sensor and record, and the place of a point force.
+        shrinkage: of the gap on validation records; None without any.
+        corrected: the rig with the effects.
+        nominal: the rig before the diagnosis.
+        attribution: the result of the search for effects.
+        detectability: effects that the records can show and distinguish, before any fit.
+        experiment: the next measurement, if alternatives remain.
+        tolerance: share of the signal's rms; a smaller gap beyond the noise is not searched for a cause.
+        disagreeing: names of validation records that have a gap although the fitted ones have none; the outcome is then
             "unknown".
-        units: names of the units of its numbers.
-        notes: what else a reader should know.
+        units: names of the units of all numbers.
+        notes: further remarks, a sentence each.
     """
 
     case: str
@@ -73,17 +73,17 @@ class Verdict:
 
     @property
     def shows_gap(self) -> bool:
-        """Whether the records that were fitted have a gap, so that where it is can be said."""
+        """Whether the fitted records have a gap, so that it can be located."""
         return self.outcome != "none" and not self.disagreeing
 
     @property
     def probability(self) -> float:
-        """Of the set named against its alternatives; 1 without any."""
+        """Probability of the named set against its alternatives; 1 without any."""
         return max(1.0 - sum(probability for _, probability in self.alternatives), 0.0)
 
     @property
     def _named(self) -> tuple[Effect, ...]:
-        """The effects, rounding or clipping of every sensor stated once."""
+        """The effects without nominal errors; quantisation or clipping of all sensors is stated as one effect."""
         shown = [e for e in self.effects if e.kind is not NOMINAL_ERRORS]
         for kind in dict.fromkeys(e.kind for e in shown if e.kind.found_in == "readings"):
             same = [e for e in shown if e.kind is kind]
@@ -95,7 +95,7 @@ class Verdict:
 
     @property
     def is_located(self) -> bool:
-        """Whether a single point force, no law assumed, makes the gap, at a place that no effect named contradicts."""
+        """Whether a single point force, of any law, explains the gap, at a place that agrees with a named effect."""
         if not self.where.place.is_single_force:
             return False
         if self.outcome != "explained":
@@ -104,12 +104,12 @@ class Verdict:
         acting = [e for e in self.effects if e.at is not None and e.kind.path in ("structure", "environment")]
         if isinstance(domain, NamedPoints):
             return any(domain.separation(effect.at, self.where.at) == 0 for effect in acting)
-        near = max(3.0 * self.where.at_std / domain.size, BESIDE)
-        return any(domain.separation(effect.at, self.where.at) < near for effect in acting)
+        tolerance = max(3.0 * self.where.at_std / domain.size, SAME_PLACE)
+        return any(domain.separation(effect.at, self.where.at) < tolerance for effect in acting)
 
     @property
     def location_in_words(self) -> str:
-        """Where the unmodelled point force acts, or that there is no single one; empty where that is not known."""
+        """Where the unmodelled point force acts, or that no single one does; empty if neither is certain."""
         place = self.where.place
         at = place_in_words(place.at, dict.fromkeys(COORDINATES, place.at_std))
         if self.is_located:
@@ -120,25 +120,25 @@ class Verdict:
 
     @property
     def nominal_errors(self) -> Effect | None:
-        """Errors of the nominal model that were fitted beside the effects; None where none were."""
+        """Errors of the nominal model that were fitted jointly with the effects; None if none were."""
         return next((effect for effect in self.effects if effect.kind is NOMINAL_ERRORS), None)
 
     @property
     def record_to_record(self) -> RecordToRecord | None:
-        """A figure of the nominal model that differs from record to record; None where that causes next to nothing."""
-        differs = RecordToRecord.of(self.nominal, self.effects)
-        if differs is None or self.budget.effects.get(differs.label, 0.0) < SHOWN:
+        """A nominal parameter that varies from record to record; None if its share of the gap is negligible."""
+        varying = RecordToRecord.of(self.nominal, self.effects)
+        if varying is None or self.budget.effects.get(varying.label, 0.0) < SHOWN:
             return None
-        return replace(differs, force=self.units.force)
+        return replace(varying, force=self.units.force)
 
     @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
         if self.disagreeing:
-            text = self._of_no_gap
+            text = self._no_gap_in_words
             return f"In the records that were fitted, {text[0].lower()}{text[1:-1]}; but {self._disagreement}."
         if not self.shows_gap:
-            return self._of_no_gap
+            return self._no_gap_in_words
         named = [_described(effect, self.nominal, self.units) for effect in self._named]
         words = joined_in_words(named)
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of its rms"
@@ -165,23 +165,23 @@ class Verdict:
                     else f"{self._rest}."
                 )
             elif self.alternatives:
-                text += f" as likely as {words}, which explains {closed or 'it'}{self._not_excluded}"
+                text += f" as well as {words}, which explains {closed or 'it'}{self._not_excluded}"
             else:
                 text += f"; {words} explains {closed or 'it'}."
         return text[0].upper() + text[1:]
 
     @property
-    def _of_no_gap(self) -> str:
-        """The sentence where the records that were fitted have no gap, or only one of errors of the model."""
+    def _no_gap_in_words(self) -> str:
+        """The sentence if the fitted records have no gap, or only errors of the nominal model."""
         if self.nominal_errors is None:
             louder = self.budget.noise_ratio > REMARKED and self.budget.unexplained < SHOWN
             beyond, tolerance = self.where.beyond_noise, self.tolerance
-            if louder or not 0.0 < beyond < tolerance:  # what is beyond the stated noise and searched for is noise
+            if louder or not 0.0 < beyond < tolerance:  # if a gap above the tolerance was searched, it is noise
                 return "There is no gap beyond the noise of the sensors."
             below = f"below the tolerance of {100.0 * tolerance:g} %"
             return f"The gap beyond the noise is {_percent(beyond)} of the signal, {below}."
         if self.record_to_record is not None:
-            return self._differing(self.record_to_record)
+            return self._record_to_record_in_words(self.record_to_record)
         if self.budget.errors_are_small:
             return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
         return (
@@ -191,16 +191,16 @@ class Verdict:
 
     @property
     def _disagreement(self) -> str:
-        """Such as: validation record high disagrees by 156 % of its signal: fit it too."""
-        by = {} if self.shrinkage is None else {n: _percent(self.shrinkage.after[n]) for n in self.disagreeing}
-        if len(by) == 1:
-            ((name, size),) = by.items()
+        """The validation records that disagree, such as: validation record high disagrees by 156 % of its signal."""
+        sizes = {} if self.shrinkage is None else {n: _percent(self.shrinkage.after[n]) for n in self.disagreeing}
+        if len(sizes) == 1:
+            ((name, size),) = sizes.items()
             return f"validation record {name} disagrees by {size} of its signal: fit it too"
-        each = joined_in_words([f"{name} by {size}" for name, size in by.items()])
+        each = joined_in_words([f"{name} by {size}" for name, size in sizes.items()])
         return f"validation records disagree, {each} of their signals: fit them too"
 
     def _share_of(self, effect: Effect) -> float:
-        """Share of the gap that an effect causes; of all sensors together where it stands for all of them."""
+        """Share of the gap that an effect causes; summed over sensors if it stands for all of them."""
         shares, named = self.budget.effects, [e for e in self.effects if not e.kind.applied_first]
         labels = dict(zip(named, labels_of(named, self.nominal.modes.domain), strict=True))
         label = labels.get(effect, effect.label)
@@ -210,11 +210,11 @@ class Verdict:
 
     @property
     def _rest(self) -> str:
-        """What the effects do not cause, in words."""
-        parts, differs = [], self.record_to_record
-        if differs is not None and self.shows_gap:
-            share = _percent(self.budget.effects.get(differs.label, 0.0))
-            parts.append(f"{share} are differences of {differs.figure} from record to record ({differs.words})")
+        """The shares of the gap that the effects do not cause, in words."""
+        parts, varying = [], self.record_to_record
+        if varying is not None and self.shows_gap:
+            share = _percent(self.budget.effects.get(varying.label, 0.0))
+            parts.append(f"{share} are differences of {varying.figure} from record to record ({varying.words})")
         if self.budget.nominal >= SHOWN:
             are = "may be" if self._is_open else "are"
             parts.append(f"{_percent(self.budget.nominal)} {are} {self._errors_named}")
@@ -224,20 +224,20 @@ class Verdict:
             parts.append(f"{_percent(self.budget.noise)} is noise")
         return "; " + ", ".join(parts) if parts else ""
 
-    def _differing(self, differs: RecordToRecord) -> str:
-        """The sentence where nothing is hidden but a figure that differs from record to record."""
-        share = _percent(self.budget.effects.get(differs.label, 0.0))
-        how = f"The {differs.figure} differs from record to record by {differs.words}"
+    def _record_to_record_in_words(self, varying: RecordToRecord) -> str:
+        """The sentence if the gap is caused by a parameter that varies from record to record."""
+        share = _percent(self.budget.effects.get(varying.label, 0.0))
+        how = f"The {varying.figure} differs from record to record by {varying.words}"
         return f"{how}. This causes {share} of the gap{self._rest}."
 
     @property
     def _is_open(self) -> bool:
-        """Whether errors of the model were fitted beside a gap that is still there, to which they have bent."""
+        """Whether most of the gap is unexplained, so that fitted nominal errors have over-fitted it."""
         return self.outcome == "unknown" and self.budget.is_open
 
     @property
     def _errors_named(self) -> str:
-        """Such as: small errors of the model (stiffness 0.4 %); without sizes where these are no findings."""
+        """Nominal errors, such as: small errors of the model (stiffness 0.4 %); no sizes if they are over-fitted."""
         if self._is_open:
             return "errors of the model"
         size = "small" if self.budget.errors_are_small else "implausibly large"
@@ -245,7 +245,7 @@ class Verdict:
 
     @property
     def _errors_in_words(self) -> str:
-        """Such as: (stiffness 0.4 %, damping 12 %)."""
+        """Sizes of the nominal errors, such as: (stiffness 0.4 %, damping 12 %)."""
         sizes = self.budget.errors
         words = [
             f"{n.removesuffix('_percent')} {v:.2g} %" for n, v in sizes.items() if n.endswith("percent") and v > 0.01
@@ -258,30 +258,30 @@ class Verdict:
             words.append(f"timing of sensors {self._delay_in_words(delays)}")
         return f" ({', '.join(words)})" if words else ""
 
-    def _delay_in_words(self, thousandths: float) -> str:
-        """A delay in thousandths of the unit of time."""
+    def _delay_in_words(self, delay: float) -> str:
+        """A delay with its unit; delay: in thousandths of the unit of time."""
         time = self.units.time
-        return f"{thousandths:.2g} ms" if time == "s" else f"{1e-3 * thousandths:.2g} {time}"
+        return f"{delay:.2g} ms" if time == "s" else f"{1e-3 * delay:.2g} {time}"
 
     @property
     def alternatives_in_words(self) -> tuple[tuple[str, float], ...]:
-        """The alternatives in words, by the phrases of their kinds: (set, probability), likeliest first."""
+        """The alternatives in words: (set, probability), most probable first."""
         return tuple(
-            (joined_in_words([_called(e) for e in fit.effects if not e.kind.applied_first]), probability)
+            (joined_in_words([_named_with_target(e) for e in fit.effects if not e.kind.applied_first]), probability)
             for fit, probability in self.attribution.alternatives
         )
 
     @property
     def _not_excluded(self) -> str:
-        """The end of the sentence: alternatives that remain."""
-        near = [words for words, probability in self.alternatives_in_words if probability > 0.01]
-        return f"; {', or '.join(near)} cannot be excluded." if near else "."
+        """The end of the sentence: the alternatives that cannot be excluded."""
+        likely = [words for words, probability in self.alternatives_in_words if probability > 0.01]
+        return f"; {', or '.join(likely)} cannot be excluded." if likely else "."
 
     def __repr__(self) -> str:
         return f"<Verdict on {self.case}: {self.sentence}>"
 
     def to_json(self) -> dict[str, Any]:
-        """The verdict as the case format asks for it, and what stands behind it."""
+        """The verdict as the case format writes it, with the shares and estimates behind it."""
         known = self.outcome in ("none", "explained")
         effects = [effect_json(effect, self.nominal) for effect in self._named]
         shrink, guessed = self.shrinkage, self.attribution.search.data.guessed
@@ -329,7 +329,7 @@ class Verdict:
 
 
 def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
-    """One effect: kind, parameters with their standard deviations, place, input or output."""
+    """An effect as the case format writes it: kind, parameters with standard deviations, place, input or output."""
     kind = effect.kind
     stated = effect.stated(nominal)
     entry: dict[str, Any] = {"kind": kind.name, "parameters": {n: rounded(v) for n, v in stated.items()}}
@@ -358,7 +358,7 @@ def _place_json(where: Any) -> dict[str, Any]:
 
 
 def where_json(where: Where) -> dict[str, Any]:
-    """Where, as plain numbers."""
+    """The location of a gap as plain numbers."""
     return {
         "path": where.path,
         "modes": list(where.modes),
@@ -390,14 +390,14 @@ def where_json(where: Where) -> dict[str, Any]:
     }
 
 
-def _called(effect: Effect) -> str:
-    """What an effect is called without its numbers, such as: a constant force of an actuator (F2)."""
+def _named_with_target(effect: Effect) -> str:
+    """An effect in words without its parameters, such as: a constant force of an actuator (F2)."""
     _, _, target = effect.label.rstrip("]").partition("[")
     return effect.words + (f" ({target})" if target else "")
 
 
 def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
-    """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01; a wrong sensor gain (d4: gain 0.93)."""
+    """An effect in words: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
     stated = effect.stated(nominal)
     units = {p.name: named_units.named(p.unit) for p in effect.parameters(nominal) if p.name in stated}
     numbers = [
@@ -420,7 +420,7 @@ def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
 
 
 def place_in_words(where: Any, deviations: Mapping[str, float]) -> str:
-    """Such as: at x = 3.40 ± 0.01; at (0.63 ± 0.01, 0.72 ± 0.01); at F1.4y; between F1.4y and F2.4y."""
+    """A place in words: at x = 3.40 ± 0.01; at (0.63 ± 0.01, 0.72 ± 0.01); at F1.4y; between F1.4y and F2.4y."""
     if isinstance(where, Between):
         return f"between {where.first} and {where.second}"
     if isinstance(where, tuple):
@@ -430,7 +430,7 @@ def place_in_words(where: Any, deviations: Mapping[str, float]) -> str:
 
 
 def _percent(share: float) -> str:
-    """A share in per cent, with a digit more where it is small or nearly all."""
+    """A share in per cent, with one decimal if it is small or nearly one."""
     percent = 100.0 * share
     if percent < 0.05:
         return "less than 0.1 %"
@@ -438,6 +438,7 @@ def _percent(share: float) -> str:
 
 
 def _with_deviation(value: float, deviation: float) -> str:
+    """A value with its standard deviation, such as 3.40 ± 0.01; without one that is negligible or unknown."""
     if not deviation > 0 or not np.isfinite(deviation):
         return f"{value:.4g}"
     if deviation < 5e-4 * abs(value):

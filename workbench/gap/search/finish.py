@@ -1,4 +1,4 @@
-"""A set of effects brought to its end: finer steps, other places, simpler forms, and its rank among others."""
+"""Last refinement of sets of effects: finer substeps, other places, limiting cases, and their ranking."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -24,33 +24,33 @@ from workbench.gap.search.settings import FINISH, SEARCH, SELECTION
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, Domain, Interval, Rectangle, Where
 
-PORTS = ("actuator", "sensor")  # paths of effects that are not the structure's
+PORTS = ("actuator", "sensor")  # paths of effects of actuators and sensors
 
 
 def finished(search: Search, candidate: Fit) -> Fit:
-    """The same set on all records with finer substeps, to the end; as it is where they bring it no nearer."""
+    """The set refitted to all records with finer substeps until convergence, unless these lower the cost little."""
     if candidate.falling == 0 and not search.explains(candidate):
-        finely = cost_of(search.rig, candidate.effects, search.data.finely(SELECTION.fine))
-        if finely - 1.0 > FINISH.no_nearer * (candidate.cost - 1.0):
+        fine_cost = cost_of(search.rig, candidate.effects, search.data.finely(SELECTION.fine))
+        if fine_cost - 1.0 > FINISH.no_nearer * (candidate.cost - 1.0):
             return _by_finest_steps(search, candidate)
     ended = fit(search.rig, candidate.effects, search.data.finely(SELECTION.fine), iterations=25, tolerance=1e-7)
     return _by_finest_steps(search, ended)
 
 
 def _by_finest_steps(search: Search, ended: Fit) -> Fit:
-    """The fit by the finest substeps, where it explains the records but for errors of stepping."""
-    near = ended.cost < FINISH.all_but or search.near(ended, FINISH.stepping)
-    if search.explains(ended) or not near or not is_stepped(apply_all(search.rig, ended.effects)):
+    """The set refitted with the finest substeps, if only the integration error may keep it above the noise floor."""
+    is_near = ended.cost < FINISH.all_but or search.near(ended, FINISH.stepping)
+    if search.explains(ended) or not is_near or not is_stepped(apply_all(search.rig, ended.effects)):
         return ended
-    # its numbers have made up for errors of stepping, so its cost by finer steps tells nothing before a fit
+    # its parameters have absorbed integration errors, so its cost with finer substeps means nothing before a fit
     finely = fit(search.rig, ended.effects, search.data.stepped(FINISH.finest), iterations=6, tolerance=1e-5)
     return _with_stepping(search, finely) if finely.cost < ended.cost else ended
 
 
 def _with_stepping(search: Search, finely: Fit) -> Fit:
-    """The fit by the finest substeps with what these may be off by: half as many move the readings by as much.
+    """The fit with the finest substeps and their integration error: the difference from half as many substeps.
 
-    Errors of stepping through a law with a corner fall with the first power of the step.
+    The integration error of a law with a corner is proportional to the step, so halving the number doubles it.
     """
     if search.explains(finely):
         return finely
@@ -63,10 +63,10 @@ def _with_stepping(search: Search, finely: Fit) -> Fit:
 
 
 def widened(search: Search, found: Fit) -> Fit:
-    """The fit, or one with an effect as what it is a limiting case of, where the records surely prefer that.
+    """The fit, or that of a more general set if its gain in likelihood is sure.
 
-    The wider law may make another effect needless: a constant force beside friction stood in for friction that differs
-    between the two directions. That is no richer a set, so any sure gain is one.
+    The more general law may make another effect needless: friction with a constant force approximates friction that
+    differs between the two directions. Such a set has no more parameters, so any sure gain suffices.
     """
     sets, kinds = list(more_general_sets(found.effects)), {effect.kind for effect in found.effects}
     if not sets:
@@ -74,33 +74,33 @@ def widened(search: Search, found: Fit) -> Fit:
     data = search.data.finely(SELECTION.fine)
     cost = cost_of(search.rig, found.effects, data)
 
-    def anew(effects: Sequence[Effect]) -> Fit:
+    def refitted(effects: Sequence[Effect]) -> Fit:
         return fit(search.rig, effects, data, iterations=FINISH.widening, workers=search.workers, chord=Chord())
 
     for effects in sets:
-        trial = anew(effects)
+        trial = refitted(effects)
         extra = trial.n_parameters - found.n_parameters
-        # what the fit anew of all other numbers brings, it brings to the plain form too
+        # refitting the other parameters lowers the cost of the original set too
         if search.tells_apart(trial.cost, cost, extra) and search.tells_apart(
-            trial.cost, anew(found.effects).cost, extra
+            trial.cost, refitted(found.effects).cost, extra
         ):
             return trial
-        instead = [anew(fewer) for fewer in each_left_out(trial.effects) if {e.kind for e in fewer} - kinds]
-        best = min(instead, key=lambda f: f.cost, default=found)
+        one_less = [refitted(fewer) for fewer in each_left_out(trial.effects) if {e.kind for e in fewer} - kinds]
+        best = min(one_less, key=lambda f: f.cost, default=found)
         if best.n_parameters <= found.n_parameters and search.surely_better(best, cost, 0):
             return best
     return found
 
 
 def simplified(search: Search, candidate: Fit) -> Fit:
-    """A near miss with an effect as what it turns into at a bound, where that comes nearer.
+    """The set, or one with an effect replaced by its limiting case, if that has the lower cost.
 
-    A hysteretic spring finds its way from where a plain one does not, and then never yields.
+    A fit of a hysteretic spring may converge where that of a linear one does not, to a spring that never yields.
     """
-    here = cost_of(search.rig, candidate.effects, search.quick)
+    cost = cost_of(search.rig, candidate.effects, search.quick)
     for effects in with_one_simpler(candidate.effects, search.rig):
         started = fit(search.rig, effects, search.quick, iterations=6)
-        if promise(started) < here:
+        if promise(started) < cost:
             trial = finished(search, fit(search.rig, started.effects, search.data, iterations=10))
             if trial.cost < candidate.cost:
                 return trial
@@ -108,7 +108,7 @@ def simplified(search: Search, candidate: Fit) -> Fit:
 
 
 def relocated(search: Search, candidate: Fit) -> Fit:
-    """The set with its places tried elsewhere: a symmetric structure has a twin valley at the mirrored place."""
+    """The best fit with an effect moved elsewhere: a symmetric structure has a local minimum at the mirrored place."""
     for i, effect in enumerate(candidate.effects):
         if effect.at is None or effect.kind.path not in ("structure", "environment"):
             continue
@@ -124,7 +124,7 @@ def relocated(search: Search, candidate: Fit) -> Fit:
 
 
 def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tuple[Effect, ...]]:
-    """The set with effect i at the two likeliest other places, and mirrored."""
+    """The set with effect i at the two best other places, and at the mirrored places."""
     effect, domain = effects[i], search.rig.modes.domain
 
     def moved(where: Where, factor: float = 1.0) -> tuple[Effect, ...]:
@@ -134,21 +134,21 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
         return (*effects[:i], replace(effect, values=values), *effects[i + 1 :])
 
     strength = next((p for p in effect.parameters(search.rig) if p.logarithmic and p.name not in COORDINATES), None)
-    # where the structure moves less, the same effect takes more strength
+    # where the structure moves less, an effect must be stronger to do the same
     factors = FINISH.factors if strength is not None else (1.0,)
     tried = []
     for where in other_places(effect, domain):
-        there = [moved(where, factor) for factor in factors]
-        likeliest = min(there, key=lambda s: cost_of(search.rig, s, search.first))
-        tried.append(fit(search.rig, likeliest, search.first, iterations=FINISH.tried))
+        strengths = [moved(where, factor) for factor in factors]
+        start = min(strengths, key=lambda s: cost_of(search.rig, s, search.first))
+        tried.append(fit(search.rig, start, search.first, iterations=FINISH.tried))
     tried.sort(key=lambda f: f.cost)
     elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > FINISH.apart]
-    # the mirrored places are always worth a fit of their own, whatever their cost before it
+    # a mirrored place may be the other minimum even if its cost is high before a fit
     return [*(f.effects for f in elsewhere[:2]), *map(moved, _mirrored(effect.at, domain))]
 
 
 def other_places(effect: Effect, domain: Domain) -> Sequence[Where]:
-    """Along an interval or over a rectangle some all over it; named points; pairs of them with either point kept."""
+    """Places to try instead: a grid of an interval or a rectangle, other named points, or pairs that share a point."""
     if isinstance(domain, Interval):
         return [float(x) for x in domain.length * np.linspace(0.04, 0.96, 13)]
     if isinstance(domain, Rectangle):
@@ -159,6 +159,7 @@ def other_places(effect: Effect, domain: Domain) -> Sequence[Where]:
 
 
 def _mirrored(where: Any, domain: Domain) -> list[Where]:
+    """The mirror images of a place; none for named points."""
     if isinstance(domain, Interval):
         return [domain.length - where]
     if isinstance(domain, Rectangle):
@@ -168,40 +169,42 @@ def _mirrored(where: Any, domain: Domain) -> list[Where]:
 
 
 def plainest(search: Search, fits: Sequence[Fit], *, worth: float = 0.0) -> list[Fit]:
-    """The fits without those that come to another of them at a bound, and are no better than it.
+    """The fits without those that are no better than another fit that is a limiting case of theirs.
 
     Args:
-        worth: of the noise power, what a fit must be better by at least.
+        worth: of the noise power: least decrease of the cost that a more general set must bring.
     """
     by_key = {candidate.key: candidate for candidate in fits}
 
-    def needless(candidate: Fit) -> bool:
-        others = (by_key.get(key_of(form)) for form in simpler_sets(candidate.effects, search.rig))
-        simpler = (other for other in others if other is not None and other is not candidate)
-        return any(not (_pays(search, candidate, f) and f.cost - candidate.cost > worth) for f in simpler)
+    def is_redundant(candidate: Fit) -> bool:
+        others = (by_key.get(key_of(simpler)) for simpler in simpler_sets(candidate.effects, search.rig))
+        limits = (other for other in others if other is not None and other is not candidate)
+        return any(not (_pays(search, candidate, f) and f.cost - candidate.cost > worth) for f in limits)
 
-    return [candidate for candidate in fits if not needless(candidate)]
+    return [candidate for candidate in fits if not is_redundant(candidate)]
 
 
 def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
+    """Whether the gain of a set over a simpler one justifies its additional parameters, at least one."""
     return search.tells_apart(candidate.cost, simpler.cost, max(candidate.n_parameters - simpler.n_parameters, 1))
 
 
 def simplest(search: Search, candidate: Fit) -> Fit:
-    """The set with effects replaced by simpler or fewer ones, where the records cannot tell them apart."""
-    here = cost_of(search.rig, candidate.effects, search.quick)
+    """The simplest set, by limiting cases or with effects left out, that explains the records as well."""
+    cost = cost_of(search.rig, candidate.effects, search.quick)
 
-    def tried(effects: tuple[Effect, ...]) -> Fit | None:
-        if promise(fit(search.rig, effects, search.quick, iterations=FINISH.at_first)) > FINISH.too_far * here:
+    def as_good(effects: tuple[Effect, ...]) -> Fit | None:
+        if promise(fit(search.rig, effects, search.quick, iterations=FINISH.at_first)) > FINISH.too_far * cost:
             return None
         trial = fit(search.rig, effects, search.data.finely(SELECTION.fine), iterations=12, tolerance=1e-7)
         return trial if search.explains(trial) and not _pays(search, candidate, trial) else None
 
-    simpler = next(filter(None, search.workers.map(tried, _simpler_sets(search, candidate))), None)
+    simpler = next(filter(None, search.workers.map(as_good, _simpler_sets(search, candidate))), None)
     return candidate if simpler is None else simplest(search, simpler)
 
 
 def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]]:
+    """The sets without one effect whose cost stays near the noise floor, and the limiting cases of the set."""
     for effect in candidate.effects if len(candidate.effects) > 1 else ():
         rest = tuple(other for other in candidate.effects if other is not effect)
         if cost_of(search.rig, rest, search.data) < 1.0 + FINISH.idle:
@@ -212,14 +215,14 @@ def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]
 def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, float], ...]]:
     """The set of least description length, and the others with their probabilities.
 
-    The likelihood of tens of thousands of values is over-confident of small misfits, so its logarithm counts half.
+    The likelihood of tens of thousands of values is over-confident about small misfits, so half its logarithm is used.
     """
     (best, _), *rivals = _weighted(search, fits)
     return best, tuple(rivals[:6])
 
 
 def _weighted(search: Search, fits: Sequence[Fit]) -> list[tuple[Fit, float]]:
-    """The best fit of every set with its probability, the most likely first."""
+    """The best fit of every set with its probability, most probable first."""
     n = search.data.n_values
     fits = best_of_each(sorted(fits, key=lambda f: f.cost))
     score = np.array([n * f.cost + f.n_parameters * np.log(n) for f in fits])
@@ -236,14 +239,15 @@ def with_equals(
     evidence: Evidence,
     alike: Sequence[tuple[str, str, float]],
 ) -> tuple[tuple[Fit, float], ...]:
-    """The rivals of a set, and those that have an effect at another actuator or sensor and explain the records as well.
+    """The rivals of a set, with the equivalent sets that have an effect at another actuator or sensor.
 
-    To one actuator and one sensor it is the same whether the one or the other is wrong. Predictions one sample ahead
-    prefer one of them, for they weigh the noise of what is read.
+    With one actuator and one sensor, errors of the one and of the other have the same effect. One-step-ahead
+    predictions depend on the sensor noise too, so they prefer one of them.
 
     Args:
         rivals: with their probabilities.
-        alike: labels of two effects that the records could not distinguish, and how alike.
+        evidence: of the nominal rig, for start values.
+        alike: labels of two effects that the records cannot distinguish, and their correlation.
     """
     data = search.data.finely(SELECTION.fine)
     known = {best.key, *(f.key for f, _ in rivals)}
@@ -255,7 +259,7 @@ def with_equals(
     if not equals:
         return rivals
     weighted = _weighted(search, [here, *equals])
-    # of what sets leave that all leave more than noise no law of chance is known
+    # if no set reaches the noise floor, their residuals have no known likelihood: equal probabilities
     if not search.explains(weighted[0][0]):
         weighted = [(f, 1.0 / len(weighted)) for f, _ in weighted]
     own = next(p for f, p in weighted if f is here)
@@ -266,14 +270,15 @@ def with_equals(
 def _at_other_ports(
     search: Search, best: Fit, evidence: Evidence, alike: Sequence[tuple[str, str, float]]
 ) -> Iterator[tuple[Effect, ...]]:
+    """The sets with one effect replaced by an indistinguishable one at another actuator or sensor."""
     at_ports = [kind for kind in search.catalogue if kind.path in PORTS]
     labels = {
         Effect(kind, target, {}).label: (kind, target) for kind in at_ports for target in kind.targets(search.rig)
     }
     for effect in best.effects:
         if effect.label in labels:
-            likes = dict.fromkeys(label for *pair, _ in alike if effect.label in pair for label in pair)
-            for kind, target in (labels[label] for label in likes if label in labels and label != effect.label):
+            same = dict.fromkeys(label for *pair, _ in alike if effect.label in pair for label in pair)
+            for kind, target in (labels[label] for label in same if label in labels and label != effect.label):
                 for values in list(kind.starts(evidence, target))[:1]:
                     other = Effect(kind, target, dict(values))
                     yield tuple(other if e is effect else e for e in best.effects)

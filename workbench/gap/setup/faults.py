@@ -1,4 +1,4 @@
-"""Faults of the test set-up, looked for before any effect: of wiring, of units and of bookkeeping."""
+"""Faults of the test set-up, detected before any effect is tried: of wiring, of units and of bookkeeping."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -6,31 +6,37 @@ from functools import partial
 
 import numpy as np
 
-from workbench.gap.setup.by_band import asked
-from workbench.gap.setup.channels import of_channels, scaled_inputs
-from workbench.gap.setup.compared import CLOSED, FELT, Compared
+from workbench.gap.setup.by_band import compared_bands
+from workbench.gap.setup.channels import channel_faults, scaled_inputs
+from workbench.gap.setup.comparison import AFFECTED, CLOSED, Comparison
 from workbench.gap.setup.corrections import SetupFault, records_alone, without_faults
-from workbench.gap.setup.gains import apart, gains_once_corrected, same_gain
-from workbench.gap.setup.rates import of_structure, rates
+from workbench.gap.setup.gains import largest_difference, log_gains_after, tolerated_difference
+from workbench.gap.setup.rates import modal_units, sampling_rates
 from workbench.gap.setup.repeats import check_names, copied, repeated
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
-Way = Callable[[Compared], list[SetupFault]]
+Detector = Callable[[Comparison], list[SetupFault]]
 
-MOST_ROUNDS = 4  # faults that hide one another are found one after the other
-OF_CHANNELS = ("exchanged inputs", "exchanged outputs", "sign", "unit")  # kinds that a record may have or not
-OF_ONE = ("outputs", "inputs", "exchanged outputs", "exchanged inputs")
-WAYS_OF_ONE: tuple[Way, ...] = (partial(of_channels, kinds=OF_ONE), scaled_inputs, rates)  # a record by itself
-WAYS: tuple[Way, ...] = (partial(of_channels, kinds=(*OF_ONE, "quantity")), scaled_inputs, rates, of_structure)
+MOST_ROUNDS = 4  # faults that mask one another are detected one after the other
+BY_RECORD = ("exchanged inputs", "exchanged outputs", "sign", "unit")  # kinds of faults that some records may not have
+CANDIDATES = ("outputs", "inputs", "exchanged outputs", "exchanged inputs")  # of channels, that one record may have
+OF_ONE_RECORD: tuple[Detector, ...] = (partial(channel_faults, kinds=CANDIDATES), scaled_inputs, sampling_rates)
+DETECTORS: tuple[Detector, ...] = (
+    partial(channel_faults, kinds=(*CANDIDATES, "quantity")),
+    scaled_inputs,
+    sampling_rates,
+    modal_units,
+)
 
 
 def setup_faults(
     rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0
 ) -> tuple[SetupFault, ...]:
-    """The faults of the test set-up that the records show against the nominal rig, in the order to correct them.
+    """The faults of the test set-up that the records show, in the order in which they are to be corrected.
 
-    Each record is judged by itself: by each fault of all fit records, then by faults that it alone has.
+    Faults are detected in all fit records together, and each is kept for the records that agree with it; then each
+    record is tested for faults of its own.
 
     Args:
         rig: nominal.
@@ -43,32 +49,32 @@ def setup_faults(
     """
     check_names((*records, *validation))
     found = [*repeated(records), *copied(rig, records)]
-    (seen_rig, fit), (_, held) = (without_faults(found, rig, these) for these in (records, validation))
-    together = Compared.of(seen_rig, fit, settle)
-    alone = [*together.each, *(Compared.of(seen_rig, (record,), settle) for record in held)]
-    for fault in _by_rounds(together, WAYS):
-        if fault.kind in OF_CHANNELS and fault.certain:
-            fault = _judged_on(alone, fault)
+    (corrected, fit), (_, held_out) = (without_faults(found, rig, these) for these in (records, validation))
+    together = Comparison.of(corrected, fit, settle)
+    alone = [*together.by_record, *(Comparison.of(corrected, (record,), settle) for record in held_out)]
+    for fault in _in_rounds(together, DETECTORS):
+        if fault.kind in BY_RECORD and fault.certain:
+            fault = _for_agreeing_records(alone, fault)
         found.append(fault)
         alone = [gap.without(fault) for gap in alone]
     for i, gap in enumerate(alone):
-        if i == 0 and len(fit) == 1:  # what one fit record has, all have
+        if i == 0 and len(fit) == 1:  # a single fit record was tested above
             continue
         what = "record" if i < len(fit) else "validation record"
         others = [*alone[:i], *alone[i + 1 :]]
         found += [
-            _of_one(what, gap.records[0], fault)
-            for fault in _by_rounds(gap, WAYS_OF_ONE)
-            if fault.certain and fault.closes >= CLOSED and _is_alone(fault, gap, others)
+            _for_one_record(what, gap.records[0], fault)
+            for fault in _in_rounds(gap, OF_ONE_RECORD)
+            if fault.certain and fault.closes >= CLOSED and _is_of_one_record(fault, gap, others)
         ]
     return tuple(found)
 
 
-def _by_rounds(gap: Compared, ways: Sequence[Way]) -> list[SetupFault]:
-    """Faults that hide one another, one kind after the other."""
+def _in_rounds(gap: Comparison, detectors: Sequence[Detector]) -> list[SetupFault]:
+    """All faults, in rounds: those of one kind are corrected before the next round, since they may mask others."""
     found: list[SetupFault] = []
     for _ in range(MOST_ROUNDS):
-        faults = _best(gap, ways)
+        faults = _best(gap, detectors)
         found += faults
         if not any(fault.certain for fault in faults):
             break
@@ -76,62 +82,65 @@ def _by_rounds(gap: Compared, ways: Sequence[Way]) -> list[SetupFault]:
     return found
 
 
-def _without_all(gap: Compared, faults: Sequence[SetupFault]) -> Compared:
+def _without_all(gap: Comparison, faults: Sequence[SetupFault]) -> Comparison:
+    """The comparison after all faults that are certain are corrected."""
     for fault in faults:
         gap = gap.without(fault)
     return gap
 
 
-def _best(gap: Compared, ways: Sequence[Way]) -> list[SetupFault]:
-    """The faults of the kind that closes most, doubtful ones where none is certain; none where none closes most."""
-    # a record at a low level may be sampled wrongly and yet leave no wide gap over all records
-    found = [way(gap) for way in (ways if gap.wide.any() else (rates,))]
-    doubtful = [fault for faults in found for fault in faults if not fault.certain]
-    found = [faults for faults in ([f for f in faults if f.certain] for faults in found) if faults]
-    if not found:
-        return doubtful
-    return found[0] if len(found) == 1 else min(found, key=lambda faults: _remaining(_without_all(gap, faults)))
+def _best(gap: Comparison, detectors: Sequence[Detector]) -> list[SetupFault]:
+    """Certain faults of the detector whose correction leaves the least residual; if there are none, those in doubt."""
+    # a record at a low level may have a wrong sampling rate and yet add little to the gap of all records
+    detected = [detector(gap) for detector in (detectors if gap.wide.any() else (sampling_rates,))]
+    certain = [faults for faults in ([f for f in faults if f.certain] for faults in detected) if faults]
+    if not certain:
+        return [fault for faults in detected for fault in faults]
+    return certain[0] if len(certain) == 1 else min(certain, key=lambda faults: _remaining(_without_all(gap, faults)))
 
 
-def _remaining(gap: Compared) -> float:
-    """The share of the measured power that remains."""
+def _remaining(gap: Comparison) -> float:
+    """Residual power as a share of the power measured, the mean over outputs."""
     return float(np.minimum(gap.before, 1.0).mean())
 
 
-def _disagreeing(gaps: Sequence[Compared], fault: SetupFault) -> list[Compared]:
-    """Those of single records that agree worse with the model by a correction.
+def _worsened(gaps: Sequence[Comparison], fault: SetupFault) -> list[Comparison]:
+    """The comparisons of single records in which a correction increases the misfit.
 
-    What is silent in a record, or decayed there, says nothing of it.
+    Channels without signal in a record do not count.
     """
 
-    def left(gap: Compared) -> float:
-        return float(gap.unlike[asked(gap.seen)].sum())
+    def misfit(gap: Comparison) -> float:
+        return float(gap.misfit[compared_bands(gap.measured_spectra)].sum())
 
-    return [gap for gap in gaps if left(gap.corrected(fault.correction)) > left(gap) + FELT]
+    return [gap for gap in gaps if misfit(gap.corrected(fault.correction)) > misfit(gap) + AFFECTED]
 
 
-def _judged_on(gaps: Sequence[Compared], fault: SetupFault) -> SetupFault:
-    """A fault of all fit records, without those records that agree worse with the model by its correction."""
-    others = [name for gap in _disagreeing(gaps, fault) for name in gap.names]
-    sentence = f"{fault.sentence[:-1]}; not in {', '.join(others)}." if others else fault.sentence
-    names = tuple(name for gap in gaps for name in gap.names if name not in others)
+def _for_agreeing_records(gaps: Sequence[Comparison], fault: SetupFault) -> SetupFault:
+    """The fault without those records in which its correction increases the misfit."""
+    others = [name for gap in _worsened(gaps, fault) for name in gap.record_names]
+    sentence = f"{fault.sentence[:-1]}, except in {', '.join(others)}." if others else fault.sentence
+    names = tuple(name for gap in gaps for name in gap.record_names if name not in others)
     return replace(fault, sentence=sentence, records=names)
 
 
-def _is_alone(fault: SetupFault, gap: Compared, others: Sequence[Compared]) -> bool:
-    """Whether some other record shows that it has not the fault: one of all records was asked for among them all.
+def _is_of_one_record(fault: SetupFault, gap: Comparison, others: Sequence[Comparison]) -> bool:
+    """Whether another record shows that it does not have the fault; a fault of all records was tested on them jointly.
 
-    Without a factor of units, that record has the gain that this one has once corrected.
+    The gain of that record must agree with the gain of this one after the correction.
     """
-    if fault.kind not in OF_CHANNELS or not others:
+    if fault.kind not in BY_RECORD or not others:
         return True
-    (own,) = gains_once_corrected(gap, fault)
-    return any(apart((own, *other.log_ratios)) <= same_gain(fault) for other in _disagreeing(others, fault))
+    (own,) = log_gains_after(gap, fault)
+    tolerated = tolerated_difference(fault)
+    return any(largest_difference((own, *other.log_ratios)) <= tolerated for other in _worsened(others, fault))
 
 
-def _of_one(what: str, record: Record, fault: SetupFault) -> SetupFault:
-    """A fault of one record alone: the rig stays as it is."""
-    words = fault.sentence
-    if fault.kind != "sample rate":  # that names its record
-        words = f"In {what} {record.name}, {words[0].lower()}{words[1:]}"
-    return replace(fault, sentence=words, records=(record.name,), correction=partial(records_alone, fault.correction))
+def _for_one_record(what: str, record: Record, fault: SetupFault) -> SetupFault:
+    """The fault of one record only, with the rig unchanged."""
+    sentence = fault.sentence
+    if fault.kind != "sample rate":  # such a sentence names its record
+        sentence = f"In {what} {record.name}, {sentence[0].lower()}{sentence[1:]}"
+    return replace(
+        fault, sentence=sentence, records=(record.name,), correction=partial(records_alone, fault.correction)
+    )

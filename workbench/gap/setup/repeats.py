@@ -1,4 +1,4 @@
-"""What is asked of records before they are compared with a model: names, records and channels that are there once."""
+"""Checks for repeated names, records and channels, which need no model."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -6,17 +6,17 @@ from itertools import combinations
 
 import numpy as np
 
-from workbench.gap.setup.compared import predicted_by
+from workbench.gap.setup.comparison import predicted_by
 from workbench.gap.setup.corrections import SetupFault, without_output, without_record
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 
 def check_names(records: Sequence[Record]) -> None:
-    """Refuse records of one name: what is found in each is known by it.
+    """Refuse records with the same name, since results are stated by it.
 
     Raises:
-        ValueError: naming it.
+        ValueError: for the first such name.
     """
     names = [record.name for record in records]
     for name in names:
@@ -31,23 +31,23 @@ def check_disjoint(records: Sequence[Record], validation: Sequence[Record]) -> N
     """Refuse validation records that repeat a record to be fitted.
 
     Raises:
-        ValueError: naming both.
+        ValueError: for the first such pair.
     """
-    for kept in validation:
+    for held_out in validation:
         for record in records:
-            if _same(kept, record):
+            if _same(held_out, record):
                 raise ValueError(
-                    f"validation record {kept.name!r} repeats the fit record {record.name!r}, so it validates"
+                    f"validation record {held_out.name!r} repeats the fit record {record.name!r}, so it validates"
                     " nothing; keep another record for validation, or none"
                 )
 
 
 def repeated(records: Sequence[Record]) -> list[SetupFault]:
-    """Records with the same samples: one measures nothing that the other does not."""
-    faults, again = [], set()
+    """Faults of records that hold the same samples as another; the later one is left out."""
+    faults, repeats = [], set()
     for i, j in combinations(range(len(records)), 2):
-        if j not in again and i not in again and _same(records[i], records[j]):
-            again.add(j)
+        if j not in repeats and i not in repeats and _same(records[i], records[j]):
+            repeats.add(j)
             first, second = records[i].name, records[j].name
             faults.append(
                 SetupFault(
@@ -61,22 +61,25 @@ def repeated(records: Sequence[Record]) -> list[SetupFault]:
 
 
 def copied(rig: Rig, records: Sequence[Record]) -> list[SetupFault]:
-    """Outputs with the same samples: noise differs from sensor to sensor, so one is a copy."""
+    """Faults of outputs that copy another: the noise of two sensors differs, so equal samples are of one.
+
+    The output that agrees less with the model is the copy.
+    """
     faults: list[SetupFault] = []
-    gone: set[int] = set()
+    copies: set[int] = set()
     for i, j in combinations(range(len(rig.sensors)), 2):
         one, other = rig.sensors[i], rig.sensors[j]
-        alike = (one.at, one.quantity) == (other.at, other.quantity) and not one.noise_std + other.noise_std
+        may_agree = (one.at, one.quantity) == (other.at, other.quantity) and not one.noise_std + other.noise_std
         same = all(np.array_equal(r.outputs[i], r.outputs[j]) for r in records)
-        if not same or alike or {i, j} & gone or not any(np.ptp(r.outputs[i]) for r in records):
+        if not same or may_agree or {i, j} & copies or not any(np.ptp(r.outputs[i]) for r in records):
             continue
         errors = [np.zeros(2)]
         for record in records:
             predicted = predicted_by(rig, record)
             errors.append(np.array([((record.outputs[k] - predicted[k]) ** 2).mean() for k in (i, j)]))
-        of_one, of_other = np.sum(errors, axis=0)
-        copy = j if of_one <= of_other else i
-        gone.add(copy)
+        error_i, error_j = np.sum(errors, axis=0)
+        copy = j if error_i <= error_j else i
+        copies.add(copy)
         kept = i + j - copy
         faults.append(
             SetupFault(
@@ -91,7 +94,7 @@ def copied(rig: Rig, records: Sequence[Record]) -> list[SetupFault]:
 
 
 def _same(one: Record, other: Record) -> bool:
-    """Whether one record repeats the other, or its beginning."""
+    """Whether one record repeats the other, or the beginning of it."""
     n = min(one.n_samples, other.n_samples)
     if n < 2 or one.outputs.shape[0] != other.outputs.shape[0] or one.n_inputs != other.n_inputs:
         return False

@@ -1,4 +1,4 @@
-"""How a fault of the test set-up is said, with its correction."""
+"""Sentences on faults of the test set-up, with their corrections."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from workbench.rig.sensors import Sensor
 
 G, TURN = 9.80665, 2.0 * np.pi
 
-# measured / predicted: what an output does that reads so, and what an input does that is logged so as to give it
+# measured over predicted amplitude: what is wrong with outputs that have this ratio, and with inputs that cause it
 FACTORS = {
     -1.0: ("have the wrong sign", "have the wrong sign"),
     1.0 / G: ("are 9.81 times too small", "are 9.81 times too large"),
@@ -26,15 +26,15 @@ IN_G = "look like g where m/s² is meant"
 RATES = {2.0: "twice", 0.5: "half", 1e3: "1000 times", 1e-3: "a thousandth of"}
 
 
-def named(what: str, names: Sequence[str]) -> str:
-    """Such as: The outputs y1, y2 and y3."""
+def subject(what: str, names: Sequence[str]) -> str:
+    """The subject of a sentence, such as: The outputs y1, y2 and y3."""
     if len(names) == 1:
         return f"The {what} {names[0]}"
     return f"The {what}s {', '.join(names[:-1])} and {names[-1]}"
 
 
-def one(sentence: str, names: Sequence[str]) -> str:
-    """The sentence with its first verb in the singular where one thing is spoken of."""
+def agreeing(sentence: str, names: Sequence[str]) -> str:
+    """The sentence with its first verb in the singular if there is one name."""
     if len(names) > 1:
         return sentence
     for many, single in ((" are ", " is "), (" have ", " has "), (" look ", " looks ")):
@@ -43,8 +43,8 @@ def one(sentence: str, names: Sequence[str]) -> str:
     return sentence
 
 
-def perhaps(what: str) -> str:
-    """The same, with "may" before its first verb."""
+def with_may(what: str) -> str:
+    """The clause with "may" before its first verb."""
     for sure, may in ((" look ", " may look "), (" looks ", " may look "), (" are ", " may be "), (" is ", " may be ")):
         if sure in what:
             return what.replace(sure, may, 1)
@@ -52,34 +52,38 @@ def perhaps(what: str) -> str:
 
 
 def doubtful(what: str, off: Floats) -> str:
-    """What may be a fault of units, and by how much it is none; off: relative differences of the gains."""
-    far = ", ".join(dict.fromkeys(f"{100 * share:+.2g} %" for share in off))
+    """A sentence on a fault of units that is in doubt; off: relative differences of the gains from the factor."""
+    differences = ", ".join(dict.fromkeys(f"{100 * share:+.2g} %" for share in off))
     return (
-        f"{perhaps(what)}; but the gain differs from that by {far}, more than its error: taken for an error of"
-        " calibration."
+        f"{with_may(what)}; but the gain differs from that by {differences}, more than its uncertainty: treated as an"
+        " error of calibration."
     )
 
 
 def sentence_of_outputs(sensors: Sequence[Sensor], at: Sequence[int], factor: float, off: Floats | None) -> str:
-    """What outputs read, and what to multiply them by; of all outputs, what the inputs may be instead.
+    """What is wrong with outputs, and the correction; if with all outputs, also what the inputs may be instead.
 
     Args:
-        off: where the factor is in doubt, relative differences of the gains from it.
+        sensors: of the rig.
+        at: indices of the outputs.
+        factor: measured over predicted amplitude, one of `FACTORS`.
+        off: relative differences of the gains from the factor, if it is in doubt.
     """
     names = [sensors[j].name for j in at]
-    every = len(at) == len(sensors)
+    is_all = len(at) == len(sensors)
     what, of_inputs = FACTORS[factor]
     if factor == 1.0 / G and {sensors[j].quantity for j in at} == {"acceleration"}:
         what = IN_G
-    who = "All outputs" if every and len(names) > 1 else named("output", names)
-    rest = f", or all inputs {of_inputs}" if every else ""
+    outputs = "All outputs" if is_all and len(names) > 1 else subject("output", names)
+    alternative = f", or all inputs {of_inputs}" if is_all else ""
     if off is not None:
-        return doubtful(f"{who} {what}{rest}", off)
-    cure = "multiply by -1" if factor == -1.0 else f"multiply by {1.0 / factor:.6g}"
-    return f"{one(f'{who} {what}', names)}{rest}: {cure}{' (the outputs)' if rest else ''}."
+        return doubtful(f"{outputs} {what}{alternative}", off)
+    correction = "multiply by -1" if factor == -1.0 else f"multiply by {1.0 / factor:.6g}"
+    clause = agreeing(f"{outputs} {what}", names)
+    return f"{clause}{alternative}: {correction}{' (the outputs)' if alternative else ''}."
 
 
 def sentence_of_inputs(names: Sequence[str], factor: float, off: Floats | None = None) -> str:
-    """What inputs are logged as, and what to multiply them by; off: as for outputs."""
-    what = f"{named('input', names)} {FACTORS[factor][1]}"
-    return f"{one(what, names)}: multiply by {factor:.6g}." if off is None else doubtful(what, off)
+    """What is wrong with logged inputs, and the correction; factor, off: as of `sentence_of_outputs`."""
+    what = f"{subject('input', names)} {FACTORS[factor][1]}"
+    return f"{agreeing(what, names)}: multiply by {factor:.6g}." if off is None else doubtful(what, off)

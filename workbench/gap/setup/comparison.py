@@ -1,0 +1,187 @@
+"""Comparison of records with the predictions of a rig, before and after a fault of the set-up is corrected."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from workbench.arrays import Flags, Floats
+from workbench.gap.prediction.residuals import lead_of
+from workbench.gap.setup.by_band import Spectra, band_misfit, log_ratios
+from workbench.gap.setup.corrections import Correction, SetupFault, without_faults
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import is_stepped, predict
+
+# rms residual, in standard deviations of the channel, from which it may be connected wrongly: a wrong sign leaves 2, an
+# exchange about 1.4, a factor of 2π at least 0.84
+WIDE_GAP = 0.3
+LARGEST_LEFT = 0.15  # share of a channel's measured power that may remain beyond the noise: zero predictions leave all
+NOISY = 0.5  # share of noise in a channel's measured power from which it shows no fault
+CLOSED = 0.9  # share of the closable power that a correction must remove, on the channels that it concerns
+AFFECTED = 0.2  # change of the misfit from which a correction affects a band
+MOST_CHANNELS = 12  # inputs that are simulated one by one, and exchanged in pairs; beyond, only neighbours are
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Measured and predicted outputs of records, after the settling time.
+
+    Attributes:
+        rig: that predicts.
+        records: that are compared.
+        predicted, measured: (n_outputs, n_samples) of each record.
+        noise: (n_outputs,) noise power, as a share of the power measured.
+        scale: (n_outputs,) mean square measured, in squared units of the output; 1 where it is zero.
+        settle: seconds at the start of each record that are not compared.
+        cache: comparisons after corrections.
+    """
+
+    rig: Rig
+    records: Sequence[Record]
+    predicted: Sequence[Floats]
+    measured: list[np.ndarray]
+    noise: np.ndarray
+    scale: np.ndarray
+    settle: float
+    cache: dict[Correction, "Comparison"] = field(default_factory=dict)
+
+    @staticmethod
+    def of(
+        rig: Rig, records: Sequence[Record], settle: float, predicted: Sequence[Floats] | None = None
+    ) -> "Comparison":
+        """The comparison of a rig with records; predicted: the predictions, if they are known."""
+        measured = [record.outputs[:, lead_of(record, settle) :] for record in records]
+        if predicted is None:
+            predicted = _compared_samples(measured, [predicted_by(rig, record) for record in records])
+        power = sum((y**2).sum(axis=1) for y in measured) / sum(y.shape[1] for y in measured)
+        scale = np.where(power > 0, power, 1.0)
+        noise = np.array([s.noise_std for s in rig.sensors]) ** 2 / scale
+        return Comparison(rig, records, predicted, measured, noise, scale, settle)
+
+    def corrected(self, correction: Correction) -> "Comparison":
+        """The corrected rig and the corrected records, compared; cached, since the same one is needed again."""
+        if correction not in self.cache:
+            self.cache[correction] = Comparison.of(*correction(self.rig, self.records), self.settle)
+        return self.cache[correction]
+
+    def without(self, fault: SetupFault) -> "Comparison":
+        """The comparison after a fault is corrected in rig and records, if it is certain."""
+        if not fault.certain:
+            return self
+        if not fault.records or set(self.record_names) <= set(fault.records):
+            return self.corrected(fault.correction)
+        return Comparison.of(*without_faults([fault], self.rig, self.records), self.settle)
+
+    @cached_property
+    def by_record(self) -> list["Comparison"]:
+        """The comparison of each record alone."""
+        pairs = zip(self.records, self.predicted, strict=True)
+        return [Comparison.of(self.rig, (record,), self.settle, (predicted,)) for record, predicted in pairs]
+
+    @cached_property
+    def by_input(self) -> list[list[Floats]]:
+        """Predictions of a linear rig for each input alone; empty for one input, too many, or a nonlinear rig."""
+        m = len(self.rig.actuators)
+        if not 1 < m <= MOST_CHANNELS or is_stepped(self.rig):
+            return []
+        alone = [[replace(r, inputs=r.inputs * (np.arange(m) == p)[:, None]) for r in self.records] for p in range(m)]
+        return [self.predict(self.rig, records) for records in alone]
+
+    @property
+    def record_names(self) -> tuple[str, ...]:
+        """Names of the records."""
+        return tuple(record.name for record in self.records)
+
+    @cached_property
+    def before(self) -> Floats:
+        """Residual power (n_outputs,) of the rig without any correction, as a share of the power measured."""
+        return self.residual_power(self.predicted)
+
+    @property
+    def wide(self) -> Flags:
+        """Whether the residual of each output (n_outputs,) is too large for an effect; False for a constant channel."""
+        moves = np.any([np.ptp(y, axis=1) > 0 for y in self.measured], axis=0)
+        return np.asarray(moves & (self.before > np.maximum(WIDE_GAP**2, 4.0 * self.noise)))
+
+    @cached_property
+    def measured_spectra(self) -> Spectra:
+        """Spectra of the measured outputs."""
+        return self.spectra_of(self.measured)
+
+    @cached_property
+    def predicted_spectra(self) -> Spectra:
+        """Spectra of the predicted outputs."""
+        return self.spectra_of(self.predicted)
+
+    @cached_property
+    def misfit(self) -> Floats:
+        """Misfit (n_records, n_outputs, n_modes) of each output in each band; see `band_misfit`."""
+        return band_misfit(self.measured_spectra, self.predicted_spectra)
+
+    @cached_property
+    def log_ratios(self) -> Floats:
+        """Log of measured over predicted amplitude (n_records, n_outputs, n_modes); NaN in bands not compared."""
+        return log_ratios(self.measured_spectra, self.predicted_spectra)
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples that are compared, of one output over all records."""
+        return sum(y.shape[1] for y in self.measured)
+
+    def spectra_of(self, signals: Sequence[Floats]) -> Spectra:
+        """Spectra of signals, (n_signals, n_samples) a record, at the samples that are compared."""
+        return Spectra.of_signals(signals, self.records, self.rig.modes.frequencies_hz)
+
+    def misfit_with(self, at: Sequence[int], misfit: Floats) -> Floats:
+        """Misfit (n_records, n_outputs, n_modes) with that of the outputs `at` replaced."""
+        whole = self.misfit.copy()
+        whole[:, list(at)] = misfit
+        return whole
+
+    @cached_property
+    def gains(self) -> Floats:
+        """Factors (n_outputs,) by which the predictions fit the measured outputs best, by least squares."""
+        over = sum((p**2).sum(axis=1) for p in self.predicted)
+        along = sum((y * p).sum(axis=1) for y, p in zip(self.measured, self.predicted, strict=True))
+        return np.asarray(np.divide(along, over, out=np.ones_like(over), where=over > 0))
+
+    def predict(self, rig: Rig, records: Sequence[Record]) -> list[Floats]:
+        """Predictions (n_outputs, n_samples) of another rig for other records, at the samples that are compared."""
+        return _compared_samples(self.measured, [predicted_by(rig, record) for record in records])
+
+    def residual_power(self, predicted: Sequence[Floats]) -> Floats:
+        """Mean square residual (n_outputs,) of predictions, as a share of the mean square measured."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            left = sum(((y - p) ** 2).sum(axis=1) for y, p in zip(self.measured, predicted, strict=True))
+        return np.asarray(np.nan_to_num(left / self.n_samples / self.scale, nan=np.inf))
+
+    def closed(self, after: np.ndarray) -> np.ndarray:
+        """Share (n_outputs,) of the residual power beyond the noise that is removed.
+
+        It counts as 0 if much of the signal remains, or if most of the signal is noise.
+
+        Args:
+            after: (n_outputs,) residual power after a correction.
+        """
+        left = np.maximum(after - self.noise, 0.0)
+        return np.where(
+            (left > LARGEST_LEFT) | (self.noise > NOISY), 0.0, 1.0 - left / np.maximum(self.before - self.noise, 1e-300)
+        )
+
+    def closes(self, rig: Rig, records: Sequence[Record]) -> float:
+        """The share that a corrected rig and records close: the median over channels with a wide gap."""
+        after = self.residual_power(self.predict(rig, records))
+        return float(np.median(self.closed(after)[self.wide]))
+
+
+def _compared_samples(measured: Sequence[Floats], predicted: Sequence[Floats]) -> list[Floats]:
+    """The last samples of each prediction, as many as are measured after the settling time."""
+    return [p[:, p.shape[1] - y.shape[1] :] for y, p in zip(measured, predicted, strict=True)]
+
+
+def predicted_by(rig: Rig, record: Record) -> Floats:
+    """Prediction (n_outputs, n_samples) of a rig, as `predict`, without warnings if it diverges."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return predict(rig, record)
