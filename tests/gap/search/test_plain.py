@@ -15,6 +15,7 @@ from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import fit_jointly, size_of, surely_late, with_all_errors
 from workbench.gap.search.plain import (
+    NO_UNIFORM_ERROR,
     _at_ports,
     delay_effects,
     few_with_uniform_errors,
@@ -279,3 +280,13 @@ def test_a_delay_of_all_sensors_is_the_effect_that_it_is(search, kind):
     named = [effect for effect in found.effects if effect.kind.name == kind]
     assert len(named) == 1 and named[0].values[SENSORS_LATE[kind]] == pytest.approx(0.003, rel=0.02)
     assert all(p < 0.01 for _, p in other_delay_causes(one, found))
+
+
+def test_an_effect_that_smooth_errors_could_mimic_stays_significant(search):
+    """Errors of the stiffness along the beam could do all that this spring does, but were estimated as 0."""
+    spring = Effect(kind_named("ground_spring"), None, {"at": 1.3, "stiffness": 0.1})
+    one = search((spring,))
+    found = uniform_as_nominal_errors(one, fit(one.rig, (spring, *NO_UNIFORM_ERROR), one.data))
+    (told,) = (e for e in with_intervals(one.rig, with_all_errors(one, found), one.data).effects if e.at is not None)
+    assert told.deviations["stiffness"] < 0.05  # 0.16 with errors that could do all of it
+    assert told.values["stiffness"] == pytest.approx(0.1, abs=3.0 * told.deviations["stiffness"])

@@ -29,10 +29,11 @@ def with_intervals(
 
     or s² A⁻¹ where that is larger, over blocks b of each record: d_b is the change of the parameters without block b.
     This cluster jackknife (MacKinnon, Nielsen & Webb, J. Applied Econometrics 38 (2023) 671) is not biased low by many
-    parameters and few blocks. P is the precision of `_with_plausible_errors`. Input noise passes through nonlinear
-    laws, for which no linear filter whitens it, so it is drawn: each draw changes the residual by δ and the parameters
-    by A⁻¹ Jᵀ δ. The joint covariance is no smaller than any of these in any direction. The relative standard error of a
-    parameter of an effect is at least 1e-4.
+    parameters and few blocks. P is the precision of `_with_plausible_errors`; of the nominal errors as estimated, if an
+    effect would be insignificant otherwise. Input noise passes through nonlinear laws, for which no linear filter
+    whitens it, so it is drawn: each draw changes the residual by δ and the parameters by A⁻¹ Jᵀ δ. The joint covariance
+    is no smaller than any of these in any direction. The relative standard error of a parameter of an effect is at
+    least 1e-4.
 
     Args:
         rig: nominal.
@@ -49,10 +50,42 @@ def with_intervals(
     parameters = parameters_of(rig, found.effects)
     level = max(float(residual @ residual) / residual.size, 1.0)
     jacobian = _with_secants_of_places(rig, found.effects, data, residual, jacobian, level)
+    drawn = _changes_by_input_noise(apply_all(rig, found.effects), data, residual, logged)
+
+    def with_prior(effects: Sequence[Effect]) -> Fit:
+        priors = np.array([_precision(p) for _, p in parameters_of(rig, effects)])
+        return _with_covariance(found, parameters, data, residual, jacobian, drawn, priors, level)
+
+    plausible = with_prior(_with_plausible_errors(rig, found.effects, jacobian, level))
+    # nominal errors that could do all that an effect does are those which the search rejected in its favour
+    named = [e for e in plausible.effects if not e.kind.applied_first]
+    is_significant = all(e.stands_out(rig) and e.is_sure(rig) for e in named)
+    return plausible if is_significant else with_prior(found.effects)
+
+
+def _with_covariance(
+    found: Fit,
+    parameters: Sequence[tuple[int, Parameter]],
+    data: FitData,
+    residual: np.ndarray,
+    jacobian: np.ndarray,
+    drawn: np.ndarray,
+    priors: np.ndarray,
+    level: float,
+) -> Fit:
+    """The fit with the covariance and the standard errors of `with_intervals`.
+
+    Args:
+        found: effects as fitted.
+        parameters: of `parameters_of`, (n_parameters,).
+        data: fit records.
+        residual: (n_values,) in units of the noise.
+        jacobian: (n_values, n_parameters).
+        drawn: (n_draws, n_values) changes of the residual by input noise.
+        priors: (n_parameters,) precisions.
+        level: mean square of the residual, at least 1.
+    """
     model_scatter = np.array([_model_scatter(found.effects[i], p) for i, p in parameters])
-    priors = np.array(
-        [_precision(p) for _, p in parameters_of(rig, _with_plausible_errors(rig, found.effects, jacobian, level))]
-    )
     scale = np.sqrt(np.maximum((jacobian**2).sum(axis=0) + level * priors, 1e-300))
     jacobian, priors = jacobian / scale, priors / scale**2
     information = jacobian.T @ jacobian + level * np.diag(priors)
@@ -60,8 +93,8 @@ def with_intervals(
     root = _square_root(information)
     without = _jackknife(residual, jacobian, data, root)
     spread = without.T @ without + level**2 * inverse @ np.diag(priors) @ inverse
-    drawn = _changes_by_input_noise(apply_all(rig, found.effects), data, residual, logged) @ jacobian @ inverse
-    of_inputs = drawn.T @ drawn / INTERVALS.draws
+    by_noise = drawn @ jacobian @ inverse
+    of_inputs = by_noise.T @ by_noise / INTERVALS.draws
     variances = np.max([np.diag(spread), level * np.diag(inverse), np.diag(of_inputs)], axis=0).clip(0.0)
     deviations: list[dict[str, float]] = [{} for _ in found.effects]
     for (i, parameter), deviation in zip(parameters, np.sqrt(variances / scale**2 + model_scatter**2), strict=True):
