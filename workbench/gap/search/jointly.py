@@ -19,7 +19,7 @@ from workbench.gap.prediction.noise import (
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Chord, Fit, fit, parameters_of
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import INPUTS, JOINT, SELECTION
+from workbench.gap.search.settings import FIT, INPUTS, JOINT, SELECTION
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
 
@@ -145,15 +145,7 @@ def fit_jointly(
             chord = Chord()
         before = power if known is not None or not on_quick else np.inf
         i += 1
-        found = fit(
-            search.rig,
-            (*effects, errors),
-            data.tempered(power),
-            iterations=JOINT.last_iterations if until_convergence else JOINT.iterations,
-            tolerance=JOINT.last_tolerance if until_convergence else JOINT.tolerance,
-            workers=search.workers,
-            chord=chord,
-        )
+        found = _fit_at_level(search, (*effects, errors), data, power, chord, is_last=until_convergence)
         *effects, errors = found.effects
         errors = _with_prior_stds(errors, _next_prior_stds(errors))
     if until_convergence:
@@ -188,17 +180,33 @@ def _at_fixed_point(search: Search, found: Fit, data: FitData, chord: Chord) -> 
         if max(changes, default=0.0) < JOINT.sized:
             break
         effects = (*found.effects[:-1], _with_prior_stds(errors, sizes))
-        found = fit(
-            search.rig,
-            effects,
-            data.tempered(_residual_level(search.rig, effects, data)),
-            iterations=JOINT.iterations,
-            tolerance=JOINT.tolerance,
-            workers=search.workers,
-            chord=Chord() if len(effects[-1].values) < JOINT.few else chord,
-            damping=JOINT.undamped,
-        )
+        kept = Chord() if len(effects[-1].values) < JOINT.few else chord
+        power = _residual_level(search.rig, effects, data)
+        found = _fit_at_level(search, effects, data, power, kept, damping=JOINT.undamped)
     return found
+
+
+def _fit_at_level(
+    search: Search,
+    effects: Sequence[Effect],
+    data: FitData,
+    power: float,
+    chord: Chord,
+    *,
+    is_last: bool = False,
+    damping: float = FIT.damping,
+) -> Fit:
+    """A fit in which a residual of that power counts as noise, by the settings of a round or of the last fit."""
+    return fit(
+        search.rig,
+        effects,
+        data.tempered(power),
+        iterations=JOINT.last_iterations if is_last else JOINT.iterations,
+        tolerance=JOINT.last_tolerance if is_last else JOINT.tolerance,
+        workers=search.workers,
+        chord=chord,
+        damping=damping,
+    )
 
 
 def _residual_level(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
@@ -348,15 +356,8 @@ def with_all_errors(search: Search, found: Fit) -> Fit:
     if not errors.target.shape or not _points_of(search.rig, found.effects):
         return replace(found, effects=effects)
     data = search.data.finely(SELECTION.fine)
-    fitted = fit(
-        search.rig,
-        effects,
-        data.tempered(_residual_level(search.rig, effects, data)),
-        iterations=JOINT.last_iterations,
-        tolerance=JOINT.last_tolerance,
-        workers=search.workers,
-        chord=Chord(),
-    )
+    power = _residual_level(search.rig, effects, data)
+    fitted = _fit_at_level(search, effects, data, power, Chord(), is_last=True)
     return evaluated(search, fitted, data.substeps).fit
 
 
