@@ -236,10 +236,13 @@ def test_trials_that_were_told_wrongly_once(seed, imperfections, size, kinds):
         ("frames", 942222, ("clearance", "modulus_error")),  # lost to noise of the inputs, of which there is none
         ("frames", 956313, ("two_way_friction",)),  # could not be simulated beside the records
         ("frames", 956326, ("clearance", "periodic_disturbance")),  # the disturbance sought at two points alone
+        ("frames", 94283008, ("point_mass",)),  # lost to large errors, which make up for the modes that the rig lacks
     ],
 )
 def test_trials_on_plates_and_frames_that_were_told_wrongly_once(structure, seed, kinds):
-    (told,) = hold_trials(1, seed, kinds=[kinds], structure=structure).scores.values()
+    how = {"imperfections": "place", "size": 0.5} if seed > 94_000_000 else {}
+    trials = hold_trials(1, seed, kinds=[kinds], structure=structure, **how)
+    (told,) = trials.scores.values()
     assert told["kinds"] and all(error < 0.02 for error in told["position_errors"])
 
 

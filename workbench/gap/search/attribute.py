@@ -423,6 +423,7 @@ def _decide_beyond_singles(
     is_near_noise = min(f.cost for f in (start, *singles)) < 1.0 + STEPWISE.no_gap
     # damping is hardly known: if only its errors are large, only an effect that makes them smaller is searched for
     is_explained = stepwise.is_sufficient or stepwise.without_errors() or stepwise.by_singles() or stepwise.by_few()
+    is_explained = is_explained or stepwise.by_almost_alone(singles)
     is_explained = is_explained or (stepwise.is_noise_only and stepwise.has_plausible_errors)
     if not (is_explained or is_near_noise or search.is_over):
         random = random_with_effects(search, singles) or random_with_nominal_errors(search, stepwise.steps[0])

@@ -234,6 +234,30 @@ class Stepwise:
             self.plain = found
         return self.plain is not None
 
+    def by_almost_alone(self, singles: Sequence[Fit]) -> bool:
+        """Whether one effect closes nearly all of the gap alone, and the rest with nominal errors; it is then a step.
+
+        Tried only if nominal errors alone explain the records but are implausible. With the effect they may be as
+        large: those of a few modes of an identified rig make up for its missing modes. One effect then replaces errors
+        of all the other modes.
+
+        Args:
+            singles: fitted to whole records without nominal errors, best first.
+        """
+        if self.has_plausible_errors or self.last.effects or not (singles and self.is_noise_only):
+            return False
+        search, best = self.search, singles[0]
+        if not search.near(best, STEPWISE.almost) or any(effect.kind in UNIFORM for effect in best.effects):
+            return False
+        found = fit_jointly(search, best.effects, nominal_errors(search.rig, search.prior), until_convergence=True)
+        if self._may_be_port_errors(found) or not self.explains(found):
+            return False
+        if not self._are_noticeable(found.effects, found.fit.effects):
+            return False
+        self.steps.append(found)
+        self.is_run = True  # errors as large as these absorb the effect at any other place too
+        return True
+
     def run(self, most: int = STEPWISE.most) -> None:
         """Add effects, `most` in all, as long as each removes most of the residual power above the noise; once."""
         if self.is_run:
