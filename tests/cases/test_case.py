@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workbench.cases.case import Case, CaseError, read_case
+from workbench.cases.case import Case, CaseError, files_of, read_case
 from workbench.cases.writing import write_case
 from workbench.records.files import read_record
 from workbench.records.limits import RecordFileError
@@ -78,6 +78,11 @@ def test_what_is_written_is_read_back(case, folder):
     np.testing.assert_array_equal(read.fit[0].outputs, case.fit[0].outputs)
     np.testing.assert_array_equal(read.fit[0].inputs, case.fit[0].inputs)
     assert read.fit[0].sample_time == 0.02
+
+
+def test_results_that_lie_in_a_case_folder_are_not_its_files(folder):
+    (folder / "verdict.json").write_text("{}")
+    assert [file.relative_to(folder).as_posix() for file in files_of(folder)] == ["records/one.npz", "records/kept.npz"]
 
 
 def test_what_the_format_cannot_say_is_refused(case, tmp_path):

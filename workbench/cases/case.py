@@ -111,6 +111,14 @@ def read_case(folder: str | Path) -> Case:
     )
 
 
+def files_of(folder: str | Path) -> list[Path]:
+    """The files that a case reads beside case.toml: mode shapes at points, then the records, each once."""
+    path = Path(folder) / "case.toml"
+    table = table_of(path)
+    named = [table["structure"].get("points"), *(entry.get("file") for entry in tables(table, "record", path))]
+    return list(dict.fromkeys(path.parent / file for file in named if isinstance(file, str)))
+
+
 def _units(table: dict[str, Any]) -> Units:
     """Units of a case, SI unless given; all four must be given, as they need not be consistent (N with mm, kg, s)."""
     if "units" not in table:

@@ -217,7 +217,7 @@ class Evidence(Protocol):
     def places_to_try(self) -> Sequence[Any]: ...
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Kind:
     """A kind of effect in the catalogue: all that a diagnosis knows of it, from start values to drawings.
 
@@ -288,6 +288,9 @@ class Kind:
 
     def __post_init__(self) -> None:
         Kind.known[id(self)] = self
+
+    def __repr__(self) -> str:
+        return f"Kind(name={self.name!r}, path={self.path!r})"
 
     @property
     def words(self) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.cases.case import Case
+from workbench.cases.case import Case, files_of
 from workbench.draw.gap import plot_budget, plot_responses, plot_single_effects, plot_unmodelled_force, plot_where
 from workbench.draw.motion import ALONG, mode_motion
 from workbench.draw.spectra import plot_distortion
@@ -166,11 +166,10 @@ def moving_modes(rig: Rig, modes: Mapping[str, Modes], *, length: str = "m") -> 
 
 
 def case_inputs(folder: Path) -> dict[str, str]:
-    """The text of case.toml and checksums of the other files of a case, by title."""
-    files = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != "case.toml")
-    digests = [f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder)}" for file in files]
+    """The text of case.toml and checksums of the other files that the case reads, by title."""
+    digests = [f"{hashlib.sha256(f.read_bytes()).hexdigest()}  {f.relative_to(folder)}" for f in files_of(folder)]
     text = (folder / "case.toml").read_text(encoding="utf-8")
-    return {f"{folder.name}/case.toml": text, "records (SHA-256)": "\n".join(digests)}
+    return {f"{folder.name}/case.toml": text, "files (SHA-256)": "\n".join(digests)}
 
 
 def _could_show(verdict: Verdict) -> str:
