@@ -1,7 +1,7 @@
 """Standard errors of fitted parameters that hold for an imperfect model and coloured residuals."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,63 +47,66 @@ def with_intervals(
     residual, jacobian = slopes(rig, found.effects, data, workers=workers, wide=wide)
     if jacobian.shape[1] == 0:
         return found
-    parameters = parameters_of(rig, found.effects)
     level = max(float(residual @ residual) / residual.size, 1.0)
     jacobian = _with_secants_of_places(rig, found.effects, data, residual, jacobian, level)
     drawn = _changes_by_input_noise(apply_all(rig, found.effects), data, residual, logged)
+    linearised = _Linearised(found, tuple(parameters_of(rig, found.effects)), data, residual, jacobian, drawn, level)
 
-    def with_prior(effects: Sequence[Effect]) -> Fit:
-        priors = np.array([_precision(p) for _, p in parameters_of(rig, effects)])
-        return _with_covariance(found, parameters, data, residual, jacobian, drawn, priors, level)
+    def with_prior_of(effects: Sequence[Effect]) -> Fit:
+        return linearised.with_covariance(np.array([_precision(p) for _, p in parameters_of(rig, effects)]))
 
-    plausible = with_prior(_with_plausible_errors(rig, found.effects, jacobian, level))
+    plausible = with_prior_of(_with_plausible_errors(rig, found.effects, jacobian, level))
     # nominal errors that could do all that an effect does are those which the search rejected in its favour
     named = [e for e in plausible.effects if not e.kind.applied_first]
     is_significant = all(e.stands_out(rig) and e.is_sure(rig) for e in named)
-    return plausible if is_significant else with_prior(found.effects)
+    return plausible if is_significant else with_prior_of(found.effects)
 
 
-def _with_covariance(
-    found: Fit,
-    parameters: Sequence[tuple[int, Parameter]],
-    data: FitData,
-    residual: np.ndarray,
-    jacobian: np.ndarray,
-    drawn: np.ndarray,
-    priors: np.ndarray,
-    level: float,
-) -> Fit:
-    """The fit with the covariance and the standard errors of `with_intervals`.
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """A fit and its residual, linear in the free coordinates of the parameters.
 
-    Args:
+    Attributes:
         found: effects as fitted.
         parameters: of `parameters_of`, (n_parameters,).
         data: fit records.
         residual: (n_values,) in units of the noise.
         jacobian: (n_values, n_parameters).
         drawn: (n_draws, n_values) changes of the residual by input noise.
-        priors: (n_parameters,) precisions.
         level: mean square of the residual, at least 1.
     """
-    model_scatter = np.array([_model_scatter(found.effects[i], p) for i, p in parameters])
-    scale = np.sqrt(np.maximum((jacobian**2).sum(axis=0) + level * priors, 1e-300))
-    jacobian, priors = jacobian / scale, priors / scale**2
-    information = jacobian.T @ jacobian + level * np.diag(priors)
-    inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
-    root = _square_root(information)
-    without = _jackknife(residual, jacobian, data, root)
-    spread = without.T @ without + level**2 * inverse @ np.diag(priors) @ inverse
-    by_noise = drawn @ jacobian @ inverse
-    of_inputs = by_noise.T @ by_noise / INTERVALS.draws
-    variances = np.max([np.diag(spread), level * np.diag(inverse), np.diag(of_inputs)], axis=0).clip(0.0)
-    deviations: list[dict[str, float]] = [{} for _ in found.effects]
-    for (i, parameter), deviation in zip(parameters, np.sqrt(variances / scale**2 + model_scatter**2), strict=True):
-        value = found.effects[i].values[parameter.name]
-        deviations[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
-    effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
-    joint = _no_smaller_sandwich(root, information @ spread @ information, level, len(without))
-    joint = _no_smaller(joint, of_inputs)
-    return replace(found, effects=tuple(effects), covariance=joint / np.outer(scale, scale) + np.diag(model_scatter**2))
+
+    found: Fit
+    parameters: tuple[tuple[int, Parameter], ...]
+    data: FitData
+    residual: np.ndarray
+    jacobian: np.ndarray
+    drawn: np.ndarray
+    level: float
+
+    def with_covariance(self, priors: np.ndarray) -> Fit:
+        """The fit with the covariance and standard errors of `with_intervals`, by prior precisions (n_parameters,)."""
+        found, level = self.found, self.level
+        model_scatter = np.array([_model_scatter(found.effects[i], p) for i, p in self.parameters])
+        scale = np.sqrt(np.maximum((self.jacobian**2).sum(axis=0) + level * priors, 1e-300))
+        jacobian, priors = self.jacobian / scale, priors / scale**2
+        information = jacobian.T @ jacobian + level * np.diag(priors)
+        inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
+        root = _square_root(information)
+        without = _jackknife(self.residual, jacobian, self.data, root)
+        spread = without.T @ without + level**2 * inverse @ np.diag(priors) @ inverse
+        by_noise = self.drawn @ jacobian @ inverse
+        of_inputs = by_noise.T @ by_noise / INTERVALS.draws
+        variances = np.max([np.diag(spread), level * np.diag(inverse), np.diag(of_inputs)], axis=0).clip(0.0)
+        deviations: list[dict[str, float]] = [{} for _ in found.effects]
+        free_deviations = np.sqrt(variances / scale**2 + model_scatter**2)
+        for (i, parameter), deviation in zip(self.parameters, free_deviations, strict=True):
+            value = found.effects[i].values[parameter.name]
+            deviations[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
+        effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
+        joint = _no_smaller_sandwich(root, information @ spread @ information, level, len(without))
+        joint = _no_smaller(joint, of_inputs) / np.outer(scale, scale) + np.diag(model_scatter**2)
+        return replace(found, effects=tuple(effects), covariance=joint)
 
 
 def _with_secants_of_places(
