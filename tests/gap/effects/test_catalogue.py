@@ -223,7 +223,7 @@ def test_exchanged_channels_are_named_by_both():
     np.testing.assert_array_equal(exchanged, plain[[2, 1, 0]])
     assert effect.label == "swapped_outputs[d, d2]"
     assert effect_json(effect, nominal) == {"kind": "swapped_outputs", "parameters": {}, "output": "d", "with": "d2"}
-    assert _described(effect, nominal) == "two outputs that are exchanged (d and d2)"
+    assert _described(effect, nominal) == "an exchange of two outputs (d and d2)"
     inputs = Effect(kind_named("swapped_inputs"), ("F1", "F2"), {})
     swapped = simulate(inputs.apply(nominal), drive(), sample_time=DT).outputs
     np.testing.assert_allclose(swapped, simulate(nominal, drive()[[1, 0, 2]], sample_time=DT).outputs, atol=1e-12)

@@ -341,7 +341,7 @@ SWAPPED_INPUTS = Kind(
     apply=lambda rig, pair, _: _swapped(rig, "actuators", pair),
     starts=lambda evidence, _: [{}],
     targets=lambda rig: tuple(combinations((a.name for a in rig.actuators), 2)),
-    phrase="two inputs that are exchanged",
+    phrase="an exchange of two inputs",
 )
 
 
@@ -535,7 +535,7 @@ SWAPPED_OUTPUTS = Kind(
     apply=lambda rig, pair, _: _swapped(rig, "sensors", pair),
     starts=_swapped_output_starts,
     targets=lambda rig: tuple(combinations(each_sensor(rig), 2)),
-    phrase="two outputs that are exchanged",
+    phrase="an exchange of two outputs",
 )
 
 
