@@ -13,6 +13,7 @@ from workbench.gap.prediction.noise import (
     logging_noise_power,
     loudest_logging_noise,
     noise_of_inputs,
+    shows_input_noise,
 )
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import log_likelihood, whiten
@@ -50,6 +51,22 @@ def test_none_is_told_from_some(rig, record_of):
     rng = np.random.default_rng(4)
     quiet = FitData((record_of(rig, rng.normal(size=(2, 1000)), rng, name="quiet"),), np.full(4, NOISE))
     assert likeliest_share(rig, quiet, quiet.differences(rig)).share < 0.1 * LOGGED.most
+
+
+def test_records_show_it_under_sensor_noise_of_five_times_its_response(rig, logged, record_of):
+    """It adds 4 % to the mean square, but all of that at the modes."""
+    rng = np.random.default_rng(7)
+    for data, is_there in ((logged, True), (FitData(tuple(_quiet(rig, logged, rng, record_of)), logged.noise), False)):
+        loud = 5.0 * np.sqrt((np.concatenate(logged.differences(rig), axis=1) ** 2).mean(axis=1))
+        noisy = [replace(r, outputs=r.outputs + loud[:, None] * rng.normal(size=r.outputs.shape)) for r in data.records]
+        under = FitData(tuple(noisy), loud)
+        cost = (under.residual(rig) ** 2).mean()
+        assert 0.97 < cost < 1.08
+        assert shows_input_noise(rig, under, under.differences(rig), SHARE) == is_there
+
+
+def _quiet(rig, logged, rng, record_of):
+    return [record_of(rig, record.inputs, rng, name=record.name) for record in logged.records]
 
 
 def test_a_law_of_the_structure_is_no_such_noise(rig, logged, record_of):

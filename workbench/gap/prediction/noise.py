@@ -171,6 +171,9 @@ class LoggedSettings:
     most: float = 0.02  # of the rms of an input: largest noise of a logger
     # likewise: where this is likelier than any logger's noise, the residual of a record has another cause
     beyond: float = 0.04
+    # log-likelihood over that of `LEAST_LOGGED`, nats, from which the records show input noise: for one parameter a
+    # gain by chance of 6 has a probability of 5e-4
+    sure: float = 6.0
 
 
 LOGGED = LoggedSettings()
@@ -282,11 +285,7 @@ def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) ->
         residuals: (n_outputs, n_samples) measured minus predicted, one per record.
     """
 
-    def losses_of(share: float) -> list[float]:
-        filters = input_filters(rig, data, share)
-        return [-log_likelihood(filters[r.name], [left]) for r, left in zip(data.records, residuals, strict=True)]
-
-    by_record = np.array([losses_of(share) for share in (LOGGED.beyond, *SHARES)])
+    by_record = np.array([_losses(rig, data, residuals, share) for share in (LOGGED.beyond, *SHARES)])
     beyond = bool(np.median(by_record.argmin(axis=0)) < 1.0)
     losses = by_record[1:].sum(axis=1)
     best = int(np.argmin(losses))
@@ -295,3 +294,15 @@ def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) ->
     before, at, lagged = losses[best - 1 : best + 2]
     turn = 0.5 * (before - lagged) / (before - 2.0 * at + lagged)
     return LikeliestShare(float(SHARES[best] * 0.5**turn), float(at), beyond)
+
+
+def shows_input_noise(rig: Rig, data: FitData, residuals: Sequence[np.ndarray], share: float) -> bool:
+    """Whether the residuals, as of `likeliest_share`, surely show input noise of a share of the inputs' rms."""
+    with_noise, without = (sum(_losses(rig, data, residuals, each)) for each in (share, LEAST_LOGGED))
+    return without - with_noise > LOGGED.sure
+
+
+def _losses(rig: Rig, data: FitData, residuals: Sequence[np.ndarray], share: float) -> list[float]:
+    """Minus the log-likelihood of the residual of each record, with input noise of a share of the inputs' rms."""
+    filters = input_filters(rig, data, share)
+    return [-log_likelihood(filters[r.name], [left]) for r, left in zip(data.records, residuals, strict=True)]

@@ -14,7 +14,13 @@ from workbench.gap.effects.nonlinear import BEYOND, any_beyond, in_catalogue
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION, clipped_level, exchanged_last, step_of
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
-from workbench.gap.prediction.noise import is_noise_alone, logging_noise, noise_found
+from workbench.gap.prediction.noise import (
+    LEAST_LOGGED,
+    is_noise_alone,
+    logging_noise,
+    noise_found,
+    shows_input_noise,
+)
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
@@ -331,11 +337,19 @@ def _is_small(nominal: Evidence, tolerance: float) -> bool:
 
 
 def _input_noise_of(search: Search, best: Fit, noise: np.ndarray) -> float:
-    """Input noise, as a share of the inputs' rms, from the residual of a set above the sensor noise (n_outputs,)."""
-    residual_power = search.data.by_channel(search.data.residual(apply_all(search.rig, best.effects)))
-    if (residual_power.mean(axis=1) < (1.0 + ATTRIBUTION.a_tenth) * ((noise / search.data.noise) ** 2).mean()).all():
-        return 0.0
-    return logging_noise(residual_power, (noise / search.data.noise) ** 2, search.logging_noise)
+    """Input noise, as a share of the inputs' rms, from the residual of a set above the sensor noise (n_outputs,).
+
+    A small excess of the residual counts only if its spectrum is that of input noise, by likelihood.
+    """
+    rig, data = apply_all(search.rig, best.effects), search.data.with_noise(noise)
+    residual_power = search.data.by_channel(search.data.residual(rig))
+    sensor_noise = (noise / search.data.noise) ** 2
+    share = logging_noise(residual_power, sensor_noise, search.logging_noise)
+    is_small = (residual_power.mean(axis=1) < (1.0 + ATTRIBUTION.a_tenth) * sensor_noise.mean()).all()
+    if not is_small:
+        return share
+    is_shown = share > LEAST_LOGGED and shows_input_noise(rig, data, data.differences(rig), share)
+    return share if is_shown else 0.0
 
 
 def noise_of(search: Search, best: Fit) -> np.ndarray:
