@@ -572,6 +572,7 @@ class Stepwise:
         tried = sorted((s for s in tried if not self._may_be_port_errors(s)), key=self._loss)
         close = [s for s in tried if s.fit.cost < STEPWISE.near * tried[0].fit.cost][: STEPWISE.finalists]
         whole = self.search.workers.map(lambda s: self._without_inactive(self._fitted_to_all(s)), close)
+        whole = [s for s in whole if not self._may_be_port_errors(s)]  # the most informative records overstate some
         whole = sorted((*whole, *singles), key=self._loss)
         return self._simplest_of_sets(whole) if whole else step
 
@@ -810,7 +811,8 @@ class Stepwise:
         good = nominal - STEPWISE.as_good * (nominal - self.ahead[0].cost)
         likely = [f.effects for f in best_of_each_kind(self.ahead) if f.cost <= good and f.n_parameters < size]
         on_quick = self._fitted_to_quick(likely, best, self._slopes(best)) if likely else []
-        return [self._fitted_to_all(step) for step in on_quick if step.fit.cost < STEPWISE.near * best.fit.cost]
+        fitted = [self._fitted_to_all(step) for step in on_quick if step.fit.cost < STEPWISE.near * best.fit.cost]
+        return [step for step in fitted if not self._may_be_port_errors(step)]
 
     def _size(self, step: Step) -> tuple[int, int]:
         """Number of parameters and of effects: of as many parameters, one effect is simpler than two."""
