@@ -217,8 +217,9 @@ def test_one_sensor_late_alone_is_an_effect(hinged_rig, late, alone):
     prior = NominalPrior(delay=0.3, sample_time=0.01)
     errors = nominal_errors(hinged_rig(n_modes=4), prior, {f"delay_{name}": delay for name, delay in late.items()})
     found = delay_effects(hinged_rig(n_modes=4), errors)
-    assert [effect.target for effect in found] == ([alone] if alone else [])
-    assert all(effect.values["delay"] == pytest.approx(0.005) for effect in found)
+    causes = [("sensor_delay", alone), ("sensor_lag", alone)] if alone else []
+    assert [(effect.kind.name, effect.target) for effect in found] == causes
+    assert all(list(effect.values.values()) == pytest.approx([0.005]) for effect in found)
 
 
 def test_a_sensor_on_the_late_side_of_jumps_stays_there_by_a_trifle(hinged_rig):

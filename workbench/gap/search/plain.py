@@ -257,15 +257,16 @@ def _common_delays(rig: Rig, late: float) -> tuple[Effect, ...]:
 def delay_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
     """The single effects that may cause the sensor delays among the nominal errors; empty if none does.
 
-    If one of several sensors is late, its own delay is the cause. If all are equally late, beyond chance, the cause is
-    a lag of the sensors or of the actuators, or a delay of the actuators.
+    If one of several sensors is late, its own delay or lag is the cause. If all are equally late, beyond chance, the
+    cause is a lag of the sensors or of the actuators, or a delay of the actuators.
     """
     delays = {name.removeprefix("delay_"): float(v) for name, v in errors.values.items() if group_of(name) == "delay"}
     uncertainty = {name: PLAIN.sure * errors.deviations.get(f"delay_{name}", 0.0) for name in delays}
     late = [name for name, delay in delays.items() if abs(delay) > max(PLAIN.smallest_delay, uncertainty[name])]
     sample_time = errors.target.sample_time
     if len(delays) >= PLAIN.several and len(late) == 1 and delays[late[0]] > 0:
-        return (Effect(SENSOR_DELAY, late[0], {"delay": delays[late[0]] * sample_time}),)
+        delay = delays[late[0]] * sample_time
+        return Effect(SENSOR_DELAY, late[0], {"delay": delay}), Effect(SENSOR_LAG, late[0], {"time_constant": delay})
     if len(delays) < 2 or len(late) < len(delays) or min(delays.values()) < 0:
         return ()
     mean = float(np.mean([*delays.values()]))
