@@ -9,6 +9,7 @@ import numpy as np
 
 from workbench.cases.case import Case, signals_of
 from workbench.cases.points import write_points
+from workbench.records.npz_file import write_arrays
 from workbench.records.units import SI
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -22,7 +23,7 @@ from workbench.structure.profile import Profile
 from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
 
 POINTS = "points.csv"
-EDGES = ("simply supported", "clamped", "free")
+EDGES = ("simply supported", "clamped", "guided", "free")
 Support = TypeVar("Support", End, Edge)
 Port = Actuator | Sensor
 
@@ -43,8 +44,7 @@ def write_case(case: Case, folder: str | Path) -> Path:
     blocks = [f"title = {_text(case.name)}", *units, *_rig(case.rig, folder)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
         file = f"records/{record.name}.npz"
-        arrays: dict[str, Any] = {**signals_of(record)}
-        np.savez_compressed(folder / file, **arrays)
+        write_arrays(folder / file, signals_of(record))
         hold = {} if record.input_hold == "zero" else {"input_hold": record.input_hold}
         entry = {"name": record.name, "file": file, "sample_time": record.sample_time, "use": use, **hold}
         blocks.append(_table("[[record]]", **entry))
@@ -198,7 +198,14 @@ def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
         for a in rig.actuators
     ]
     outputs = [
-        _table("[[output]]", name=s.name, quantity=s.quantity, **at(s), **_direction(s), noise_std=s.noise_std)
+        _table(
+            "[[output]]",
+            name=s.name,
+            quantity=s.quantity,
+            **at(s),
+            **_direction(s),
+            **({"noise_std": s.noise_std} if s.noise_std else {}),
+        )
         for s in rig.sensors
     ]
     return [*inputs, *outputs]
