@@ -18,11 +18,11 @@ from workbench.cases.case import Case, CaseError, read_case, read_rig
 from workbench.cases.writing import write_case
 from workbench.cli.app import app
 from workbench.rig.actuators import Actuator
-from workbench.rig.rig import Rig
+from workbench.rig.rig import Rig, shape_of
 from workbench.rig.sensors import Sensor
 from workbench.structure import surface_ritz
 from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
+from workbench.structure.member import Bar
 
 LONGEST, MOST = 10.0, 2 * 2**20  # s; KiB, as the system counts
 SAMPLES, STEP = 64, 0.25  # of a record, s
@@ -285,7 +285,9 @@ def check_told(case, folder):
     again = read_case(write_case(case, folder / "again").parent)
     np.testing.assert_allclose(again.rig.modes.omega, omega, rtol=1e-9)
     np.testing.assert_array_equal(again.fit[0].outputs, case.fit[0].outputs)
-    assert (again.rig.actuators, again.rig.sensors) == (case.rig.actuators, case.rig.sensors)
+    for ports in ("actuators", "sensors"):
+        moved = [[shape_of(rig.modes, port) for port in getattr(rig, ports)] for rig in (case.rig, again.rig)]
+        np.testing.assert_allclose(*moved, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -349,11 +351,19 @@ def test_a_plate_whose_corners_are_clamped_and_free_is_read_on_one_thread(tmp_pa
     assert np.sqrt(1.0 - 0.3**2) * stiff < omega[0] < stiff and threads == {1}
 
 
-def test_a_channel_may_be_called_as_an_argument_of_savez(tmp_path):
-    beam = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged",
-                damping=ModalDamping(0.01))  # fmt: skip
-    rig = Rig(beam.modes(1), (Actuator("file", 0.3),), (Sensor("allow_pickle", 0.5),), structure=beam)
-    signals = np.random.default_rng(0).standard_normal((2, 1, 40))
-    record = rig.record(*signals, sample_time=0.1, name="r")
-    write_case(Case("x", rig, (record,), ()), tmp_path / "case")
-    np.testing.assert_array_equal(read_case(tmp_path / "case").fit[0].outputs, signals[1])
+def test_names_and_jumps_that_are_read_are_written(tmp_path):
+    """Names of arguments of `savez`, names that would be paths, and points twice at one place."""
+    mass, stiffness = ([0.0, 0.4, 0.4, 1.0], [1.0, 1.0, 3.0, 2.0]), ([0.0, 0.7, 0.7, 1.0], [4.0, 5.0, 1.0, 1.0])
+    bar = Bar(length=1.0, mass_per_length=mass, axial_stiffness=stiffness, left="fixed", right="free",
+              damping=ModalDamping(0.01))  # fmt: skip
+    rig = Rig(bar.modes(3), (Actuator("file", 0.3),), (Sensor("allow_pickle", 0.5),), structure=bar)
+    records = [
+        rig.record(*np.random.default_rng(i).standard_normal((2, 1, 60)), sample_time=0.1, name=name)
+        for i, name in enumerate(("a/b", "a%2Fb", "../../c"))
+    ]
+    case = read_case(write_case(Case("x", rig, tuple(records), ()), tmp_path / "case").parent)
+    np.testing.assert_allclose(case.rig.modes.omega, rig.modes.omega, rtol=1e-8)
+    for read, record in zip(case.fit, records, strict=True):
+        assert read.name == record.name
+        np.testing.assert_array_equal(read.outputs, record.outputs)
+    assert [path.name for path in tmp_path.iterdir()] == ["case"]

@@ -43,7 +43,8 @@ def write_case(case: Case, folder: str | Path) -> Path:
     units = [] if case.units == SI else [_table("[units]", **asdict(case.units))]
     blocks = [f"title = {_text(case.name)}", *units, *_rig(case.rig, folder)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
-        file = f"records/{record.name}.npz"
+        name = record.name.replace("%", "%25").replace("/", "%2F").replace("\\", "%5C")  # it names no folder
+        file = f"records/{name}.npz"
         write_arrays(folder / file, signals_of(record))
         hold = {} if record.input_hold == "zero" else {"input_hold": record.input_hold}
         entry = {"name": record.name, "file": file, "sample_time": record.sample_time, "use": use, **hold}
@@ -134,10 +135,15 @@ def _damping_ratio(structure: Structure | Plate) -> float:
 
 
 def _profile(profile: Profile, length: float, name: str) -> float | dict[str, list[float]]:
-    x = np.unique([0.0, *(b for b in profile.breaks if 0 < b < length), length])
-    value = profile(x)
-    fine = np.linspace(0.0, length, 1001)
-    if np.abs(profile(fine) - np.interp(fine, x, value)).max() > 1e-9 * np.abs(value).max():
+    at = np.unique([0.0, *(b for b in profile.breaks if 0 < b < length), length])
+    left, here, right = (
+        profile(np.clip(x, 0.0, length)) for x in (np.nextafter(at, -np.inf), at, np.nextafter(at, np.inf))
+    )
+    rounding = 1e-9 * np.abs(here).max()
+    sides = [(a, b) if abs(b - a) > rounding else (value,) for a, value, b in zip(left, here, right)]
+    x, value = np.repeat(at, [len(each) for each in sides]), np.concatenate(sides)  # a jump is two points at one place
+    fine = np.setdiff1d(np.linspace(0.0, length, 1001), at)
+    if np.abs(profile(fine) - np.interp(fine, x, value)).max() > rounding:
         raise ValueError(f"{name} is not linear between its breaks; the case format interpolates linearly")
     return float(value[0]) if np.ptp(value) == 0 else {"x": x.tolist(), "value": value.tolist()}
 
