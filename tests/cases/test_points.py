@@ -19,6 +19,7 @@ from workbench.structure.domain import Between, NamedPoints, Rectangle
 from workbench.structure.member import Beam
 from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
+from workbench.structure.supports import Edge
 
 PORTS = """
 [[input]]
@@ -161,7 +162,7 @@ def again(rig, folder):
 
 
 def test_a_written_plate_is_read_as_it_was(tmp_path):
-    edges = {"left": "clamped", "right": "free", "bottom": "simply supported", "top": "free"}
+    edges = {"left": "clamped", "right": "free", "bottom": "simply supported", "top": "guided"}
     plate = Plate(
         length=(0.6, 0.4),
         mass_per_area=8.1,
@@ -189,7 +190,7 @@ def test_a_written_plate_is_read_as_it_was(tmp_path):
     for change, words in (
         ({"bending_stiffness": lambda x, y: 170.0 + x}, "varies over the plate"),
         ({"tension": 5.0}, "no tension of a plate"),
-        ({"edges": {**edges, "left": "guided"}}, "no name for"),
+        ({"edges": {**edges, "left": Edge(0.0, 5.0)}}, "no name for"),
     ):
         with pytest.raises(ValueError, match=words):
             again(replace(rig, structure=replace(plate, **change)), tmp_path / "no")

@@ -139,6 +139,7 @@ WAVE = np.array([1.0, -2.0, 3.0, -4.0, 5.0, 6.0])
         ("time,a\n1,1\n0.5,2\n0,3\n", "not uniformly sampled"),
         ("time,a\n0,1\n1e308,2\n-1e308,3\n", "not uniformly sampled"),
         ("time,a\n0,1\nnan,2\n1,3\n", "time, row 2"),
+        ("time,1\n0,1\n0.5,2\n", "row 1: a header line is needed before the numbers, and '1' is no name in one"),
         ("time,a\n0,1_5\n1,2\n", "'1_5' is not a number"),
         ("time,a\n0,inf\n1,2\n", "channel 'a', row 1: inf"),
         ("time,a\n0,1e999\n1,2\n", "channel 'a', row 1: inf"),

@@ -25,7 +25,7 @@ from workbench.records.files import read_record
 from workbench.records.limits import RecordFileError, check_file
 from workbench.records.npz_file import arrays as load_arrays
 from workbench.records.record import HOLDS, Channel, Record
-from workbench.records.units import SI, Units
+from workbench.records.units import SI, Units, split_unit
 from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.rig import Rig, derivative_of
 from workbench.rig.sensors import MEASURED, Sensor
@@ -38,6 +38,7 @@ from workbench.structure.plate import Plate
 MOST_SAMPLES = 5_000_000
 LEAST_SAMPLES = 16
 MOST_MODES = 200
+PLATE_TOLERANCE = 1e-5  # of frequencies; where a clamped edge meets a free one, 1e-6 may need too many functions
 
 # The keys of each table; any other key is refused as a misspelling.
 TABLES = ("title", "input_hold", "units", "structure", "input", "output", "record")
@@ -94,7 +95,7 @@ def read_case(folder: str | Path) -> Case:
         raise CaseError(f"{folder} has no case.toml, so it is not a case folder")
     table = table_of(path)
     rig = _rig(table, path)
-    hold, units = _hold(table, str(path)), _units(table)
+    hold, units = _hold(table, str(path)), _units(table, path)
     records = [
         (_read_record(folder, {"input_hold": hold, **entry}, rig, path, units), _use(entry, path))
         for entry in tables(table, "record", path)
@@ -119,15 +120,15 @@ def files_of(folder: str | Path) -> list[Path]:
     return list(dict.fromkeys(path.parent / file for file in named if isinstance(file, str)))
 
 
-def _units(table: dict[str, Any]) -> Units:
+def _units(table: dict[str, Any], path: Path) -> Units:
     """Units of a case, SI unless given; all four must be given, as they need not be consistent (N with mm, kg, s)."""
     if "units" not in table:
         return SI
-    units = table["units"]
+    units, where = table["units"], f"{path}: [units]"
     if not isinstance(units, dict):
-        raise CaseError(f"[units] must be a table of {', '.join(UNITS)}; got {shown(units)}")
-    check_keys(units, UNITS, "[units]")
-    return Units(**{name: text(units, name, "[units]") for name in UNITS})
+        raise CaseError(f"{where} must be a table of {', '.join(UNITS)}; got {shown(units)}")
+    check_keys(units, UNITS, where)
+    return Units(**{name: text(units, name, where) for name in UNITS})
 
 
 def in_units(channels: Sequence[Channel], units: Units) -> tuple[Channel, ...]:
@@ -141,7 +142,7 @@ def read_units(path: str | Path) -> Units:
     Raises:
         CaseError: naming the file, the key, the value, and what would be right.
     """
-    return _units(table_of(Path(path)))
+    return _units(table_of(Path(path)), Path(path))
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -164,6 +165,12 @@ def _rig(table: dict[str, Any], path: Path) -> Rig:
         if name == "t" or names.count(name) > 1:
             raise CaseError(
                 f"{path}: the name {name!r} of an input or output is taken by another or by time; rename it"
+            )
+        bare, unit = split_unit(name)
+        if unit:
+            raise CaseError(
+                f"{path}: the name {shown(name)} of an input or output ends in a unit, {unit}, which is not converted"
+                f" here: name it {shown(bare)}, and state units in the record's file"
             )
     structure = table.get("structure")
     if not isinstance(structure, dict):
@@ -225,7 +232,7 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
         edges={side: text(edges, side, "[structure] edges") for side in EDGES},
         damping=ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     )
-    modes = structure.modes(count(table, "modes", MOST_MODES))
+    modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=PLATE_TOLERANCE)
     return _rig_of(modes, inputs, outputs, lambda e, where: tuple(numbers(e, "at", where, 2).tolist()), structure)
 
 

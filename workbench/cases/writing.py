@@ -9,6 +9,7 @@ import numpy as np
 
 from workbench.cases.case import Case, signals_of
 from workbench.cases.points import write_points
+from workbench.records.npz_file import write_arrays
 from workbench.records.units import SI
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -22,7 +23,7 @@ from workbench.structure.profile import Profile
 from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
 
 POINTS = "points.csv"
-EDGES = ("simply supported", "clamped", "free")
+EDGES = ("simply supported", "clamped", "guided", "free")
 Support = TypeVar("Support", End, Edge)
 Port = Actuator | Sensor
 
@@ -42,9 +43,9 @@ def write_case(case: Case, folder: str | Path) -> Path:
     units = [] if case.units == SI else [_table("[units]", **asdict(case.units))]
     blocks = [f"title = {_text(case.name)}", *units, *_rig(case.rig, folder)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
-        file = f"records/{record.name}.npz"
-        arrays: dict[str, Any] = {**signals_of(record)}
-        np.savez_compressed(folder / file, **arrays)
+        name = record.name.replace("%", "%25").replace("/", "%2F").replace("\\", "%5C")  # it names no folder
+        file = f"records/{name}.npz"
+        write_arrays(folder / file, signals_of(record))
         hold = {} if record.input_hold == "zero" else {"input_hold": record.input_hold}
         entry = {"name": record.name, "file": file, "sample_time": record.sample_time, "use": use, **hold}
         blocks.append(_table("[[record]]", **entry))
@@ -134,10 +135,15 @@ def _damping_ratio(structure: Structure | Plate) -> float:
 
 
 def _profile(profile: Profile, length: float, name: str) -> float | dict[str, list[float]]:
-    x = np.unique([0.0, *(b for b in profile.breaks if 0 < b < length), length])
-    value = profile(x)
-    fine = np.linspace(0.0, length, 1001)
-    if np.abs(profile(fine) - np.interp(fine, x, value)).max() > 1e-9 * np.abs(value).max():
+    at = np.unique([0.0, *(b for b in profile.breaks if 0 < b < length), length])
+    left, here, right = (
+        profile(np.clip(x, 0.0, length)) for x in (np.nextafter(at, -np.inf), at, np.nextafter(at, np.inf))
+    )
+    rounding = 1e-9 * np.abs(here).max()
+    sides = [(a, b) if abs(b - a) > rounding else (value,) for a, value, b in zip(left, here, right)]
+    x, value = np.repeat(at, [len(each) for each in sides]), np.concatenate(sides)  # a jump is two points at one place
+    fine = np.setdiff1d(np.linspace(0.0, length, 1001), at)
+    if np.abs(profile(fine) - np.interp(fine, x, value)).max() > rounding:
         raise ValueError(f"{name} is not linear between its breaks; the case format interpolates linearly")
     return float(value[0]) if np.ptp(value) == 0 else {"x": x.tolist(), "value": value.tolist()}
 
@@ -198,7 +204,14 @@ def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
         for a in rig.actuators
     ]
     outputs = [
-        _table("[[output]]", name=s.name, quantity=s.quantity, **at(s), **_direction(s), noise_std=s.noise_std)
+        _table(
+            "[[output]]",
+            name=s.name,
+            quantity=s.quantity,
+            **at(s),
+            **_direction(s),
+            **({"noise_std": s.noise_std} if s.noise_std else {}),
+        )
         for s in rig.sensors
     ]
     return [*inputs, *outputs]

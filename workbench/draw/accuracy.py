@@ -54,7 +54,7 @@ def peers_errors(
         Line2D([], [], color="black", lw=2.2, label="median (a missed mode counts as infinite error)"),
         Line2D([], [], color=GREY, lw=3, alpha=0.5, label="median of a method that attains the bound"),
     ]
-    figure.legend(handles=handles, loc="outside upper left", ncols=4)
+    figure.legend(handles=handles, loc="outside upper left", ncols=2)
     return figure
 
 

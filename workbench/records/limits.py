@@ -15,6 +15,8 @@ MOST_CHANNELS = 10_000
 TELLING = 0.1  # of the time limit, after which the remaining time is extrapolated
 SPARE = 0.3  # tolerance of extrapolations, as rows grow longer with the digits of their times
 LONGEST = 200  # characters of a reader's message that is passed on
+# of a reader that did not see what is wrong; their messages speak of its code, not of the file
+STUMBLES = (ArithmeticError, AssertionError, AttributeError, LookupError, NameError, TypeError)
 
 
 class RecordFileError(ValueError):
@@ -25,6 +27,8 @@ def unreadable(path: Path, error: Exception) -> RecordFileError:
     """The error for a reader's exception: the first line of its message, shortened, without control characters."""
     text = next(iter(str(error).splitlines()), "") or type(error).__name__
     shown = "".join(c if c.isprintable() else "?" for c in text[:LONGEST]) + ("..." if len(text) > LONGEST else "")
+    if isinstance(error, STUMBLES):
+        shown = f"{type(error).__name__} in its reader ({shown}): it is damaged, or of a kind that is not read"
     return RecordFileError(f"{path} cannot be read as {path.suffix[1:].upper()}: {shown}")
 
 

@@ -50,6 +50,14 @@ def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], heade
         np.savez(file, **held)
 
 
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays of any names, compressed; to `np.savez` some, such as `file`, are its own arguments."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}{ENDING}", "w", force_zip64=True) as file:
+                npy.write_array(file, values, allow_pickle=False)
+
+
 def _declared(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     """Shape and type declared by an array's header."""
     version = npy.read_magic(file)

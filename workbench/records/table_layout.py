@@ -209,6 +209,12 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
     labview = labview_header(path, [_fields(line, found.delimiter, False) for _, line in lines])
     if not titles:  # as numpy's savetxt: behind a comment
         names = _fields(comment, found.delimiter, found.trailing)[found.n_front :]
+        if len(names) != width and rows:
+            odd = next(f for f in rows[-1][2] if _is_number(f, None) or MOMENT.fullmatch(f))
+            raise RecordFileError(
+                f"{path}, row {rows[-1][0]}: a header line is needed before the numbers, and {odd[:40]!r} is no name"
+                " in one"
+            )
         if len(names) != width:
             above = f"; the line above has {len(_fields(lines[-1][1], found.delimiter, False))}" if lines else ""
             raise RecordFileError(

@@ -1,16 +1,42 @@
 """TDMS files of LabVIEW: one channel per signal, with unit and sampling among its properties."""
 
+import logging
 from collections import Counter
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError, check_counts
 
+LEAD_IN, BIG_ENDIAN = 28, 1 << 6  # bytes before each segment; the flag in them of its byte order
 TOGETHER = 0.01  # of a step: tolerance of the start times of channels
 arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
+
+
+class _Refused(logging.Handler):
+    """Warnings of npTDMS as errors: after one it leaves the end of a file out, or returns unscaled numbers."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.name != "nptdms.types":  # texts in another encoding
+            raise ValueError(f"it is damaged, was cut short, or is of a kind that is not read: {record.getMessage()}")
+
+
+def _check_whole(path: Path) -> None:
+    """Refuse a file that ends within a segment, by the lengths in their lead-ins; npTDMS overlooks one in a lead-in."""
+    size, position = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            lead_in = file.read(LEAD_IN)
+            if position == 0 and lead_in[:4] != b"TDSm":
+                return  # no TDMS file at all, as npTDMS says
+            order: Literal["big", "little"] = "big" if int.from_bytes(lead_in[4:8], "little") & BIG_ENDIAN else "little"
+            position += LEAD_IN + int.from_bytes(lead_in[12:20], order)
+    if position > size:
+        raise RecordFileError(f"{path} ends within its last segment: it was cut short, or is still being written")
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
@@ -20,9 +46,9 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """
     from nptdms import TdmsFile
 
+    logging.getLogger("nptdms").handlers = [_Refused()]
+    _check_whole(path)
     with TdmsFile.open(path) as file:
-        if file.file_status.incomplete_final_segment:
-            raise RecordFileError(f"{path} ends within its last segment: it was cut short, or is still being written")
         channels = [channel for group in file.groups() for channel in group.channels() if len(channel)]
         channels = [channel for channel in channels if channel.dtype.kind in "fiub"]
         check_counts(path, len(channels), sum(map(len, channels)), limits)
@@ -33,7 +59,10 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         for channel in channels:
             name = channel.name if twice[channel.name] == 1 else f"{channel.group_name}/{channel.name}"
             unit = str(channel.properties.get("unit_string", "")).strip()
-            found[f"{name} [{unit}]" if unit else name] = channel[:]
+            name = f"{name} [{unit}]" if unit else name
+            if name in found:
+                raise RecordFileError(f"{path} has two channels {name!r}; rename one of them")
+            found[name] = channel[:]
             step = float(channel.properties.get("wf_increment", 0.0))
             if step > 0:
                 sampling.add((float(channel.properties.get("wf_start_offset", 0.0)), step))
@@ -51,5 +80,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     lengths = {values.size for values in found.values()}
     if sampling and len(lengths) == 1:
         ((start, step),) = sampling
+        if "t" in found:
+            raise RecordFileError(f"{path} has a channel 't' beside the sample instants of its channels; rename it")
         return {"t": start + step * np.arange(lengths.pop()), **found}
     return found

@@ -26,6 +26,7 @@ from workbench.structure.surface_basis import (
     products,
     weights_on,
 )
+from workbench.threads import one_blas_thread
 
 WORTH = 4  # functions per further mode of sufficient accuracy
 MOST_FUNCTIONS = 3000  # of the eigenvalue problem, which then takes ten seconds
@@ -66,6 +67,7 @@ class SurfaceModes:
         return np.asarray(np.einsum("qpr,qp,qps->rs", values, shares, values, optimize=True))
 
 
+@one_blas_thread
 def solve(problem: SurfaceProblem, n_modes: int, *, tolerance: float, beyond: int = 0) -> SurfaceModes:
     """The lowest modes, refined until the frequencies converge to a relative `tolerance`.
 
