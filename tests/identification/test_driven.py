@@ -612,3 +612,11 @@ def test_the_former_name_of_the_hold_warns_and_an_unknown_one_is_refused():
         identify_driven(record, straight=True)
     with pytest.raises(ValueError, match="input_hold is 'zero' or 'first' or 'band-limited'; got 'straight'"):
         identify_driven(record, input_hold="straight")
+
+
+def test_the_response_to_long_inputs_is_that_of_the_state_space():
+    plant = system(n_outputs=1, n_inputs=1)
+    found = identify_driven(measured(plant, excitation("noise", 1)), at_rest=True)
+    u = excitation("noise", 1, n=6000, seed=3)
+    exact = measured(plant, u).outputs
+    assert np.abs(found.response(u) - exact).max() < 1e-6 * np.abs(exact).max()

@@ -177,8 +177,7 @@ class Driven(ParticipatingModes):
         y = self.feedthrough @ data.direct(0)
         time = self.sample_time * np.arange(u.shape[1])
         for r, pole in enumerate(self.modes.poles):
-            real, imaginary = data.responses(pole)
-            z = (real + 1j * imaginary) @ self.participation[r]
+            z = data.modal_coordinate(pole, self.participation[r])[0]
             if record is not None:
                 z += self.initial[record][r] * np.exp(pole * time)
             y += 2.0 * np.real(np.outer(self._measured_shapes[:, r], z))

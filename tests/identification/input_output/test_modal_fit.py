@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 
 from workbench.identification.input_output.known_inputs import powers
-from workbench.identification.input_output.modal_fit import MANY_ROWS, _orthonormal, _part
+from workbench.identification.input_output.modal_fit import MANY_ROWS, _part, orthonormal
 
 
 @pytest.mark.parametrize("apart", [1.0, 1e-3, 1e-6, 1e-10])
-def test_columns_are_made_orthonormal_however_close_they_are(apart):
+def test_columns_are_madeorthonormal_however_close_they_are(apart):
     rng = np.random.default_rng(1)
     columns = rng.normal(size=(500, 6))
     columns[:, 5] = columns[:, 0] + apart * rng.normal(size=500)
     columns /= np.linalg.norm(columns, axis=0)
-    q, r = _orthonormal(columns)
+    q, r = orthonormal(columns)
     assert np.abs(q.T @ q - np.eye(6)).max() < 1e-14
     assert np.abs(q @ r - columns).max() < 1e-14
     assert np.abs(np.tril(r, -1)).max() == 0.0
 
 
 def test_no_column_has_none():
-    q, r = _orthonormal(np.zeros((500, 0)))
+    q, r = orthonormal(np.zeros((500, 0)))
     assert q.shape == (500, 0) and r.shape == (0, 0)
 
 

@@ -74,13 +74,13 @@ def propagated_covariance(
         c = np.einsum("ckj,k->cj", effect, all_unknowns) if c is None else c
         directions.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
 
-    for column in _root(covariance(fit, noise_ratio)).T:
+    for column in scaled_root(covariance(fit, noise_ratio)).T:
         add(column)
     if further is not None:
-        for column in _root(further).T:
+        for column in scaled_root(further).T:
             add(column[: free.size], column[free.size :].reshape(fit.noise.size, -1).T)
     for part, outputs in fit.outputs():
-        spread = _root(part.spread[: 2 * n, : 2 * n])
+        spread = scaled_root(part.spread[: 2 * n, : 2 * n])
         for output in range(outputs.start, outputs.stop):
             for column in (np.tile(np.sqrt(noise_ratio[output]), 2)[:, None] * spread).T:
                 a = np.zeros_like(fit.amplitudes)
@@ -164,7 +164,7 @@ def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:
     return np.vstack([coordinates, np.ones((part.coefficients.shape[0] - len(coordinates), len(rows)))])
 
 
-def _root(matrix: np.ndarray) -> np.ndarray:
+def scaled_root(matrix: np.ndarray) -> np.ndarray:
     """R with R R^T = matrix, also of a matrix that close modes make singular."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     return size[:, None] * symmetric_root(matrix / np.outer(size, size))

@@ -75,10 +75,10 @@ def without_unpredictive(
             first_half = settled(half, start, SELECTION.few_steps, budget)
             with np.errstate(over="ignore", invalid="ignore"):
                 predicted = columns(whole, first_half.poles, first_half.participation)[0] @ first_half.coefficients
-                errors = (whole.values - predicted) / noise
+                errors = whole.as_samples((whole.values - predicted) / noise)
         except np.linalg.LinAlgError:
             return None
-        seconds = [errors[a.start + b.stop - b.start : a.stop] for a, b in zip(whole.rows, half.rows)]
+        seconds = [each[rows.stop - rows.start :] for each, rows in zip(errors, half.rows, strict=True)]
         if not all(np.isfinite(each).all() for each in seconds):
             return None
         return [_power(each) for each in seconds]
@@ -125,7 +125,8 @@ def _is_faint(data: KnownInputs, fit: Fit, r: int) -> bool:
     """Whether the response of mode r is a negligible share of the power of every output."""
     z = np.concatenate(data.modal_coordinate(fit.poles[r], fit.participation[r]))
     power = np.abs(fit.amplitudes[:, r]) ** 2 * 0.5 * (np.abs(z) ** 2).mean()
-    return bool((power < HELD_OUT.faint * data.values.var(axis=0)).all())
+    outputs = np.hstack([record.outputs[:, data.first :] for record in data.records])
+    return bool((power < HELD_OUT.faint * outputs.var(axis=1)).all())
 
 
 def _power(samples: Floats) -> Floats:
@@ -143,9 +144,9 @@ class _ResidualSpectra:
     """Residual and response of each record in lines of Hann's window, outputs in units of their noise."""
 
     def __init__(self, data: KnownInputs, fit: Fit) -> None:
-        window = np.concatenate([np.hanning(rows.stop - rows.start) for rows in data.rows])[:, None] / fit.noise
         self.lines, self.response = (
-            [_power((window * y)[rows]) for rows in data.rows] for y in (fit.residual, data.values)
+            [_power(np.hanning(len(each))[:, None] * each / fit.noise) for each in data.as_samples(y)]
+            for y in (fit.residual, data.values)
         )
         self.usual, self.highest = float(np.median(np.concatenate(self.lines))), data.highest
 

@@ -255,7 +255,7 @@ def _impulse_responses(data: KnownInputs, fit: Fit) -> Floats:
     impulses = data.from_rest(records)
     phi = columns(impulses, fit.poles, fit.participation[:, :m])[0]
     k = 2 * fit.poles.size + (phi.shape[1] - 2 * fit.poles.size - m if data.feedthrough else 0)
-    return np.asarray((phi[:, :k] @ fit.coefficients[:k]).reshape(m, n, -1)[:, 1:].transpose(0, 2, 1))
+    return np.array([each[1:].T for each in impulses.as_samples(phi[:, :k] @ fit.coefficients[:k])])
 
 
 def _spectra(responses: Floats, size: int) -> Complexes:

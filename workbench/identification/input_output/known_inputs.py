@@ -30,12 +30,15 @@ from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
 from workbench.arrays import Complexes, Floats
-from workbench.identification.input_output.fit_errors import covariance
+from workbench.identification.input_output.fit_errors import covariance, scaled_root
+from workbench.identification.input_output.lines_of_poles import LinesOfPoles
 from workbench.identification.input_output.modal_fit import (
+    MANY_ROWS,
     Fit,
-    columns,
+    combinations,
     free_parameters,
     modal_coordinate,
+    regressors,
     tangent_weights,
 )
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
@@ -59,7 +62,8 @@ SERIES = [np.array([1.0 / factorial(i + k) for i in range(TERMS)]) for k in (1, 
 class KnownInputs:
     """The `modal_fit.Measurement` of records with known inputs.
 
-    Rows are the samples, one record after another, or, with `line_std`, the lines of each record over their noise.
+    Rows are the samples, one record after another, or the lines of each record: with `line_std` these over their noise,
+    and of long records with held inputs without it, since lines of their responses take less time (`lines_of_poles`).
 
     Args:
         records: with the same inputs and outputs at one rate.
@@ -116,7 +120,15 @@ class KnownInputs:
         ends = np.cumsum([0, *lengths])
         self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]
         self.line_std = line_std
-        self.rows_are_lines = line_std is not None and any(np.ptp(size, axis=0).any() for size in line_std)
+        # a delayed first-order hold has a corner at the first sample of the input, which no closed form has
+        held = not self.fraction.any() and (hold == "zero" or (hold == "first" and not self.whole.any()))
+        coloured = line_std is not None and any(np.ptp(size, axis=0).any() for size in line_std)
+        self.rows_are_lines = coloured or (held and sum(lengths) >= MANY_ROWS)
+        self.of_poles = (
+            [LinesOfPoles(self._shifted(u), self.first, self.dt, at_rest) for u in self.driving]
+            if held and self.rows_are_lines
+            else []
+        )
         self.weights = None if line_std is None else 1.0 / np.vstack(line_std)
         self.values = self._rows(np.vstack(self._measured()))
         if self.weights is not None:
@@ -237,8 +249,11 @@ class KnownInputs:
 
     def left(self, fit: Fit) -> list[np.ndarray]:
         """The residual of each record at its samples, (n_samples, n_outputs), in the unit of each output."""
-        raw = fit.residual if self.weights is None else fit.residual / self.weights
-        return [self.samples(raw[rows]) for rows in self.rows]
+        return self.as_samples(fit.residual if self.weights is None else fit.residual / self.weights)
+
+    def as_samples(self, rows: Floats) -> list[Floats]:
+        """Rows of all records as the samples of each, (n_samples, k)."""
+        return [self.samples(rows[part]) for part in self.rows]
 
     def _with(self, **changed: Any) -> "KnownInputs":
         same = {
@@ -271,18 +286,19 @@ class KnownInputs:
 
     def leverage(self, fit: Fit) -> np.ndarray:
         """Leverage of each line, the share of its noise that the fit absorbs, (n_rows, n_outputs)."""
-        phi, t = columns(self, fit.poles, fit.participation)
+        x = regressors(self, fit.poles, fit.participation)
         if not self.rows_are_lines:
-            phi, t = (np.vstack([lines_of(matrix[rows]) for rows in self.rows]) for matrix in (phi, t))
-        free, leverages = free_parameters(fit), []
-        bound = covariance(fit) if free.size else np.zeros((0, 0))
-        changes = np.concatenate([tangent_weights(fit, part)[:, free] for part in fit.parts], axis=2)
+            x = np.vstack([lines_of(x[rows]) for rows in self.rows])
+        combined, free, leverages = combinations(fit.participation, self.fixed.shape[1]), free_parameters(fit), []
+        bound = scaled_root(covariance(fit) if free.size else np.zeros((0, 0)))
         weights = np.ones((1, fit.noise.size)) if self.weights is None else self.weights
-        for weight, std, each in zip(weights.T[:, :, None], fit.noise, changes.transpose(2, 0, 1)):
-            q = np.linalg.qr(weight * phi / np.maximum(np.linalg.norm(weight * phi, axis=0), 1e-300))[0]
-            nonlinear = (weight * t) @ each
-            nonlinear -= q @ (q.T @ nonlinear)
-            leverages.append((q**2).sum(axis=1) + ((nonlinear @ bound) * nonlinear).sum(axis=1) / std**2)
+        for part, outputs in fit.outputs():
+            changes = -combined @ part.tilt
+            changes[: len(part.gram)] += np.eye(len(part.gram))  # tangents less their projections
+            linear = combined @ scaled_root(part.spread)
+            for j, nonlinear in enumerate(tangent_weights(fit, part)[:, free].transpose(2, 0, 1), outputs.start):
+                each = np.hstack([linear, changes @ nonlinear @ bound / fit.noise[j]])
+                leverages.append(weights[:, j] ** 2 * ((x @ each) ** 2).sum(axis=1))
         return np.array(leverages).T
 
     def cost(self, fit: Fit) -> float:
@@ -368,7 +384,22 @@ class KnownInputs:
         """Columns (n_samples, k) of each record as rows of the fit, (n_rows, k)."""
         return np.vstack([lines_of(each) if self.rows_are_lines else each for each in samples])
 
+    def _lines_of(self, pole: complex) -> "list[LinesOfPoles] | None":
+        """The closed form of each record; None where the pole or the records have none."""
+        return None if any(each.on_line(pole) for each in self.of_poles) else self.of_poles or None
+
+    def _acting(self, record: int) -> np.ndarray:
+        """Indices of the excitations that act in a record: its inputs, and its initial state."""
+        return np.append(np.arange(self.n_inputs), [] if self.at_rest else self.n_inputs + record).astype(int)
+
     def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+        of_poles = self._lines_of(pole)
+        if of_poles is not None:
+            held = sources(pole, self.dt, self.hold)
+            real, imaginary = (np.zeros((self.n_excitations, len(self.values))) for _ in range(2))
+            for k, (rows, of_record) in enumerate(zip(self.rows, of_poles, strict=True)):
+                of_record.responses(pole, held, self._acting(k), real[:, rows], imaginary[:, rows])
+            return real.T, imaginary.T
         x = np.zeros((self.values.shape[0], self.n_excitations), complex, order="F")
         for k, (record, rows, (driven, _, decay)) in enumerate(zip(self.records, self.rows, self._of_pole(pole))):
             z = self._late_driven(record.inputs, pole, driven)
@@ -378,10 +409,18 @@ class KnownInputs:
         return self._rows(x.real), self._rows(x.imag)
 
     def slopes(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        of_poles = self._lines_of(pole)
+        if of_poles is not None:
+            held = sources(pole, self.dt, self.hold)
+            real, imaginary = (np.zeros((1, len(self.values))) for _ in range(2))
+            for k, (rows, of_record) in enumerate(zip(self.rows, of_poles, strict=True)):
+                l_r = participation[self._acting(k)]
+                of_record.slopes(pole, held, l_r, real[:, rows], imaginary[:, rows])
+            return real[0], imaginary[0]
         slopes = np.zeros(self.values.shape[0], complex)
         mu, l_r = np.exp(pole * self.dt), participation[: self.n_inputs]
-        each = zip(self.records, self.rows, self._of_pole(pole))
-        for k, (record, rows, (z, forcing_slope, decay)) in enumerate(each):
+        of_records = zip(self.records, self.rows, self._of_pole(pole))
+        for k, (record, rows, (z, forcing_slope, decay)) in enumerate(of_records):
             u = record.inputs
             if self.fraction.any():
                 forcing = self.dt * mu * z[:, :-1] + forcing_slope[:, 1:]

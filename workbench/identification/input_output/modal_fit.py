@@ -11,7 +11,7 @@ gives the Gauss-Newton matrix H; H^-1 in the noise of the outputs is the Cramér
 each mode is held at 1: the shape carries its scale.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -26,8 +26,11 @@ Pair = tuple[np.ndarray, np.ndarray]
 # From this many rows on, the Gram matrix is that of the tangents less that of their projections: to form the projected
 # tangents takes three times as long, and the rounding error of the difference is below the noise of so many rows
 MANY_ROWS = 5000
+BLOCK = 2048  # rows at a time: these stay in the processor's cache
 # Length of a unit column orthogonal to the others, below which Cholesky factors lose it in rounding
 LEAST_INDEPENDENT = 1e-5
+# The same where only products of the columns are known, whose rounding error grows with its inverse square
+LEAST_INDEPENDENT_OF_PRODUCTS = 1e-3
 
 
 class Measurement(Protocol):
@@ -84,6 +87,7 @@ class Part:
     slopes: np.ndarray  # T^T residual
     spread: np.ndarray  # (Φ^T Φ)^-1
     tilt: np.ndarray  # Φ^+ T
+    sizes: np.ndarray  # (n_tangents,) norms of T
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +132,13 @@ class Fit:
 
 def projected(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> Fit:
     """The fit with given poles and participation factors; shapes by least squares."""
-    phi, t = columns(data, poles, participation)
+    x, combined = regressors(data, poles, participation), combinations(participation, data.fixed.shape[1])
+    if len(x) >= MANY_ROWS:
+        try:
+            return Fit(poles, participation, tuple(_parts_by_products(data, x, combined)))
+        except np.linalg.LinAlgError:
+            pass  # columns that are nearly dependent
+    phi, t = x @ combined, x[:, : x.shape[1] - data.fixed.shape[1]]
     if data.weights is None:
         return Fit(poles, participation, (_part(phi, t, data.values),))
     each = data.weights.T[:, :, None]
@@ -144,20 +154,75 @@ def modal_coordinate(response: Pair, l_r: np.ndarray) -> Pair:
 
 def columns(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> Pair:
     """Modal coordinates and fixed columns, Φ (n_rows, n_columns), and tangents T (n_rows, n_tangents), not weighted."""
-    n, n_rows, n_fixed = poles.size, *data.fixed.shape
-    phi = np.empty((n_rows, 2 * n + n_fixed), order="F")
-    phi[:, 2 * n :] = data.fixed
-    q = participation.shape[1] + 1
-    t = np.empty((n_rows, 2 * n * q), order="F")
+    x, n_fixed = regressors(data, poles, participation), data.fixed.shape[1]
+    return x @ combinations(participation, n_fixed), x[:, : x.shape[1] - n_fixed]
+
+
+def regressors(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> np.ndarray:
+    """Tangents T and fixed columns V, [T, V] (n_rows, n_tangents + n_fixed), not weighted.
+
+    T holds of each mode its slope and its responses, real parts, then imaginary ones.
+    """
+    n, q, (n_rows, n_fixed) = poles.size, participation.shape[1] + 1, data.fixed.shape
+    x = np.empty((n_rows, 2 * n * q + n_fixed), order="F")
+    x[:, 2 * n * q :] = data.fixed
     for r, (pole, l_r) in enumerate(zip(poles, participation)):
         responses, slopes = data.responses(pole), data.slopes(pole, l_r)
-        coordinate = modal_coordinate(responses, l_r)
-        for part in (0, 1):  # real parts, imaginary parts
-            phi[:, part * n + r] = coordinate[part]
+        for part in (0, 1):
             first = (part * n + r) * q
-            t[:, first] = slopes[part]
-            t[:, first + 1 : first + q] = responses[part]
-    return phi, t
+            x[:, first] = slopes[part]
+            x[:, first + 1 : first + q] = responses[part]
+    return x
+
+
+def combinations(participation: np.ndarray, n_fixed: int) -> np.ndarray:
+    """K of Φ = [T, V] K, (n_tangents + n_fixed, n_columns): modal coordinates are combinations of responses."""
+    n, q = participation.shape[0], participation.shape[1] + 1
+    k = np.zeros((2 * n * q + n_fixed, 2 * n + n_fixed))
+    k[2 * n * q :, 2 * n :] = np.eye(n_fixed)
+    for r, l_r in enumerate(participation):
+        real, imaginary = (slice((part * n + r) * q + 1, (part * n + r + 1) * q) for part in (0, 1))
+        k[real, r], k[real, n + r] = l_r.real, l_r.imag
+        k[imaginary, r], k[imaginary, n + r] = -l_r.imag, l_r.real
+    return k
+
+
+def _parts_by_products(data: Measurement, x: np.ndarray, combined: np.ndarray) -> Iterator[Part]:
+    """The projections from the products of X = [T, V]; Φ = X K.
+
+    Raises:
+        LinAlgError: columns too nearly dependent for that.
+    """
+    t = slice(0, x.shape[1] - data.fixed.shape[1])
+    if data.weights is None:
+        each: Iterable[Pair] = [(np.ones((1, 1)), data.values)]
+    else:
+        each = zip(data.weights.T[:, :, None], data.values.T[:, :, None], strict=True)
+    for weight, y in each:
+        products = products_of(x, weight)
+        with_columns = combined.T @ products
+        of_columns = with_columns @ combined
+        size = np.maximum(np.sqrt(np.diag(of_columns)), 1e-300)
+        factor = np.linalg.cholesky(of_columns / np.outer(size, size)).T
+        if factor.size and np.diag(factor).min() < LEAST_INDEPENDENT_OF_PRODUCTS:
+            raise np.linalg.LinAlgError("columns that are nearly dependent")
+        inverse = solve_triangular(factor, np.eye(size.size)) / size[:, None]
+        qt, qy = inverse.T @ with_columns[:, t], inverse.T @ (combined.T @ (x.T @ (weight * y)))
+        coefficients = inverse @ qy
+        residual = y - weight * (x @ (combined @ coefficients))
+        slopes, gram, sizes = x[:, t].T @ (weight * residual), products[t, t], np.sqrt(np.diag(products)[t])
+        yield Part(residual, coefficients, gram - qt.T @ qt, slopes, inverse @ inverse.T, inverse @ qt, sizes)
+
+
+def products_of(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """X^T W² X of columns X (n_rows, n_columns), weights (n_rows, 1), or (1, 1) for rows of equal weight."""
+    if len(weight) == 1:
+        return np.asarray(weight**2 * (x.T @ x))
+    products = np.zeros((x.shape[1], x.shape[1]))
+    for first in range(0, len(x), BLOCK):
+        block = weight[first : first + BLOCK] * x[first : first + BLOCK]
+        products += block.T @ block
+    return products
 
 
 def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
@@ -167,7 +232,7 @@ def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
 
 def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
     size = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
-    q, r = _orthonormal(phi / size)
+    q, r = orthonormal(phi / size)
     if phi.shape[1] and np.abs(np.diag(r)).min() < 1e-13:
         raise np.linalg.LinAlgError("modes that cannot be distinguished")
     qy, qt = q.T @ y, q.T @ t
@@ -178,10 +243,15 @@ def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
         gram, slopes = orthogonal.T @ orthogonal, orthogonal.T @ residual
     else:
         gram, slopes = t.T @ t - qt.T @ qt, t.T @ residual
-    return Part(residual, inverse @ qy, gram, slopes, inverse @ inverse.T, inverse @ qt)
+    return Part(residual, inverse @ qy, gram, slopes, inverse @ inverse.T, inverse @ qt, column_norms(t))
 
 
-def _orthonormal(columns: np.ndarray) -> Pair:
+def column_norms(columns: np.ndarray) -> np.ndarray:
+    """Norm of each column, without a further table of their size."""
+    return np.asarray(np.sqrt(np.einsum("kc,kc->c", columns, columns)))
+
+
+def orthonormal(columns: np.ndarray) -> Pair:
     """Q and R of columns: by two Cholesky factorisations where well conditioned, else by Householder reflections.
 
     As accurate there as reflections, in a fraction of the time (Yamamoto et al., ETNA 44 (2015) 306).
@@ -254,8 +324,7 @@ def normal_equations(fit: Fit, noise: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def search(
     data: Measurement,
-    poles: np.ndarray,
-    participation: np.ndarray,
+    fit: Fit,
     noise: np.ndarray,
     most_steps: int = FIT.most_steps,
     budget: Budget | None = None,
@@ -264,13 +333,20 @@ def search(
     """Least-squares fit over poles and participation factors, outputs in units of `noise`.
 
     Args:
+        fit: to start from, of the same data.
         negligible: expected decrease of χ² per value below which the search ends.
     """
-    strength = np.abs(participation) * [np.linalg.norm(np.vstack(data.responses(pole)), axis=0) for pole in poles]
-    held = participation[np.arange(poles.size), np.argmax(strength, axis=1)]
-    start = projected(data, poles, participation / held[:, None])
-    minimum = minimise(_OutputError(data, noise, negligible), start, most_steps=most_steps, budget=budget)
+    held = fit.participation[np.arange(fit.poles.size), np.argmax(_strength(fit), axis=1)]
+    if (held != 1.0).any():
+        fit = projected(data, fit.poles, fit.participation / held[:, None])
+    minimum = minimise(_OutputError(data, noise, negligible), fit, most_steps=most_steps, budget=budget)
     return replace(minimum.state, converged=minimum.converged, steps=minimum.steps)
+
+
+def _strength(fit: Fit) -> np.ndarray:
+    """Norm of the response of each mode to each excitation, (n_modes, n_excitations)."""
+    squares = np.sum([part.sizes**2 for part in fit.parts], axis=0).reshape(2, fit.poles.size, -1).sum(axis=0)
+    return np.asarray(np.abs(fit.participation) * np.sqrt(squares[:, 1:]))
 
 
 class _OutputError:
@@ -319,9 +395,15 @@ def settled(
     budget: Budget | None = None,
     negligible: float = FIT.negligible,
 ) -> Fit:
-    """The fit searched, reweighted by the noise it estimates, and searched again; unchanged where the time is up."""
+    """The fit searched, reweighted by the noise it estimates, and searched again; unchanged where the time is up.
+
+    A single output has no other to be weighted against.
+    """
     for _ in range(2):
         if fit.poles.size == 0 or (budget is not None and budget.spent("refinement")):
             break
-        fit = search(data, fit.poles, fit.participation, fit.noise, most_steps, budget, negligible)
+        noise = fit.noise
+        fit = search(data, fit, noise, most_steps, budget, negligible)
+        if fit.converged and noise.size == 1:
+            break
     return fit

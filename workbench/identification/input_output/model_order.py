@@ -1,6 +1,7 @@
 """Model order selection for a measurement with any excitation, stepwise by likelihood ratio."""
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,11 +10,15 @@ from scipy.stats import chi2
 from workbench.arrays import scaled_inverse
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.modal_fit import (
+    MANY_ROWS,
     Fit,
     Measurement,
+    column_norms,
     free_parameters,
     modal_coordinate,
     only,
+    orthonormal,
+    products_of,
     projected,
     search,
     settled,
@@ -32,6 +37,7 @@ class OrderSettings:
     decided: float = 0.1  # χ² of each output, expected of a further step, below which such a fit ends
     enter: float = 0.5  # of the threshold, at which a candidate is fitted: its participation factors are approximate
     distinct: float = 10.0  # times the threshold: two close modes, each above it, are not tested for removal
+    apart: float = 10.0  # decay rates: a candidate nearer to a mode is fitted with it, not alone
     floor: float = 1e-5  # noise floor of each output, relative: -100 dB
     collinear: float = 1e-10  # of the energy of each column, added so that coincident poles leave no singular matrix
     # distorted_rates, distorted_share: decay rates, and share of the frequency, to either side of a nonlinear mode,
@@ -41,6 +47,7 @@ class OrderSettings:
 
 
 ORDER = OrderSettings()
+Scored = tuple[float, np.ndarray, complex]  # gain, participation factors and pole of a candidate
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +101,8 @@ def select_modes(
             pass  # modes that cannot be distinguished: search without a start
     fit = selection.select(fit)
     order = np.argsort(np.abs(fit.poles))
-    ordered = replace(only(data, fit, order), converged=fit.converged, steps=fit.steps)
+    sorted_already = (np.diff(order) == 1).all()
+    ordered = fit if sorted_already else replace(only(data, fit, order), converged=fit.converged, steps=fit.steps)
     return Selected(ordered, statistic_of_each(fit)[order], problem.limit, selection.full)
 
 
@@ -106,19 +114,21 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
     """
     poles = poles[_may_be_mode(data, poles) & (poles.real < data.resolution / (2.0 * np.pi))]
     size = 2 * data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
-    columns = np.hstack([*(np.hstack(data.responses(pole)) for pole in poles), data.fixed])
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    columns = np.empty((len(data.values), poles.size * size + data.fixed.shape[1]), order="F")
+    for r, pole in enumerate(poles):
+        columns[:, r * size : (r + 1) * size] = np.hstack(data.responses(pole))
+    columns[:, poles.size * size :] = data.fixed
+    scale = np.maximum(column_norms(columns), 1e-300)
     together = [data.values] if data.weights is None else np.hsplit(data.values, data.values.shape[1])
     spreads: list[np.ndarray] = []
     coefficients: list[np.ndarray] = []
     variances: list[np.ndarray] = []
     for weights, y in zip(weights_of(data), together, strict=True):
-        weighted = weights * columns / scale
-        gram = weighted.T @ weighted
+        gram = products_of(columns, weights) / np.outer(scale, scale)
         gram[np.diag_indices_from(gram)] *= 1.0 + ORDER.collinear
         spreads.append(np.linalg.inv(gram))
-        coefficients.append(spreads[-1] @ (weighted.T @ y))
-        rss = ((y - weighted @ coefficients[-1]) ** 2).sum(axis=0)
+        coefficients.append(spreads[-1] @ (columns.T @ (weights * y) / scale[:, None]))
+        rss = ((y - weights * (columns @ (coefficients[-1] / scale[:, None]))) ** 2).sum(axis=0)
         variances.append(
             np.maximum(rss / max(len(columns) - columns.shape[1], 1), ORDER.floor**2 * (y**2).mean(axis=0))
         )
@@ -154,13 +164,19 @@ def sure_modes(data: Measurement, start: Fit, false_alarm: float, budget: Budget
 def _rank_one_participation(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
     """Participation factors (n_excitations,) of the rank-one approximation of residues (2 n_excitations, n_outputs).
 
+    That of the strongest response is 1, as `modal_fit` holds it.
+
     Args:
         residues: real parts, then negated imaginary parts.
         norm: (2 n_excitations,) norms of the columns they belong to.
     """
     half = len(residues) // 2
     size = np.maximum(np.hypot(norm[:half], norm[half:]), 1e-300)
-    return np.asarray(np.linalg.svd((residues[:half] - 1j * residues[half:]) * size[:, None])[0][:, 0] / size)
+    direction = np.linalg.svd((residues[:half] - 1j * residues[half:]) * size[:, None])[0][:, 0]
+    participation, held = direction / size, int(np.argmax(np.abs(direction)))
+    participation = participation / participation[held]
+    participation[held] = 1.0
+    return np.asarray(participation)
 
 
 class _Modes:
@@ -169,7 +185,7 @@ class _Modes:
     def __init__(self, data: Measurement, false_alarm: float, budget: Budget) -> None:
         self.data, self.budget = data, budget
         self.excitations = data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
-        self._scored: tuple[Fit, list[tuple[float, np.ndarray, complex]]] | None = None
+        self._scored: tuple[Fit, list[Scored]] | None = None
         self.limit = float(chi2.isf(false_alarm / data.cells, 2 * (data.values.shape[1] + self.excitations)))
 
     def n_modes(self, model: Fit) -> int:
@@ -180,21 +196,62 @@ class _Modes:
 
     def strongest(self, model: Fit, rejected: list[tuple[complex, float]]) -> tuple[complex, np.ndarray] | None:
         if self._scored is None or self._scored[0] is not model:
-            bases, scaled = bases_of(self.data, model), model.residual / model.noise
-            self._scored = (
-                model,
-                [(*_candidate_gain(self.data, bases, scaled, p), p) for p in _candidates(self.data, model)],
-            )
+            clear = None if rejected else self._still_clear(model)
+            if clear is not None:
+                return clear[2], clear[1]
+            poles = _candidates(self.data, model)
+            self._scored = model, [(*gain, pole) for gain, pole in zip(self._gains(model, poles), poles, strict=True)]
         candidates = [item for item in self._scored[1] if not self._is_near(item[2], rejected)]
         if not candidates:
             return None
         strength, participation, pole = max(candidates, key=lambda item: item[0])
         return None if strength < ORDER.enter * self.threshold(model, pole) else (pole, participation)
 
+    def _gains(self, model: Fit, poles: np.ndarray, at_once: int = 8) -> Iterator[tuple[float, np.ndarray]]:
+        """`_candidate_gains`, so many poles at a time: a basis is read from memory once for them all."""
+        bases, scaled = bases_of(self.data, model), model.residual / model.noise
+        for first in range(0, len(poles), at_once):
+            yield from _candidate_gains(self.data, bases, scaled, poles[first : first + at_once])
+
+    def _still_clear(self, model: Fit) -> Scored | None:
+        """The strongest candidate of a smaller model, where its gain in this one is clear; for long records.
+
+        A further mode lowers the gains of candidates, mostly of those near to it. So these are tried in the order of
+        their gains in the smaller model, until the next can no longer exceed the best.
+        """
+        if self._scored is None or len(self.data.values) < MANY_ROWS:
+            return None
+        queue, best = sorted(self._scored[1], key=lambda item: -item[0]), (-np.inf, np.zeros(0), 0j)
+        self._scored = self._scored[0], queue
+        for k, gain in enumerate(self._gains(model, np.array([pole for _, _, pole in queue]), 2)):
+            queue[k] = (*gain, queue[k][2])
+            best = max(best, queue[k], key=lambda item: item[0])
+            if k + 1 < len(queue) and best[0] >= queue[k + 1][0]:
+                break
+        return best if best[0] > SELECTION.weak * self.threshold(model, best[2]) else None
+
     def extended(self, model: Fit, candidate: tuple[complex, np.ndarray]) -> Fit:
-        poles = np.append(model.poles, candidate[0])
-        participation = np.vstack([model.participation, candidate[1]])
-        return search(self.data, poles, participation, model.noise, ORDER.steps, self.budget, ORDER.decided)
+        pole, participation = self._alone(model, *candidate)
+        poles, factors = np.append(model.poles, pole), np.vstack([model.participation, participation])
+        start = projected(self.data, poles, factors)
+        return search(self.data, start, model.noise, ORDER.steps, self.budget, ORDER.decided)
+
+    def _alone(self, model: Fit, pole: complex, participation: np.ndarray) -> tuple[complex, np.ndarray]:
+        """A candidate fitted to the residual of the other modes of a long record, unless it comes near to one of them.
+
+        The steps that a coarse candidate takes to its place cost a fraction of those of all modes together.
+        """
+        if len(self.data.values) < MANY_ROWS:
+            return pole, participation
+        residual = copy(self.data)
+        residual.values = model.residual
+        start = projected(residual, np.array([pole]), participation[None])
+        fit = search(residual, start, model.noise, ORDER.steps, self.budget, ORDER.decided)
+        apart = np.abs(np.append(model.poles, pole) - fit.poles[0])
+        near = ORDER.apart * max(abs(fit.poles[0].real), self.data.resolution)
+        if not fit.converged or apart[-1] > near or (apart[:-1] < near).any():
+            return pole, participation
+        return complex(fit.poles[0]), fit.participation[0]
 
     def gain(self, smaller: Fit, larger: Fit) -> float:
         """Log-likelihood ratio statistic of two fits, the noise of each output a nuisance parameter."""
@@ -293,33 +350,41 @@ def _reaches_nyquist(data: Measurement, poles: np.ndarray) -> np.ndarray:
     return np.asarray(poles.imag > data.nyquist - np.maximum(np.abs(poles.real), data.resolution))
 
 
-def _candidate_gain(
-    data: Measurement, bases: list[np.ndarray], residual: np.ndarray, pole: complex
-) -> tuple[float, np.ndarray]:
-    """Decrease of χ² by one more pole with unconstrained residues, and its best participation factors (rank one).
+def _candidate_gains(
+    data: Measurement, bases: list[np.ndarray], residual: np.ndarray, poles: np.ndarray
+) -> list[tuple[float, np.ndarray]]:
+    """Decrease of χ² by each of some further poles with unconstrained residues, and its best participation factors.
 
-    Only the part of its response orthogonal to the columns of the fit counts.
+    The factors are those of rank one. Only the part of its response orthogonal to the columns of the fit counts.
 
     Args:
         bases: orthonormal columns of the fit, see `bases_of`.
         residual: (n_rows, n_outputs), in units of the noise.
+        poles: (n_poles,), each by itself.
     """
-    real, imaginary = data.responses(pole)
-    columns, strength, blocks = np.hstack([real, imaginary]), 0.0, []
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    columns = np.hstack([part for pole in poles for part in data.responses(pole)])
+    scale = np.maximum(column_norms(columns), 1e-300)
+    each = np.arange(scale.size).reshape(len(poles), -1)
+    strengths, blocks = np.zeros(len(poles)), [list[np.ndarray]() for _ in poles]
     together = [residual] if data.weights is None else np.hsplit(residual, residual.shape[1])
     for weights, basis, output in zip(weights_of(data), bases, together, strict=True):
-        weighted = weights * columns / scale
-        in_basis = basis.T @ weighted
-        eigenvalues, directions = np.linalg.eigh(weighted.T @ weighted - in_basis.T @ in_basis)
-        singular_values = np.sqrt(np.maximum(eigenvalues, 0.0))
-        kept = singular_values > 1e-4 * max(singular_values[-1], 1e-3)
-        whitening = directions[:, kept] / singular_values[kept]
-        amplitudes = whitening.T @ (weighted.T @ output)  # the residual is orthogonal to the basis
-        blocks.append(whitening @ amplitudes / scale[:, None])
-        strength += float((amplitudes**2).sum())
-    residues = np.hstack(blocks)
-    return strength, _rank_one_participation(residues, scale)
+        weighted = columns if len(weights) == 1 else weights * columns
+        in_basis = basis.T @ weighted / scale
+        moments = weighted.T @ output / scale[:, None]  # the residual is orthogonal to the basis
+        for k, at in enumerate(each):
+            own = weighted[:, at[0] : at[-1] + 1]
+            gram = own.T @ own / np.outer(scale[at], scale[at])
+            eigenvalues, directions = np.linalg.eigh(gram - in_basis[:, at].T @ in_basis[:, at])
+            singular_values = np.sqrt(np.maximum(eigenvalues, 0.0))
+            kept = singular_values > 1e-4 * max(singular_values[-1], 1e-3)
+            whitening = directions[:, kept] / singular_values[kept]
+            amplitudes = whitening.T @ moments[at]
+            blocks[k].append(whitening @ amplitudes / scale[at, None])
+            strengths[k] += float((amplitudes**2).sum())
+    return [
+        (float(strength), _rank_one_participation(np.hstack(block), scale[at]))
+        for strength, block, at in zip(strengths, blocks, each, strict=True)
+    ]
 
 
 def bases_of(data: Measurement, fit: Fit) -> list[np.ndarray]:
@@ -339,7 +404,7 @@ def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> 
     each = zip(fit.poles, fit.participation)
     coordinates = [part for pole, l_r in each for part in modal_coordinate(data.responses(pole), l_r)]
     phi = weights * (np.column_stack([*coordinates, data.fixed]) if coordinates else data.fixed)
-    return np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))[0]
+    return orthonormal(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))[0]
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:

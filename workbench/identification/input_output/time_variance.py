@@ -29,6 +29,8 @@ from workbench.identification.input_output.modal_fit import (
     added_misfit,
     columns,
     only,
+    products_of,
+    regressors,
     settled,
 )
 from workbench.identification.input_output.model_order import statistic_of, statistic_of_each
@@ -73,22 +75,21 @@ class Change(NamedTuple):
 def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     """The change of every mode over the records, to first order about a fit of constant modes."""
     n, poles = fit.poles.size, fit.poles
-    phi, t = columns(data, poles, fit.participation)
     slopes = [data.slopes(pole, l_r) for pole, l_r in zip(poles, fit.participation, strict=True)]
-    real, imaginary = (data.modulated(np.column_stack([s[k] for s in slopes]), data.time) for k in (0, 1))
-    basis = np.hstack([phi, t])
-    basis = basis / np.maximum(np.linalg.norm(basis, axis=0), 1e-300)
-    products, right_side = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
-    each = zip(fit.amplitudes, fit.noise, fit.residual.T, strict=True)
-    common_basis = np.linalg.qr(basis)[0] if data.weights is None else None
-    for j, (a, noise, residual) in enumerate(each):
-        weight = 1.0 if data.weights is None else data.weights[:, j : j + 1]
-        q = np.linalg.qr(weight * basis)[0] if common_basis is None else common_basis
-        regressors = weight * np.hstack([a.real * real - a.imag * imaginary, -a.real * imaginary - a.imag * real])
-        regressors = (regressors - q @ (q.T @ regressors)) / noise
-        products += regressors.T @ regressors
-        right_side += regressors.T @ (residual / noise)
-    inverse = scaled_inverse(products)
+    changed = [data.modulated(np.column_stack([s[k] for s in slopes]), data.time) for k in (0, 1)]
+    x = np.hstack([regressors(data, poles, fit.participation), *changed])
+    known = slice(0, x.shape[1] - 2 * n)
+    normal, right_side = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
+    unweighted = products_of(x, np.ones((1, 1))) if data.weights is None else None
+    for j, (a, noise, residual) in enumerate(zip(fit.amplitudes, fit.noise, fit.residual.T, strict=True)):
+        weight = np.ones((1, 1)) if data.weights is None else data.weights[:, j : j + 1]
+        products = products_of(x, weight) if unweighted is None else unweighted
+        real, imaginary = np.diag(a.real), np.diag(a.imag)
+        along = np.vstack([np.zeros((known.stop, 2 * n)), np.block([[real, -imaginary], [-imaginary, -real]])]) / noise
+        along[known] = -scaled_inverse(products[known, known]) @ products[known] @ along  # beside all known columns
+        normal += along.T @ products @ along
+        right_side += along.T @ (x.T @ (weight[:, 0] * residual / noise))
+    inverse = scaled_inverse(normal)
     change, deviation = inverse @ right_side, np.sqrt(np.diag(inverse))
     omega, span = np.abs(poles), 2.0 * np.pi / data.resolution
     size, error = np.abs(change[n:]), deviation[n:]
