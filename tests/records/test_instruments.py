@@ -133,7 +133,7 @@ def test_labview_text_that_is_no_record(tmp_path, over, start, words):
 
 
 def test_what_was_changed_is_remarked(tmp_path):
-    record = read(tmp_path, "t,a [g],b [m],c [counts],d (left)\n0,1,1,1,1\n1,2,2,2,2\n")
+    record = read(tmp_path, "t [s],a [g],b [m],c [counts],d (left)\n0,1,1,1,1\n1,2,2,2,2\n")
     assert record.remarks[0] == "a: g taken as 9.80665 m/s^2"
     assert record.remarks[1].startswith("c: in counts") and len(record.remarks) == 2
     assert record.output_names == ("a", "b", "c", "d (left)")
@@ -151,14 +151,14 @@ def test_uneven_steps_are_resampled(tmp_path):
     """Against the function itself at the new instants."""
     steps = 0.01 * (1.0 + 0.2 * np.random.default_rng(0).uniform(-1.0, 1.0, 400))
     times = np.cumsum(steps)
-    record = read(tmp_path, "t,a\n" + "".join(f"{t!r},{float(np.sin(3 * t))!r}\n" for t in map(float, times)))
+    record = read(tmp_path, "t [s],a\n" + "".join(f"{t!r},{float(np.sin(3 * t))!r}\n" for t in map(float, times)))
     np.testing.assert_allclose(record.outputs[0], np.sin(3 * record.time), atol=1e-7)
     assert record.time[[0, -1]] == pytest.approx(times[[0, -1]]) and "resampled" in record.remarks[0]
 
 
 def test_rounded_times_are_no_uneven_ones(tmp_path):
     """1,024 Hz, written in milliseconds: the signal stays as it is."""
-    record = read(tmp_path, "t,a\n" + "".join(f"{k / 1024:.3f},{k % 7}\n" for k in range(2000)))
+    record = read(tmp_path, "t [s],a\n" + "".join(f"{k / 1024:.3f},{k % 7}\n" for k in range(2000)))
     assert record.sample_rate_hz == pytest.approx(1024.0, rel=1e-4)
     np.testing.assert_array_equal(record.outputs[0], np.arange(2000) % 7)
     assert "rounded" in record.remarks[0]

@@ -75,8 +75,8 @@ def identify(
             read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz, seconds=seconds, progress=report
         )
     as_read = dict.fromkeys(remark for measured in read for remark in getattr(measured, "remarks", ()))
-    lines = [by_options(line) for line in found.lines]
-    found = replace(found, lines=(*lines, *(f"as read: {remark}" for remark in as_read)))
+    lines = (*found.lines, *(f"as read: {remark}" for remark in as_read))
+    found = replace(found, lines=tuple(map(by_options, lines)))
     say(found.heading, bold=True)
     show_table(HEADINGS, found.rows, right=[heading for heading in HEADINGS if "[" in heading])
     for line in found.lines:

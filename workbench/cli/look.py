@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.terminal import as_typed, guarded, names_in, say, short, show_table
+from workbench.cli.terminal import as_typed, by_options, guarded, names_in, say, short, show_table
 
 
 @guarded
@@ -33,7 +33,7 @@ def look(
     say(seen.heading, bold=True)
     show_table(HEADINGS, seen.rows, right=HEADINGS[2:])
     for remark in seen.remarks:
-        say(f"  {remark}")
+        say(f"  {by_options(remark)}")
     say(f"  page     {short(write_page(page or Path('out') / f'{file.stem}.html', shown))}")
     command = seen.command + (f" --sample-rate-hz {sample_rate_hz:g}" if sample_rate_hz else "")
     say(f"  go on    {command}")

@@ -10,15 +10,17 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from datetime import datetime
+from functools import partial
 from io import TextIOWrapper
-from itertools import zip_longest
+from itertools import islice, zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from workbench.records.assembly import Signals
+from workbench.records.instants import in_seconds
 from workbench.records.limits import DEFAULT, Deadline, Limits, RecordFileError, check_counts
-from workbench.records.named_arrays import Signals
 from workbench.records.table_layout import (
     LONGEST_LINE,
     MARK,
@@ -41,7 +43,7 @@ DATES = ("%d.%m.%Y", "%Y/%m/%d")  # beside ISO's, which numpy reads
 
 
 def read(path: Path, limits: Limits = DEFAULT) -> Signals:
-    """(time or None, signals by name, header text or None), with units in brackets after the names.
+    """The signals of a table, with units in brackets after the names.
 
     Raises:
         RecordFileError: rows that do not fit the names, or more than the limits allow.
@@ -57,27 +59,26 @@ def read(path: Path, limits: Limits = DEFAULT) -> Signals:
         for name, unit in zip_longest(layout.names, layout.units)
     ]
     signals = dict(zip(names, columns[layout.stamped :]))
+    contents = Signals(None, signals, layout.header, row_of=partial(_row_in_file, path, layout))
     if layout.stamped:
-        return columns[0], signals, layout.header
+        return contents._replace(time=columns[0])
     if layout.sampling is not None:
         start, step = layout.sampling
-        return start + step * np.arange(columns[0].size), signals, layout.header
+        return contents._replace(time=start + step * np.arange(columns[0].size))
     first, *others = signals
     if first.lower() in COUNTERS and others and time_factor(others[0]) is not None:
         first = others[0]
-    factor = time_factor(first)
-    if factor is None:
-        return None, signals, layout.header
-    time = signals.pop(first)
-    time = time if factor == 1.0 else factor * time
+    if time_factor(first) is None:
+        return contents
+    time, remarks = in_seconds(first, signals.pop(first))
     for name in [name for name in signals if time_base(name) == time_base(first)]:
         # some programs write a time column for each channel, which must all be equal
-        if not np.allclose((time_factor(name) or 1.0) * signals.pop(name), time, rtol=1e-9, atol=SAME * np.ptp(time)):
+        if not np.allclose(in_seconds(name, signals.pop(name))[0], time, rtol=1e-9, atol=SAME * np.ptp(time)):
             raise RecordFileError(
                 f"{path}: channels have different sample instants, {first!r} and {name!r}; export them with one rate"
                 " and start"
             )
-    return time, signals, layout.header
+    return contents._replace(time=time, remarks=() if layout.header else remarks)
 
 
 def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
@@ -154,6 +155,15 @@ def _row_by_row(path: Path, layout: Layout, number: int, block: str) -> Iterator
         check_length(path, row, line)
         if line and not line.isspace() and not line.startswith("#"):
             yield check_row(path, layout, row, line)
+
+
+def _row_in_file(path: Path, layout: Layout, sample: int) -> int:
+    """The number of the line of the file with a sample, which a message names; blank lines and comments count too."""
+    assert layout.first is not None
+    with path.open(encoding=encoding_of(path), newline=None) as file:
+        lines = islice(enumerate(file, 1), layout.first[0] - 1, None)
+        rows = (number for number, line in lines if not line.isspace() and not line.startswith("#"))
+        return next(islice(rows, sample, None))
 
 
 class _Clock:

@@ -51,5 +51,5 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     lengths = {values.size for values in found.values()}
     if sampling and len(lengths) == 1:
         ((start, step),) = sampling
-        return {"t": start + step * np.arange(lengths.pop()), **found}
+        return {"t [s]": start + step * np.arange(lengths.pop()), **found}
     return found
