@@ -66,8 +66,12 @@ def complain(fault: str) -> None:
 
 
 def by_options(text: str) -> str:
-    """The text with arguments in backquotes, such as `seconds`, replaced by options."""
-    return re.sub(r"`(\w+)`", lambda named: "--" + named[1].replace("_", "-"), text)
+    """The text with arguments in backquotes, such as `seconds`, and with values, such as name='x', as options."""
+    return re.sub(
+        r"`(\w+)`|\b(\w+)='([\w-]+)'",
+        lambda named: "--" + (named[1] or named[2]).replace("_", "-") + (f" {named[3]}" if named[3] else ""),
+        text,
+    )
 
 
 def say(text: str, *, bold: bool = False) -> None:
