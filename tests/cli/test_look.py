@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import firwin, lfilter
 
-from workbench.cli.terminal import by_options
+from workbench.cli.terminal import by_options, names_in
 
 RATE, N = 1000.0, 4000
 OMEGA, ZETA = 2.0 * np.pi * 40.0, 0.01
@@ -152,3 +152,16 @@ def test_a_short_clean_decay_is_no_random_vibration(run, tmp_path, seconds):
     path = write(tmp_path / "short.csv", ["t [s]", "a1", "a2"], [time, *moves])
     told = run("look", path, "--page", tmp_path / "p.html").output
     assert "go on    workbench identify" in told and "--ambient" not in told
+
+
+def test_names_with_commas_are_offered_in_quotes_that_are_understood(run, tmp_path):
+    time, tip = decay(np.random.default_rng(0))
+    path = tmp_path / "comma.csv"
+    rows = "".join(f"{t:.3f},{y:.6g},{2 * y + 0.01 * (k % 7):.6g},{k}\n" for k, (t, y) in enumerate(zip(time, tip)))
+    path.write_text('t [s],"Acc 1, root [g]","5"" tip, Acc 2 [g]",n\n' + rows)
+    told = run("look", path, "--page", tmp_path / "p.html").output
+    words = shlex.split(told.split("go on")[1])
+    assert names_in(words[-1]) == ("Acc 1, root", '5" tip, Acc 2')
+    found = run(*words[1:])
+    assert found.exit_code == 0 and "2 sensors" in found.output
+    assert names_in("a, b,,c ") == ("a", "b", "c")

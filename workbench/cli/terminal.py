@@ -1,5 +1,6 @@
 """Output, progress bar and exit codes of the commands."""
 
+import csv
 import json
 import re
 import shlex
@@ -174,5 +175,6 @@ def as_typed() -> str:
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """The names of a text, separated by commas."""
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+    """The names of a text, separated by commas; a name that holds one stands in double quotes, as in CSV."""
+    fields = next(csv.reader([text], skipinitialspace=True), [])
+    return tuple(name.strip() for name in fields if name.strip())

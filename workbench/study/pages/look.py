@@ -1,5 +1,7 @@
 """The report of `workbench look` on a measured file: channels, levels, spectra, faults, and the next command."""
 
+import csv
+import io
 import re
 import shlex
 from collections.abc import Sequence
@@ -82,7 +84,7 @@ def _record(record: Record, path: Path) -> Look:
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
     if unstated:
         remarks.append(f"the file states no quantity for {', '.join(unstated)}: their units are as recorded")
-    options = ["--inputs", ",".join(forces or record.input_names)] if forces or inputs else []
+    options = ["--inputs", _listed(forces or record.input_names)] if forces or inputs else []
     if forces:
         remarks.append(f"{', '.join(forces)}: taken as input by name or unit; leave --inputs out if this is wrong")
     if not options:
@@ -94,7 +96,7 @@ def _record(record: Record, path: Path) -> Look:
     if forces and kept and _is_band_limited(record):
         options += ["--input-hold", "band-limited"]
     if faulty and kept:
-        options += ["--outputs", ",".join(kept)]
+        options += ["--outputs", _listed(kept)]
     moving = (
         record.select_outputs([name for name in record.output_names if name not in faulty])
         if kept or forces
@@ -190,6 +192,13 @@ def _is_band_limited(record: Record) -> bool:
     # of the whole record: windows would hide a blow at its beginning
     powers = (np.abs(rfft(row - row.mean())) ** 2 for row in record.inputs)
     return all(power[-(power.size // 10 + 1) :].mean() < ABOVE * power.mean() for power in powers)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names for an option, separated by commas; one that holds a comma in double quotes."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="").writerow(names)
+    return text.getvalue()
 
 
 def _command(path: Path, options: Sequence[str]) -> str:
