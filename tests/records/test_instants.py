@@ -119,3 +119,9 @@ def test_a_row_is_that_of_the_file(tmp_path):
         (tmp_path / "x.csv").write_text("\n".join(lines) + "\n")
         with pytest.raises(RecordFileError, match=words):
             read_record(tmp_path / "x.csv")
+
+
+def test_an_axis_of_unknown_name_is_no_reason_to_state_a_rate(tmp_path):
+    """A rate beside it would make a signal of the clock, or a record of transfer functions."""
+    with pytest.raises(RecordFileError, match=r"unless 'Speed', which rises all along, is one: call it time \[s\]"):
+        read(tmp_path, [f"{t:.3f}" for t in EVEN], name="Speed")

@@ -135,8 +135,8 @@ def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int)
 
 
 TURNED = (
-    "the impulse responses come before the impulse, as in transfer functions for e^(-iωt): their complex conjugates were"
-    " identified"
+    "the impulse responses come before the impulse, as in transfer functions for e^(-iωt): their complex conjugates"
+    " were identified"
 )
 
 
@@ -161,7 +161,8 @@ def identify_transfer(
 
     Args:
         transfer: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
-            input, for e^(iωt), or, which is recognised at even lines and remarked, for e^(-iωt); of receptance, mobility or accelerance by the quantity of each channel.
+            input, for e^(iωt); those for e^(-iωt) are recognised at evenly spaced lines, and remarked. Receptance,
+            mobility or accelerance by the quantity of each channel.
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
         channels: one per output; where no quantity is stated, the residual terms are those of any motion.
         band_hz: lowest and highest line to fit; modes outside the band are represented by residual terms.

@@ -236,7 +236,10 @@ def _sampling(path: Path, contents: Signals, described: Description, sample_rate
         raise RecordFileError(f"{path}: sample_rate_hz must be positive; got {sample_rate_hz}")
     if time is None:
         if sample_rate_hz is None:
-            raise RecordFileError(f"{path} has no sample instants; give sample_rate_hz")
+            name, first = next(iter(contents.signals.items()))
+            axis = (np.diff(first) > 0).all()
+            which = f", unless {_name(name)!r}, which rises all along, is one: call it time [s] or frequency [Hz]"
+            raise RecordFileError(f"{path} has no sample instants; give sample_rate_hz{which if axis else ''}")
         return Sampling(0.0, 1.0 / sample_rate_hz)
     if not np.isfinite(time).all():
         raise RecordFileError(f"{path}, time, row {contents.row_of(int(np.argmax(~np.isfinite(time))))}: not a number")

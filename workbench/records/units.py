@@ -29,7 +29,7 @@ BY_QUANTITY: dict[str, tuple[str, dict[str, float]]] = {
     "time": ("s", {"s": 1, "sec": 1, "secs": 1, "second": 1, "seconds": 1, "ms": 1e-3, "msec": 1e-3, "us": 1e-6,
                    "usec": 1e-6, "ns": 1e-9, "min": 60, "h": 3600, "Sekunde": 1, "Sekunden": 1, "Millisekunden": 1e-3,
                    "seconde": 1, "secondes": 1, "segundos": 1}),
-    "frequency": ("Hz", {"Hz": 1, "hz": 1, "HZ": 1, "kHz": 1e3, "MHz": 1e6}),
+    "frequency": ("Hz", {"Hz": 1, "hz": 1, "HZ": 1, "kHz": 1e3, "MHz": 1e6, "CPM": 1 / 60, "cpm": 1 / 60}),
     "displacement": ("m", {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "micron": 1e-6, "microns": 1e-6, "nm": 1e-9,
                            "in": INCH, "inch": INCH, "mil": 1e-3 * INCH, "mils": 1e-3 * INCH, "ft": 12 * INCH}),
     "velocity": ("m/s", {"m/s": 1, "cm/s": 1e-2, "mm/s": 1e-3, "um/s": 1e-6, "nm/s": 1e-9, "in/s": INCH, "ips": INCH}),
@@ -61,7 +61,7 @@ SPELLINGS = (
 )  # fmt: skip
 SI_NAME = re.compile(r"\b(m|kg|s|N|Hz|J)(?![^\W²³])")
 POWERS = re.compile(r"(/?)\s*([A-Za-z]+)(?:\^(\d))?")
-BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*([^()]*(?:\(s\^2\))?[^()]*)\))")
+BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*((?:[^()]++|\([^()]*+\))*+)\))")
 AFTER_SLASH = re.compile(r"(.*\S)\s+(?:/|in)\s+(\S.*)")  # axis labels of DIN and ISO
 TIME = {"t", "time", "zeit", "temps", "tiempo", "x_value", "timestamp", "time stamp", "elapsed time", "relative time"}
 # names of Arduino's clocks, and units that stand alone
