@@ -206,6 +206,17 @@ def test_lines_in_any_unit(tmp_path, first, factor):
     assert found.output_channels[0].quantity == "acceleration" and found.remarks == ("Coherence: left out",)
 
 
+@pytest.mark.parametrize("form", ["{0.real!r}{0.imag:+}i", "{0!r}"])
+def test_a_table_of_complex_numbers(tmp_path, form):
+    """As MATLAB and Python write them."""
+    rows = [f"{f!r}," + ",".join(form.format(complex(h)) for h in both)
+            for f, both in zip(LINES.tolist(), SPECTRA[:2, 0].T)]  # fmt: skip
+    (tmp_path / "x.csv").write_text("\n".join(["f,a [g/N],b", *rows]) + "\n")
+    found = read_measured(tmp_path / "x.csv")
+    np.testing.assert_allclose(found.values[:, 0] / [[9.80665], [1.0]], SPECTRA[:2, 0], rtol=1e-12)
+    assert found.output_names == ("a", "b") and found.output_channels[0].unit == "m/s^2"
+
+
 @pytest.mark.parametrize(("unit", "degrees"), [("", True), ("", False), (" [rad]", False)])
 def test_phases_beyond_a_turn_are_degrees_unless_a_unit_is_told(tmp_path, unit, degrees):
     h = SPECTRA[0, 0]

@@ -63,9 +63,16 @@ SI_NAME = re.compile(r"\b(m|kg|s|N|Hz|J)(?![^\W²³])")
 POWERS = re.compile(r"(/?)\s*([A-Za-z]+)(?:\^(\d))?")
 BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*((?:[^()]++|\([^()]*+\))*+)\))")
 AFTER_SLASH = re.compile(r"(.*\S)\s+(?:/|in)\s+(\S.*)")  # axis labels of DIN and ISO
-TIME = {"t", "time", "zeit", "temps", "tiempo", "x_value", "timestamp", "time stamp", "elapsed time", "relative time"}
-# names of Arduino's clocks, and units that stand alone
-TIME_AS_UNIT = {"millis": "ms", "micros": "us", "milliseconds": "ms", "microseconds": "us", "seconds": "s"}
+TIME = {"t", "time", "zeit", "temps", "tiempo", "x-axis", "timestamp", "time stamp", "elapsed time", "relative time"}
+# the clocks of Arduino, the instants of LabVIEW, and units that stand alone
+TIME_AS_UNIT = {
+    "x_value": "s",
+    "millis": "ms",
+    "micros": "us",
+    "milliseconds": "ms",
+    "microseconds": "us",
+    "seconds": "s",
+}
 TIME_UNDERSCORE = re.compile(r"(t|time)_(s|sec|ms|us)", re.IGNORECASE)
 NUMBERED = re.compile(r"(\S\D*?\S)\s+\d+\b.*")  # one time of several, as catman's `Time 1 - default sample rate`
 
