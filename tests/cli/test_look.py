@@ -165,3 +165,11 @@ def test_names_with_commas_are_offered_in_quotes_that_are_understood(run, tmp_pa
     found = run(*words[1:])
     assert found.exit_code == 0 and "2 sensors" in found.output
     assert names_in("a, b,,c ") == ("a", "b", "c")
+
+
+def test_an_acceleration_to_the_north_is_no_input(run, tmp_path):
+    time, tip = decay(np.random.default_rng(0))
+    path = write(tmp_path / "north.csv", ["t [s]", "Acc (N)", "Acc (E)"], [time, tip, np.roll(tip, 7)])
+    told = run("look", path, "--page", tmp_path / "p.html").output
+    assert "Acc: motions by name and forces by unit, so no inputs; does N mean north?" in told
+    assert "--inputs" not in told

@@ -24,6 +24,7 @@ from workbench.study.pages.page import PageContent, block
 
 HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strongest at [Hz]")
 FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)
+MOTIONS = re.compile(r"acc|beschl|vib|disp|veloc|geschw|(^|[^a-z])weg", re.IGNORECASE)
 PEAKS = 4  # per channel
 PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of 1/8 of all lines around the peak
 ABOVE = 1e-3  # of the mean power of an input: the power in the last tenth below Nyquist, behind an anti-alias filter
@@ -60,7 +61,9 @@ def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
 def _record(record: Record, path: Path) -> Look:
     faults = [fault for fault in data_faults(record) if not fault.inputs]
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
+    doubtful = [c.name for c in record.output_channels if c.quantity == "force" and _is_motion(c.name)]
     applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
+    applied -= set(doubtful)
     forces = [] if record.n_inputs else [name for name in record.output_names if name in applied]
     # constant stretches are no fault of a force: it may be zero for long, or held from sample to sample
     faults = [fault for fault in faults if fault.outputs[-1] not in forces]
@@ -79,6 +82,8 @@ def _record(record: Record, path: Path) -> Look:
         f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
     )
     remarks = [*record.remarks, *_messages([*faults, *input_faults(record)])]
+    if doubtful:
+        remarks.append(f"{', '.join(doubtful)}: motions by name and forces by unit, so no inputs; does N mean north?")
     if len(channels) > MOST_ROWS:
         remarks.append(f"the first {MOST_ROWS} of {len(channels)} channels are shown")
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
@@ -180,6 +185,11 @@ def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:
     peaks = peaks[power[peaks] > PROMINENT * about[peaks]]
     best = peaks[np.argsort(-power[peaks])[:PEAKS]]
     return sorted(float(lines[i]) for i in best)
+
+
+def _is_motion(name: str) -> bool:
+    """Whether the name of a channel is that of a motion."""
+    return bool(MOTIONS.search(name)) and not FORCES.search(name)
 
 
 def _is_band_limited(record: Record) -> bool:
