@@ -14,7 +14,9 @@ from workbench.cli.terminal import as_typed, by_options, guarded, names_in, say,
 def look(
     file: Annotated[Path, typer.Argument(help="Measured file: .csv, .txt, .npz, .mat, .h5, .uff, ...")],
     sample_rate_hz: options.SampleRate = None,
-    inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="Channels that are inputs.")] = "",
+    inputs: Annotated[
+        str, typer.Option(metavar="NAME,NAME", help='Channels that are inputs; "A, B" where a name holds a comma.')
+    ] = "",
     memory: options.Memory = 1.0,
     page: options.PagePath = None,
 ) -> None:
