@@ -4,6 +4,9 @@ import shlex
 
 import numpy as np
 import pytest
+from scipy.signal import firwin, lfilter
+
+from workbench.cli.terminal import by_options, names_in
 
 RATE, N = 1000.0, 4000
 OMEGA, ZETA = 2.0 * np.pi * 40.0, 0.01
@@ -78,7 +81,7 @@ def test_a_clipped_blow_and_an_output_of_no_unit_are_said_before_modes_are(run, 
     struck = write(tmp_path / "struck.csv", ["t", "force (N)", "a1 [m]", "a2"], [time, blow, *outputs])
     told = " ".join(run("look", struck, "--page", tmp_path / "p.html").output.split())
     assert "input 'force' is clipped at 5, 7 samples" in told and "'a2' states no quantity" in told
-    assert "--inputs force --outputs a1" in told
+    assert "--inputs force --input-hold band-limited --outputs a1" in told
     found = run("identify", struck, "--inputs", "force", "--outputs", "a1")
     assert found.exit_code == 0 and "input 'force' is clipped at 5, 7 samples" in " ".join(found.output.split())
     refused = run("identify", struck, "--inputs", "force")
@@ -119,3 +122,54 @@ def test_of_many_faults_of_a_kind_the_first_and_their_number_are_said(run, tmp_p
     columns = [*decay(np.random.default_rng(0)), *np.ones((30, N))]
     seen = run("look", write(tmp_path / "many.csv", names, columns), "--page", tmp_path / "p.html")
     assert seen.output.count("the sensor is dead") == 24 and "6 more channels are dead" in seen.output
+
+
+@pytest.mark.parametrize(("cut", "hold"), [(400.0, " --input-hold band-limited"), (None, "")])
+def test_a_force_behind_an_anti_alias_filter_is_offered_as_band_limited(run, tmp_path, cut, hold):
+    """Filtered at 20 times the rate by SciPy; as it would be held, `identify` calls it wrong."""
+    fine = np.arange(20 * N) / (20 * RATE)
+    blow = np.where(fine < 0.002, 100.0 * np.sin(np.pi * fine / 0.002).clip(0.0), 0.0)
+    if cut:
+        blow = lfilter(firwin(801, cut, fs=20 * RATE, window=("kaiser", 8.0)), 1.0, blow)
+    force = blow[::20] + 0.01 * np.random.default_rng(0).normal(size=N)
+    path = write(tmp_path / "struck.csv", ["t [s]", "hammer [N]", "tip [m]"], [fine[::20], force, np.cumsum(force)])
+    told = run("look", path, "--page", tmp_path / "p.html").output
+    assert told.split("--inputs hammer")[1].rstrip() == hold
+
+
+def test_a_remark_on_an_argument_names_the_option():
+    told = by_options("not as input_hold='zero' says; give input_hold='band-limited' or more `seconds`")
+    assert told == "not as --input-hold zero says; give --input-hold band-limited or more --seconds"
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.0])
+def test_a_short_clean_decay_is_no_random_vibration(run, tmp_path, seconds):
+    """Its level rises from one tenth of it to the next, as each holds a period of the slowest mode."""
+    time = np.arange(0.0, seconds, 1 / RATE)
+    modes = [np.exp(-z * w * time) * np.sin(w * time + 0.3) for w, z in ((75.4, 0.008), (472.5, 0.006), (1323, 0.005))]
+    moves = np.array([[1.0, 0.8, 0.5], [2.0, -1.0, 1.0]]) @ modes
+    moves += 1e-3 * np.random.default_rng(0).normal(size=moves.shape)
+    path = write(tmp_path / "short.csv", ["t [s]", "a1", "a2"], [time, *moves])
+    told = run("look", path, "--page", tmp_path / "p.html").output
+    assert "go on    workbench identify" in told and "--ambient" not in told
+
+
+def test_names_with_commas_are_offered_in_quotes_that_are_understood(run, tmp_path):
+    time, tip = decay(np.random.default_rng(0))
+    path = tmp_path / "comma.csv"
+    rows = "".join(f"{t:.3f},{y:.6g},{2 * y + 0.01 * (k % 7):.6g},{k}\n" for k, (t, y) in enumerate(zip(time, tip)))
+    path.write_text('t [s],"Acc 1, root [g]","5"" tip, Acc 2 [g]",n\n' + rows)
+    told = run("look", path, "--page", tmp_path / "p.html").output
+    words = shlex.split(told.split("go on")[1])
+    assert names_in(words[-1]) == ("Acc 1, root", '5" tip, Acc 2')
+    found = run(*words[1:])
+    assert found.exit_code == 0 and "2 sensors" in found.output
+    assert names_in("a, b,,c ") == ("a", "b", "c")
+
+
+def test_an_acceleration_to_the_north_is_no_input(run, tmp_path):
+    time, tip = decay(np.random.default_rng(0))
+    path = write(tmp_path / "north.csv", ["t [s]", "Acc (N)", "Acc (E)"], [time, tip, np.roll(tip, 7)])
+    told = run("look", path, "--page", tmp_path / "p.html").output
+    assert "Acc: motions by name and forces by unit, so no inputs; does N mean north?" in told
+    assert "--inputs" not in told

@@ -79,6 +79,7 @@ def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
     assert refused.exit_code == 2 and "workbench diagnose CASE --json plain.json" in refused.output
     none = run("redesign", folder, "--verdict", tmp_path / "none.json")
     assert none.exit_code == 2 and "workbench diagnose CASE --json none.json" in none.output
+    assert "there is no such file" in none.output and "not a verdict" not in none.output
     told = json.loads(verdict.read_text())
     told["posterior"]["nominal"]["frequencies_hz"][1] *= 1.001
     plain.write_text(json.dumps(told))

@@ -204,11 +204,16 @@ def transfer_functions(noise):
     return h, lines, {"channels": tuple(Channel(f"a{j}", "acceleration", at=j / 4) for j in range(4))}
 
 
-def test_transfer_functions_of_the_other_sign_are_remarked():
+@pytest.mark.parametrize("outputs", [slice(None), slice(3, 4)])
+def test_transfer_functions_of_the_other_sign_are_turned_with_a_remark(outputs):
+    """Of one output alone, no mode rose above the noise."""
     h, lines, channels = transfer_functions(0.01)
-    assert not identify_transfer(h, lines, **channels).remarks
-    (remark, *_) = identify_transfer(h.conj(), lines, **channels).remarks
-    assert "complex conjugates" in remark
+    h, channels = h[outputs], {"channels": channels["channels"][outputs]}
+    found, turned = (identify_transfer(values, lines, **channels) for values in (h, h.conj()))
+    assert not found.remarks and "complex conjugates" in turned.remarks[0]
+    np.testing.assert_allclose(turned.modes.frequencies_hz, found.modes.frequencies_hz, rtol=1e-12)
+    np.testing.assert_allclose(found.modes.frequencies_hz, HZ, rtol=1e-3)
+    np.testing.assert_allclose(turned.fitted, found.fitted.conj(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])

@@ -75,7 +75,7 @@ def test_a_plain_csv_of_another_program(tmp_path):
     [
         ("", "empty"),
         ("time,a\n0,1\n1,x\n", "channel 'a', row 3"),
-        ("time,a\n0,1\n1,nan\n2,2\n", "channel 'a', row 2"),
+        ("time,a\n0,1\n1,nan\n2,2\n", "channel 'a', row 3"),
         ("time,a\n0,1\n1,2,3\n", "row 3 has 3 fields"),
         ("time,a\n0,1\n1,2\n5,3\n", "not uniformly sampled"),
         ("0,1\n1,2\n", "header"),

@@ -88,6 +88,25 @@ def read(tmp_path, text, encoding="utf-8", ending=".csv", **options):
         pytest.param("Sample,Time (us),V (mm/s)\n1,0,1\n2,500,3\n3,1000,2\n", "utf-8", 5e-4,
                      {"Sample": ("", ""), "V": ("velocity", "m/s")}, [[1, 2, 3], [1e-3, 3e-3, 2e-3]],
                      id="time behind the numbers of the samples"),
+        pytest.param("Time,1,2\n0,1,2\n0.5,3,4\n", "utf-8", 0.5, {"1": ("", ""), "2": ("", "")}, [[1, 3], [2, 4]],
+                     id="channels by their numbers"),
+        pytest.param("x-axis,1,2\nsecond,Volt,Volt\n-1E+0,1,2\n0,3,4\n", "utf-8", 1.0,
+                     {"1": ("voltage", "V"), "2": ("voltage", "V")}, [[1, 3], [2, 4]],
+                     id="channels by their numbers above their units"),
+        pytest.param(",t,a\n0,1,1\n1,2,2\n2,3,5\n", "utf-8", 1.0, {"a": ("", "")}, [[1, 2, 5]],
+                     id="an index without a name"),
+        pytest.param(" t a\n 0.0D+00 1.5D+00\n 1.0D-01 -2.5D-1\n", "utf-8", 0.1, {"a": ("", "")}, [[1.5, -0.25]],
+                     id="exponents of Fortran"),
+        pytest.param("t,a\n05/03/2024 11:59:59.50 PM,1\n05/04/2024 12:00:00.00 AM,2\n05/04/2024 12:00:00.5 AM,3\n",
+                     "utf-8", 0.5, {"a": ("", "")}, [[1, 2, 3]], id="twelve hours"),
+        pytest.param("t;a\n03/05/2024 23:59:59,5;1\n04/05/2024 00:00:00,0;2\n", "utf-8", 0.5, {"a": ("", "")},
+                     [[1, 2]], id="days before months"),
+        pytest.param("t,a\n2024-10-27T02:59:59.5+02:00,1\n2024-10-27T02:00:00.0+01:00,2\n", "utf-8", 0.5,
+                     {"a": ("", "")}, [[1, 2]], id="the end of summer time"),
+        pytest.param("time [s]\ta [g]\n0\t1\n1\t2\n", "utf-16-le", 1.0, {"a": ("acceleration", "m/s^2")},
+                     [[G, 2 * G]], id="utf-16 without a mark"),
+        pytest.param("Zeit;a\nSekunden;g\n0;1\n1;2\n", "utf-8", 1.0, {"a": ("acceleration", "m/s^2")}, [[G, 2 * G]],
+                     id="seconds in German"),
     ],
 )  # fmt: skip
 def test_a_table_in_any_layout(tmp_path, text, encoding, step, channels, values):
@@ -95,6 +114,30 @@ def test_a_table_in_any_layout(tmp_path, text, encoding, step, channels, values)
     assert record.sample_time == pytest.approx(step, rel=1e-9)
     assert {c.name: (c.quantity, c.unit) for c in record.output_channels} == channels
     np.testing.assert_allclose(record.outputs, values, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t,marker,a\n" + "".join(f"{k},,1\n" for k in range(1200)), "in row 2 a field is empty; leave that column"),
+        ("t,a\n" + "".join(f"{k},x{k}\n" for k in range(1200)), "in row 2 'x0' is no number"),
+        (",t,a\n0,1,1\n5,2,2\n", "its first column has no name"),
+        ("t,a\n03/05/2024 11:00:00,1\n04/05/2024 11:00:01,2\n", "do not say which number is the month"),
+        ("t;a\n0,5;1,5\n1,5;-24\u202f603,5\n", "'-24.u202f603,5' is not a number .* without thousands separators"),
+    ],
+)
+def test_the_cause_is_said_where_a_table_cannot_be_read(tmp_path, text, words):
+    with pytest.raises(RecordFileError, match=words):
+        read(tmp_path, text)
+
+
+@pytest.mark.parametrize("dated", [False, True])
+def test_times_of_day_pass_many_midnights_in_many_blocks(tmp_path, monkeypatch, dated):
+    monkeypatch.setattr(csv_file, "BLOCK", 100)
+    hours = range(0, 24 * 5, 3)
+    stamps = [f"{f'0{h // 24 + 1}/05/2024 ' if dated else ''}{h % 24:02d}:00:00" for h in hours]
+    record = read(tmp_path, "time,a\n" + "".join(f"{stamp},1\n" for stamp in stamps))
+    assert record.sample_time == pytest.approx(3 * 3600.0) and record.n_samples == len(hours)
 
 
 LABVIEW = (
@@ -111,13 +154,16 @@ LABVIEW = (
         ("One", "X_Value\tA\tB\tComment\n0.50\t1\t3\tsegment 1\n0.75\t2\t4\n"),
         ("One", "X_Value\tA\tB\tComment\n0.50\t1\t3\n0.75\t2\t4\t2.5\n"),
         ("No", "X_Value\tA\tB\tComment\n\t1\t3\tsegment 1\n\t2\t4\n"),
+        ("No, without tabs behind the lines", "X_Value\tA\tB\n\t1\t3\n\t2\t4\n"),
         ("Multi", "X_Value\tA\tX_Value\tB\tComment\n0.50\t1\t0.50\t3\n0.75\t2\t0.75\t4\n"),
     ],
 )
 def test_labview_text(tmp_path, columns, table):
     """As its format is specified: the unit of each channel in the header, texts in a column of their own, and
     instants beside the first channel, beside each, or as a start and a step in the header alone."""
-    record = read(tmp_path, LABVIEW.format(columns, "Time", "Time", 0.5) + table, ending=".lvm")
+    columns, bare, _ = columns.partition(", without")
+    header = LABVIEW.format(columns, "Time", "Time", 0.5)
+    record = read(tmp_path, (header.replace("\t\n", "\n") if bare else header) + table, ending=".lvm")
     assert (record.sample_time, record.start_time) == (0.25, 0.5)
     assert [(c.name, c.unit) for c in record.output_channels] == [("A", "m/s^2"), ("B", "m")]
     np.testing.assert_allclose(record.outputs, [[G, 2 * G], [3e-3, 4e-3]], rtol=1e-12)
@@ -133,7 +179,7 @@ def test_labview_text_that_is_no_record(tmp_path, over, start, words):
 
 
 def test_what_was_changed_is_remarked(tmp_path):
-    record = read(tmp_path, "t,a [g],b [m],c [counts],d (left)\n0,1,1,1,1\n1,2,2,2,2\n")
+    record = read(tmp_path, "t [s],a [g],b [m],c [counts],d (left)\n0,1,1,1,1\n1,2,2,2,2\n")
     assert record.remarks[0] == "a: g taken as 9.80665 m/s^2"
     assert record.remarks[1].startswith("c: in counts") and len(record.remarks) == 2
     assert record.output_names == ("a", "b", "c", "d (left)")
@@ -151,14 +197,14 @@ def test_uneven_steps_are_resampled(tmp_path):
     """Against the function itself at the new instants."""
     steps = 0.01 * (1.0 + 0.2 * np.random.default_rng(0).uniform(-1.0, 1.0, 400))
     times = np.cumsum(steps)
-    record = read(tmp_path, "t,a\n" + "".join(f"{t!r},{float(np.sin(3 * t))!r}\n" for t in map(float, times)))
+    record = read(tmp_path, "t [s],a\n" + "".join(f"{t!r},{float(np.sin(3 * t))!r}\n" for t in map(float, times)))
     np.testing.assert_allclose(record.outputs[0], np.sin(3 * record.time), atol=1e-7)
     assert record.time[[0, -1]] == pytest.approx(times[[0, -1]]) and "resampled" in record.remarks[0]
 
 
 def test_rounded_times_are_no_uneven_ones(tmp_path):
     """1,024 Hz, written in milliseconds: the signal stays as it is."""
-    record = read(tmp_path, "t,a\n" + "".join(f"{k / 1024:.3f},{k % 7}\n" for k in range(2000)))
+    record = read(tmp_path, "t [s],a\n" + "".join(f"{k / 1024:.3f},{k % 7}\n" for k in range(2000)))
     assert record.sample_rate_hz == pytest.approx(1024.0, rel=1e-4)
     np.testing.assert_array_equal(record.outputs[0], np.arange(2000) % 7)
     assert "rounded" in record.remarks[0]

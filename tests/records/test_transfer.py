@@ -191,6 +191,32 @@ def test_units_of_a_table_are_brought_to_si(tmp_path, names):
     assert found.remarks == ("a: g taken as 9.80665 m/s^2", "a: lbf taken as 4.44822 N")
 
 
+@pytest.mark.parametrize(
+    ("first", "factor"),
+    [("Frequency (rad/s)", 2.0 * np.pi), ("omega [rad/s]", 2.0 * np.pi), ("Frequency (CPM)", 60.0), ("f [kHz]", 1e-3)],
+)
+def test_lines_in_any_unit(tmp_path, first, factor):
+    h = SPECTRA[0, 0]
+    header = f"{first},a Real ((m/s2)/N),a Imag ((m/s2)/N),Coherence"
+    columns = [factor * LINES, h.real, h.imag, 0.0 * LINES + 0.99]
+    np.savetxt(tmp_path / "x.csv", np.column_stack(columns), delimiter=",", comments="", header=header)
+    found = read_measured(tmp_path / "x.csv")
+    np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-12)
+    np.testing.assert_allclose(found.values[0, 0], h, rtol=1e-12)
+    assert found.output_channels[0].quantity == "acceleration" and found.remarks == ("Coherence: left out",)
+
+
+@pytest.mark.parametrize("form", ["{0.real!r}{0.imag:+}i", "{0!r}"])
+def test_a_table_of_complex_numbers(tmp_path, form):
+    """As MATLAB and Python write them."""
+    rows = [f"{f!r}," + ",".join(form.format(complex(h)) for h in both)
+            for f, both in zip(LINES.tolist(), SPECTRA[:2, 0].T)]  # fmt: skip
+    (tmp_path / "x.csv").write_text("\n".join(["f,a [g/N],b", *rows]) + "\n")
+    found = read_measured(tmp_path / "x.csv")
+    np.testing.assert_allclose(found.values[:, 0] / [[9.80665], [1.0]], SPECTRA[:2, 0], rtol=1e-12)
+    assert found.output_names == ("a", "b") and found.output_channels[0].unit == "m/s^2"
+
+
 @pytest.mark.parametrize(("unit", "degrees"), [("", True), ("", False), (" [rad]", False)])
 def test_phases_beyond_a_turn_are_degrees_unless_a_unit_is_told(tmp_path, unit, degrees):
     h = SPECTRA[0, 0]
@@ -205,7 +231,7 @@ def test_phases_beyond_a_turn_are_degrees_unless_a_unit_is_told(tmp_path, unit, 
     assert found.remarks == (said if degrees else ())
 
 
-@pytest.mark.parametrize("names", ["a", "a real", "a real,b imag", "a real,a imag,coherence", "a real,a phase"])
+@pytest.mark.parametrize("names", ["a", "a real", "a real,b imag", "a real,a imag,weight", "a real,a phase"])
 def test_a_table_of_frequencies_is_no_record(tmp_path, names):
     """It was told to lack a sample rate; with one it would have been taken for signals over time."""
     columns = [LINES] * (1 + len(names.split(",")))

@@ -115,7 +115,7 @@ def test_a_model_holds_where_its_worst_sensor_has_what_is_expected_of_it(n):
     assert "no test of the model: its bands allow for an error of 115 %" in replace(check, allowed=1.15).sentence
 
 
-def test_coloured_noise_of_the_same_size_is_seen_in_the_spectrum_alone(plain):
+def test_coloured_noise_of_the_same_size_is_seen_in_the_spectrum_alone(plain, tmp_path):
     rng = np.random.default_rng(4)
     new = measured(plain, 1.0, rng, n=2000)
     truth = simulate(plain, new.inputs, sample_time=0.01).outputs
@@ -127,9 +127,17 @@ def test_coloured_noise_of_the_same_size_is_seen_in_the_spectrum_alone(plain):
     assert abs(bad.overall - 0.95) < 0.02
     assert good.band_coverage[:, -1].min() > 0.9 > 0.85 > bad.band_coverage[:, -1].max()
     # over time nothing is amiss, so no sensor is named but in the band
-    j = int(bad.band_coverage[:, 0].argmin())
+    j, mean = int(bad.band_coverage[:, 0].argmin()), bad.band_coverage[:, 0].mean()
     share, edges = 100 * bad.band_coverage[j, 0], "{:.4g} to {:.4g} Hz".format(*bad.bands_hz[0])
-    said = f"worst is the band from {edges}, where {share:.3g} % of the amplitudes of {bad.sensors[j]} lie inside."
+    least = bad.expected_least_in_bands
+    said = f"worst is the band from {edges}, where {100 * mean:.3g} % of the amplitudes lie inside"
+    said += f" ({share:.3g} % of {bad.sensors[j]}), at least {100 * least:.3g} % expected."
+    assert mean < least <= good.band_coverage.mean(axis=0).min()
+    # the table and the log say the same
+    assert bad._printed()[2][-1][2] == f"≥ {100 * least:.3g}"
+    logged = read_log(log_test(tmp_path / "tests.csv", bad))[0]
+    assert logged["worst_sensor"] == f"all, {edges}" and logged["holds"] == "no"
+    assert float(logged["worst_coverage"]) < float(logged["expected_least"]) == pytest.approx(least, abs=1e-4)
     assert bad.sentence.endswith(said)
 
 

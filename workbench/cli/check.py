@@ -65,6 +65,7 @@ def check(
             "bands_hz": result.bands_hz,
             "band_coverage": dict(zip(result.sensors, result.band_coverage)),
             "expected_least": result.expected_least,
+            "expected_least_in_bands": result.expected_least_in_bands,
         },
     )
     target = page or Path("out") / f"{found.name}-check.html"

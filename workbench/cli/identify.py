@@ -32,13 +32,20 @@ def identify(
         float | None, typer.Option(help="Time at which the free decay begins, s; detected unless given.")
     ] = None,
     inputs: Annotated[
-        str, typer.Option(metavar="NAME,NAME", help="Measured inputs: identify from inputs and outputs.")
+        str,
+        typer.Option(
+            metavar="NAME,NAME",
+            help='Measured inputs: identify from inputs and outputs; "A, B" where a name holds a comma.',
+        ),
     ] = "",
     input_hold: options.InputHold = None,
     ambient: Annotated[
         bool, typer.Option("--ambient", help="Output-only: unknown broadband forces act throughout.")
     ] = False,
-    outputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="Outputs to use; all unless given.")] = "",
+    outputs: Annotated[
+        str,
+        typer.Option(metavar="NAME,NAME", help='Outputs to use; all unless given; "A, B" where a name holds a comma.'),
+    ] = "",
     band_hz: Annotated[
         tuple[float, float] | None,
         typer.Option(metavar="LOW HIGH", help="Frequency band of transfer functions to fit."),
@@ -75,8 +82,8 @@ def identify(
             read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz, seconds=seconds, progress=report
         )
     as_read = dict.fromkeys(remark for measured in read for remark in getattr(measured, "remarks", ()))
-    lines = [by_options(line) for line in found.lines]
-    found = replace(found, lines=(*lines, *(f"as read: {remark}" for remark in as_read)))
+    lines = (*found.lines, *(f"as read: {remark}" for remark in as_read))
+    found = replace(found, lines=tuple(map(by_options, lines)))
     say(found.heading, bold=True)
     show_table(HEADINGS, found.rows, right=[heading for heading in HEADINGS if "[" in heading])
     for line in found.lines:

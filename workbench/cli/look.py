@@ -7,14 +7,16 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.terminal import as_typed, guarded, names_in, say, short, show_table
+from workbench.cli.terminal import as_typed, by_options, guarded, names_in, say, short, show_table
 
 
 @guarded
 def look(
     file: Annotated[Path, typer.Argument(help="Measured file: .csv, .txt, .npz, .mat, .h5, .uff, ...")],
     sample_rate_hz: options.SampleRate = None,
-    inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="Channels that are inputs.")] = "",
+    inputs: Annotated[
+        str, typer.Option(metavar="NAME,NAME", help='Channels that are inputs; "A, B" where a name holds a comma.')
+    ] = "",
     memory: options.Memory = 1.0,
     page: options.PagePath = None,
 ) -> None:
@@ -33,7 +35,7 @@ def look(
     say(seen.heading, bold=True)
     show_table(HEADINGS, seen.rows, right=HEADINGS[2:])
     for remark in seen.remarks:
-        say(f"  {remark}")
+        say(f"  {by_options(remark)}")
     say(f"  page     {short(write_page(page or Path('out') / f'{file.stem}.html', shown))}")
     command = seen.command + (f" --sample-rate-hz {sample_rate_hz:g}" if sample_rate_hz else "")
     say(f"  go on    {command}")

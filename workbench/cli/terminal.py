@@ -1,5 +1,6 @@
 """Output, progress bar and exit codes of the commands."""
 
+import csv
 import json
 import re
 import shlex
@@ -66,8 +67,12 @@ def complain(fault: str) -> None:
 
 
 def by_options(text: str) -> str:
-    """The text with arguments in backquotes, such as `seconds`, replaced by options."""
-    return re.sub(r"`(\w+)`", lambda named: "--" + named[1].replace("_", "-"), text)
+    """The text with arguments in backquotes, such as `seconds`, and with values, such as name='x', as options."""
+    return re.sub(
+        r"`(\w+)`|\b(\w+)='([\w-]+)'",
+        lambda named: "--" + (named[1] or named[2]).replace("_", "-") + (f" {named[3]}" if named[3] else ""),
+        text,
+    )
 
 
 def say(text: str, *, bold: bool = False) -> None:
@@ -170,5 +175,6 @@ def as_typed() -> str:
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """The names of a text, separated by commas."""
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+    """The names of a text, separated by commas; a name that holds one stands in double quotes, as in CSV."""
+    fields = next(csv.reader([text], skipinitialspace=True), [])
+    return tuple(name.strip() for name in fields if name.strip())

@@ -90,10 +90,12 @@ def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...]
     """The uncertain rig of a verdict in JSON, and the estimated noise (n_outputs,).
 
     Raises:
-        ValueError: the file is not a verdict of this case.
+        ValueError: no such file, or none that is a verdict of this case.
     """
     from workbench.robust.posterior import UncertainRig
 
+    if not path.is_file():
+        raise ValueError(f"{path}: there is no such file; write it by `workbench diagnose CASE --json {path.name}`")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         posterior, noise = content["posterior"], content.get("noise", {}).get("found")

@@ -134,6 +134,12 @@ def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int)
     return np.asarray(np.abs(h) * np.sqrt((1.0 - squared) / (2.0 * squared * averages)))
 
 
+TURNED = (
+    "the impulse responses come before the impulse, as in transfer functions for e^(-iωt): their complex conjugates"
+    " were identified"
+)
+
+
 @former_arguments(most_modes="max_modes")
 @one_blas_thread
 def identify_transfer(
@@ -155,7 +161,8 @@ def identify_transfer(
 
     Args:
         transfer: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
-            input; of receptance, mobility or accelerance by the quantity of each channel.
+            input, for e^(iωt); those for e^(-iωt) are recognised at evenly spaced lines, and remarked. Receptance,
+            mobility or accelerance by the quantity of each channel.
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
         channels: one per output; where no quantity is stated, the residual terms are those of any motion.
         band_hz: lowest and highest line to fit; modes outside the band are represented by residual terms.
@@ -177,6 +184,8 @@ def identify_transfer(
     check_count("max_modes", max_modes)
     budget = Budget(seconds, progress)
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
+    turned = _is_acausal(h, f)
+    h = h.conj() if turned else h
     options: dict[str, Any] = {"channels": channels, "noise": noise, "max_modes": max_modes, "false_alarm": false_alarm}
     estimate, s = _in_bands(h, f, budget, **options), 2j * np.pi * f
     for least in (CLOCKS.phase, CLOCKS.refined):
@@ -196,7 +205,7 @@ def identify_transfer(
         estimate.modes.poles, np.sqrt(estimate.statistic), 2.0 * np.pi * estimate.scatter_hz, deviation
     )
     checks = (
-        *_acausal_remark(h, f),
+        *([TURNED] if turned else []),
         *_delay_remarks(estimate.delays, channels),
         *repeated_remarks(estimate),
         *set_up_remarks(estimate),
@@ -205,6 +214,7 @@ def identify_transfer(
     estimate = replace(
         estimate,
         remarks=(*checks, *estimate.remarks, *overlap, *_scatter_remark(estimate), *overtones, *budget.remarks),
+        fitted=frozen(estimate.fitted.conj() if turned else estimate.fitted, complex),
     )
     if estimate.modes.n_modes == 0:
         raise ValueError(
@@ -441,19 +451,14 @@ def _residual_terms(
     return below, below_std, above
 
 
-def _acausal_remark(h: np.ndarray, f: np.ndarray) -> tuple[str, ...]:
-    """A remark where impulse responses precede the impulse: transfer functions of the opposite sign convention."""
+def _is_acausal(h: np.ndarray, f: np.ndarray) -> bool:
+    """Whether impulse responses precede the impulse: transfer functions of the opposite sign convention."""
     step = np.diff(f)
     if np.ptp(step) > 1e-6 * step.max():
-        return ()
+        return False
     power = (np.abs(np.fft.ifft(h * np.hanning(f.size), axis=-1)) ** 2).sum(axis=(0, 1))
     after, before = power[1 : f.size // 2].sum(), power[-(f.size // 2) + 1 :].sum()
-    if before < TRANSFER.acausal * after:
-        return ()
-    return (
-        "the impulse responses come before the impulse: are these transfer functions for e^(-iωt)? Then take their"
-        " complex conjugates",
-    )
+    return bool(before > TRANSFER.acausal * after)
 
 
 def _window_remark(rate: float) -> tuple[str, ...]:

@@ -5,24 +5,19 @@ Files of other programs are converted to SI units and to equal time steps, with 
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
 
+from workbench.records.instants import UNIFORM, Sampling, even_sampling
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.records.units import SI, Unit, Units, split_unit, unit_named
 
-UNIFORM = 1e-3  # of the time step
-PART = 2**20  # steps checked together
-# Steps between half and twice the median are resampled; a longer one is a gap.
-SHORTEST, LONGEST = 0.5, 2.0
-FINEST_ROUNDING = 10  # decimals of a second
-FEWEST_ODD = 3  # least number of unequal steps if instants were rounded
 KINDS = ("input", "output")
 KEY = "crc32"  # of the checksum that detects changes of a file written here
 
@@ -36,20 +31,22 @@ def checksum(description: Mapping[str, Any], signals: Iterable[np.ndarray]) -> i
     return total
 
 
-@dataclass(frozen=True, eq=False)
-class Sampling:
-    """The sampling of a record.
+class Signals(NamedTuple):
+    """The signals in a file, before they are a record.
 
     Attributes:
-        start, step: of equal steps, s.
-        times: (n_samples,) unequal instants, from which the signals are to be resampled; else None.
+        time: (n_samples,) instants, s, where the file has them.
+        signals: (n_samples,) each; a name may begin with its kind, `input:` or `output:`.
+        header: the description as a JSON text.
         remarks: on assumptions and changes.
+        row_of: the number in the file, from 1 on, of the row of a sample, from 0 on.
     """
 
-    start: float
-    step: float
-    times: np.ndarray | None = None
+    time: np.ndarray | None
+    signals: dict[str, np.ndarray]
+    header: str | None = None
     remarks: tuple[str, ...] = ()
+    row_of: Callable[[int], int] = (1).__add__
 
 
 @dataclass(frozen=True)
@@ -71,9 +68,7 @@ class Description:
 
 def record_of(
     path: Path,
-    time: np.ndarray | None,
-    signals: Mapping[str, np.ndarray],
-    header: str | None,
+    contents: Signals,
     *,
     sample_rate_hz: float | None,
     inputs: Sequence[str],
@@ -83,9 +78,7 @@ def record_of(
 
     Args:
         path: of the file, for messages.
-        time: (n_samples,) instants, s, where the file has them.
-        signals: (n_samples,) each; a name may begin with its kind, `input:` or `output:`.
-        header: the description as a JSON text.
+        contents: of the file.
         sample_rate_hz: where the file has no time.
         inputs: names of the input signals, where the file does not say.
         into: the units into which stated units are converted.
@@ -93,16 +86,17 @@ def record_of(
     Raises:
         RecordFileError: the message names the file, channel and row, and the remedy.
     """
+    time, signals, header, remarked, row_of = contents
     if not signals:
         raise RecordFileError(f"{path} holds no signals")
     described = Description({}) if header is None else _description(path, header, signals)
-    n_samples = _n_samples(path, time, signals)
+    _check_lengths(path, time, signals)
     for key, values in signals.items():
         bad = ~np.isfinite(values)
         if bad.any():
-            row = int(np.argmax(bad))
-            raise RecordFileError(f"{path}, channel {_name(key)!r}, row {row + 1}: {values[row]} is not a number")
-    sampling = _sampling(path, time, n_samples, described, sample_rate_hz)
+            at = int(np.argmax(bad))
+            raise RecordFileError(f"{path}, channel {_name(key)!r}, row {row_of(at)}: {values[at]} is not a number")
+    sampling = _sampling(path, contents, described, sample_rate_hz)
     units = _units(path, (key for key in signals if key not in described.channels), into)
     names = {key: split_unit(_name(key))[0] if key in units else _name(key) for key in signals}
     for name in inputs:
@@ -133,7 +127,7 @@ def record_of(
             input_hold=described.input_hold,
             start_time=sampling.start,
             name=described.name or path.stem,
-            remarks=(*filter(None, remarks), *sampling.remarks),
+            remarks=(*filter(None, remarks), *remarked, *sampling.remarks),
         )
     except ValueError as error:
         raise RecordFileError(f"{path}: {error}") from error
@@ -159,7 +153,7 @@ def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> 
     return described
 
 
-def _n_samples(path: Path, time: np.ndarray | None, signals: Mapping[str, np.ndarray]) -> int:
+def _check_lengths(path: Path, time: np.ndarray | None, signals: Mapping[str, np.ndarray]) -> None:
     lengths = [values.size for values in signals.values()]
     most = time.size if time is not None else Counter(lengths).most_common(1)[0][0]
     for key, length in zip(signals, lengths):
@@ -167,7 +161,6 @@ def _n_samples(path: Path, time: np.ndarray | None, signals: Mapping[str, np.nda
             raise RecordFileError(f"{path}, channel {_name(key)!r} has {length} samples; the others have {most}")
     if most < 2:
         raise RecordFileError(f"{path} holds {most} samples per channel; a record needs at least two")
-    return most
 
 
 def _name(key: str) -> str:
@@ -237,18 +230,27 @@ def _rows(signals: Sequence[np.ndarray], units: Sequence[Unit | None], sampling:
     return rows
 
 
-def _sampling(
-    path: Path, time: np.ndarray | None, n_samples: int, described: Description, sample_rate_hz: float | None
-) -> Sampling:
+def _sampling(path: Path, contents: Signals, described: Description, sample_rate_hz: float | None) -> Sampling:
+    time = contents.time
     if sample_rate_hz is not None and not 0 < sample_rate_hz < np.inf:
         raise RecordFileError(f"{path}: sample_rate_hz must be positive; got {sample_rate_hz}")
     if time is None:
         if sample_rate_hz is None:
-            raise RecordFileError(f"{path} has no sample instants; give sample_rate_hz")
+            name, first = next(iter(contents.signals.items()))
+            axis = (np.diff(first) > 0).all()
+            which = f", unless {_name(name)!r}, which rises all along, is one: call it time [s] or frequency [Hz]"
+            raise RecordFileError(f"{path} has no sample instants; give sample_rate_hz{which if axis else ''}")
         return Sampling(0.0, 1.0 / sample_rate_hz)
     if not np.isfinite(time).all():
-        raise RecordFileError(f"{path}, time, row {int(np.argmax(~np.isfinite(time))) + 1}: not a number")
-    sampling = _of_times(path, time, correct=described.sampling is None)
+        raise RecordFileError(f"{path}, time, row {contents.row_of(int(np.argmax(~np.isfinite(time))))}: not a number")
+    sampling = even_sampling(
+        path,
+        time,
+        [*contents.signals.values()],
+        correct=described.sampling is None,
+        stated_hz=sample_rate_hz,
+        row_of=contents.row_of,
+    )
     if sample_rate_hz is not None and abs(sample_rate_hz * sampling.step - 1.0) > UNIFORM:
         raise RecordFileError(f"{path} is sampled at {1 / sampling.step:g} Hz, not at {sample_rate_hz:g} Hz")
     if described.sampling is None:
@@ -261,59 +263,3 @@ def _sampling(
             f" and {step:g} s; correct or remove the description"
         )
     return replace(sampling, start=start, step=stated)
-
-
-def _of_times(path: Path, time: np.ndarray, *, correct: bool) -> Sampling:
-    """Start and step of sample instants; if `correct`, rounded instants are recognised, and unequal ones resampled."""
-    start, n_samples = float(time[0]), time.size
-    with np.errstate(over="ignore", invalid="ignore"):
-        mean = float((time[-1] - time[0]) / (n_samples - 1))
-        if 0 < mean < np.inf and _is_steady(time, mean):
-            return Sampling(start, mean)
-        steps = np.diff(time)
-        median = float(np.median(steps))
-        even = np.abs(steps - median) <= UNIFORM * abs(median)
-    if 0 < median < np.inf and even.all():
-        return Sampling(start, mean)
-    shortest, longest = float(steps.min()), float(steps.max())
-    if correct and 0 < mean < np.inf and shortest >= 0:
-        rounded = _rounded(time, steps)
-        if rounded is not None:
-            return rounded
-        if SHORTEST * median <= shortest and longest <= LONGEST * median and shortest > 0:
-            remark = f"unequal time steps, {shortest:g} to {longest:g} s: resampled every {mean:g} s by cubic splines"
-            return Sampling(start, mean, time, (remark,))
-    with np.errstate(over="ignore", invalid="ignore"):  # times near the largest number, whose differences are infinite
-        relative = np.nan_to_num(steps / median if median else steps, posinf=1e300, neginf=-1e300)
-    row = int(np.argmax(np.abs(relative - 1.0)))
-    raise RecordFileError(
-        f"{path} is not uniformly sampled: row {row + 2} comes {steps[row]:g} s after the one before, the others"
-        f" {median:g} s; fill the gap, or cut the record there"
-    )
-
-
-def _is_steady(time: np.ndarray, step: float) -> bool:
-    """Whether all steps are near one value, and so near their median; checked in parts, without copying the record."""
-    parts = (time[first : first + PART + 1] for first in range(0, time.size - 1, PART))
-    return all((np.abs(np.diff(part) - step) <= 0.4 * UNIFORM * step).all() for part in parts)
-
-
-def _rounded(time: np.ndarray, steps: np.ndarray) -> Sampling | None:
-    """The sampling of equal steps whose instants were rounded to a power of ten; None for other instants."""
-    rounding = next((r for r in (10.0**-d for d in range(FINEST_ROUNDING)) if _are_multiples(time, r)), None)
-    if rounding is None:
-        return None
-    wholes = np.round(steps / rounding)
-    index = np.arange(time.size)
-    step, start = np.polyfit(index, time, 1)
-    # one or two unequal steps are missing samples, not rounding
-    odd = wholes.size - Counter(wholes.tolist()).most_common(1)[0][1]
-    if odd < FEWEST_ODD or np.abs(time - (start + step * index)).max() > 0.6 * rounding:
-        return None
-    remark = f"times rounded to {rounding:g} s: taken as evenly sampled at {1 / step:.6g} Hz"
-    return Sampling(float(start), float(step), remarks=(remark,))
-
-
-def _are_multiples(time: np.ndarray, unit: float) -> bool:
-    scaled = time / unit
-    return bool(np.abs(scaled - np.round(scaled)).max() <= 1e-9 * max(np.abs(scaled).max(), 1.0))

@@ -10,16 +10,19 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from datetime import datetime
+from functools import partial
 from io import TextIOWrapper
-from itertools import zip_longest
+from itertools import islice, zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from workbench.records.assembly import Signals
+from workbench.records.instants import in_seconds
 from workbench.records.limits import DEFAULT, Deadline, Limits, RecordFileError, check_counts
-from workbench.records.named_arrays import Signals
 from workbench.records.table_layout import (
+    FORTRAN,
     LONGEST_LINE,
     MARK,
     Layout,
@@ -37,11 +40,16 @@ BLANK_LINES = re.compile(r"\n[ \t\n]+(?<=\n)")
 COMMENT_LINES = re.compile(r"^(?:#.*+\n?+)++", re.MULTILINE)
 SAME = 1e-9  # of the record's length: tolerance of two equal columns of instants
 COUNTERS = ("sample", "samples", "index", "n", "no", "no.", "nr", "nr.", "#", "scan", "point", "row")  # before the time
+PARTS = re.compile(
+    r"(?:(?P<date>[^\sT]+)[T\s]+)?(?P<hour>\d{1,2})(?P<rest>:\d\d:\d\d(?:[.,]\d+)?)(?: ?(?P<half>[AaPp])[Mm])?"
+    r"(?P<zone>Z|[-+]\d\d:?\d\d)?"
+)
+DAY_OR_MONTH = re.compile(r"\d{1,2}/\d{1,2}/\d{4}")
 DATES = ("%d.%m.%Y", "%Y/%m/%d")  # beside ISO's, which numpy reads
 
 
 def read(path: Path, limits: Limits = DEFAULT) -> Signals:
-    """(time or None, signals by name, header text or None), with units in brackets after the names.
+    """The signals of a table, with units in brackets after the names.
 
     Raises:
         RecordFileError: rows that do not fit the names, or more than the limits allow.
@@ -57,27 +65,32 @@ def read(path: Path, limits: Limits = DEFAULT) -> Signals:
         for name, unit in zip_longest(layout.names, layout.units)
     ]
     signals = dict(zip(names, columns[layout.stamped :]))
+    contents = Signals(None, signals, layout.header, row_of=partial(_row_in_file, path, layout))
     if layout.stamped:
-        return columns[0], signals, layout.header
+        return contents._replace(time=columns[0])
     if layout.sampling is not None:
         start, step = layout.sampling
-        return start + step * np.arange(columns[0].size), signals, layout.header
+        return contents._replace(time=start + step * np.arange(columns[0].size))
+    unnamed = signals.pop("", None)
+    if unnamed is not None and not (np.diff(unnamed) == 1.0).all():
+        raise RecordFileError(f"{path}: its first column has no name; give it one, as time [s]")
+    numbered = () if unnamed is None else ("the first column, without a name, counts the rows: left out",)
+    if not signals:
+        return contents
     first, *others = signals
     if first.lower() in COUNTERS and others and time_factor(others[0]) is not None:
         first = others[0]
-    factor = time_factor(first)
-    if factor is None:
-        return None, signals, layout.header
-    time = signals.pop(first)
-    time = time if factor == 1.0 else factor * time
+    if time_factor(first) is None:
+        return contents._replace(remarks=numbered)
+    time, remarks = in_seconds(first, signals.pop(first))
     for name in [name for name in signals if time_base(name) == time_base(first)]:
         # some programs write a time column for each channel, which must all be equal
-        if not np.allclose((time_factor(name) or 1.0) * signals.pop(name), time, rtol=1e-9, atol=SAME * np.ptp(time)):
+        if not np.allclose(in_seconds(name, signals.pop(name))[0], time, rtol=1e-9, atol=SAME * np.ptp(time)):
             raise RecordFileError(
                 f"{path}: channels have different sample instants, {first!r} and {name!r}; export them with one rate"
                 " and start"
             )
-    return time, signals, layout.header
+    return contents._replace(time=time, remarks=() if layout.header else (*numbered, *remarks))
 
 
 def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
@@ -128,12 +141,14 @@ def _lines(path: Path, block: str) -> list[str]:
 
 def _numbers(path: Path, layout: Layout, number: int, block: str, lines: list[str], clock: "_Clock") -> np.ndarray:
     delimiter = None if layout.delimiter == " " else layout.delimiter
-    tails = lines
+    tails = lines = [*map(layout.parted, lines)] if layout.has_complex else lines
     if layout.n_front:
         split = [line.split(delimiter, layout.n_front) for line in lines]
         tails = [parts[-1] for parts in split]
     if layout.trailing:
         tails = [line.rstrip(" ").removesuffix(layout.delimiter) for line in tails]
+    if FORTRAN.search(tails[0]):
+        tails = [FORTRAN.sub("e", line) for line in tails]
     commas = [line.replace(",", ".") for line in tails] if layout.decimal_comma else tails
     try:
         if any(map(LONGEST_LINE.__le__, map(len, lines))) or (layout.decimal_comma and any("." in t for t in tails)):
@@ -156,6 +171,15 @@ def _row_by_row(path: Path, layout: Layout, number: int, block: str) -> Iterator
             yield check_row(path, layout, row, line)
 
 
+def _row_in_file(path: Path, layout: Layout, sample: int) -> int:
+    """The number of the line of the file with a sample, which a message names; blank lines and comments count too."""
+    assert layout.first is not None
+    with path.open(encoding=encoding_of(path), newline=None) as file:
+        lines = islice(enumerate(file, 1), layout.first[0] - 1, None)
+        rows = (number for number, line in lines if not line.isspace() and not line.startswith("#"))
+        return next(islice(rows, sample, None))
+
+
 class _Clock:
     """Seconds since the first time stamp of a file."""
 
@@ -163,6 +187,7 @@ class _Clock:
         self._path = path
         self._start: np.datetime64 | None = None
         self._last: np.datetime64 | None = None
+        self._date, self._days = "", 0  # of the last stamp, and midnights up to it
 
     def seconds(self, stamps: list[str]) -> np.ndarray:
         """Seconds (n_stamps,) of dates with times of day, or of times of day alone, which may pass midnight.
@@ -171,25 +196,48 @@ class _Clock:
             RecordFileError: a text that is no time stamp.
         """
         try:
-            times = np.array([_iso(stamp) for stamp in stamps], "datetime64[ns]")
+            dates, clocks, zones = zip(*map(_parts, stamps))
+            # in 03/05/2024 the month is unknown, and of no account where the date changes at midnight alone
+            unsure = any(DAY_OR_MONTH.fullmatch(date) for date in dates)
+            known = ["1970-01-01" if unsure or not date else _iso(date) for date in dates]
+            times = np.array([f"{date}T{clock}" for date, clock in zip(known, clocks)], "datetime64[ns]")
         except ValueError as error:
             raise RecordFileError(f"{self._path}: a time stamp cannot be read: {error}") from error
-        self._start = times[0] if self._start is None else self._start
+        times -= np.array(zones, "timedelta64[m]")
         last = times[0] if self._last is None else self._last
         passed = np.diff(times, prepend=last) < np.timedelta64(0, "ns")
-        if stamps[0][2:3] == ":" or stamps[0][1:2] == ":":
-            times = times + np.cumsum(passed) * np.timedelta64(1, "D")
-        self._last = times[-1]
-        return (times - self._start) / np.timedelta64(1, "ns") * 1e-9
+        if unsure and (passed != [x != y for x, y in zip(dates, (self._date or dates[0], *dates))]).any():
+            raise RecordFileError(
+                f"{self._path}: dates such as {dates[0]} do not say which number is the month, and they change not only"
+                " at midnight; write them as 2024-05-03"
+            )
+        self._date, self._last = dates[-1], times[-1]
+        if unsure or not dates[0]:
+            days = self._days + np.cumsum(passed)
+            self._days = days[-1]
+            times = times + days * np.timedelta64(1, "D")
+        self._start = times[0] if self._start is None else self._start
+        return np.asarray((times - self._start) / np.timedelta64(1, "ns") * 1e-9)
 
 
-def _iso(stamp: str) -> str:
-    """A time stamp in ISO 8601; a time of day alone gets the date 1970-01-01."""
-    stamp = stamp.strip(' "').replace(",", ".").removesuffix("Z")
-    date, _, clock = stamp.replace("T", " ").partition(" ")
-    if not clock:
-        date, clock = "1970-01-01", date
+def _parts(stamp: str) -> tuple[str, str, int]:
+    """Date (or none), time of day in 24 hours, and minutes east of Greenwich (0 where unstated) of a time stamp.
+
+    Raises:
+        ValueError: no time stamp.
+    """
+    found = PARTS.fullmatch(stamp.replace('"', "").strip())
+    if found is None:
+        raise ValueError(f"{stamp[:40]!r}")
+    hour = int(found["hour"]) if not found["half"] else int(found["hour"]) % 12 + 12 * (found["half"] in "pP")
+    zone = found["zone"] or "Z"
+    minutes = 0 if zone == "Z" else int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
+    return found["date"] or "", f"{hour:02d}{found['rest'].replace(',', '.')}", minutes
+
+
+def _iso(date: str) -> str:
+    """A date in ISO 8601."""
     for form in DATES:
-        if ("." in date[:3] and form[2] == ".") or ("/" in date and "/" in form):
-            date = datetime.strptime(date, form).date().isoformat()
-    return f"{date}T{clock.strip():0>8}" if clock.strip()[1:2] != ":" else f"{date}T0{clock.strip()}"
+        if ("." in date and form[2] == ".") or ("/" in date and "/" in form):
+            return datetime.strptime(date, form).date().isoformat()
+    return date

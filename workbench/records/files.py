@@ -106,13 +106,13 @@ def read_measured(
     check_file(path)
     with reading(path):
         if module is csv_file:
-            time, signals, header = csv_file.read(path, limits)
+            contents = csv_file.read(path, limits)
             # in a table with sample instants, a column called F is a force
-            arrays = complex_columns(path, signals) if time is None else {}
+            arrays = complex_columns(path, contents.signals) if contents.time is None else {}
         else:
             arrays = module.arrays(path, limits)
             if not holds_transfer(arrays):
-                time, signals, header = signals_of(path, arrays)
+                contents = signals_of(path, arrays)
                 arrays = {}
     if holds_transfer(arrays):
         if inputs or input_hold is not None:
@@ -120,7 +120,7 @@ def read_measured(
                 f"{path} holds transfer functions, which name no inputs; leave them and their hold out"
             )
         return transfer_of(path, arrays, sample_rate_hz=sample_rate_hz)
-    record = record_of(path, time, signals, header, sample_rate_hz=sample_rate_hz, inputs=inputs, into=units)
+    record = record_of(path, contents, sample_rate_hz=sample_rate_hz, inputs=inputs, into=units)
     return record if input_hold is None else replace(record, input_hold=input_hold)
 
 

@@ -14,7 +14,7 @@ from workbench.records.confined import load_confined
 from workbench.records.limits import BYTES_PER_NUMBER, Limits, RecordFileError, check_counts
 from workbench.records.named_arrays import HEADER, check_struct, numbered
 from workbench.records.transfer_functions import PLACES
-from workbench.records.units import unit_named
+from workbench.records.units import time_factor, time_unit, unit_named
 
 UNIT = ("unit", "units")  # attributes
 
@@ -59,7 +59,8 @@ def _in_units(name: str, dataset: Any) -> tuple[str, np.ndarray]:
     if not text or values.dtype.kind == "c" or (values.size == 1 and unit is None):
         return name, values
     if unit is not None and (values.size == 1 or unit.quantity in ("time", "frequency") or name.lower() in PLACES):
-        return name, unit.factor * values
+        instants = unit.quantity == "time" and time_factor(name) is not None and not time_unit(name)
+        return f"{name} [s]" if instants else name, unit.factor * values
     return f"{name} [{text}]", values
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from workbench.records.assembly import Signals
+from workbench.records.instants import in_seconds
 from workbench.records.limits import RecordFileError, check_counts
 from workbench.records.transfer_functions import SURE_RATES
 from workbench.records.units import time_factor
 
 HEADER = "record_header"
 NUMBERED = "record_channel_"
-
-Signals = tuple[np.ndarray | None, dict[str, np.ndarray], str | None]
 
 
 def numbered(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -52,6 +52,7 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
     """
     header = str(np.ravel(arrays[HEADER])[0]) if HEADER in arrays and np.size(arrays[HEADER]) else None
     time: np.ndarray | None = None
+    remarks: tuple[str, ...] = ()
     signals: dict[str, np.ndarray] = {}
     numbers = [values for values in arrays.values() if values.dtype.kind in "fiub" and values.size > 1]
     lengths = {values.size for values in numbers if values.size == max(values.shape)}
@@ -65,11 +66,10 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
                 signals[f"{name} {i}"] = each
             continue
         row = values.reshape(-1).astype(float, copy=False)
-        factor = time_factor(name)
-        if factor is None:
+        if time_factor(name) is None:
             signals[name] = row
         elif time is None:
-            time, first = (row if factor == 1.0 else factor * row), name
+            (time, remarks), first = in_seconds(name, row), name
         else:
             raise RecordFileError(f"{path} holds two arrays of times, {first} and {name}; leave one out")
     if time is None and signals:
@@ -85,7 +85,7 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
         if header is None or sorted(signals) != sorted(counted):
             raise RecordFileError(f"{path} is damaged: its channels and their description do not belong together")
         signals = dict(zip(_keys(path, header), (signals[name] for name in counted)))
-    return time, signals, header
+    return Signals(time, signals, header, () if header else remarks)
 
 
 def _rows(path: Path, name: str, values: np.ndarray, lengths: set[int]) -> np.ndarray:

@@ -14,7 +14,7 @@ from io import TextIOBase
 from pathlib import Path
 
 from workbench.records.assembly import KEY
-from workbench.records.labview import WITHOUT_X, labview_header
+from workbench.records.labview import END, WITHOUT_X, labview_header
 from workbench.records.limits import RecordFileError
 from workbench.records.units import split_unit, time_factor, unit_named
 
@@ -25,11 +25,15 @@ SNIFFED = 2**20  # bytes, for the encoding
 DELIMITERS = "\t", ";", ",", " "
 # parts of a description written by this program: a line with one of them is not a header of another program
 OURS = (f'"{KEY}":', '"channels":', '"kind":', '"noise_std":')
-DATE = re.compile(r"\d{4}-\d\d-\d\d|\d{4}/\d\d/\d\d|\d{1,2}\.\d{1,2}\.\d{4}")
-CLOCK = re.compile(r"\d{1,2}:\d\d:\d\d(?:[.,]\d+)?")
-STAMP = re.compile(rf"(?:{DATE.pattern})[T ]+(?:{CLOCK.pattern})Z?")
+DATE = re.compile(r"\d{4}-\d\d-\d\d|\d{4}/\d\d/\d\d|\d{1,2}\.\d{1,2}\.\d{4}|\d{1,2}/\d{1,2}/\d{4}")
+CLOCK = re.compile(r"\d{1,2}:\d\d:\d\d(?:[.,]\d+)?(?: ?[AaPp][Mm])?")
+STAMP = re.compile(rf"(?:{DATE.pattern})[T ]+(?:{CLOCK.pattern})(?:Z|[-+]\d\d:?\d\d)?")
 MOMENT = re.compile(rf"{STAMP.pattern}|{DATE.pattern}|{CLOCK.pattern}")
 SMALL = re.compile(r" *[-+]?[1-9]\d{0,2} *")  # a whole number that needs no thousands separator
+FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[-+\d])")  # the exponent of a double, as in 1.5D+00
+REAL = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+COMPLEX = re.compile(rf"\s*\(?([-+]?{REAL})([-+]{REAL})[ij]\)?\s*")
+BETWEEN = re.compile(r"[\s'’]")  # the digits of thousands
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(?:(?:,\d{3})+(?:\.\d*)?|(?:\.\d{3})+(?:,\d*)?)")
 ONE_MARK = "write numbers with one decimal mark and without thousands separators"
 MARKS = re.compile("[.,]")
@@ -53,6 +57,7 @@ class Layout:
         first: (number of the row in the file, text) of the first row of numbers; None where there is none.
         sampling: (start, step), s, where the header states them.
         decimal_comma: whether the decimal mark is a comma; None until a number has a mark.
+        has_complex: whether numbers as 1.2+3.4i are two columns, of real and imaginary parts.
     """
 
     names: tuple[str, ...]
@@ -66,10 +71,15 @@ class Layout:
     first: tuple[int, str] | None = None
     sampling: tuple[float, float] | None = None
     decimal_comma: bool | None = None
+    has_complex: bool = False
+
+    def parted(self, line: str) -> str:
+        """A row with the real and imaginary parts of complex numbers in fields of their own."""
+        return COMPLEX.sub(rf"\1{self.delimiter}\2", line) if self.has_complex else line
 
     def fields(self, line: str) -> list[str]:
         """The fields of a row that should be numbers."""
-        fields = _fields(line, self.delimiter, self.trailing)[self.n_front :]
+        fields = _fields(self.parted(line), self.delimiter, self.trailing)[self.n_front :]
         return fields[: len(self.names)] if self.comments else fields
 
     def number(self, text: str) -> float:
@@ -107,11 +117,14 @@ def decided(path: Path, layout: Layout, block: str, lines: Sequence[str]) -> Lay
 
 
 def encoding_of(path: Path) -> str:
-    """The encoding of a file by its first bytes: UTF-8 or UTF-16, else Latin-1."""
+    """The encoding of a file by its first bytes: UTF-8 or UTF-16, with a mark or without, else Latin-1."""
     with path.open("rb") as file:
         start = file.read(SNIFFED)
     if start.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
         return "utf-16"
+    high, low = (start[first::2].count(0) for first in (0, 1))
+    if max(high, low) > len(start) // 4 and min(high, low) == 0:  # without a mark, of Latin letters
+        return "utf-16-be" if high else "utf-16-le"
     try:
         getincrementaldecoder("utf-8")().decode(start.removeprefix(BOM_UTF8))
     except UnicodeDecodeError:
@@ -152,7 +165,7 @@ def layout_of(path: Path, file: TextIOBase) -> Layout:
             comments = comments or COMMENTS.search(line) is not None
             lines.append((number, line))
     else:
-        raise RecordFileError(f"{path}: no row of numbers in its first {LONGEST_HEADER[0]} rows; is it a table?")
+        raise RecordFileError(f"{path}: no row of numbers in its first {LONGEST_HEADER[0]} rows{_obstacle(lines)}")
     if not lines:
         raise RecordFileError(f"{path} holds no rows")
     number, line = lines[0]
@@ -161,6 +174,19 @@ def layout_of(path: Path, file: TextIOBase) -> Layout:
     for number, line in lines[1:]:
         check_row(path, layout, number, line)
     return layout
+
+
+def _obstacle(lines: Sequence[tuple[int, str]]) -> str:
+    """What is no number in the row with the most numbers, in words."""
+    most, at, what = 0, 0, ""
+    for number, line in lines:
+        for delimiter in DELIMITERS:
+            fields = line.split(delimiter)
+            others = [field.strip() for field in fields if not _is_number(field, None)]
+            if others and len(fields) - len(others) > most:
+                most, at, what = len(fields) - len(others), number, others[0][:40]
+    found = f"{what!r} is no number" if what else "a field is empty"
+    return f": in row {at} {found}; leave that column out, or write numbers" if most else "; is it a table?"
 
 
 def check_length(path: Path, number: int, line: str) -> None:
@@ -188,7 +214,8 @@ def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]
             numbers.append(layout.number(field))
         except ValueError:
             text = field if len(field) < 40 else f"{field[:40]}..."
-            marked = _is_number(field, None) or THOUSANDS.fullmatch(field.strip())
+            joined = BETWEEN.sub("", field)
+            marked = _is_number(joined, None) or THOUSANDS.fullmatch(joined)
             hint = f" with the decimal mark of this table; {ONE_MARK}" if marked else ""
             raise RecordFileError(f"{path}, channel {name!r}, row {number}: {text!r} is not a number{hint}") from None
     return numbers
@@ -199,13 +226,17 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
     assert found.first is not None
     first, width = found.first[0], len(found.names)
     rows = []
-    for number, line in lines:
+    # in the header of LabVIEW files lines may have as many fields as the table
+    below = next((i for i in reversed(range(len(lines))) if lines[i][1].startswith(END)), -1) + 1
+    for number, line in lines[below:]:
         fields = _fields(line, found.delimiter, found.trailing)
         if found.comments and fields and fields[-1].strip().lower() == "comment":
             fields = fields[:-1]
         if len(fields) == found.n_front + width:
             rows.append((number, line, [field.strip() for field in fields[found.n_front :]]))
     titles = [row for row in rows if not any(_is_number(f, None) or MOMENT.fullmatch(f) for f in row[2])]
+    if not titles or (len(titles) == 1 and _are_units(titles[0][2], set())):
+        titles = [row for row in rows if row in titles or _are_numbered(row[2])]
     labview = labview_header(path, [_fields(line, found.delimiter, False) for _, line in lines])
     if not titles:  # as numpy's savetxt: behind a comment
         names = _fields(comment, found.delimiter, found.trailing)[found.n_front :]
@@ -221,7 +252,7 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
                 f"{path}, row {first} has {found.n_front + width} fields{above}: a header line of as many names is"
                 " needed before the numbers"
             )
-        return replace(found, names=_names(path, names))
+        return _with_parts(replace(found, names=_names(path, names)))
     at, units = _names_and_units([fields for _, _, fields in titles])
     names = _distinct_names([fields for i, (_, _, fields) in enumerate(titles[: at + 1]) if i != units])
     layout = replace(
@@ -241,7 +272,20 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
                         f"{path}, row {number}: {text[:40]!r} below {name!r} is neither a number nor one of a line of"
                         " known units; write units in brackets behind the names"
                     )
-    return layout
+    return _with_parts(layout)
+
+
+def _with_parts(layout: Layout) -> Layout:
+    """The layout with a column each for the real and the imaginary part of complex numbers."""
+    assert layout.first is not None
+    if not layout.has_complex:
+        return layout
+    fields = _fields(layout.first[1], layout.delimiter, layout.trailing)[layout.n_front :]
+    units, names = layout.units or ("",) * len(layout.names), []
+    for name, unit, field in zip(layout.names, units, fields):
+        full = f"{name} [{unit}]" if unit else name
+        names += [f"{full} real", f"{full} imag"] if COMPLEX.fullmatch(field) else [full]
+    return replace(layout, names=tuple(names), units=())
 
 
 def _names_and_units(titles: Sequence[list[str]]) -> tuple[int, int | None]:
@@ -255,6 +299,11 @@ def _names_and_units(titles: Sequence[list[str]]) -> tuple[int, int | None]:
     others = [i for i in range(len(titles)) if i != units]
     nearest = others[-1] if units in (None, 0) else units - 1
     return next((i for i in reversed(others) if timed[i]), nearest), units
+
+
+def _are_numbered(fields: list[str]) -> bool:
+    """Whether the fields of a header line are a time and channels by their numbers, as `Time, 1, 2`."""
+    return time_factor(fields[0]) is not None and all(field.isdecimal() for field in fields[1:])
 
 
 def _are_units(fields: Sequence[str], timed: set[int]) -> bool:
@@ -309,6 +358,8 @@ def _row_of_numbers(path: Path, number: int, line: str, without_x: bool) -> Layo
         numbers = fields[n_front:]
         if numbers and any(all(_is_number(field, comma) for field in numbers) for comma in (False, True)):
             return Layout(("",) * len(numbers), (), delimiter, n_front, n_stamps > 0, trailing)
+        if numbers and all(COMPLEX.fullmatch(field) or _is_number(field, False) for field in numbers):
+            return Layout(("",) * len(numbers), (), delimiter, n_front, n_stamps > 0, trailing, has_complex=True)
         if len(numbers) > 1 and all(_is_number(f, None) or THOUSANDS.fullmatch(f.strip()) for f in numbers):
             shown = ", ".join(repr(field) for field in numbers[:10])
             raise RecordFileError(f"{path}, row {number} has points and commas in its numbers, {shown}; {ONE_MARK}")
@@ -338,7 +389,7 @@ def _names(path: Path, fields: Sequence[str]) -> tuple[str, ...]:
     names = tuple(name.strip() for name in fields)
     if all(_is_number(name, False) for name in names):
         raise RecordFileError(f"{path}: a header line of names is needed before the numbers")
-    if len(set(names)) != len(names) or not all(names):
+    if len(set(names)) != len(names) or not all(names[1:]):  # pandas writes its index without a name
         shown = ", ".join(map(repr, names[:10])) + (", ..." if len(names) > 10 else "")
         raise RecordFileError(f"{path}: the names of the header must differ and not be empty; got {shown}")
     return names
@@ -349,7 +400,7 @@ def _number(text: str, decimal_comma: bool | None) -> float:
     # Python alone accepts an underscore; a second mark would be a thousands separator
     if "_" in text or (decimal_comma is not False and "." in text and (decimal_comma or "," in text)):
         raise ValueError
-    return float(text if decimal_comma is False else text.replace(",", "."))
+    return float(FORTRAN.sub("e", text if decimal_comma is False else text.replace(",", ".")))
 
 
 def _is_number(text: str, decimal_comma: bool | None) -> bool:

@@ -80,7 +80,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     lengths = {values.size for values in found.values()}
     if sampling and len(lengths) == 1:
         ((start, step),) = sampling
-        if "t" in found:
+        if not found.keys().isdisjoint(("t", "t [s]")):
             raise RecordFileError(f"{path} has a channel 't' beside the sample instants of its channels; rename it")
-        return {"t": start + step * np.arange(lengths.pop()), **found}
+        return {"t [s]": start + step * np.arange(lengths.pop()), **found}
     return found

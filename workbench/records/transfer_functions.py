@@ -32,6 +32,7 @@ PLACES = ("positions", "at")
 COLUMN = re.compile(
     r"(?:(.+?)[ ._]+)?(?:(re|real)|(im|imag|imaginary)|(mag|magnitude|amplitude)|(phase))", re.IGNORECASE
 )
+COHERENCE = re.compile(r"(?:.*[ ._])?(?:coh|coherence|γ²|gamma\^?2)(?:[ ._\d].*)?", re.IGNORECASE)
 DECIBEL = re.compile(r"(.+?)\s*[\[(]\s*dB\s*[\])]", re.IGNORECASE)
 DESCRIPTION = "transfer_header"
 TURN = 2.0 * np.pi * (1.0 + 1e-6)  # rad: a larger phase without a unit is in degrees
@@ -124,12 +125,14 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
     names = list(signals)
     base, text = split_unit(names[0]) if names else ("", "")
     unit = unit_named(text)
-    in_hertz = unit is not None and unit.quantity == "frequency" and base.lower() in HERTZ
-    if not names or not (in_hertz or names[0].lower() in (*HERTZ, *RADIANS)):
+    in_unit = unit is not None and unit.quantity in ("frequency", "angular velocity")
+    if not names or not ((in_unit and base.lower() in (*HERTZ, *RADIANS)) or names[0].lower() in (*HERTZ, *RADIANS)):
         return {}
+    left_out = [name for name in names if COHERENCE.fullmatch(name)]
+    names = [name for name in names if name not in left_out]
     parts: dict[str, dict[int, np.ndarray]] = {}
     outputs: dict[str, dict[str, str]] = {}
-    remarks: dict[str, None] = {}
+    remarks: dict[str, None] = {f"{name}: left out": None for name in left_out}
     for name in names[1:]:
         values, decibel = signals[name], DECIBEL.fullmatch(name)
         bare, *behind = _split_ratio(decibel[1] if decibel else name)
@@ -158,11 +161,13 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
             f"{path} begins with frequencies, {names[0]!r}, and is no record; transfer functions need two columns each,"
             f" NAME real and NAME imag, or NAME magnitude and NAME phase [deg]; got {', '.join(names[1:7])}"
         )
-    lines = signals[names[0]] * (unit.factor if in_hertz and unit else 1.0)
+    lines = signals[names[0]]
+    if in_unit and unit is not None:
+        lines = lines * (unit.factor / (2.0 * np.pi if unit.quantity == "angular velocity" else 1.0))
     both = {
         name: part[2] + 1j * part[3] if 2 in part else part[4] * np.exp(1j * part[5]) for name, part in parts.items()
     }
-    arrays = {"f" if in_hertz else names[0]: lines, **both}
+    arrays = {"f" if in_unit else names[0]: lines, **both}
     if not remarks and not any(facts["unit"] for facts in outputs.values()):
         return arrays
     described = {

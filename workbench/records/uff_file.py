@@ -73,7 +73,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         if key in arrays:
             raise RecordFileError(f"{where}: a second channel is called {key.partition(':')[2]!r}")
         time = _abscissa(where, entry, "time")
-        first = arrays.setdefault("t", time)
+        first = arrays.setdefault("t [s]", time)
         if time.size != first.size or np.abs(time - first).max() > 1e-6 * max(np.abs(first).max(), 1e-300):
             raise RecordFileError(f"{where} ({key.partition(':')[2]}) has other sample instants than the first")
         arrays[key] = data

@@ -27,8 +27,9 @@ DEGREE = pi / 180
 # By quantity: the SI unit, then names and factors of all its units. Small and capital letters differ: mN is not MN.
 BY_QUANTITY: dict[str, tuple[str, dict[str, float]]] = {
     "time": ("s", {"s": 1, "sec": 1, "secs": 1, "second": 1, "seconds": 1, "ms": 1e-3, "msec": 1e-3, "us": 1e-6,
-                   "usec": 1e-6, "ns": 1e-9, "min": 60, "h": 3600}),
-    "frequency": ("Hz", {"Hz": 1, "hz": 1, "HZ": 1, "kHz": 1e3, "MHz": 1e6}),
+                   "usec": 1e-6, "ns": 1e-9, "min": 60, "h": 3600, "Sekunde": 1, "Sekunden": 1, "Millisekunden": 1e-3,
+                   "seconde": 1, "secondes": 1, "segundos": 1}),
+    "frequency": ("Hz", {"Hz": 1, "hz": 1, "HZ": 1, "kHz": 1e3, "MHz": 1e6, "CPM": 1 / 60, "cpm": 1 / 60}),
     "displacement": ("m", {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "micron": 1e-6, "microns": 1e-6, "nm": 1e-9,
                            "in": INCH, "inch": INCH, "mil": 1e-3 * INCH, "mils": 1e-3 * INCH, "ft": 12 * INCH}),
     "velocity": ("m/s", {"m/s": 1, "cm/s": 1e-2, "mm/s": 1e-3, "um/s": 1e-6, "nm/s": 1e-9, "in/s": INCH, "ips": INCH}),
@@ -60,9 +61,18 @@ SPELLINGS = (
 )  # fmt: skip
 SI_NAME = re.compile(r"\b(m|kg|s|N|Hz|J)(?![^\W²³])")
 POWERS = re.compile(r"(/?)\s*([A-Za-z]+)(?:\^(\d))?")
-BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*([^()]*(?:\(s\^2\))?[^()]*)\))")
-AFTER_SLASH = re.compile(r"(.*\S)\s+/\s+(\S.*)")  # axis labels of DIN and ISO
-TIME = {"t", "time", "zeit", "temps", "tiempo", "x_value", "timestamp", "time stamp", "elapsed time", "relative time"}
+BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*((?:[^()]++|\([^()]*+\))*+)\))")
+AFTER_SLASH = re.compile(r"(.*\S)\s+(?:/|in)\s+(\S.*)")  # axis labels of DIN and ISO
+TIME = {"t", "time", "zeit", "temps", "tiempo", "x-axis", "timestamp", "time stamp", "elapsed time", "relative time"}
+# the clocks of Arduino, the instants of LabVIEW, and units that stand alone
+TIME_AS_UNIT = {
+    "x_value": "s",
+    "millis": "ms",
+    "micros": "us",
+    "milliseconds": "ms",
+    "microseconds": "us",
+    "seconds": "s",
+}
 TIME_UNDERSCORE = re.compile(r"(t|time)_(s|sec|ms|us)", re.IGNORECASE)
 NUMBERED = re.compile(r"(\S\D*?\S)\s+\d+\b.*")  # one time of several, as catman's `Time 1 - default sample rate`
 
@@ -75,7 +85,8 @@ def unit_named(text: str) -> Unit | None:
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """A column's name without its unit, and the unit as written: `Acc [g]`, `Acc (g)` and `Acc / g` give (Acc, g).
+    """A column's name without its unit, and the unit as written: `Acc [g]`, `Acc (g)`, `Acc / g` and
+    `Acc in g` give (Acc, g).
 
     Text in brackets that is not a unit belongs to the name.
     """
@@ -90,12 +101,16 @@ def split_unit(name: str) -> tuple[str, str]:
 
 def time_factor(name: str) -> float | None:
     """Factor to seconds of a column of sample instants; None where the name is not that of a time."""
-    underscore = TIME_UNDERSCORE.fullmatch(name)
-    text = underscore[2].lower() if underscore else split_unit(name)[1]
     if not time_base(name):
         return None
-    unit = unit_named(text) if text else UNITS["s"]
+    unit = unit_named(time_unit(name) or "s")
     return unit.factor if unit is not None and unit.quantity == "time" else None
+
+
+def time_unit(name: str) -> str:
+    """The unit that the name of a column of sample instants states, as `time_ms`, `t [ms]` and `millis`; else empty."""
+    underscore = TIME_UNDERSCORE.fullmatch(name)
+    return underscore[2].lower() if underscore else split_unit(name)[1] or TIME_AS_UNIT.get(name.strip().lower(), "")
 
 
 def time_base(name: str) -> str:
@@ -103,7 +118,7 @@ def time_base(name: str) -> str:
     underscore, base = TIME_UNDERSCORE.fullmatch(name), split_unit(name)[0].strip()
     numbered = NUMBERED.fullmatch(base)
     base = (underscore[1] if underscore else numbered[1] if numbered else base).lower()
-    return base if base in TIME else ""
+    return base if base in TIME or base in TIME_AS_UNIT else ""
 
 
 @dataclass(frozen=True)

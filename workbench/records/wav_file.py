@@ -28,4 +28,4 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     else:
         full = -float(np.iinfo(samples.dtype).min) if samples.dtype.kind == "i" else 1.0
     channels = {f"channel {i + 1}": column / full for i, column in enumerate(samples.T)}
-    return {"t": np.arange(samples.shape[0]) / rate, **channels}
+    return {"t [s]": np.arange(samples.shape[0]) / rate, **channels}

@@ -1,5 +1,7 @@
 """The report of `workbench look` on a measured file: channels, levels, spectra, faults, and the next command."""
 
+import csv
+import io
 import re
 import shlex
 from collections.abc import Sequence
@@ -7,11 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.fft import rfft
 from scipy.ndimage import median_filter
 from scipy.signal import find_peaks
 
 from workbench.draw.plot import plot
 from workbench.draw.spectra import SEGMENTS, plot_frf, plot_spectra, plot_transfer, power_spectrum
+from workbench.identification.free_decay.decaying import decays
 from workbench.identification.free_decay.preparation import decay_start
 from workbench.identification.signal.data_quality import DataFault, data_faults, input_faults
 from workbench.records.record import Channel, Record
@@ -20,10 +24,10 @@ from workbench.study.pages.page import PageContent, block
 
 HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strongest at [Hz]")
 FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)
-DECAYED = 0.1  # rms of the last tenth over the largest of any tenth, below which a record is a free decay
-FALLING = 6  # tenths of decreasing level that make a free decay: by chance in 1 of 720 stationary records
+MOTIONS = re.compile(r"acc|beschl|vib|disp|veloc|geschw|(^|[^a-z])weg", re.IGNORECASE)
 PEAKS = 4  # per channel
 PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of 1/8 of all lines around the peak
+ABOVE = 1e-3  # of the mean power of an input: the power in the last tenth below Nyquist, behind an anti-alias filter
 MOST_ROWS = 100  # of the table
 MOST_FAULTS = 24  # messages per kind of fault; further faults are counted
 
@@ -57,7 +61,9 @@ def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
 def _record(record: Record, path: Path) -> Look:
     faults = [fault for fault in data_faults(record) if not fault.inputs]
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
+    doubtful = [c.name for c in record.output_channels if c.quantity == "force" and _is_motion(c.name)]
     applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
+    applied -= set(doubtful)
     forces = [] if record.n_inputs else [name for name in record.output_names if name in applied]
     # constant stretches are no fault of a force: it may be zero for long, or held from sample to sample
     faults = [fault for fault in faults if fault.outputs[-1] not in forces]
@@ -76,22 +82,26 @@ def _record(record: Record, path: Path) -> Look:
         f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
     )
     remarks = [*record.remarks, *_messages([*faults, *input_faults(record)])]
+    if doubtful:
+        remarks.append(f"{', '.join(doubtful)}: motions by name and forces by unit, so no inputs; does N mean north?")
     if len(channels) > MOST_ROWS:
         remarks.append(f"the first {MOST_ROWS} of {len(channels)} channels are shown")
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
     if unstated:
         remarks.append(f"the file states no quantity for {', '.join(unstated)}: their units are as recorded")
-    options = ["--inputs", ",".join(forces or record.input_names)] if forces or inputs else []
+    options = ["--inputs", _listed(forces or record.input_names)] if forces or inputs else []
     if forces:
         remarks.append(f"{', '.join(forces)}: taken as input by name or unit; leave --inputs out if this is wrong")
     if not options:
-        decays = _decays(record.select_outputs(kept)) if kept else False
-        start = decay_start(record.select_outputs(kept)) if decays else record.start_time
-        if decays and start > record.start_time:
+        free = bool(kept) and decays(record.select_outputs(kept))
+        start = decay_start(record.select_outputs(kept)) if free else record.start_time
+        if free and start > record.start_time:
             remarks.append(f"the free decay begins at {start:.6g} s")
-        options += [] if decays else ["--ambient"]
+        options += [] if free else ["--ambient"]
+    if forces and kept and _is_band_limited(record):
+        options += ["--input-hold", "band-limited"]
     if faulty and kept:
-        options += ["--outputs", ",".join(kept)]
+        options += ["--outputs", _listed(kept)]
     moving = (
         record.select_outputs([name for name in record.output_names if name not in faulty])
         if kept or forces
@@ -177,12 +187,28 @@ def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:
     return sorted(float(lines[i]) for i in best)
 
 
-def _decays(record: Record) -> bool:
-    """Whether the outputs are a free decay: small in the last tenth, or with a level that only falls from its peak."""
-    about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
-    tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
-    falling = tenths[int(np.argmax(tenths)) :]
-    return tenths[-1] < DECAYED**2 * max(tenths) or (len(falling) >= FALLING and bool(np.all(np.diff(falling) < 0)))
+def _is_motion(name: str) -> bool:
+    """Whether the name of a channel is that of a motion."""
+    return bool(MOTIONS.search(name)) and not FORCES.search(name)
+
+
+def _is_band_limited(record: Record) -> bool:
+    """Whether the inputs are measured forces without content near the Nyquist frequency.
+
+    No converter holds what a force sensor reads from sample to sample, as it does a command.
+    """
+    if any(channel.quantity != "force" for channel in record.input_channels):
+        return False
+    # of the whole record: windows would hide a blow at its beginning
+    powers = (np.abs(rfft(row - row.mean())) ** 2 for row in record.inputs)
+    return all(power[-(power.size // 10 + 1) :].mean() < ABOVE * power.mean() for power in powers)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names for an option, separated by commas; one that holds a comma in double quotes."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="").writerow(names)
+    return text.getvalue()
 
 
 def _command(path: Path, options: Sequence[str]) -> str:
