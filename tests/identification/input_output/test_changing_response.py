@@ -1,7 +1,11 @@
+import control
 import numpy as np
 import pytest
 
+from workbench.identification.driven import identify_driven
+from workbench.identification.input_output import changing_response
 from workbench.identification.input_output.changing_response import _simulated
+from workbench.records.record import Channel, Record
 
 
 @pytest.mark.parametrize("many", [1, 40])
@@ -29,3 +33,28 @@ def test_what_drives_a_mode_at_first_is_followed_sample_by_sample():
     law = np.zeros((1, 2), complex), np.array([1.0]), False, step
     z = _simulated(np.zeros(1, complex), drive, *law, 5.0, 1e-3, 1e3, dt, 0.2, 0.3, 16.0, 30, 40)[:, 0]
     np.testing.assert_allclose(z, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+
+
+def test_two_linear_modes_are_no_changing_one_after_a_step_of_each_law(monkeypatch):
+    """No law of one mode fits two that are 3 % apart, and none of more terms is tried where its parts failed."""
+    n, dt, omega, zeta = 4000, 0.01, 2.0 * np.pi * np.array([9.0, 9.27]), np.array([0.006, 0.012])
+    rng = np.random.default_rng(5)
+    poles = -zeta * omega + 1j * omega * np.sqrt(1.0 - zeta**2)
+    plant = control.ss(np.kron(np.diag(poles.real), np.eye(2)) + np.kron(np.diag(poles.imag), [[0, 1], [-1, 0]]),
+                       [[1.0], [0.0], [1.0], [0.0]], [[1.0, 0.0, 1.0, 0.0]], 0.0)  # fmt: skip
+    force = rng.standard_normal((1, n))
+    outputs = control.forced_response(control.sample_system(plant, dt), inputs=force).outputs.reshape(1, -1)
+    outputs = outputs + 1e-3 * outputs.std() * rng.standard_normal(outputs.shape)
+    simulations: list[bool] = []
+    monkeypatch.setattr(changing_response, "_simulated", lambda *law: (simulations.append(law[4]), _simulated(*law))[1])
+    record = Record(
+        sample_time=dt,
+        inputs=force,
+        outputs=outputs,
+        input_channels=(Channel("F"),),
+        output_channels=(Channel("d", "displacement"),),
+    )
+    modes = identify_driven(record).modes
+    np.testing.assert_allclose(modes.omega, omega, rtol=1e-3)
+    # four laws of two terms, the start and one step each; twice, as the noise spectrum is estimated again
+    assert 0 < len(simulations) <= 16
