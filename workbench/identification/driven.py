@@ -51,6 +51,7 @@ from workbench.identification.input_output.model_order import (
     sure_modes,
 )
 from workbench.identification.input_output.noise_spectrum import alike
+from workbench.identification.input_output.output_clock import clock_remarks, on_inputs_clock, on_one_clock
 from workbench.identification.input_output.peak_shape import overlap_remarks
 from workbench.identification.input_output.residual_bursts import burst_remarks
 from workbench.identification.input_output.sensor_drift import beside_drift
@@ -288,6 +289,8 @@ def identify_driven(
             f" {', '.join(records[0].output_names)} rises above the noise; excite harder or longer, or check whether"
             " inputs and outputs belong together"
         )
+    if data.clock:
+        logged, records = ([on_inputs_clock(record, data.clock) for record in each] for each in (logged, records))
     data, selected, changing = _as_time_invariant(data, selected, budget)
     selected = _without_unpredictive(data, selected, Budget(DRIVEN.final_seconds))
     selected, remarks = _without_artefacts(data, selected, budget)
@@ -295,6 +298,7 @@ def identify_driven(
         remarks = (*_delay_remarks(data), *remarks)
     fit = joined(data, selected.fit, budget)
     selected = selected if fit is selected.fit else selected.refitted(fit)
+    clocks = clock_remarks(data, selected.fit)
     holds = hold_remarks(data, selected.fit, selected.limit, budget)
     bursts = burst_remarks(logged, data.left(fit), fit.noise)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
@@ -309,7 +313,7 @@ def identify_driven(
         records,
         data,
         selected,
-        (*clipped, *bursts, *windowed, *drift, *holds, *remarks, *overlap, *changes, *budget.remarks),
+        (*clipped, *clocks, *bursts, *windowed, *drift, *holds, *remarks, *overlap, *changes, *budget.remarks),
     )
     deviation = driven.modes.omega * driven.zeta_std + 1j * driven.omega_std
     decays = by_amplitude.remarks(fit.poles, _response_sizes(data, fit), deviation)
@@ -526,6 +530,14 @@ def _select(
     options["budget"] = budget
     start = _subspace_start(data, **options) if strongest is None else strongest.fit
     sure = sure_modes(data, start, options["false_alarm"], budget)
+
+    def sure_of(other: KnownInputs) -> Fit:
+        return sure_modes(other, _subspace_start(other, **options), options["false_alarm"], budget)
+
+    on_one = on_one_clock(data, sure, sure_of, budget)
+    if on_one is not None:
+        (data, sure), strongest = on_one, None
+        start = sure
     noise = None if budget.spent("search for noise of the inputs") else input_noise(data, sure)
     if noise is not None:
         (data, start), strongest = with_white_noise(data, sure, noise, options["false_alarm"], budget), None

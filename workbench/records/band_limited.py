@@ -6,6 +6,7 @@ record is not periodic; it is continued from its end to its start by reflections
 
 import numpy as np
 from scipy.fft import fft, ifft, next_fast_len
+from scipy.signal import czt
 
 from workbench.arrays import Complexes, Floats
 
@@ -52,6 +53,21 @@ def finer(signals: Floats, times: int) -> Floats:
     fine[:, :half] = spectrum[:, :half]
     fine[:, fine.shape[1] - (size - half) :] = spectrum[:, half:]
     return np.asarray(times * ifft(fine, axis=1).real[:, : signals.shape[1] * times])
+
+
+def spaced(signals: Floats, spacing: float, n: int) -> Floats:
+    """The signals (n_signals, n_samples) at n instants `spacing` samples apart, the first at the first sample."""
+    spectrum = spectrum_of(signals)
+    size = spectrum.shape[1]
+    one_sided = spectrum[:, : (size + 1) // 2]
+    one_sided[:, 1:] *= 2.0
+    return np.asarray(czt(one_sided, n, np.exp(2j * np.pi * spacing / size), axis=1).real / size)
+
+
+def derivative_of(signals: Floats) -> Floats:
+    """The derivative of the signals (n_signals, n_samples) at their samples, per sample."""
+    spectrum = spectrum_of(signals)
+    return np.asarray(ifft(1j * angles(spectrum.shape[1]) * spectrum, axis=1).real[:, : signals.shape[1]])
 
 
 def response_of_pole(spectrum: Complexes, pole: complex, n: int) -> tuple[Complexes, Complexes]:

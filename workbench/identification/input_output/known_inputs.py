@@ -78,6 +78,7 @@ class KnownInputs:
         distorted: poles of nonlinear modes; no further mode is searched near these.
         free: poles identified from the free decay within the records, to start from where some are distorted.
         measured: the records as measured, where the noise of their inputs was whitened.
+        clock: ε of the clock of the outputs (`output_clock`), by which they were resampled; 0 where they were not.
     """
 
     def __init__(
@@ -96,8 +97,9 @@ class KnownInputs:
         distorted: tuple[complex, ...] = (),
         free: tuple[complex, ...] = (),
         measured: Sequence[Record] | None = None,
+        clock: float = 0.0,
     ) -> None:
-        self.measured = measured
+        self.measured, self.clock = measured, clock
         self.distorted, self.free = distorted, free
         self.records, self.at_rest, self.hold, self.may_have_feedthrough = records, at_rest, hold, feedthrough
         self.dt, self.places = records[0].sample_time, records[0].positions
@@ -186,6 +188,10 @@ class KnownInputs:
         """The same records with other inputs, as samples of equal weight."""
         return self._with(records=records, line_std=None)
 
+    def with_outputs(self, records: Sequence[Record], clock: float) -> "KnownInputs":
+        """Records with outputs resampled by this ε of their clock, as samples of equal weight."""
+        return self._with(records=records, clock=clock, line_std=None)
+
     def with_white_noise(self, records: Sequence[Record]) -> "KnownInputs":
         """Records in which the noise of the inputs was whitened, as samples of equal weight."""
         return self._with(records=records, measured=self.records, line_std=None)
@@ -270,6 +276,7 @@ class KnownInputs:
             "distorted": self.distorted,
             "free": self.free,
             "measured": self.measured,
+            "clock": self.clock,
         }
         return KnownInputs(**{**same, **changed})
 
