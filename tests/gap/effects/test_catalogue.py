@@ -216,6 +216,15 @@ def test_an_effect_is_unsure_where_a_number_that_is_stated_may_be_nothing():
     assert replace(joint, deviations={"stiffness": 1.0, "yield_displacement": 1e-9}).is_sure(frame())
 
 
+def test_rounding_of_all_sensors_is_described_with_their_unit():
+    nominal = rig()
+    of_one = replace(nominal, sensors=tuple(s for s in nominal.sensors if s.quantity == "displacement"))
+    effect = Effect(kind_named("sensor_quantisation"), "all", {"step": 2e-3})
+    assert _described(effect, of_one) == "rounding of a sensor (all: step 0.002 m)"
+    other = replace(of_one.sensors[0], name="v", quantity="velocity")
+    assert "0.002)" in _described(effect, replace(of_one, sensors=(*of_one.sensors, other)))
+
+
 def test_exchanged_channels_are_named_by_both():
     nominal = rig()
     effect = Effect(kind_named("swapped_outputs"), ("d", "d2"), {})
