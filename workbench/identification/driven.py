@@ -17,6 +17,7 @@ from scipy.stats import chi2
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.after_impacts import after_impacts
+from workbench.identification.input_output.changing_response import CHANGE_CHECK
 from workbench.identification.input_output.excitation import check_inputs, unexcited_remarks
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.force_window import force_window
@@ -302,7 +303,7 @@ def identify_driven(
     holds = hold_remarks(data, selected.fit, selected.limit, budget)
     bursts = burst_remarks(logged, data.left(fit), fit.noise)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
-    out_of_time = budget.spent("check of modes that change within the record")
+    out_of_time = budget.spent(CHANGE_CHECK)
     in_decay = by_amplitude.among(fit.poles)
     changes, explained = ((), in_decay) if out_of_time else change_remarks(data, fit, changing, in_decay)
     distorted = (*selected.distorted, *left_about(data, fit))

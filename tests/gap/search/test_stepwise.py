@@ -238,13 +238,17 @@ def test_trials_that_were_told_wrongly_once(seed, imperfections, size, kinds):
         ("frames", 942222, ("clearance", "modulus_error")),  # lost to noise of the inputs, of which there is none
         ("frames", 956313, ("two_way_friction",)),  # could not be simulated beside the records
         ("frames", 956326, ("clearance", "periodic_disturbance")),  # the disturbance sought at two points alone
-        ("frames", 94283008, ("point_mass",)),  # lost to large errors, which make up for the modes that the rig lacks
     ],
 )
 def test_trials_on_plates_and_frames_that_were_told_wrongly_once(structure, seed, kinds):
-    how = {"imperfections": "place", "size": 0.5} if seed > 94_000_000 else {}
-    trials = hold_trials(1, seed, kinds=[kinds], structure=structure, **how)
-    (told,) = trials.scores.values()
+    (told,) = hold_trials(1, seed, kinds=[kinds], structure=structure).scores.values()
+    assert told["kinds"] and all(error < 0.02 for error in told["position_errors"])
+
+
+@pytest.mark.slow
+def test_a_mass_is_named_beside_large_errors_that_make_up_for_modes_the_rig_lacks():
+    how = {"structure": "frames", "imperfections": "place", "size": 0.5}
+    (told,) = hold_trials(1, 94283008, kinds=[("point_mass",)], **how).scores.values()
     assert told["kinds"] and all(error < 0.02 for error in told["position_errors"])
 
 

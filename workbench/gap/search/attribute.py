@@ -341,13 +341,14 @@ def _input_noise_of(search: Search, best: Fit, noise: np.ndarray) -> float:
 
     A small excess of the residual counts only if its spectrum is that of input noise, by likelihood.
     """
-    rig, data = apply_all(search.rig, best.effects), search.data.with_noise(noise)
+    rig = apply_all(search.rig, best.effects)
     residual_power = search.data.by_channel(search.data.residual(rig))
     sensor_noise = (noise / search.data.noise) ** 2
     share = logging_noise(residual_power, sensor_noise, search.logging_noise)
     is_small = (residual_power.mean(axis=1) < (1.0 + ATTRIBUTION.a_tenth) * sensor_noise.mean()).all()
     if not is_small:
         return share
+    data = search.data.with_noise(noise)
     is_shown = share > LEAST_LOGGED and shows_input_noise(rig, data, data.differences(rig), share)
     return share if is_shown else 0.0
 

@@ -250,9 +250,9 @@ class Stepwise:
         if not search.near(best, STEPWISE.almost) or any(effect.kind in UNIFORM for effect in best.effects):
             return False
         found = fit_jointly(search, best.effects, nominal_errors(search.rig, search.prior), until_convergence=True)
-        if self._may_be_port_errors(found) or not self.explains(found):
-            return False
-        if not self._are_noticeable(found.effects, found.fit.effects):
+        if self._may_be_port_errors(found) or not (
+            self.explains(found) and self._are_noticeable(found.effects, found.fit.effects)
+        ):
             return False
         self.steps.append(found)
         self.is_run = True  # errors as large as these absorb the effect at any other place too

@@ -44,6 +44,7 @@ class ChangingResponseSettings:
 
 
 RESPONSE = ChangingResponseSettings()
+CHANGE_CHECK = "check of modes that change within the record"  # its name where the time is spent
 # (whether the rate changes with time, powers); λ is one coefficient more.
 LAWS = (
     (True, (1.0, 2.0)),
@@ -65,7 +66,7 @@ class Motion:
 
 
 class _GivenUp(Exception):
-    """A law is hopeless, or the time is spent."""
+    """A law is hopeless after its first step, or the time is spent."""
 
 
 def in_place_of(data: KnownInputs, fit: Fit, cluster: np.ndarray, limit: float, budget: Budget) -> Motion | None:
@@ -78,6 +79,8 @@ def in_place_of(data: KnownInputs, fit: Fit, cluster: np.ndarray, limit: float, 
     n_coefficients = cluster.size * (n_excitations + n_outputs) - (n_excitations - 1 + n_outputs)
     given_up: set[tuple[bool, tuple[float, ...]]] = set()
     for by_time, powers in LAWS:
+        if budget.spent(CHANGE_CHECK):
+            break
         parts = {law for law in LAWS if law[0] == by_time and set(law[1]) < set(powers)}
         if len(powers) + 1 > n_coefficients or (parts and parts <= given_up):
             continue
@@ -214,19 +217,22 @@ class _Response:
         if not active.any():
             return None
 
+        def beyond_threshold() -> float:
+            return float(np.log(_squares(once(unknowns)[0], self.fit.noise.size)).sum() - threshold)
+
         beyond: list[float] = []
 
         def among_active(x: Floats) -> tuple[Floats, Floats]:
             unknowns[active] = x
             residual, jacobian = once(unknowns)
-            beyond.append(np.log(_squares(residual, self.fit.noise.size)).sum() - threshold)
+            beyond.append(beyond_threshold())
             is_hopeless = len(beyond) > 1 and min(beyond) > RESPONSE.hopeless
-            if is_hopeless or budget.spent("check of modes that change within the record"):
+            if is_hopeless or budget.spent(CHANGE_CHECK):
                 raise _GivenUp
             return residual, jacobian[:, active]
 
         unknowns[active] = Once(among_active).least(unknowns[active], RESPONSE.most_tries)
-        if np.log(_squares(once(unknowns)[0], self.fit.noise.size)).sum() > threshold:
+        if beyond_threshold() > 0.0:
             return None
         return self._motion(self._motions(unknowns, by_time, powers))
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from workbench.arrays import scaled_inverse
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, column_norms, orthonormal, regressors
+from workbench.identification.input_output.modal_fit import Fit, orthonormal, regressors
+from workbench.identification.input_output.rivals import normalised_columns
 from workbench.identification.input_output.time_variance import slopes_in_time
 from workbench.identification.signal.modal_estimates import time_derivatives
 from workbench.identification.signal.searches import Budget
@@ -121,4 +122,4 @@ def clock_remarks(data: KnownInputs, fit: Fit) -> tuple[str, ...]:
 
 
 def _basis(columns: np.ndarray) -> np.ndarray:
-    return orthonormal(columns / np.maximum(column_norms(columns), 1e-300))[0]
+    return orthonormal(normalised_columns(columns))[0]

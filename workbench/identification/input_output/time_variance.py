@@ -21,7 +21,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from workbench.arrays import Floats, scaled_inverse
-from workbench.identification.input_output.changing_response import in_place_of
+from workbench.identification.input_output.changing_response import CHANGE_CHECK, in_place_of
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import (
     Fit,
@@ -115,7 +115,7 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
         change = changes_in_time(data, one)
         return float((change.frequency[at] / change.deviation[at]) ** 2) if change.sure[at] else -np.inf
 
-    return one_for_two(data, fit, budget, statistic, "check of modes that change within the record")[0]
+    return one_for_two(data, fit, budget, statistic, CHANGE_CHECK)[0]
 
 
 def one_for_two(
@@ -161,7 +161,7 @@ def beside_changing(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -
         weak = strength < CHANGING.faint * strength[r]
         close = np.abs(fit.poles.imag - fit.poles.imag[r]) < CHANGING.reach * np.abs(fit.poles.imag[r])
         others = np.flatnonzero(weak & close & alike[r] & ~removed)
-        if removed[r] or not others.size or budget.spent("check of modes that change within the record"):
+        if removed[r] or not others.size or budget.spent(CHANGE_CHECK):
             continue
         kept = np.delete(np.arange(fit.poles.size), others)
         one = settled(data, only(data, fit, kept), SELECTION.few_steps, budget)
