@@ -198,13 +198,7 @@ def _identify_with_drift(
 ) -> tuple[Identified, list[Record], list[str]]:
     """The modes, the records without drift, and notes; modes and drift are estimated alternately until both settle."""
     poles = np.zeros(0, complex)
-    taken: list[Drift] = []  # one per record once drift is removed
-    # Modes would be fitted to a drift that is larger than they are; no mode is a parabola.
-    drifts = [without_drift(record, poles, most=RING_DOWN.parabola) for record in records]
-    variances = [(d.record.outputs.var(axis=1), r.outputs.var(axis=1)) for d, r in zip(drifts, records, strict=True)]
-    dominant = any((remaining < RING_DOWN.dominant * total).any() for remaining, total in variances)
-    if dominant and not any(_settles_within_a_period(drift) for drift in drifts):
-        taken = drifts
+    taken = _dominant_drifts(records)  # one per record once drift is removed
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(RING_DOWN.drift_rounds):
         identified = _identify([drift.record for drift in taken] or records, n_modes, budget)
@@ -231,6 +225,15 @@ def _identify_with_drift(
     i, j = np.unravel_index(int(np.argmax(size_over_noise)), size_over_noise.shape)
     name, drift = records[0].output_names[j], taken[int(i)]
     return identified, without, [f"{drift.words} of {drift.size[j]:.3g} was removed from output {name!r}"]
+
+
+def _dominant_drifts(records: list[Record]) -> list[Drift]:
+    """The drift of each record where it is larger than the motion, to which modes would be fitted; else none."""
+    # no mode is a parabola
+    drifts = [without_drift(record, np.zeros(0, complex), most=RING_DOWN.parabola) for record in records]
+    variances = [(d.record.outputs.var(axis=1), r.outputs.var(axis=1)) for d, r in zip(drifts, records, strict=True)]
+    dominant = any((remaining < RING_DOWN.dominant * total).any() for remaining, total in variances)
+    return drifts if dominant and not any(_settles_within_a_period(drift) for drift in drifts) else []
 
 
 def _drift_changed(drifts: list[Drift], before: list[Drift], identified: Identified) -> bool:
