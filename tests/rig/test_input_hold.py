@@ -6,12 +6,13 @@ import control
 import numpy as np
 import pytest
 
+from workbench.records.band_limited import finer
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import prediction_errors, simulate
+from workbench.rig.simulate import BAND_STEPS, prediction_errors, simulate
 from workbench.rig.statespace import state_space
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes, PointShapes
@@ -68,6 +69,26 @@ def test_delay_and_lag_act_on_the_straight_input(delay, lag):
     found = simulate(model, u, sample_time=DT, input_hold="first").outputs
     expected = on_fine_steps(model, u, force)
     np.testing.assert_allclose(found[:2], expected[:2], atol=2e-3 * np.abs(expected[:2]).max())
+
+
+@pytest.mark.parametrize("late", [0.0, 0.25, 1.5, -0.75])
+def test_band_limited_inputs_are_a_first_order_hold_of_many_steps(late):
+    """Of the inputs interpolated by Fourier series; also for readings between the samples, with a constant force."""
+    u = np.array(command())
+    u.setflags(write=False)
+    steps = round(late * BAND_STEPS)
+    model = rig(bias=0.3)
+    fine = finer(u, BAND_STEPS) + 0.3
+    instants = DT / BAND_STEPS * np.arange(fine.shape[1])
+    system = state_space(model.modes, rig().actuators, model.sensors)
+    whole = control.forced_response(system, instants, fine).outputs
+    at = BAND_STEPS * np.arange(SAMPLES) - steps
+    inside = (at >= 0) & (at < fine.shape[1])
+    expected = whole[2, at[inside]]
+    sensors = tuple(replace(s, delay=late * DT) if s.name == "acceleration" else s for s in model.sensors)
+    found = simulate(replace(model, sensors=sensors), u, sample_time=DT, input_hold="band-limited").outputs
+    np.testing.assert_allclose(found[2, inside], expected, atol=1e-8 * np.abs(expected).max())
+    np.testing.assert_allclose(found[:2], whole[:2, ::BAND_STEPS], atol=1e-8 * np.abs(whole).max())
 
 
 SLOW = {"delay": 1.3 * DT, "time_constant": 0.05, "bias": 0.2}

@@ -116,7 +116,7 @@ class Drives:
     sizes: Floats
 
 
-class _Signals:
+class Signals:
     """A read-only array as a key of a cache, compared by identity."""
 
     def __init__(self, values: Floats) -> None:
@@ -126,7 +126,7 @@ class _Signals:
         return id(self.values)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Signals) and self.values is other.values
+        return isinstance(other, Signals) and self.values is other.values
 
 
 def drives(
@@ -136,14 +136,18 @@ def drives(
 
     They are cached for the read-only inputs of a record, because structure and sensors of a rig change more often.
     """
-    read_only = inputs.base is None and not inputs.flags.writeable
-    compute = _cached_drives if read_only and inputs.size * substeps <= MOST_KEPT else _cached_drives.__wrapped__
-    return compute(actuators, _Signals(inputs), sample_time, substeps, input_hold)
+    compute = _cached_drives if is_cacheable(inputs, substeps) else _cached_drives.__wrapped__
+    return compute(actuators, Signals(inputs), sample_time, substeps, input_hold)
+
+
+def is_cacheable(inputs: Floats, substeps: int) -> bool:
+    """Whether what is computed from inputs may be cached: they are read-only, and so many substeps are not too many."""
+    return inputs.base is None and not inputs.flags.writeable and inputs.size * substeps <= MOST_KEPT
 
 
 @lru_cache(maxsize=DRIVES_KEPT)
 def _cached_drives(
-    actuators: tuple[Actuator, ...], inputs: _Signals, sample_time: float, substeps: int, input_hold: str
+    actuators: tuple[Actuator, ...], inputs: Signals, sample_time: float, substeps: int, input_hold: str
 ) -> Drives:
     lines, at_samples, nonlinear = _forces_on_substeps(actuators, inputs.values, sample_time, substeps, input_hold)
     (starts, ends), h = lines, sample_time / substeps

@@ -1,9 +1,11 @@
 """Exact propagation of a linear rig: held inputs, delays, lags and sinusoids in closed form, pole by pole."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import expm
 
 from workbench.arrays import Complexes, Floats
@@ -177,68 +179,98 @@ def straight_response(
     *,
     delay: float = 0.0,
     time_constant: float = 0.0,
+    every: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pole coordinates under inputs that are linear between samples and zero before the first (first-order hold).
 
-    Arguments and results are those of `held_response`. With the response R_λ of a pole to the inputs, the response to
-    inputs with a lag T is (R_λ - R_{-1/T}) / (1 + λ T).
+    With the response R_λ of a pole to the inputs, the response to inputs with a lag T is (R_λ - R_{-1/T}) / (1 + λ T).
+
+    Args:
+        system, forces, participation, sample_time, delay, time_constant: as of `held_response`.
+        every: results are of every so many samples; n_samples is a multiple of it.
+
+    Returns:
+        As `held_response`.
     """
     poles, weights = system.poles, system.weights @ participation
-    pieces = _LinearPieces.of(forces, sample_time, delay)
-    response = pieces.response(poles, weights)
+    inputs = _DelayedInputs.of(forces, sample_time, delay, every)
+    response = np.zeros((poles.size, forces.shape[1] // every), complex)
+    for j, own in enumerate(inputs.responses(poles)):
+        response += weights[:, j, None] * own
     if time_constant == 0:
-        return response, pieces.first[0]
+        return response, inputs.at_steps
     denominator = 1.0 + poles * time_constant
     denominator = np.where(np.abs(denominator) < CLOSE, CLOSE, denominator)
-    n_inputs = forces.shape[0]
-    lagging = pieces.response(np.full(n_inputs, -1.0 / time_constant), np.eye(n_inputs)).real
+    of_lag = inputs.responses(np.array([-1.0 / time_constant], complex))
+    lagging = np.reshape([own[0].real for own in of_lag], (len(forces), -1))
     return (response - weights @ lagging) / denominator[:, None], lagging / time_constant
 
 
 @dataclass(frozen=True, eq=False)
-class _LinearPieces:
-    """Delayed inputs over each sample interval: two linear pieces, before and after the corner within it.
+class _DelayedInputs:
+    """Inputs that are linear between samples and delayed, over steps of a number of samples.
 
     Attributes:
-        first, second: (2, n_inputs, n_samples) values at the start and the end of each piece.
-        spans: their durations, s.
+        windows: (n_inputs, every + 2, n_steps) the inputs delayed by whole samples: at the samples of each step, one
+            before and one after it.
+        first: (n_inputs,) their first samples.
+        late: whole samples of the delay.
+        spans: of the rest of the delay, and from there to the next sample, s.
+        every: number of samples of a step.
     """
 
-    first: np.ndarray
-    second: np.ndarray
+    windows: Floats
+    first: Floats
+    late: int
     spans: tuple[float, float]
+    every: int
 
     @classmethod
-    def of(cls, forces: np.ndarray, sample_time: float, delay: float) -> "_LinearPieces":
+    def of(cls, forces: Floats, sample_time: float, delay: float, every: int) -> "_DelayedInputs":
+        n_inputs, n_samples = forces.shape
         late, rest = whole_samples(delay, sample_time)
-        share = 1.0 - rest / sample_time
-        ahead = np.c_[forces[:, 1:], forces[:, -1:]]
-        old, middle, new = shifted(forces, late + 1), shifted(forces, late), shifted(ahead, late)
-        if late < forces.shape[1]:
-            middle_before = middle.copy()
-            middle_before[:, late] = 0.0  # zero before the first sample
-        else:
-            middle_before = middle
-        first = np.stack([old + share * (middle_before - old), middle_before])
-        second = np.stack([middle, middle + share * (new - middle)])
-        return cls(first if rest else np.stack([middle, middle]), second, (rest, sample_time - rest))
+        padded = np.concatenate([np.zeros((n_inputs, late + 1)), forces, forces[:, -1:]], axis=1)[:, : n_samples + 2]
+        windows = sliding_window_view(padded, every + 2, axis=1)[:, ::every].transpose(0, 2, 1)
+        return cls(np.ascontiguousarray(windows), forces[:, 0], late, (rest, sample_time - rest), every)
 
-    def response(self, poles: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Coordinates (n_poles, n_samples) of poles that the inputs drive by weights (n_poles, n_inputs)."""
-        before, after = self.spans
-        drive = np.exp(poles * after)[:, None] * self._driven(poles, weights, self.first, before)
-        drive = drive + self._driven(poles, weights, self.second, after)
-        response = np.zeros(drive.shape, complex)
-        _recursion(np.exp(poles * (before + after)).astype(complex), drive.astype(complex), response)
-        return response
+    @property
+    def _share(self) -> float:
+        """Of the next sample in the value at a sample, once delayed."""
+        rest, remaining = self.spans
+        return remaining / (rest + remaining)
 
-    @staticmethod
-    def _driven(poles: np.ndarray, weights: np.ndarray, ends: np.ndarray, span: float) -> np.ndarray:
-        """Contribution (n_poles, n_samples) of a piece to each pole's coordinate at its end."""
-        if span == 0:
-            return np.zeros((poles.size, ends.shape[2]))
-        level, rise = _growth(poles, span), _ramp_growth(poles, span)
-        return np.asarray(level[:, None] * (weights @ ends[0]) + rise[:, None] * (weights @ (ends[1] - ends[0])))
+    @property
+    def at_steps(self) -> Floats:
+        """The inputs (n_inputs, n_steps) at the beginning of each step."""
+        values: Floats = (1.0 - self._share) * self.windows[:, 0] + self._share * self.windows[:, 1]
+        step, sample = divmod(self.late, self.every)
+        if self.spans[0] > 0 and sample == 0 and step < values.shape[1]:
+            values[:, step] = 0.0
+        return values
+
+    def responses(self, poles: Complexes) -> Iterator[Complexes]:
+        """Coordinates (n_poles, n_steps) of the poles that each input alone drives."""
+        (rest, remaining), share = self.spans, self._share
+        before, after = _ends_of_ramp(poles, rest), _ends_of_ramp(poles, remaining)
+        fade = np.exp(poles * remaining)
+        # weights of the last, this and the next delayed sample in one interval, two linear pieces
+        to_this, to_next = fade * (share * before[0] + before[1]), share * after[1]
+        of_samples = fade * (1.0 - share) * before[0], to_this + after[0] + (1.0 - share) * after[1], to_next
+        decay = np.exp(np.outer(poles, (rest + remaining) * np.arange(self.every - 1, -1, -1)))
+        weights = np.zeros((poles.size, self.every + 2), complex)
+        for i, weight in enumerate(of_samples):
+            weights[:, i : i + self.every] += weight[:, None] * decay
+        for window, first in zip(self.windows, self.first, strict=True):
+            # two real products: one of complex by real numbers takes four
+            drive = weights.real @ window + 1j * (weights.imag @ window)
+            # no ramp from the zero before to the first sample, where the inputs begin with a step
+            for interval, ramp in ((self.late - 1, to_next), (self.late, to_this)):
+                step, sample = divmod(interval, self.every)
+                if 0 <= step < drive.shape[1]:
+                    drive[:, step] -= first * ramp * decay[:, sample]
+            response = np.zeros(drive.shape, complex)
+            _recursion(np.exp(poles * (rest + remaining) * self.every), drive, response)
+            yield response
 
 
 def sinusoid_response(
@@ -287,6 +319,12 @@ def _ramp_growth(poles: np.ndarray, span: float) -> np.ndarray:
     x = np.where(small, z, 0.0)
     series = 1.0 / 2 + x * (1.0 / 6 + x * (1.0 / 24 + x * (1.0 / 120 + x * (1.0 / 720 + x / 5040.0))))
     return span * np.where(small, series, (np.expm1(z) - z) / np.where(small, 1.0, z) ** 2)
+
+
+def _ends_of_ramp(poles: Complexes, span: float) -> tuple[Complexes, Complexes]:
+    """Weights of the values at both ends of a linear force over a span in the coordinates at its end."""
+    rise = _ramp_growth(poles, span)
+    return _growth(poles, span) - rise, rise
 
 
 def _faded_growth(poles: Complexes, rate: float, span: float) -> Complexes:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, lru_cache, partial, reduce
 
 import numpy as np
 from scipy.signal import lfilter
@@ -12,7 +12,14 @@ from workbench.records.band_limited import finer
 from workbench.records.record import Record
 from workbench.rig import elements, stepping
 from workbench.rig.between_samples import BetweenSamples, Step
-from workbench.rig.driving import actuator_force, drives, motion_correction, sinusoid_on_substeps
+from workbench.rig.driving import (
+    Signals,
+    actuator_force,
+    drives,
+    is_cacheable,
+    motion_correction,
+    sinusoid_on_substeps,
+)
 from workbench.rig.linear import (
     ModalPoles,
     held_response,
@@ -60,6 +67,8 @@ class Motion:
         held: (n_modes, n_samples) the part of the forces that is constant over each interval but for the steps.
         finer: (factor, function) that recomputes the motion with `factor` times as many samples, where forces change
             within an interval in another way; None where not needed.
+        delayed: function of a delay, s, that recomputes the motion so much later, at the same instants; None where
+            there is none.
     """
 
     displacement: Floats
@@ -70,6 +79,7 @@ class Motion:
     steps: tuple[Step, ...] = ()
     held: Floats | float = 0.0
     finer: "tuple[int, Callable[[], Motion]] | None" = None
+    delayed: "Callable[[float], Motion] | None" = None
 
     def between_samples(self, sample_time: float) -> BetweenSamples:
         """The motion at any time; cached, since sensors of many delays may read one motion."""
@@ -94,17 +104,12 @@ class Motion:
         q, v, forces = (array[:, lead:] for array in (self.displacement, self.velocity, self.forces))
         steps = tuple(replace(step, forces=step.forces[:, lead:]) for step in self.steps)
         held = self.held[:, lead:] if isinstance(self.held, np.ndarray) else self.held
-        later = Motion(q, v, forces, stiffness, self.damping, steps, held, self.finer)
-        if self.finer is None:
-            return later
-        times, _ = self.finer
-        return replace(later, finer=(times, lambda: self.finely.after(times * lead)))
-
-    def every(self, times: int) -> "Motion":
-        """Every `times`-th sample of a motion whose forces are linear between its own samples."""
-        stiffness = self.stiffness[:, ::times] if self.stiffness.shape[1] > 1 else self.stiffness
-        q, v, forces = (array[:, ::times] for array in (self.displacement, self.velocity, self.forces))
-        return Motion(q, v, forces, stiffness, self.damping, finer=(times, lambda: self))
+        later = Motion(q, v, forces, stiffness, self.damping, steps, held)
+        if self.finer is not None:
+            times, _ = self.finer
+            later = replace(later, finer=(times, lambda: self.finely.after(times * lead)))
+        delayed = self.delayed
+        return later if delayed is None else replace(later, delayed=lambda delay: delayed(delay).after(lead))
 
     @cached_property
     def finely(self) -> "Motion":
@@ -160,8 +165,7 @@ def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8,
     if is_stepped(rig):
         return _move_in_steps(rig, inputs, sample_time, substeps, input_hold)
     if input_hold == "band-limited":
-        finely = _move_exactly(rig, finer(inputs, BAND_STEPS), sample_time / BAND_STEPS, "first")
-        return finely.every(BAND_STEPS)
+        return _move_band_limited(rig, inputs, sample_time)
     return _move_exactly(rig, inputs, sample_time, input_hold)
 
 
@@ -189,8 +193,12 @@ def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
         delays = np.array([0.0 if rig.sensors[j].interpolated else rig.sensors[j].delay for j in here])
         if not delays.all():
             outputs[here] = shapes @ getattr(motion, QUANTITIES[order])
-        if delays.any():
-            delayed = np.flatnonzero(delays)
+        delayed = np.flatnonzero(delays)
+        if order == 2 and motion.delayed is not None:
+            for delay in set(delays[delayed]):
+                late = np.flatnonzero(delays == delay)
+                outputs[np.array(here)[late]] = shapes[late] @ motion.delayed(delay).acceleration
+        elif delayed.size:
             factor, fine = 1, motion
             if motion.finer is not None and (order == 2 or _is_rate_limited(rig)):
                 factor, fine = motion.finer[0], motion.finely
@@ -261,27 +269,60 @@ def participation_of(rig: Rig) -> np.ndarray:
     return shapes
 
 
-def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: str) -> Motion:
+def _move_band_limited(rig: Rig, inputs: Floats, sample_time: float) -> Motion:
+    """Motion under inputs that are linear between many points of each sample interval."""
+    fine = _on_band_steps(Signals(inputs)) if is_cacheable(inputs, BAND_STEPS) else finer(inputs, BAND_STEPS)
+    h = sample_time / BAND_STEPS
+
+    @lru_cache(maxsize=KEPT)
+    def delayed(delay: float) -> Motion:
+        """The motion under inputs so much later; a negative delay takes whole samples from after the last one."""
+        ahead = max(int(np.ceil(-delay / sample_time)), 0)
+        extended = np.pad(fine, ((0, 0), (0, ahead * BAND_STEPS)), mode="edge")
+        later = delay + ahead * sample_time
+        return _move_exactly(rig, extended, h, "first", every=BAND_STEPS, later=later).after(ahead)
+
+    motion = _move_exactly(rig, fine, h, "first", every=BAND_STEPS)
+    return replace(
+        motion,
+        finer=(BAND_STEPS, lambda: _move_exactly(rig, fine, h, "first")),
+        delayed=None if rig.elements else delayed,
+    )
+
+
+@lru_cache(maxsize=KEPT)
+def _on_band_steps(inputs: Signals) -> Floats:
+    return finer(inputs.values, BAND_STEPS)
+
+
+def _move_exactly(
+    rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: str, *, every: int = 1, later: float = 0.0
+) -> Motion:
+    """Motion of a linear rig, at every so many samples; `later` is a further delay of the inputs, s.
+
+    With held inputs, at every sample.
+    """
     modes, participation = rig.modes, participation_of(rig)
     system = _poles(modes)
-    n_samples = inputs.shape[1]
     responses: list[Complexes] = []
-    acting = np.zeros_like(inputs)
-    response_to = held_response if input_hold == "zero" else straight_response
+    acting = np.zeros((inputs.shape[0], inputs.shape[1] // every))
+    response_to = held_response if input_hold == "zero" else partial(straight_response, every=every)
     for delay, lag in {(a.delay, a.time_constant) for a in rig.actuators}:
         group = [j for j, a in enumerate(rig.actuators) if (a.delay, a.time_constant) == (delay, lag)]
         forces = np.array([actuator_force(rig.actuators[j], inputs[j]) for j in group])
         share, at_samples = response_to(
-            system, forces, participation[:, group], sample_time, delay=delay, time_constant=lag
+            system, forces, participation[:, group], sample_time, delay=delay + later, time_constant=lag
         )
         responses.append(share)
         acting[group] = at_samples
+    n_samples, sample_time = acting.shape[1], sample_time * every
     steps = _steps_within(rig, inputs, acting, participation, sample_time) if input_hold == "zero" else ()
     bias = np.array([actuator.bias for actuator in rig.actuators])
     if bias.any():
         constant = np.outer(bias, np.ones(n_samples))
-        responses.append(held_response(system, constant, participation, sample_time)[0])
-        acting += constant
+        share, at_samples = held_response(system, constant, participation, sample_time, delay=later)
+        responses.append(share)
+        acting += at_samples
     on_modes = participation @ acting
     held = on_modes if input_hold == "zero" else 0.0
     time = sample_time * np.arange(n_samples)
