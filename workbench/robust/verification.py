@@ -74,6 +74,10 @@ class Verification:
         return int(self.stable.size)
 
     @property
+    def n_stable(self) -> int:
+        return int(self.stable.sum())
+
+    @property
     def share_stable(self) -> float:
         return float(self.stable.mean())
 
@@ -112,7 +116,7 @@ class Verification:
         }
         return {
             "draws": self.n_draws,
-            "stable": int(self.stable.sum()),
+            "stable": self.n_stable,
             "small_gain_margin": rounded(self.small_gain_margin),
             "margin_frequency_hz": rounded(self.margin_frequency_hz),
             "damping": [[rounded(v) for v in interval(self.damping[:, r])] for r in self.controlled],
