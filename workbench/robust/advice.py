@@ -351,7 +351,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
-def _ratios(values: np.ndarray, lead: str = "") -> str:
+def _ratios(values: np.ndarray, lead: str) -> str:
     """Median and 95 % interval in per cent as text, with two to four digits until the ends differ."""
     middle, low, high = (100.0 * v for v in interval(values))
     digits = next((n for n in (2, 3, 4) if _rounded(low, n) != _rounded(high, n)), 0)

@@ -11,8 +11,9 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.records.record import Record
-from workbench.robust.prediction import LEVEL, Prediction
-from workbench.structure.modes import frozen
+from workbench.robust.prediction import Prediction
+from workbench.robust.verification import LEVEL
+from workbench.structure.modes import freeze
 from workbench.structure.printed import Printed
 
 UNLIKELY = 0.01  # significance level: the model is rejected if fewer tests of a true model come out as badly
@@ -46,8 +47,7 @@ class PredictionCheck(Printed):
     allowed: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("coverage", "band_coverage", "bands_hz", "expected"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "coverage", "band_coverage", "bands_hz", "expected")
 
     @property
     def overall(self) -> float:

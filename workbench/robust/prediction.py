@@ -18,12 +18,11 @@ from workbench.rig.elements import RandomForce
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion, read, simulate
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
-from workbench.robust.verification import check_loop_kinds, drawn_with_errors
-from workbench.structure.modes import Modes, frozen
+from workbench.robust.verification import LEVEL, QUANTILES, check_loop_kinds, drawn_with_errors
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, counted
 from workbench.threads import one_blas_thread
 
-LEVEL = 0.95
 DRAWS, LEAST_DRAWS = 200, 40
 NOISES = 4  # realisations of noise per draw, for the bands over time
 MOST_BANDS = 8
@@ -66,9 +65,8 @@ class Prediction(Printed):
     allowed: float = 0.0
 
     def __post_init__(self) -> None:
-        arrays = ("time", "median", "lower", "upper", "frequencies_hz", "bands_hz", "expected")
-        for name in (*arrays, "spectrum_median", "spectrum_lower", "spectrum_upper"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "time", "median", "lower", "upper", "frequencies_hz", "bands_hz", "expected")
+        freeze(self, "spectrum_median", "spectrum_lower", "spectrum_upper")
 
     @property
     def sample_time(self) -> float:
@@ -301,7 +299,7 @@ def _banded(
             f" {100 * uncertain.unexplained:.3g} % of the readings, of any phase and in any frequency band."
         )
     readings = np.array(truths)
-    low, median, high = _over_time(readings, rig, noise, rng)
+    median, low, high = _over_time(readings, rig, noise, rng)
     for i, truth in enumerate(readings):
         readings[i] = _read(truth, rig, noise, rng)
     sizes = np.array([amplitudes(reading) for reading in readings])
@@ -313,8 +311,8 @@ def _banded(
         low,
         high,
         frequencies,
-        spectrum[1],
         spectrum[0],
+        spectrum[1],
         spectrum[2],
         bands,
         np.zeros((0, len(rig.sensors), 1 + len(bands))),
@@ -323,9 +321,6 @@ def _banded(
         uncertain.unexplained,
     )
     return replace(prediction, expected=np.array([prediction.coverage(reading) for reading in readings]))
-
-
-QUANTILES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)
 
 
 def amplitudes(outputs: Floats) -> Floats:
