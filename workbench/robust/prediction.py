@@ -213,7 +213,11 @@ def _uncertain(rig: Verdict | UncertainRig, noise_std: Sequence[float] | Floats 
     uncertain = rig if isinstance(rig, UncertainRig) else UncertainRig.of(rig)
     if noise_std is None and isinstance(rig, Verdict) and rig.budget.noise_found:
         noise_std = rig.budget.noise_found
-    return uncertain, _noise(uncertain.nominal, noise_std)
+    sensors = uncertain.nominal.sensors
+    noise = np.array([s.noise_std for s in sensors] if noise_std is None else noise_std, float)
+    if noise.shape != (len(sensors),) or not (np.isfinite(noise) & (noise >= 0)).all():
+        raise ValueError(f"noise_std must be 0 or more for each of the {len(sensors)} sensors; got {noise}")
+    return uncertain, noise
 
 
 def _with_noise(rig: Rig, noise: Floats) -> Rig:
@@ -356,13 +360,6 @@ def _inputs(rig: Rig, inputs: Record | Floats, sample_time: float | None) -> tup
             f"inputs must be finite, one row for each of {', '.join(names)} and 2 samples or more; got {sent.shape}"
         )
     return sent, period, hold, start
-
-
-def _noise(rig: Rig, given: Sequence[float] | Floats | None) -> Floats:
-    noise = np.array([s.noise_std for s in rig.sensors] if given is None else given, float)
-    if noise.shape != (len(rig.sensors),) or not (np.isfinite(noise) & (noise >= 0)).all():
-        raise ValueError(f"noise_std must be 0 or more for each of the {len(rig.sensors)} sensors; got {noise}")
-    return noise
 
 
 def _bands(modes: Modes, frequencies: Floats) -> Floats:
