@@ -91,12 +91,7 @@ class Redesign:
     @property
     def _better(self) -> bool:
         """Whether the redesigned controller costs less than the present one, or settles sooner."""
-        return self._over[0] < 1.0 or self._sooner
-
-    @property
-    def _sooner(self) -> bool:
-        """Whether the redesigned controller settles sooner, in the median of the draws."""
-        return self._sooner_by > 0.0
+        return self._over[0] < 1.0 or self._sooner_by > 0.0
 
     @property
     def _sooner_by(self) -> float:
@@ -113,7 +108,7 @@ class Redesign:
 
     def _medians(self, name: str) -> tuple[float, float]:
         """A quantity in the median of the draws, with the present and with the redesigned controller."""
-        old, new = (interval(getattr(one, name))[0] for one in self._both)
+        old, new = (float(interval(getattr(one, name))[0]) for one in self._both)
         return old, new
 
     @property
@@ -250,9 +245,9 @@ class Redesign:
             effort = self._times("effort")
             settles = f"{self._settles(after, ' the controlled modes')} where the present one"
             settles += f" {self._settles(before, ' them')}"
-            return f"{settles}, for {effort}" if self._sooner else f"takes {effort} and {settles}"
+            return f"{settles}, for {effort}" if self._sooner_by > 0.0 else f"takes {effort} and {settles}"
         less = 1.0 - self._over[0]
-        if self._sooner and self._sooner_by >= less:  # state the larger of the two gains
+        if self._sooner_by > 0.0 and self._sooner_by >= less:  # state the larger of the two gains
             return f"{self._settles(after)} where the present one {self._settles(before)}"
         parts = f"{self._times('vibration')} and {self._times('effort')}"
         return f"{'lowers' if less > 0 else 'raises'} the cost J by {_percent(abs(less))}, with {parts}"

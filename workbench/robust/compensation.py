@@ -236,52 +236,44 @@ def _matrices(
         correction[:n] = estimator
         b[:n_x] = _held(observer, correction, model.sample_time)
     step, added = model.moved(observer, model.sample_time)
-    a[:n_x, :n_x] = step
-    if filters:
-        a[:n] = 0.0
+    own = slice(n if filters else 0, n_x)
+    a[own, :n_x] = step[own]
     for j, by_age in enumerate(added):
         for age, share in by_age.items():
-            column = share.copy()
-            if filters:
-                column[:n] = 0.0
             if age == 0:
-                e[:n_x, j] += column
+                e[own, j] += share[own]
             else:
-                a[:n_x, starts[j] + age - 1] += column
-        for k in range(late[j]):
-            if k == 0:
-                e[starts[j], j] = 1.0
-            else:
-                a[starts[j] + k, starts[j] + k - 1] = 1.0
+                a[own, starts[j] + age - 1] += share[own]
+        if late[j]:
+            past = slice(starts[j], starts[j] + late[j])
+            e[starts[j], j], a[past, past] = 1.0, np.eye(late[j], k=-1)
     feedback = _feedback(model, loop)
     if isinstance(loop.law, OnOffLaw):
         horizon = float(model.delays.max()) + 0.5 * model.sample_time if delays else 0.0
-        predicted, _ = _predicted(model, horizon, starts, by_state, n_u)
-        return a, b, feedback @ predicted, feedback @ expm(model.a * horizon) @ by_reading, e
+        step, predicted, _ = _predicted(model, horizon, starts, by_state)
+        return a, b, feedback @ predicted, feedback @ step @ by_reading, e
     rows, direct, now = np.zeros((n_u, size)), np.zeros((n_u, n_y)), np.zeros((n_u, n_u))
     for j in range(n_u):
         horizon = model.delays[j] + 0.5 * model.sample_time if delays else 0.0
-        predicted, by_now = _predicted(model, horizon, starts, by_state, n_u)
-        rows[j] = feedback[j] @ predicted
-        direct[j] = feedback[j] @ expm(model.a * horizon) @ by_reading
-        now[j] = feedback[j] @ by_now
+        step, predicted, by_now = _predicted(model, horizon, starts, by_state)
+        rows[j], direct[j], now[j] = feedback[j] @ predicted, feedback[j] @ step @ by_reading, feedback[j] @ by_now
     algebraic = np.linalg.inv(np.eye(n_u) - now)  # the command to be sent acts within the horizon that it depends on
     return a, b, algebraic @ rows, algebraic @ direct, e
 
 
 def _predicted(
-    model: _Model, horizon: float, starts: np.ndarray, by_state: np.ndarray, n_u: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """X̂ predicted at a horizon, from the states (n_x, n_states) and from the commands to be sent (n_x, n_actuators)."""
-    step, added = model.moved(model.a, horizon) if horizon > 0 else (np.eye(len(model.a)), [{} for _ in range(n_u)])
-    rows, now = step @ by_state, np.zeros((len(model.a), n_u))
+    model: _Model, horizon: float, starts: np.ndarray, by_state: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """X̂ predicted at a horizon: from X̂ now (n_x, n_x), from the states, and from the commands to be sent."""
+    step, added = model.moved(model.a, horizon)
+    rows, now = step @ by_state, np.zeros_like(model.b)
     for j, by_age in enumerate(added):
         for age, share in by_age.items():
             if age == 0:
                 now[:, j] += share
             else:
                 rows[:, starts[j] + age - 1] += share
-    return rows, now
+    return step, rows, now
 
 
 def _feedback(model: _Model, loop: Loop) -> np.ndarray:

@@ -26,8 +26,6 @@ from workbench.threads import one_blas_thread
 
 __all__ = ["CRITERIA", "Redesign", "Step", "force_weight", "redesign"]
 
-Report = Callable[[str, float], None]
-
 CRITERIA = ("cost", "settling")
 
 
@@ -47,7 +45,7 @@ def redesign(
     more_cost: float = MORE_COST,
     more_work: float = np.inf,
     units: Units | None = None,
-    progress: Report = lambda text, share: None,
+    progress: Callable[[str, float], None] = lambda text, share: None,
 ) -> Redesign:
     """A controller of the same kind, redesigned for the corrected rig; both are verified on the same draws.
 
