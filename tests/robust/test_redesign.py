@@ -22,7 +22,8 @@ from workbench.rig.sensors import Sensor
 from workbench.robust.on_rig import default_estimator, impulse_test, loop_on_rig, tuned
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.redesign import _losses, redesign
+from workbench.robust.redesign import redesign
+from workbench.robust.steps import _losses
 from workbench.robust.verification import Verification, verify
 from workbench.structure.domain import Patch
 from workbench.trials.controlled import control_plant

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, in_units, new_figure, plain_ticks
 from workbench.records.record import Record
-from workbench.robust.prediction import LEVEL, Prediction, amplitudes
+from workbench.robust.prediction import Prediction, amplitudes
 from workbench.robust.redesign import Redesign
-from workbench.robust.verification import SETTLED, interval
+from workbench.robust.verification import LEVEL, SETTLED, interval
 
 OLD, NEW = COLOURS[1], COLOURS[0]
 MOST_SENSORS = 8

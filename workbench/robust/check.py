@@ -5,14 +5,16 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 
 from workbench.arrays import Floats
 from workbench.records.record import Record
-from workbench.robust.prediction import LEVEL, Prediction
-from workbench.structure.modes import frozen
+from workbench.robust.prediction import Prediction
+from workbench.robust.verification import LEVEL
+from workbench.structure.modes import freeze
 from workbench.structure.printed import Printed
 
 UNLIKELY = 0.01  # significance level: the model is rejected if fewer tests of a true model come out as badly
@@ -46,8 +48,7 @@ class PredictionCheck(Printed):
     allowed: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("coverage", "band_coverage", "bands_hz", "expected"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "coverage", "band_coverage", "bands_hz", "expected")
 
     @property
     def overall(self) -> float:
@@ -57,13 +58,12 @@ class PredictionCheck(Printed):
     @property
     def expected_least(self) -> float:
         """The one per cent quantile of the worst sensor's coverage over time, for a true model."""
-        return _least(self.expected[:, :, 0].min(axis=1))
+        return _least(_worst_shares(self.expected)[0])
 
     @property
     def expected_least_in_bands(self) -> float:
         """The one per cent quantile of the worst band's coverage, mean of the sensors, for a true model; 1 without."""
-        # a band holds few lines, so that the mean over sensors has more power than the worst sensor
-        return _least(self.expected[:, :, 1:].mean(axis=1).min(axis=1, initial=1.0))
+        return _least(_worst_shares(self.expected)[1])
 
     @property
     def probability(self) -> float:
@@ -73,12 +73,9 @@ class PredictionCheck(Printed):
     @property
     def _probabilities(self) -> tuple[float, float]:
         """p-values over time (worst sensor) and in the frequency bands (worst band, mean of the sensors)."""
-        coverage = np.column_stack([self.coverage, self.band_coverage])
-        over_time = np.mean(self.expected[:, :, 0].min(axis=1) <= coverage[:, 0].min())
-        if coverage.shape[1] == 1:
-            return float(over_time), 1.0
-        in_bands = np.mean(self.expected[:, :, 1:].mean(axis=1).min(axis=1) <= coverage[:, 1:].mean(axis=0).min())
-        return float(over_time), float(in_bands)
+        own = _worst_shares(np.column_stack([self.coverage, self.band_coverage]))
+        over_time, in_bands = (float(np.mean(e <= o)) for e, o in zip(_worst_shares(self.expected), own))
+        return over_time, in_bands
 
     @property
     def holds(self) -> bool:
@@ -149,6 +146,14 @@ class PredictionCheck(Printed):
         rows.append(("mean", *(f"{100 * share:.3g}" for share in means)))
         rows.append(("expected: any sensor, mean in a band", *(f"≥ {100 * share:.3g}" for share in least)))
         return self.sentence, ("sensor", "over time [%]", *bands), rows, ()
+
+
+def _worst_shares(shares: Floats) -> tuple[Floats, Floats]:
+    """Of coverages (..., n_outputs, 1 + n_bands) the worst sensor's over time, and the worst band's, each (...,).
+
+    A band holds few lines, so that the mean over sensors has more power than the worst sensor. Without bands it is 1.
+    """
+    return shares[..., 0].min(axis=-1), shares[..., 1:].mean(axis=-2).min(axis=-1, initial=1.0)
 
 
 def _least(shares: Floats) -> float:
@@ -228,9 +233,11 @@ def log_test(path: str | Path, check: PredictionCheck) -> Path:
         "yes" if check.holds else "no",
     )
     lines = [row] if path.exists() else [COLUMNS, row]
+    text = StringIO()
+    csv.writer(text, lineterminator="\n").writerows([" ".join(str(value).split()) for value in line] for line in lines)
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     try:
-        os.write(handle, "".join(_line(line) for line in lines).encode())
+        os.write(handle, text.getvalue().encode())
     finally:
         os.close(handle)
     return path
@@ -257,9 +264,3 @@ def _check_log(path: Path) -> None:
                 raise ValueError(
                     f"{path} is no log of tests: its first line must be {','.join(COLUMNS)}; choose another file"
                 )
-
-
-def _line(values: Sequence[object]) -> str:
-    """A line of CSV; texts with commas or quotes are quoted."""
-    texts = [" ".join(str(value).split()) for value in values]
-    return ",".join(f'"{t.replace(chr(34), chr(34) * 2)}"' if any(c in t for c in ',"') else t for t in texts) + "\n"

@@ -27,6 +27,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
+from workbench.robust.small_motion import crosstalk, lag_response, late_output
 from workbench.structure.modes import Modes
 
 STEPS = ("sensors", "delay", "dead zone", "saturation", "friction")  # compensations, in this order
@@ -88,19 +89,17 @@ class _Model:
             by_age: dict[int, np.ndarray] = {}
             for start, end in zip(times, times[1:]):
                 age = -int(np.floor(round((0.5 * (start + end) - delay) / step, 9)))
-                share = _held(a, self.b[:, j], end - start)
+                share = _held(a, self.b[:, [j]], end - start)[:, 0]
                 by_age[max(age, 0)] = by_age.get(max(age, 0), 0.0) + expm(a * (horizon - end)) @ share
             added.append(by_age)
         return expm(a * horizon), added
 
 
 def _held(a: np.ndarray, b: np.ndarray, span: float) -> np.ndarray:
-    """∫_0^span e^{a s} ds b, (n_x,) or (n_x, n_inputs)."""
-    b = b.reshape(len(a), -1)
+    """∫_0^span e^{a s} ds b, (n_x, n_inputs)."""
     block = np.zeros((len(a) + b.shape[1],) * 2)
     block[: len(a), : len(a)], block[: len(a), len(a) :] = a, b
-    moved = expm(block * span)[: len(a), len(a) :]
-    return np.asarray(moved[:, 0] if moved.shape[1] == 1 else moved)
+    return np.asarray(expm(block * span)[: len(a), len(a) :])
 
 
 def check_rate(modes: Modes, controlled: Sequence[int], sample_time: float) -> None:
@@ -143,28 +142,31 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
     delays = "delay" in steps
     model = _model(loop, actuators, sample_time, delays)
     a, b, c, d, e = _matrices(model, loop, sensors, delays, "sensors" in steps)
-    gains = np.array([x.gain for x in actuators])
+    gain, dead_zone = _values(actuators, "gain"), _values(actuators, "dead_zone")
     parts: dict[str, Any] = {}
     if "dead zone" in steps:
-        parts["dead_zone"] = np.array([x.dead_zone for x in actuators]) / np.abs(gains)
-        parts["bias"] = np.array([x.bias for x in actuators]) / gains
+        parts |= {"dead_zone": dead_zone / np.abs(gain), "bias": _values(actuators, "bias") / gain}
+        dead_zone = np.zeros(len(actuators))
     if "saturation" in steps:
-        dead = np.array([0.0 if "dead zone" in steps else x.dead_zone for x in actuators])
-        parts["limit"] = (np.array([x.limit for x in actuators]) + dead) / np.abs(gains)
-        parts["rate"] = np.array([x.rate_limit for x in actuators]) * sample_time / np.abs(gains)
+        parts["limit"] = (_values(actuators, "limit") + dead_zone) / np.abs(gain)
+        parts["rate"] = _values(actuators, "rate_limit") * sample_time / np.abs(gain)
     if "sensors" in steps:
-        parts["offset"] = np.array([s.bias for s in sensors])
-        parts["scale"] = np.array([1.0 / s.gain for s in sensors])
-        uncoupling = np.linalg.inv(_crosstalk(sensors))
+        parts |= {"offset": _values(sensors, "bias"), "scale": 1.0 / _values(sensors, "gain")}
+        uncoupling = np.linalg.inv(crosstalk(sensors))
         b, d = b @ uncoupling, d @ uncoupling
     if isinstance(loop.law, OnOffLaw):
-        force, band = (np.array([getattr(r, name) for r in loop.law.relays]) for name in ("force", "dead_band"))
-        parts["relays"] = Relays(loop.law.spread, force, band)
+        relays = loop.law.relays
+        parts["relays"] = Relays(loop.law.spread, _values(relays, "force"), _values(relays, "dead_band"))
     if "friction" in steps:
         parts["friction"] = _friction(rig, loop, model, a, b, d)
     names = tuple(s.name for s in sensors), tuple(x.name for x in actuators)
     parts |= {"name": loop.controller.name, "states": _states(model, loop, names[1])}
     return DigitalController(sample_time, *names, a, b, c, d, e, **parts)
+
+
+def _values(parts: Sequence[object], name: str) -> np.ndarray:
+    """An attribute of each part (n_parts,)."""
+    return np.array([getattr(part, name) for part in parts])
 
 
 def _states(model: _Model, loop: Loop, actuators: Sequence[str]) -> tuple[str, ...]:
@@ -183,8 +185,7 @@ def _states(model: _Model, loop: Loop, actuators: Sequence[str]) -> tuple[str, .
 def _model(loop: Loop, actuators: Sequence[Actuator], sample_time: float, compensate: bool) -> _Model:
     """The model of the controlled modes, with delays and lags of the actuators where these are compensated."""
     a, b, _ = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
-    lags = np.array([x.time_constant if compensate else 0.0 for x in actuators])
-    delays = np.array([x.delay if compensate else 0.0 for x in actuators])
+    delays, lags = (compensate * _values(actuators, name) for name in ("delay", "time_constant"))
     if (delays > LONGEST * sample_time).any():
         latest = max(actuators, key=lambda x: x.delay)
         raise DesignError(
@@ -233,54 +234,46 @@ def _matrices(
         observer[:n, :n] -= estimator @ output
         correction = np.zeros((n_x, n_y))
         correction[:n] = estimator
-        b[:n_x] = _held(observer, correction, model.sample_time).reshape(n_x, n_y)
+        b[:n_x] = _held(observer, correction, model.sample_time)
     step, added = model.moved(observer, model.sample_time)
-    a[:n_x, :n_x] = step
-    if filters:
-        a[:n] = 0.0
+    own = slice(n if filters else 0, n_x)
+    a[own, :n_x] = step[own]
     for j, by_age in enumerate(added):
         for age, share in by_age.items():
-            column = share.copy()
-            if filters:
-                column[:n] = 0.0
             if age == 0:
-                e[:n_x, j] += column
+                e[own, j] += share[own]
             else:
-                a[:n_x, starts[j] + age - 1] += column
-        for k in range(late[j]):
-            if k == 0:
-                e[starts[j], j] = 1.0
-            else:
-                a[starts[j] + k, starts[j] + k - 1] = 1.0
+                a[own, starts[j] + age - 1] += share[own]
+        if late[j]:
+            past = slice(starts[j], starts[j] + late[j])
+            e[starts[j], j], a[past, past] = 1.0, np.eye(late[j], k=-1)
     feedback = _feedback(model, loop)
     if isinstance(loop.law, OnOffLaw):
         horizon = float(model.delays.max()) + 0.5 * model.sample_time if delays else 0.0
-        predicted, _ = _predicted(model, horizon, starts, by_state, n_u)
-        return a, b, feedback @ predicted, feedback @ expm(model.a * horizon) @ by_reading, e
+        step, predicted, _ = _predicted(model, horizon, starts, by_state)
+        return a, b, feedback @ predicted, feedback @ step @ by_reading, e
     rows, direct, now = np.zeros((n_u, size)), np.zeros((n_u, n_y)), np.zeros((n_u, n_u))
     for j in range(n_u):
         horizon = model.delays[j] + 0.5 * model.sample_time if delays else 0.0
-        predicted, by_now = _predicted(model, horizon, starts, by_state, n_u)
-        rows[j] = feedback[j] @ predicted
-        direct[j] = feedback[j] @ expm(model.a * horizon) @ by_reading
-        now[j] = feedback[j] @ by_now
+        step, predicted, by_now = _predicted(model, horizon, starts, by_state)
+        rows[j], direct[j], now[j] = feedback[j] @ predicted, feedback[j] @ step @ by_reading, feedback[j] @ by_now
     algebraic = np.linalg.inv(np.eye(n_u) - now)  # the command to be sent acts within the horizon that it depends on
     return a, b, algebraic @ rows, algebraic @ direct, e
 
 
 def _predicted(
-    model: _Model, horizon: float, starts: np.ndarray, by_state: np.ndarray, n_u: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """X̂ predicted at a horizon, from the states (n_x, n_states) and from the commands to be sent (n_x, n_actuators)."""
-    step, added = model.moved(model.a, horizon) if horizon > 0 else (np.eye(len(model.a)), [{} for _ in range(n_u)])
-    rows, now = step @ by_state, np.zeros((len(model.a), n_u))
+    model: _Model, horizon: float, starts: np.ndarray, by_state: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """X̂ predicted at a horizon: from X̂ now (n_x, n_x), from the states, and from the commands to be sent."""
+    step, added = model.moved(model.a, horizon)
+    rows, now = step @ by_state, np.zeros_like(model.b)
     for j, by_age in enumerate(added):
         for age, share in by_age.items():
             if age == 0:
                 now[:, j] += share
             else:
                 rows[:, starts[j] + age - 1] += share
-    return rows, now
+    return step, rows, now
 
 
 def _feedback(model: _Model, loop: Loop) -> np.ndarray:
@@ -305,12 +298,10 @@ def _output(loop: Loop, sensors: Sequence[Sensor], hold_delay: float, recalibrat
     _, _, c = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
     omega = loop.modes.omega[list(loop.law.controlled)]
     n = omega.size
-    delays = np.array([s.delay if recalibrated else 0.0 for s in sensors]) + hold_delay
-    lags = np.array([s.time_constant if recalibrated else 0.0 for s in sensors])
-    h = np.exp(-1j * np.outer(delays, omega)) / (1.0 + 1j * np.outer(lags, omega))
+    delays, lags = (recalibrated * _values(sensors, name) for name in ("delay", "time_constant"))
     if loop.controller.state.size == 0:
         estimator = np.array(loop.controller.estimator)
-        inverse = 1.0 / h.T  # (n, n_channels)
+        inverse = 1.0 / lag_response(omega, delays + hold_delay, lags).T  # (n, n_channels)
         q, v = estimator[:n], estimator[n:]
         # the part in quadrature of a displacement adds to q' / ω, and that of a velocity to -ω q
         safe = np.maximum(omega, 1e-12)[:, None]
@@ -319,21 +310,7 @@ def _output(loop: Loop, sensors: Sequence[Sensor], hold_delay: float, recalibrat
         return np.vstack(
             [of_q * inverse.real + of_v * inverse.imag / safe, of_v * inverse.real - of_q * inverse.imag * safe]
         )
-    c_q, c_v = c[:, :n], c[:, n:]
-    safe = np.where(omega > 0, omega, 1.0)
-    # y = Re(H (c_q + iω c_v) (q - i q'/ω))
-    return np.hstack([c_q * h.real - c_v * omega * h.imag, c_v * h.real + c_q * h.imag / safe])
-
-
-def _crosstalk(sensors: Sequence[Sensor]) -> np.ndarray:
-    """M (n_sensors, n_sensors) of readings = M y, y without cross-talk, of the channels that the controller reads."""
-    names = [s.name for s in sensors]
-    mixed = np.eye(len(sensors))
-    for j, sensor in enumerate(sensors):
-        for name, share in sensor.crosstalk:
-            if name in names:
-                mixed[j, names.index(name)] += share
-    return mixed
+    return late_output(c[:, :n], c[:, n:], omega, delays + hold_delay, lags)
 
 
 def _friction(rig: Rig, loop: Loop, model: _Model, a: Floats, b: Floats, d: Floats) -> FrictionForward | None:
@@ -342,28 +319,17 @@ def _friction(rig: Rig, loop: Loop, model: _Model, a: Floats, b: Floats, d: Floa
     if not frictions or isinstance(loop.law, OnOffLaw):
         return None
     index = list(loop.law.controlled)
-    shapes = np.array([loop.modes.phi_at(f.at)[index] for f in frictions])
-    n, into = len(index), _participation(loop)
+    n, shapes = len(index), np.array([loop.modes.phi_at(f.at)[index] for f in frictions])
+    _, forced, _ = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
     of_state = np.zeros((len(frictions), len(a)))
     of_reading = np.zeros((len(frictions), b.shape[1]))
     if loop.controller.state.size:
         of_state[:, n : 2 * n] = shapes
     else:
         of_reading = shapes @ np.array(loop.controller.estimator)[n:]
-    push = np.linalg.pinv(into) @ shapes.T
-    return FrictionForward(
-        push,
-        of_state,
-        of_reading,
-        np.array([f.force for f in frictions]),
-        np.array([f.smoothing_speed for f in frictions]),
-    )
-
-
-def _participation(loop: Loop) -> np.ndarray:
-    """Participation factors (n_controlled, n_actuators) of the controlled modes."""
-    _, b, _ = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
-    return b[len(b) // 2 :]
+    push = np.linalg.pinv(forced[n:]) @ shapes.T
+    speeds = _values(frictions, "smoothing_speed")
+    return FrictionForward(push, of_state, of_reading, _values(frictions, "force"), speeds)
 
 
 def without_faults(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:

@@ -152,19 +152,21 @@ def loop_on_rig(rig: Rig, design: Design, test: LoopTest) -> Loop:
             " imsc, imsc_poles, coupled_lqr, coupled_poles or on_off"
         )
     law = replace(law, actuators=tuple(_same_actuator(rig, a) for a in law.actuators))
-    linear = law if isinstance(law, Law) else _without_gain(law)
     if isinstance(design, Controller):
         if design.designed_by is None:
             raise DesignError(
                 f"{design.name} does not say how its estimator was designed: make it by luenberger, kalman or"
                 " filtered(law, hermite_filter(...))"
             )
-        return Loop(rig.modes, law, replace(design, law=linear, sensors=_same_sensors(rig, design.sensors)))
-    return Loop(rig.modes, law, default_estimator(rig, linear, test))
+        sensors = tuple(_same_sensor(rig, s) for s in design.sensors)
+        return Loop(rig.modes, law, replace(design, law=_linear(law), sensors=sensors))
+    return Loop(rig.modes, law, default_estimator(rig, _linear(law), test))
 
 
-def _without_gain(law: OnOffLaw) -> Law:
-    """A linear law of zero gain with the modes and actuators of an on-off law."""
+def _linear(law: Law | OnOffLaw) -> Law:
+    """The law; of an on-off law, a linear one of zero gain with its modes and actuators."""
+    if isinstance(law, Law):
+        return law
     return Law(np.zeros((len(law.actuators), 2 * len(law.controlled))), law.controlled, law.actuators, law.name)
 
 
@@ -227,7 +229,7 @@ def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
     # an actuator of the same name at another place does not do: the gains are for their places
     match = next((a for a in near if a.name == wanted.name), next((a for a in near if not a.direct), None))
     if match is not None:
-        return replace(match)
+        return match
     names = ", ".join(f"{a.name} ({a.kind}) at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
     raise DesignError(
         f"the law drives {wanted.name} ({wanted.kind}) at {rig.modes.domain.text(wanted.at)}, where the rig has no"
@@ -235,19 +237,16 @@ def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
     )
 
 
-def _same_sensors(rig: Rig, wanted: Sequence[Sensor]) -> tuple[Sensor, ...]:
-    """The rig's sensors of the same quantities at the same places, by preference of the same names."""
-    matches = []
-    for one in wanted:
-        near = [s for s in rig.sensors if s.quantity == one.quantity and separation(rig.modes, s, one) < SAME_PLACE]
-        if not near:
-            names = ", ".join(f"{s.name} ({s.quantity} at {rig.modes.domain.text(s.at)})" for s in rig.sensors)
-            raise DesignError(
-                f"the controller reads {one.quantity} at {rig.modes.domain.text(one.at)}, where the rig has no such"
-                f" sensor: it has {names}; design the estimator for these"
-            )
-        matches.append(next((s for s in near if s.name == one.name), near[0]))
-    return tuple(matches)
+def _same_sensor(rig: Rig, wanted: Sensor) -> Sensor:
+    """The rig's sensor of the same quantity at the same place, by preference of the same name."""
+    near = [s for s in rig.sensors if s.quantity == wanted.quantity and separation(rig.modes, s, wanted) < SAME_PLACE]
+    if near:
+        return next((s for s in near if s.name == wanted.name), near[0])
+    names = ", ".join(f"{s.name} ({s.quantity} at {rig.modes.domain.text(s.at)})" for s in rig.sensors)
+    raise DesignError(
+        f"the controller reads {wanted.quantity} at {rig.modes.domain.text(wanted.at)}, where the rig has no such"
+        f" sensor: it has {names}; design the estimator for these"
+    )
 
 
 def redesigned_for(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = ()) -> Loop:
@@ -271,10 +270,8 @@ def redesigned_for(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = 
     if isinstance(loop.law, OnOffLaw):
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
     law = _scaled_design(loop, modes, controlled)(modes, controlled=controlled, actuators=actuators)
-    linear = law if isinstance(law, Law) else _without_gain(law)
-    sensors = [named(rig.sensors, old.name) for old in loop.controller.sensors]
-    controller = _redesigned_estimator(loop.controller, modes, linear, without_faults(sensors), removed)
-    return Loop(modes, law, controller)
+    sensors = without_faults([named(rig.sensors, old.name) for old in loop.controller.sensors])
+    return Loop(modes, law, _redesigned_estimator(loop.controller, modes, _linear(law), sensors, removed))
 
 
 def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> Loop | None:

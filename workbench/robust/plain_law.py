@@ -1,6 +1,6 @@
 """A law by a rule of thumb, from the damping wanted of its controlled modes."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Where
 from workbench.structure.modes import Modes
 
+KINDS = ("imsc", "coupled", "poles", "on-off")
 PERIODS = 5.0  # within which on-off control stops each mode
 BAND = 0.02  # dead band of on-off control over the initial modal speed
 
@@ -53,44 +54,23 @@ def plain_law(
         raise DesignError(f"no law is called {kind!r}; the laws are {', '.join(KINDS)}")
     modes = rig.modes
     index = controlled_indices(modes, len(actuators) if controlled is None else controlled)
-    if (modes.omega[list(index)] == 0).any():
+    omega = modes.omega[list(index)]
+    if (omega == 0).any():
         raise DesignError("a rigid mode has no damping ratio; design its law with a given weight or poles")
-    if kind == "on-off":
-        shape = unit_participation(modes, actuators[0]) if impulse_at is None else modes.phi_at(impulse_at)
-        return _on_off(modes, index, actuators, np.abs(impulse * shape[list(index)]))
-    return LINEAR[kind](modes, index, actuators, damping)
+    if kind == "imsc":
+        return imsc(modes, index, actuators, weight=0.5 / (damping * omega) ** 2)
+    if kind == "coupled":
+        squared = (input_matrix(modes, actuators)[list(index)] ** 2).sum(axis=1)
+        return coupled_lqr(modes, index, actuators, weight=float(np.mean(0.5 * squared / (damping * omega) ** 2)))
+    if kind == "poles":
+        return coupled_poles(modes, index, actuators, poles=omega * (-damping + 1j * np.sqrt(1.0 - damping**2)))
+    shape = unit_participation(modes, actuators[0]) if impulse_at is None else modes.phi_at(impulse_at)
+    speed = np.abs(impulse * shape[list(index)])
+    speed = np.maximum(speed, 0.1 * speed.max())
+    # a relay reduces the amplitude q'/ω by 4 k / ω² per period
+    return on_off(modes, index, actuators, force=speed * omega / (4.0 * PERIODS), dead_band=BAND * speed)
 
 
 def unit_participation(modes: Modes, actuator: Actuator) -> np.ndarray:
     """Modal forces (n_modes,) of a unit force or moment at an actuator's place."""
     return input_matrix(modes, [replace(actuator, gain=1.0)])[:, 0]
-
-
-Rule = Callable[[Modes, tuple[int, ...], list[Actuator], float], Law]
-
-
-def _imsc(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float) -> Law:
-    return imsc(modes, index, actuators, weight=0.5 / (ratio * modes.omega[list(index)]) ** 2)
-
-
-def _coupled(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float) -> Law:
-    squared = (input_matrix(modes, actuators)[list(index)] ** 2).sum(axis=1)
-    return coupled_lqr(
-        modes, index, actuators, weight=float(np.mean(0.5 * squared / (ratio * modes.omega[list(index)]) ** 2))
-    )
-
-
-def _poles(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], ratio: float) -> Law:
-    poles = modes.omega[list(index)] * (-ratio + 1j * np.sqrt(1.0 - ratio**2))
-    return coupled_poles(modes, index, actuators, poles=poles)
-
-
-def _on_off(modes: Modes, index: tuple[int, ...], actuators: list[Actuator], speed: np.ndarray) -> OnOffLaw:
-    speed = np.maximum(speed, 0.1 * speed.max())
-    # a relay reduces the amplitude q'/ω by 4 k / ω² per period
-    force = speed * modes.omega[list(index)] / (4.0 * PERIODS)
-    return on_off(modes, index, actuators, force=force, dead_band=BAND * speed)
-
-
-LINEAR: Mapping[str, Rule] = {"imsc": _imsc, "coupled": _coupled, "poles": _poles}
-KINDS = (*LINEAR, "on-off")

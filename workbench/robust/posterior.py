@@ -1,6 +1,6 @@
 """A corrected rig with its uncertainty, and rigs drawn from it: the posterior of a diagnosis."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -104,6 +104,7 @@ class UncertainRig:
     def _parameters(self) -> list[tuple[int, Parameter]]:
         return parameters_of(self.nominal, self.effects)
 
+    @one_blas_thread
     def draws(self, n: int, seed: int | np.random.Generator = 0) -> tuple[Rig, ...]:
         """Rigs (n,) drawn from the posterior, alternative sets in proportion to their probability.
 
@@ -118,13 +119,6 @@ class UncertainRig:
             TypeError: n is no number.
             ValueError: n is not a whole number of 1 or more, or hardly any draw is feasible.
         """
-        return tuple(rig for rig, _ in self.draws_with_effects(n, seed))
-
-    @one_blas_thread
-    def draws_with_effects(
-        self, n: int, seed: int | np.random.Generator = 0
-    ) -> tuple[tuple[Rig, tuple[Effect, ...]], ...]:
-        """Rigs drawn as by `draws`, each with its effects."""
         n = whole(n, WHAT_DRAWS, least=1)
         rng = np.random.default_rng(seed)
         sets = [self, *(alternative for alternative, _ in self.alternatives)]
@@ -133,12 +127,12 @@ class UncertainRig:
         chosen = rng.choice(len(sets), n, p=shares / shares.sum())
         return tuple(sets[i]._drawn(rng) for i in chosen)
 
-    def _drawn(self, rng: np.random.Generator) -> tuple[Rig, tuple[Effect, ...]]:
-        """One feasible rig drawn from this set of effects, with its effects."""
+    def _drawn(self, rng: np.random.Generator) -> Rig:
+        """One feasible rig drawn from this set of effects."""
         for _ in range(MOST_TRIES):
             effects = self._at(self._root @ rng.standard_normal(self._root.shape[1]))
             try:
-                return apply_all(self.nominal, effects), effects
+                return apply_all(self.nominal, effects)
             except (ValueError, np.linalg.LinAlgError):
                 continue
         raise ValueError(
@@ -246,15 +240,12 @@ def _covariance(nominal: Rig, fit: Fit) -> np.ndarray:
     parameters = parameters_of(nominal, fit.effects)
     if fit.covariance is not None and fit.covariance.shape == (len(parameters),) * 2:
         return fit.covariance
-    return np.diag(list(_variances(fit.effects, parameters))) if parameters else np.zeros((0, 0))
+    return np.diag([_variance(fit.effects[i], parameter) for i, parameter in parameters])
 
 
-def _variances(effects: Sequence[Effect], parameters: Sequence[tuple[int, Parameter]]) -> Iterator[float]:
-    for i, parameter in parameters:
-        effect = effects[i]
-        slope = parameter.slope(effect.values[parameter.name])
-        deviation = effect.deviations.get(parameter.name, 0.0)
-        yield (deviation / slope) ** 2 if slope and np.isfinite(deviation) else 0.0
+def _variance(effect: Effect, parameter: Parameter) -> float:
+    slope, deviation = parameter.slope(effect.values[parameter.name]), effect.deviations.get(parameter.name, 0.0)
+    return (deviation / slope) ** 2 if slope and np.isfinite(deviation) else 0.0
 
 
 def _unexplained(verdict: Verdict) -> float:

@@ -18,12 +18,11 @@ from workbench.rig.elements import RandomForce
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion, read, simulate
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
-from workbench.robust.verification import check_loop_kinds, drawn_with_errors
-from workbench.structure.modes import Modes, frozen
+from workbench.robust.verification import LEVEL, QUANTILES, check_loop_kinds, drawn_with_errors
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, counted
 from workbench.threads import one_blas_thread
 
-LEVEL = 0.95
 DRAWS, LEAST_DRAWS = 200, 40
 NOISES = 4  # realisations of noise per draw, for the bands over time
 MOST_BANDS = 8
@@ -66,9 +65,8 @@ class Prediction(Printed):
     allowed: float = 0.0
 
     def __post_init__(self) -> None:
-        arrays = ("time", "median", "lower", "upper", "frequencies_hz", "bands_hz", "expected")
-        for name in (*arrays, "spectrum_median", "spectrum_lower", "spectrum_upper"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "time", "median", "lower", "upper", "frequencies_hz", "bands_hz", "expected")
+        freeze(self, "spectrum_median", "spectrum_lower", "spectrum_upper")
 
     @property
     def sample_time(self) -> float:
@@ -215,7 +213,11 @@ def _uncertain(rig: Verdict | UncertainRig, noise_std: Sequence[float] | Floats 
     uncertain = rig if isinstance(rig, UncertainRig) else UncertainRig.of(rig)
     if noise_std is None and isinstance(rig, Verdict) and rig.budget.noise_found:
         noise_std = rig.budget.noise_found
-    return uncertain, _noise(uncertain.nominal, noise_std)
+    sensors = uncertain.nominal.sensors
+    noise = np.array([s.noise_std for s in sensors] if noise_std is None else noise_std, float)
+    if noise.shape != (len(sensors),) or not (np.isfinite(noise) & (noise >= 0)).all():
+        raise ValueError(f"noise_std must be 0 or more for each of the {len(sensors)} sensors; got {noise}")
+    return uncertain, noise
 
 
 def _with_noise(rig: Rig, noise: Floats) -> Rig:
@@ -301,7 +303,7 @@ def _banded(
             f" {100 * uncertain.unexplained:.3g} % of the readings, of any phase and in any frequency band."
         )
     readings = np.array(truths)
-    low, median, high = _over_time(readings, rig, noise, rng)
+    median, low, high = _over_time(readings, rig, noise, rng)
     for i, truth in enumerate(readings):
         readings[i] = _read(truth, rig, noise, rng)
     sizes = np.array([amplitudes(reading) for reading in readings])
@@ -313,8 +315,8 @@ def _banded(
         low,
         high,
         frequencies,
-        spectrum[1],
         spectrum[0],
+        spectrum[1],
         spectrum[2],
         bands,
         np.zeros((0, len(rig.sensors), 1 + len(bands))),
@@ -323,9 +325,6 @@ def _banded(
         uncertain.unexplained,
     )
     return replace(prediction, expected=np.array([prediction.coverage(reading) for reading in readings]))
-
-
-QUANTILES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)
 
 
 def amplitudes(outputs: Floats) -> Floats:
@@ -361,13 +360,6 @@ def _inputs(rig: Rig, inputs: Record | Floats, sample_time: float | None) -> tup
             f"inputs must be finite, one row for each of {', '.join(names)} and 2 samples or more; got {sent.shape}"
         )
     return sent, period, hold, start
-
-
-def _noise(rig: Rig, given: Sequence[float] | Floats | None) -> Floats:
-    noise = np.array([s.noise_std for s in rig.sensors] if given is None else given, float)
-    if noise.shape != (len(rig.sensors),) or not (np.isfinite(noise) & (noise >= 0)).all():
-        raise ValueError(f"noise_std must be 0 or more for each of the {len(rig.sensors)} sensors; got {noise}")
-    return noise
 
 
 def _bands(modes: Modes, frequencies: Floats) -> Floats:

@@ -1,5 +1,6 @@
 """The loop linearised about the motion under test: its poles, and its small-gain margin."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from workbench.design.export.sampled_loop import closed_by, held, linear_plant
 from workbench.design.loop.rig_loop import LoopRun, named
 from workbench.rig.elements import PointElement
 from workbench.rig.rig import Rig
-from workbench.rig.sensors import MEASURED
+from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
@@ -96,25 +97,36 @@ def _closed(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.n
 def _output(rig: Rig, controller: DigitalController, modes: Modes, total: int) -> np.ndarray:
     """C (n_sensors, total) of the readings, modal states first, with sensors' lags and delays at modal frequencies."""
     sensors = [named(rig.sensors, name) for name in controller.sensors]
-    n = modes.n_modes
-    reads = np.zeros((len(sensors), total))
-    shapes = output_matrix(modes, sensors)
-    for i, sensor in enumerate(sensors):
-        order = MEASURED[sensor.quantity][1]
-        # transfer function of the sensor's delay and lag at each mode's frequency
-        h = np.exp(-1j * modes.omega * max(sensor.delay, 0.0)) / (1.0 + 1j * modes.omega * sensor.time_constant)
-        safe = np.where(modes.omega > 0, modes.omega, 1.0)
-        if order == 0:
-            reads[i, :n], reads[i, n : 2 * n] = shapes[i] * h.real, shapes[i] * h.imag / safe
-        else:
-            reads[i, :n], reads[i, n : 2 * n] = -shapes[i] * modes.omega * h.imag, shapes[i] * h.real
+    rates = np.array([[MEASURED[s.quantity][1]] for s in sensors])
+    shapes, gains = output_matrix(modes, sensors), np.array([s.gain for s in sensors])
+    delays, lags = np.array([max(s.delay, 0.0) for s in sensors]), np.array([s.time_constant for s in sensors])
+    reads = late_output(shapes * (rates == 0), shapes * (rates != 0), modes.omega, delays, lags)
+    mixed = gains[:, None] * crosstalk(sensors) / gains
+    return np.asarray(mixed @ np.pad(reads, ((0, 0), (0, total - reads.shape[1]))))
+
+
+def lag_response(omega: np.ndarray, delays: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """H (n_sensors, n_modes) of delays and lags (n_sensors,), s, at frequencies (n_modes,), rad/s."""
+    return np.asarray(np.exp(-1j * np.outer(delays, omega)) / (1.0 + 1j * np.outer(lags, omega)))
+
+
+def late_output(
+    c_q: np.ndarray, c_v: np.ndarray, omega: np.ndarray, delays: np.ndarray, lags: np.ndarray
+) -> np.ndarray:
+    """C (n_sensors, 2 n_modes) of y = Re(H (c_q + iω c_v) (q - i q'/ω)), H of `lag_response`, states (q, q')."""
+    h, safe = lag_response(omega, delays, lags), np.where(omega > 0, omega, 1.0)
+    return np.hstack([c_q * h.real - c_v * omega * h.imag, c_v * h.real + c_q * h.imag / safe])
+
+
+def crosstalk(sensors: Sequence[Sensor]) -> np.ndarray:
+    """M (n_sensors, n_sensors) of readings = M y, y without cross-talk, of the channels that a controller reads."""
     names = [s.name for s in sensors]
     mixed = np.eye(len(sensors))
-    for i, sensor in enumerate(sensors):
+    for j, sensor in enumerate(sensors):
         for name, share in sensor.crosstalk:
             if name in names:
-                mixed[i, names.index(name)] += share * sensor.gain / sensors[names.index(name)].gain
-    return np.asarray(mixed @ reads)
+                mixed[j, names.index(name)] += share
+    return mixed
 
 
 def small_gain_margin(rig: Rig, controller: DigitalController, modes: Modes | None = None) -> tuple[float, float]:

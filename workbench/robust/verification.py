@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,13 +17,14 @@ from workbench.rig.rig import Rig
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
 from workbench.structure.domain import NamedPoints, middle
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import rounded
 from workbench.threads import one_blas_thread
 
 SETTLED = 0.01  # of the largest energy: a tenth of the amplitude
 GROWN = 2.0  # ratio of the largest energies in the last and in the first quarter above which the motion grows
-LEVEL = 0.95
+LEVEL = 0.95  # probability of an interval
+QUANTILES = (0.5, 0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,14 +65,17 @@ class Verification:
     margin = Renamed("small_gain_margin")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "stable", frozen(self.stable, bool))
-        loads, motion = ("peak_force", "stroke", "work", "effort"), ("vibration", "energy", "damping")
-        for name in (*loads, *motion, "settling", "controlled_settling"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "stable", dtype=bool)
+        freeze(self, "damping", "peak_force", "stroke", "work", "effort")
+        freeze(self, "vibration", "settling", "controlled_settling", "energy")
 
     @property
     def n_draws(self) -> int:
         return int(self.stable.size)
+
+    @property
+    def n_stable(self) -> int:
+        return int(self.stable.sum())
 
     @property
     def share_stable(self) -> float:
@@ -112,7 +116,7 @@ class Verification:
         }
         return {
             "draws": self.n_draws,
-            "stable": int(self.stable.sum()),
+            "stable": self.n_stable,
             "small_gain_margin": rounded(self.small_gain_margin),
             "margin_frequency_hz": rounded(self.margin_frequency_hz),
             "damping": [[rounded(v) for v in interval(self.damping[:, r])] for r in self.controlled],
@@ -120,11 +124,12 @@ class Verification:
         }
 
 
-def interval(values: np.ndarray) -> tuple[float, float, float]:
-    """Median, and lower and upper end of the 95 % interval, as order statistics, since values may be infinite."""
-    outer = 0.5 * (1.0 - LEVEL)
-    median, low, high = np.quantile(values, (0.5, outer, 1.0 - outer), method="nearest")
-    return float(median), float(low), float(high)
+def interval(values: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
+    """Median, and lower and upper end of the 95 % interval, over the draws (n_draws, ...): shape (3, ...).
+
+    They are order statistics, since values may be infinite.
+    """
+    return np.asarray(np.quantile(values, QUANTILES, axis=0, method="nearest"))
 
 
 @former_arguments(possible="rig", centre="margin_rig")
@@ -170,39 +175,35 @@ def verify(
     if unknown:
         raise ValueError(f"controlled are modes 0 to {n_modes - 1} of the rigs, counted from zero; got {unknown[0]}")
 
-    def drawn(rig: Rig, one: LoopTest, run: LoopRun) -> _Draw:
+    def drawn(rig: Rig, one: LoopTest, run: LoopRun) -> tuple[Any, ...]:
         poles, energy = loop_poles(rig, controller, modes_in_motion(rig, run)), run.response.energy
         with np.errstate(over="ignore", invalid="ignore"):
             total = energy.sum(axis=0)
-            return _Draw(
-                stable=poles.spectral_radius <= 1.0 + 1e-9 and _stays_bounded(rig, controller, one, run),
-                damping=poles.damping[:n_modes],
-                peak_force=np.abs(run.response.forces).max(),
-                stroke=_stroke(rig, controller, run),
-                work=run.work[:n_modes],
-                effort=run.effort,
-                energy=total,
-                of_controlled=energy[index].sum(axis=0) if index else total,
-            )
+            of_controlled = energy[index].sum(axis=0) if index else total
+            bounded = poles.spectral_radius <= 1.0 + 1e-9 and _stays_bounded(rig, controller, one, run)
+            peak_force, stroke = np.abs(run.response.forces).max(), _stroke(rig, controller, run)
+            damping, work = poles.damping[:n_modes], run.work[:n_modes]
+            return bounded, damping, peak_force, stroke, work, run.effort, total, of_controlled
 
-    results = _Draw(*(list(values) for values in zip(*of_loops(rigs, controller, test, drawn))))
+    results = zip(*of_loops(rigs, controller, test, drawn))
+    stable, damping, peak_force, stroke, work, effort, energies, of_controlled = results
     margin, frequency = small_gain_margin(
         margin_rig, controller, modes_in_motion(margin_rig, run_loop(margin_rig, controller, test))
     )
     dt = test.sample_time
     with np.errstate(over="ignore", invalid="ignore"):
         return Verification(
-            stable=np.array(results.stable),
-            damping=np.array(results.damping),
-            peak_force=_finite(results.peak_force),
-            stroke=_finite(results.stroke),
-            work=_finite(results.work),
+            stable=np.array(stable),
+            damping=np.array(damping),
+            peak_force=_finite(peak_force),
+            stroke=_finite(stroke),
+            work=_finite(work),
             controlled=tuple(index),
-            effort=_finite(results.effort),
-            vibration=_finite([energy.sum() * dt for energy in results.energy]),
-            settling=_settlings(results.energy, results.stable, dt),
-            controlled_settling=_settlings(results.of_controlled, results.stable, dt),
-            energy=_band(results.energy),
+            effort=_finite(effort),
+            vibration=_finite([energy.sum() * dt for energy in energies]),
+            settling=_settlings(energies, stable, dt),
+            controlled_settling=_settlings(of_controlled, stable, dt),
+            energy=interval(energies),
             small_gain_margin=margin,
             margin_frequency_hz=frequency,
         )
@@ -255,19 +256,6 @@ def check_test(test: object) -> None:
         )
 
 
-class _Draw(NamedTuple):
-    """The results of one draw, see `Verification`; with lists as fields, those of all draws."""
-
-    stable: Any
-    damping: Any
-    peak_force: Any
-    stroke: Any
-    work: Any
-    effort: Any
-    energy: Any
-    of_controlled: Any
-
-
 def drawn_with_errors(uncertain: UncertainRig, draws: int, seed: int = 0) -> tuple[Rig, ...]:
     """Samples of an uncertain rig, with an error of each sensor's gain, uniform within ± the unexplained share."""
     rng = np.random.default_rng(seed)
@@ -283,12 +271,6 @@ def drawn_with_errors(uncertain: UncertainRig, draws: int, seed: int = 0) -> tup
         )
         for rig in rigs
     )
-
-
-def _band(energies: Sequence[np.ndarray]) -> np.ndarray:
-    """Median and 95 % interval (3, n_samples) of the draws at each sample."""
-    outer = 0.5 * (1.0 - LEVEL)
-    return np.asarray(np.quantile(energies, (0.5, outer, 1.0 - outer), axis=0, method="nearest"))
 
 
 def _finite(values: ArrayLike) -> np.ndarray:

@@ -5,7 +5,8 @@ from pathlib import Path
 from workbench.draw.robust import MOST_SENSORS, plot_prediction
 from workbench.records.record import Record
 from workbench.robust.check import PredictionCheck
-from workbench.robust.prediction import LEVEL, Prediction
+from workbench.robust.prediction import Prediction
+from workbench.robust.verification import LEVEL
 from workbench.study.pages.page import PageContent, block, write_page
 from workbench.study.pages.verdict_page import case_inputs
 

@@ -90,7 +90,7 @@ def redesign_page(
 
 def _figures(found: Redesign) -> list[tuple[str, ...]]:
     old, new = found.present_verification, found.verification
-    rows: list[tuple[str, ...]] = [("stable samples", *(f"{int(p.stable.sum())} of {p.n_draws}" for p in (old, new)))]
+    rows: list[tuple[str, ...]] = [("stable samples", *(f"{p.n_stable} of {p.n_draws}" for p in (old, new)))]
     for r in found.controlled:
         rows.append((f"damping ratio of mode {r + 1} [%]", *(_rounded(100.0 * p.damping[:, r]) for p in (old, new))))
     each = (
