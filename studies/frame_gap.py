@@ -104,7 +104,7 @@ def study(outcome, data=None):
     verdict = diagnose(rig, fitted, validation=(records["check"],), name="frame")
     outcome.say(verdict.sentence)
     effect = verdict.effects[0]
-    outcome.table("found", {"kind": effect.kind.name, "between": list(effect.at), **effect.values})
+    outcome.table("effect", {"kind": effect.kind.name, "between": list(effect.at), **effect.values})
     outcome.check(
         "one effect is named, a hysteretic spring",
         [e.kind.name for e in verdict.effects] == ["bouc_wen"],

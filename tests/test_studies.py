@@ -1,5 +1,6 @@
 """Every study runs, what it checks holds, and its committed results say the same."""
 
+import ast
 import json
 import os
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from workbench.study.catalogue import describe, run_study
-from workbench.study.runs.outcome import Outcome
+from workbench.study.runs.outcome import OWN, Outcome
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("WORKBENCH_SHARED", ROOT.parent / "shared"))
@@ -48,6 +49,17 @@ TRUE = {
         "other_hz": pytest.approx([6.7, 551.0], rel=0.02),
     }
 }
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "studies").glob("*.py")), ids=lambda path: path.stem)
+def test_no_table_takes_the_name_of_an_entry_of_the_results(path):
+    calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+    named = {
+        call.args[0].value
+        for call in calls
+        if isinstance(call.func, ast.Attribute) and call.func.attr == "table" and isinstance(call.args[0], ast.Constant)
+    }
+    assert not named & set(OWN)
 
 
 @pytest.mark.parametrize("path", STUDIES)
