@@ -11,7 +11,7 @@ gives the Gauss-Newton matrix H; H^-1 in the noise of the outputs is the Cramér
 each mode is held at 1: the shape carries its scale.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -329,17 +329,20 @@ def search(
     most_steps: int = FIT.most_steps,
     budget: Budget | None = None,
     negligible: float = FIT.negligible,
+    is_vain: Callable[[Fit], bool] = lambda fit: False,
 ) -> Fit:
     """Least-squares fit over poles and participation factors, outputs in units of `noise`.
 
     Args:
         fit: to start from, of the same data.
         negligible: expected decrease of χ² per value below which the search ends.
+        is_vain: whether a fit ends the search, since what follows from it is of no use.
     """
     held = fit.participation[np.arange(fit.poles.size), np.argmax(_strength(fit), axis=1)]
     if (held != 1.0).any():
         fit = projected(data, fit.poles, fit.participation / held[:, None])
-    minimum = minimise(_OutputError(data, noise, negligible), fit, most_steps=most_steps, budget=budget)
+    problem = _OutputError(data, noise, negligible)
+    minimum = minimise(problem, fit, most_steps=most_steps, budget=budget, is_vain=is_vain)
     return replace(minimum.state, converged=minimum.converged, steps=minimum.steps)
 
 
