@@ -68,6 +68,10 @@ class Measurement(Protocol):
         """∂/∂λ of Σ_p l_p x_p(λ), (n_rows,) each."""
         ...
 
+    def tangents(self, pole: complex, participation: np.ndarray, real: np.ndarray, imaginary: np.ndarray) -> None:
+        """Write `slopes`, then `responses`, into columns (n_rows, 1 + n_excitations)."""
+        ...
+
     def candidates(self, residual: np.ndarray) -> np.ndarray:
         """Poles to try, (n_candidates,), from the residual in units of the noise."""
         ...
@@ -166,12 +170,10 @@ def regressors(data: Measurement, poles: np.ndarray, participation: np.ndarray) 
     n, q, (n_rows, n_fixed) = poles.size, participation.shape[1] + 1, data.fixed.shape
     x = np.empty((n_rows, 2 * n * q + n_fixed), order="F")
     x[:, 2 * n * q :] = data.fixed
+    real, imaginary = x[:, : n * q], x[:, n * q : 2 * n * q]
     for r, (pole, l_r) in enumerate(zip(poles, participation)):
-        responses, slopes = data.responses(pole), data.slopes(pole, l_r)
-        for part in (0, 1):
-            first = (part * n + r) * q
-            x[:, first] = slopes[part]
-            x[:, first + 1 : first + q] = responses[part]
+        of_mode = slice(r * q, (r + 1) * q)
+        data.tangents(pole, l_r, real[:, of_mode], imaginary[:, of_mode])
     return x
 
 
