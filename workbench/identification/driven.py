@@ -467,7 +467,8 @@ def _any_acts_later(data: KnownInputs, selected: Selected, budget: Budget) -> bo
 def _select_strongest(data: KnownInputs, start: Fit | None = None, **options: Any) -> Selected:
     """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN.strongest`.
 
-    As long as all are sure, as many more are searched: strong modes left out would be taken for noise.
+    As long as all are sure, as many more are searched: strong modes left out would be taken for noise. Not where the
+    inputs contain noise, which leaves sure peaks at the modes.
     """
     fit = _subspace_start(data, **options) if start is None else start
     few = _few_modes(options, fit.poles.size)
@@ -475,7 +476,7 @@ def _select_strongest(data: KnownInputs, start: Fit | None = None, **options: An
         selected = _without_unpredictive(data, select_modes(data, start=fit, **few), options["budget"])
         fit, most = selected.fit, few["max_modes"]
         sure = bool((selected.statistic > SELECTION.weak * selected.limit).all())
-        if fit.poles.size < most or most == options["max_modes"] or not sure:
+        if fit.poles.size < most or most == options["max_modes"] or not sure or input_noise(data, fit) is not None:
             return selected
         few = _few_modes(options, most + DRIVEN.strongest)
 
