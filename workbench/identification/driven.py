@@ -467,16 +467,17 @@ def _any_acts_later(data: KnownInputs, selected: Selected, budget: Budget) -> bo
 def _select_strongest(data: KnownInputs, start: Fit | None = None, **options: Any) -> Selected:
     """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN.strongest`.
 
-    As long as all are sure, as many more are searched: strong modes left out would be taken for noise. Not where the
-    inputs contain noise, which leaves sure peaks at the modes.
+    As long as all are sure, as many more are searched: strong modes left out would be taken for noise.
     """
-    fit = _subspace_start(data, **options) if start is None else start
+    fit, budget = _subspace_start(data, **options) if start is None else start, options["budget"]
     few = _few_modes(options, fit.poles.size)
     while True:
-        selected = _without_unpredictive(data, select_modes(data, start=fit, **few), options["budget"])
+        selected = _without_unpredictive(data, select_modes(data, start=fit, **few), budget)
         fit, most = selected.fit, few["max_modes"]
-        sure = bool((selected.statistic > SELECTION.weak * selected.limit).all())
-        if fit.poles.size < most or most == options["max_modes"] or not sure or input_noise(data, fit) is not None:
+        if fit.poles.size < most or most == options["max_modes"]:
+            return selected
+        # beside the residual about each: noise of the inputs leaves peaks at the modes far above white noise
+        if sure_modes(data, fit, options["false_alarm"], budget).poles.size < fit.poles.size:
             return selected
         few = _few_modes(options, most + DRIVEN.strongest)
 

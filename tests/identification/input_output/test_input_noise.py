@@ -58,14 +58,18 @@ def errors_of(seeds, remark, **excitation):
 
 
 @pytest.mark.parametrize("band_limited", [True, False])
-@pytest.mark.parametrize(
-    "seeds", [(0, 4, 8, 11), pytest.param(range(9, 40), marks=pytest.mark.slow)], ids=["few", "many"]
-)
+@pytest.mark.parametrize("seeds", [(0, 4, 8), pytest.param(range(9, 40), marks=pytest.mark.slow)], ids=["few", "many"])
 def test_intervals_hold_without_false_modes(seeds, band_limited):
     errors = errors_of(seeds, "standard errors allow for it", band_limited=band_limited)
     inside = (np.abs(errors) < 1.96).mean()
     assert inside >= 0.95 - 3.0 * np.sqrt(0.95 * 0.05 / errors.size)
     assert np.sqrt((errors**2).mean()) > 0.6  # nor are they too wide
+
+
+def test_its_peaks_at_modes_are_no_strong_modes():
+    """Above white noise they pass for more modes than are searched at first."""
+    record, omega, _ = record_of(23)
+    assert identify_driven(record, seconds=None).modes.n_modes == omega.size
 
 
 def test_the_noise_is_found_as_large_as_it_is():
