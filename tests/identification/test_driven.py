@@ -7,6 +7,7 @@ from scipy.optimize import approx_fprime
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import binom
 
+from workbench.identification import driven
 from workbench.identification.driven import identify_driven
 from workbench.identification.input_output import time_variance
 from workbench.identification.input_output.held_out import without_unpredictive
@@ -620,3 +621,32 @@ def test_the_response_to_long_inputs_is_that_of_the_state_space():
     u = excitation("noise", 1, n=6000, seed=3)
     exact = measured(plant, u).outputs
     assert np.abs(found.response(u) - exact).max() < 1e-6 * np.abs(exact).max()
+
+
+def test_noise_is_estimated_beside_all_strong_modes(monkeypatch):
+    """More modes than are searched at first, far above white noise: left out, these would be taken for its spectrum."""
+    rng, dt, n = np.random.default_rng(4), 1e-3, 6000
+    frequencies, sizes = np.linspace(20.0, 400.0, 11), []
+    poles, u = 2.0 * np.pi * frequencies * (-0.01 + 1j), np.zeros((1, n))
+    u[0, [100, 2100, 4100]] = [1.0, 0.8, 1.2]  # too brief for a subspace model to start from
+    y = sum(p.imag**2 * np.real(lfilter([0.0, 1.0], [1.0, -np.exp(p * dt)], u[0].astype(complex))) for p in poles)
+    y = y + 1e-3 * y.std() * rng.standard_normal(n)
+    record = Record(dt, y[None], (Channel("a", "displacement"),), u, (Channel("f", "force"),))
+    estimated = KnownInputs.noise_spectrum
+    monkeypatch.setattr(
+        KnownInputs, "noise_spectrum", lambda data, fit: (sizes.append(fit.poles.size), estimated(data, fit))[1]
+    )
+    modes = identify_driven(record, delays=0.0).modes
+    np.testing.assert_allclose(np.sort(np.abs(modes.poles)), np.abs(poles), rtol=1e-3)
+    assert set(sizes) == {len(poles)}
+
+
+def test_the_start_is_fitted_once_for_sure_and_for_strong_modes(monkeypatch):
+    record = measured(system(1, 1), excitation("noise", 1, 6000), fraction=0.01)
+    starts, sure, strongest = [], driven.sure_modes, driven._select_strongest
+    monkeypatch.setattr(driven, "sure_modes", lambda data, fit, *rest: (starts.append(fit), sure(data, fit, *rest))[1])
+    monkeypatch.setattr(
+        driven, "_select_strongest", lambda data, fit, **how: (starts.append(fit), strongest(data, fit, **how))[1]
+    )
+    assert identify_driven(record, delays=0.0).modes.n_modes == 4
+    assert starts[0] is starts[1] and starts[0].converged

@@ -465,11 +465,21 @@ def _any_acts_later(data: KnownInputs, selected: Selected, budget: Budget) -> bo
 
 
 def _select_strongest(data: KnownInputs, start: Fit | None = None, **options: Any) -> Selected:
-    """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN.strongest`."""
-    start = _subspace_start(data, **options) if start is None else start
-    few = _few_modes(options)
-    few["max_modes"] = max(few["max_modes"], start.poles.size)
-    return _without_unpredictive(data, select_modes(data, start=start, **few), options["budget"])
+    """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN.strongest`.
+
+    As long as all are sure, as many more are searched: strong modes left out would be taken for noise.
+    """
+    fit, budget = _subspace_start(data, **options) if start is None else start, options["budget"]
+    few = _few_modes(options, fit.poles.size)
+    while True:
+        selected = _without_unpredictive(data, select_modes(data, start=fit, **few), budget)
+        fit, most = selected.fit, few["max_modes"]
+        if fit.poles.size < most or most == options["max_modes"]:
+            return selected
+        # beside the residual about each: noise of the inputs leaves peaks at the modes far above white noise
+        if sure_modes(data, fit, options["false_alarm"], budget).poles.size < fit.poles.size:
+            return selected
+        few = _few_modes(options, most + DRIVEN.strongest)
 
 
 def _subspace_start(data: KnownInputs, **options: Any) -> Fit:
@@ -492,8 +502,9 @@ def _without_unpredictive(data: KnownInputs, selected: Selected, budget: Budget)
     return replace(selected, distorted=(*data.distorted, *distorted))
 
 
-def _few_modes(options: dict[str, Any]) -> dict[str, Any]:
-    return {**options, "max_modes": min(DRIVEN.strongest, options["max_modes"])}
+def _few_modes(options: dict[str, Any], fewest: int) -> dict[str, Any]:
+    """The options with at most `DRIVEN.strongest` modes, or `fewest` where these are more."""
+    return {**options, "max_modes": min(max(DRIVEN.strongest, fewest), options["max_modes"])}
 
 
 def _delay_remarks(data: KnownInputs) -> tuple[str, ...]:
@@ -530,6 +541,7 @@ def _select(
     """
     options["budget"] = budget
     start = _subspace_start(data, **options) if strongest is None else strongest.fit
+    start = settled(data, start, SELECTION.few_steps, budget, ORDER.decided)  # once for all searches from there
     sure = sure_modes(data, start, options["false_alarm"], budget)
 
     def sure_of(other: KnownInputs) -> Fit:
@@ -570,8 +582,7 @@ def _select_weighted(data: KnownInputs, strongest: Selected, options: dict[str, 
     underestimated and the mode appears significant. The noise is therefore estimated again without all doubtful modes;
     they stay if modes and noise together are less likely without them.
     """
-    budget, few = options["budget"], _few_modes(options)
-    few["max_modes"] = max(few["max_modes"], strongest.fit.poles.size)
+    budget, few = options["budget"], _few_modes(options, strongest.fit.poles.size)
     data, selected = _alternate_with_noise(data, strongest, few, options, budget)
     doubtful = (selected.statistic < SELECTION.weak * selected.limit) | ~_are_oscillatory(data, selected)
     if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):

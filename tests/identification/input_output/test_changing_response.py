@@ -45,8 +45,10 @@ def test_two_linear_modes_are_no_changing_one_after_a_step_of_each_law(monkeypat
     force = rng.standard_normal((1, n))
     outputs = control.forced_response(control.sample_system(plant, dt), inputs=force).outputs.reshape(1, -1)
     outputs = outputs + 1e-3 * outputs.std() * rng.standard_normal(outputs.shape)
-    simulations: list[bool] = []
-    monkeypatch.setattr(changing_response, "_simulated", lambda *law: (simulations.append(law[4]), _simulated(*law))[1])
+    motions: list[int] = []
+    monkeypatch.setattr(
+        changing_response, "_simulated", lambda *law: (motions.append(law[1].shape[1]), _simulated(*law))[1]
+    )
     record = Record(
         sample_time=dt,
         inputs=force,
@@ -57,4 +59,6 @@ def test_two_linear_modes_are_no_changing_one_after_a_step_of_each_law(monkeypat
     modes = identify_driven(record).modes
     np.testing.assert_allclose(modes.omega, omega, rtol=1e-3)
     # four laws of two terms, the start and one step each; twice, as the noise spectrum is estimated again
-    assert 0 < len(simulations) <= 16
+    assert 0 < len(motions) <= 16
+    # a law that is given up after its step is not differentiated there
+    assert motions[1::2] == [1] * (len(motions) // 2) and min(motions[::2]) > 6

@@ -66,6 +66,12 @@ def test_intervals_hold_without_false_modes(seeds, band_limited):
     assert np.sqrt((errors**2).mean()) > 0.6  # nor are they too wide
 
 
+def test_its_peaks_at_modes_are_no_strong_modes():
+    """Above white noise they pass for more modes than are searched at first."""
+    record, omega, _ = record_of(23)
+    assert identify_driven(record, seconds=None).modes.n_modes == omega.size
+
+
 def test_the_noise_is_found_as_large_as_it_is():
     record, _, _ = record_of(4, band_limited=False)
     remark = next(r for r in identify_driven(record).remarks if "inputs contain measurement noise" in r)

@@ -30,16 +30,14 @@ def by_recursion(inputs, first, pole, hold):
 def test_lines_are_those_of_the_recursion(hold, first):
     inputs, step = np.random.default_rng(0).standard_normal((2, 1501)), 1e-4
     lines, l_r, held = LinesOfPoles(inputs, first, DT, False), np.array([1.0, 0.3 - 0.2j, 2.0]), sources(POLE, DT, hold)
-    real, imaginary = np.zeros((2, 3, 1501 - first))
-    lines.responses(POLE, held, np.arange(3), real, imaginary)
     exact = by_recursion(inputs, first, POLE, hold)
-    assert np.abs(real + 1j * imaginary - exact).max() < 1e-11 * np.abs(exact).max()
-    real, imaginary = np.zeros((2, 1, 1501 - first))
-    lines.slopes(POLE, held, l_r, real, imaginary)
+    real, imaginary = np.zeros((2, 4, 1501 - first))
+    lines.tangents(POLE, held, 1 + np.arange(3), l_r, real, imaginary)
+    assert np.abs(real[1:] + 1j * imaginary[1:] - exact).max() < 1e-11 * np.abs(exact).max()
     above, below = (by_recursion(inputs, first, POLE + h, hold) for h in (step, -step))
     # l_r multiplies the response, not its real and imaginary lines apart
     slope = l_r @ ((above - below) / (2.0 * step))
-    assert np.abs(real + 1j * imaginary - slope).max() < 1e-6 * np.abs(slope).max()
+    assert np.abs(real[0] + 1j * imaginary[0] - slope).max() < 1e-6 * np.abs(slope).max()
 
 
 def long_record(seed=0):

@@ -1,7 +1,10 @@
 import numpy as np
+from scipy.signal import lfilter
 
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.model_order import select_modes
+from workbench.identification.input_output.modal_fit import projected
+from workbench.identification.input_output.model_order import _Modes, select_modes
+from workbench.identification.signal.searches import Budget, overdamped
 from workbench.records.record import Channel, Record
 
 
@@ -19,3 +22,15 @@ def test_how_a_blow_runs_between_samples_is_no_mode():
     record = Record(dt, moves[None], (Channel("v", "velocity"),), force[None], (Channel("f", "force"),))
     found = select_modes(KnownInputs([record], at_rest=True, hold="zero", feedthrough=True), max_modes=6)
     np.testing.assert_allclose(found.fit.poles.imag, omega, rtol=1e-3)
+
+
+def test_a_candidate_that_ceases_to_oscillate_is_fitted_no_further():
+    rng, dt, n = np.random.default_rng(3), 1e-3, 2000
+    u, omega = rng.standard_normal((1, n)), 200.0
+    pole = omega * (-0.6 + 0.8j)  # far beyond the largest damping of a mode
+    y = np.imag(lfilter([0.0, 1.0], [1.0, -np.exp(pole * dt)], u.astype(complex)))
+    record = Record(dt, y + 0.01 * rng.standard_normal(y.shape), (Channel("y"),), u, (Channel("u"),))
+    data = KnownInputs([record], at_rest=True, hold="zero", feedthrough=False)
+    nothing = projected(data, np.zeros(0, complex), np.zeros((0, 1), complex))
+    trial = _Modes(data, 1e-3, Budget()).extended(nothing, (omega * (-0.1 + 1j), np.ones(1, complex)))
+    assert overdamped(trial.poles).all() and not trial.converged

@@ -53,3 +53,10 @@ def test_time_that_is_up_ends_the_search_and_is_noted():
     found = minimise(Misra(), np.array([500.0, 1e-4]), most_steps=100, budget=budget)
     assert found.steps == 1 and not found.converged and found.cost < Misra().cost((500.0, 1e-4))
     assert [*budget.unfinished] == ["refinement"] and "allow more time" in budget.remarks[0]
+
+
+def test_a_search_that_is_in_vain_ends():
+    whole, start = minimise(Misra(), np.array([500.0, 1e-4]), most_steps=100), np.array([500.0, 1e-4])
+    ended = minimise(Misra(), start, most_steps=100, is_vain=lambda b: b[0] < 450.0)
+    assert ended.steps < whole.steps and not ended.converged
+    assert CERTIFIED[0] < ended.state[0] < 450.0

@@ -127,7 +127,7 @@ def _simulated(
             n_steps = 1 if k < driven else min(many, n - 1 - k)
             propagated = step if n_steps == 1 else step**n_steps
             force = drive[k, i] if k < driven else 0j
-            first, rate, predicted = 0j, 0j, current
+            first, predicted = 0j, current
             for stage in range(2):
                 size = (
                     min(((k + stage * n_steps) / (n - 1) - middle) / width, faded)
@@ -138,23 +138,28 @@ def _simulated(
                 for p in range(powers.size):
                     change_rate += change[i, p + 1] * size ** powers[p]
                 if stage == 0:
-                    first = rate = change_rate
-                    predicted = propagated * np.exp(rate * n_steps * dt) * current + force * np.exp(0.5 * rate * dt)
-                else:
-                    rate = 0.5 * (rate + change_rate)
+                    first = change_rate
+                rate = 0.5 * (first + change_rate)
+                half = np.exp(0.5 * rate * n_steps * dt)  # a force acts in steps of one sample only
+                predicted = half * (propagated * half * current + force)
             if n_steps > 1:
                 rate_slope = (rate - first) * 2.0 * dt / n_steps
                 factor, factor_step = step * np.exp(first * dt + 0.5 * rate_slope), np.exp(rate_slope)
                 for j in range(1, n_steps):
                     z[k + j, i] = z[k + j - 1, i] * factor
                     factor *= factor_step
-            current = propagated * np.exp(rate * n_steps * dt) * current + force * np.exp(0.5 * rate * dt)
+            current = predicted
             if not abs(current) < largest * scale:
                 z[k + 1 :, i] = np.nan
                 break
             k += n_steps
             z[k, i] = current
     return z
+
+
+def _with_neighbours(unknowns: Floats) -> Floats:
+    """Unknowns, then those with each slightly larger in turn, (1 + n_unknowns, n_unknowns)."""
+    return np.vstack([unknowns, unknowns + RIVALS.slightly * np.eye(unknowns.size)])
 
 
 class _Response:
@@ -208,7 +213,7 @@ class _Response:
         Raises:
             _GivenUp: the first step leaves far more, or the time is spent.
         """
-        once = Once(lambda x: self._residual(self._motions(x, by_time, powers)))
+        once = Once(lambda x: self._residual(self._motions(_with_neighbours(x), by_time, powers)))
         start = self._start(by_time, powers)
         unknowns = np.r_[start.real, start.imag]
         sensitivity = np.linalg.norm(once(unknowns)[1], axis=0)
@@ -217,24 +222,26 @@ class _Response:
         if not active.any():
             return None
 
-        def beyond_threshold() -> float:
-            return float(np.log(_squares(once(unknowns)[0], self.fit.noise.size)).sum() - threshold)
+        def beyond_threshold(residual: Floats) -> float:
+            return float(np.log(_squares(residual, self.fit.noise.size)).sum() - threshold)
 
         beyond: list[float] = []
 
         def among_active(x: Floats) -> tuple[Floats, Floats]:
             unknowns[active] = x
-            residual, jacobian = once(unknowns)
-            beyond.append(beyond_threshold())
-            is_hopeless = len(beyond) > 1 and min(beyond) > RESPONSE.hopeless
-            if is_hopeless or budget.spent(CHANGE_CHECK):
+            if len(beyond) == 1:  # without the Jacobian, which takes most of the time
+                beyond.append(beyond_threshold(self._residual(self._motions(unknowns[None], by_time, powers))[0]))
+            if (len(beyond) == 2 and min(beyond) > RESPONSE.hopeless) or budget.spent(CHANGE_CHECK):
                 raise _GivenUp
+            residual, jacobian = once(unknowns)
+            if not beyond:
+                beyond.append(beyond_threshold(residual))
             return residual, jacobian[:, active]
 
         unknowns[active] = Once(among_active).least(unknowns[active], RESPONSE.most_tries)
-        if beyond_threshold() > 0.0:
+        if beyond_threshold(once(unknowns)[0]) > 0.0:
             return None
-        return self._motion(self._motions(unknowns, by_time, powers))
+        return self._motion(self._motions(_with_neighbours(unknowns), by_time, powers))
 
     def _start(self, by_time: bool, powers: Floats) -> np.ndarray:
         """Starting coefficients of a law: regression on the sum of the linear modes, from sample to sample."""
@@ -262,10 +269,14 @@ class _Response:
         held_factors = self.participation[self.others]
         return np.asarray(np.r_[coefficients, (participation[self.others] / unit - held_factors) / self.units])
 
-    def _motions(self, unknowns: Floats, by_time: bool, powers: Floats) -> list[np.ndarray]:
-        """z of each record and its change with each unknown, (n_samples, 1 + n_unknowns) each."""
-        cases = np.vstack([unknowns, unknowns + RIVALS.slightly * np.eye(unknowns.size)])
-        coefficients = cases[:, : unknowns.size // 2] + 1j * cases[:, unknowns.size // 2 :]
+    def _motions(self, cases: Floats, by_time: bool, powers: Floats) -> list[np.ndarray]:
+        """z of each record at the first case, and its change to each other, (n_samples, n_cases) each.
+
+        Args:
+            cases: (n_cases, n_unknowns), as `_with_neighbours` gives, or the first of these alone.
+        """
+        half = cases.shape[1] // 2
+        coefficients = cases[:, :half] + 1j * cases[:, half:]
         size = 1 + powers.size
         participation = np.tile(self.participation, (len(cases), 1))
         participation[:, self.others] += coefficients[:, size:] * self.units

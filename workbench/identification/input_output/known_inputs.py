@@ -400,13 +400,9 @@ class KnownInputs:
         return np.append(np.arange(self.n_inputs), [] if self.at_rest else self.n_inputs + record).astype(int)
 
     def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
-        of_poles = self._lines_of(pole)
-        if of_poles is not None:
-            held = sources(pole, self.dt, self.hold)
-            real, imaginary = (np.zeros((self.n_excitations, len(self.values))) for _ in range(2))
-            for k, (rows, of_record) in enumerate(zip(self.rows, of_poles, strict=True)):
-                of_record.responses(pole, held, self._acting(k), real[:, rows], imaginary[:, rows])
-            return real.T, imaginary.T
+        if self._lines_of(pole) is not None:
+            real, imaginary = self._tangents(pole, np.zeros(self.n_excitations, complex))
+            return real[:, 1:], imaginary[:, 1:]
         x = np.zeros((self.values.shape[0], self.n_excitations), complex, order="F")
         for k, (record, rows, (driven, _, decay)) in enumerate(zip(self.records, self.rows, self._of_pole(pole))):
             z = self._late_driven(record.inputs, pole, driven)
@@ -415,15 +411,28 @@ class KnownInputs:
                 x[rows, self.n_inputs + k] = decay[self.first :]
         return self._rows(x.real), self._rows(x.imag)
 
-    def slopes(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def tangents(self, pole: complex, participation: np.ndarray, real: np.ndarray, imaginary: np.ndarray) -> None:
         of_poles = self._lines_of(pole)
-        if of_poles is not None:
-            held = sources(pole, self.dt, self.hold)
-            real, imaginary = (np.zeros((1, len(self.values))) for _ in range(2))
-            for k, (rows, of_record) in enumerate(zip(self.rows, of_poles, strict=True)):
-                l_r = participation[self._acting(k)]
-                of_record.slopes(pole, held, l_r, real[:, rows], imaginary[:, rows])
-            return real[0], imaginary[0]
+        if of_poles is None:
+            real[:, 0], imaginary[:, 0] = self.slopes(pole, participation)
+            real[:, 1:], imaginary[:, 1:] = self.responses(pole)
+            return
+        if not self.at_rest and len(of_poles) > 1:  # the initial state of a record does not act in the others
+            real[:, 1:] = imaginary[:, 1:] = 0.0
+        held = sources(pole, self.dt, self.hold)
+        for k, (rows, of_record) in enumerate(zip(self.rows, of_poles, strict=True)):
+            acting = self._acting(k)
+            of_record.tangents(pole, held, 1 + acting, participation[acting], real.T[:, rows], imaginary.T[:, rows])
+
+    def _tangents(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        real, imaginary = (np.empty((len(self.values), 1 + self.n_excitations), order="F") for _ in range(2))
+        self.tangents(pole, participation, real, imaginary)
+        return real, imaginary
+
+    def slopes(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self._lines_of(pole) is not None:
+            real, imaginary = self._tangents(pole, participation)
+            return real[:, 0], imaginary[:, 0]
         slopes = np.zeros(self.values.shape[0], complex)
         mu, l_r = np.exp(pole * self.dt), participation[: self.n_inputs]
         of_records = zip(self.records, self.rows, self._of_pole(pole))

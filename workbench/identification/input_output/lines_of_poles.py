@@ -42,7 +42,6 @@ class LinesOfPoles:
         if not at_rest:
             spectra = np.vstack([spectra, np.zeros(self.size)])
         self.turn, self.half = _parts(np.exp(-1j * angles)), _parts(half)
-        self.other = self.half * (1.0 - 2.0 * (np.arange(self.size) % 2))
         self.spectra = np.array([_parts(each) for each in spectra])
 
     def on_line(self, pole: complex) -> bool:
@@ -51,23 +50,25 @@ class LinesOfPoles:
         line = np.round(pole.imag * self.dt / spacing) * spacing
         return bool(abs(1.0 - np.exp(pole * self.dt - 1j * line)) < LEAST_DISTANCE * spacing)
 
-    def responses(self, pole: complex, held: Sources, rows: np.ndarray, real: Floats, imaginary: Floats) -> None:
-        """Add the response to each input, and to the initial state, to these rows of (n_rows, n_lines).
+    def tangents(
+        self,
+        pole: complex,
+        held: Sources,
+        rows: np.ndarray,
+        participation: Complexes,
+        real: Floats,
+        imaginary: Floats,
+    ) -> None:
+        """Write the response to each input, and to the initial state, into these rows of (n_rows, n_lines).
+
+        Row 0 becomes the derivative by the pole of their sum with participation factors. Responses alone take as long.
 
         Args:
             held: (c_0, c_1), and their derivatives by the pole.
         """
         factors, ends = self._factors(pole, held)
-        unit = np.ones(rows.size, complex)
-        _lines(self.turn, self.half, self.other, self.spectra, factors, ends, unit, False, rows, real, imaginary)
-
-    def slopes(self, pole: complex, held: Sources, participation: Complexes, real: Floats, imaginary: Floats) -> None:
-        """Add the derivative by the pole of the response with such participation factors to (1, n_lines)."""
-        factors, ends = self._factors(pole, held)
-        rows = np.zeros(participation.size, int)
-        _lines(
-            self.turn, self.half, self.other, self.spectra, factors, ends, participation, True, rows, real, imaginary
-        )
+        real[0] = imaginary[0] = 0.0
+        _lines(self.turn, self.half, self.spectra, factors, ends, participation, rows, real, imaginary)
 
     def _factors(self, pole: complex, held: Sources) -> tuple[Complexes, Complexes]:
         """m, c_0, c_1 and their derivatives, and what `_ends` gives; cached for the last pole."""
@@ -112,8 +113,8 @@ def _ends(inputs, first, begin, factors):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _lines(turn, half, other, spectra, factors, ends, participation, by_pole, rows, real, imaginary):  # type: ignore[no-untyped-def]
-    """Add the lines of the responses, or of their derivative for participation factors, to rows of `real`, `imaginary`.
+def _lines(turn, half, spectra, factors, ends, participation, rows, real, imaginary):  # type: ignore[no-untyped-def]
+    """Write the lines of the responses to rows of `real` and `imaginary`; add those of their derivative to row 0.
 
     x belongs to m, y to its conjugate. Real arithmetic without a check for zero is done on several lines at a time.
     """
@@ -121,10 +122,16 @@ def _lines(turn, half, other, spectra, factors, ends, participation, by_pole, ro
     for i in range(ends.shape[0]):
         before, after, before_slope, after_slope = ends[i]
         a = participation[i]
-        into_real, into_imaginary = real[rows[i]], imaginary[rows[i]]
+        into_real, into_imaginary, slope_real, slope_imaginary = (
+            real[rows[i]],
+            imaginary[rows[i]],
+            real[0],
+            imaginary[0],
+        )
         for k in range(turn.shape[1]):
             er, ei, ur, ui = turn[0, k], turn[1, k], spectra[i, 0, k], spectra[i, 1, k]
-            hr, hi, gr, gi = half[0, k], half[1, k], other[0, k], other[1, k]
+            hr, hi, sign = half[0, k], half[1, k], 1.0 - 2.0 * (k & 1)
+            gr, gi = sign * hr, sign * hi
             vr, vi = er * ur - ei * ui, er * ui + ei * ur  # the input a sample later
             # 1 / (1 - m e) for both
             xr, xi = 1.0 - m.real * er + m.imag * ei, -m.real * ei - m.imag * er
@@ -139,18 +146,19 @@ def _lines(turn, half, other, spectra, factors, ends, participation, by_pole, ro
             sr, si, tr, ti = pr - qi, pi + qr, pr + qi, pi - qr
             x_r, x_i = sr * xr - si * xi, sr * xi + si * xr
             y_r, y_i = tr * yr - ti * yi, tr * yi + ti * yr
-            if by_pole:
-                pr = c_0_slope.real * vr + c_1_slope.real * ur + before_slope.real * hr + after_slope.real * gr
-                pi = c_0_slope.real * vi + c_1_slope.real * ui + before_slope.real * hi + after_slope.real * gi
-                qr = c_0_slope.imag * vr + c_1_slope.imag * ur + before_slope.imag * hr + after_slope.imag * gr
-                qi = c_0_slope.imag * vi + c_1_slope.imag * ui + before_slope.imag * hi + after_slope.imag * gi
-                lr, li = m_slope.real * er - m_slope.imag * ei, m_slope.real * ei + m_slope.imag * er
-                kr, ki = m_slope.real * er + m_slope.imag * ei, m_slope.real * ei - m_slope.imag * er
-                sr, si = pr - qi + lr * x_r - li * x_i, pi + qr + lr * x_i + li * x_r
-                tr, ti = pr + qi + kr * y_r - ki * y_i, pi - qr + kr * y_i + ki * y_r
-                x_r, x_i = sr * xr - si * xi, sr * xi + si * xr
-                y_r, y_i = tr * yr - ti * yi, tr * yi + ti * yr
-                x_r, x_i = a.real * x_r - a.imag * x_i, a.real * x_i + a.imag * x_r
-                y_r, y_i = a.real * y_r + a.imag * y_i, a.real * y_i - a.imag * y_r
-            into_real[k] += 0.5 * (x_r + y_r)
-            into_imaginary[k] += 0.5 * (x_i - y_i)
+            into_real[k] = 0.5 * (x_r + y_r)
+            into_imaginary[k] = 0.5 * (x_i - y_i)
+            pr = c_0_slope.real * vr + c_1_slope.real * ur + before_slope.real * hr + after_slope.real * gr
+            pi = c_0_slope.real * vi + c_1_slope.real * ui + before_slope.real * hi + after_slope.real * gi
+            qr = c_0_slope.imag * vr + c_1_slope.imag * ur + before_slope.imag * hr + after_slope.imag * gr
+            qi = c_0_slope.imag * vi + c_1_slope.imag * ui + before_slope.imag * hi + after_slope.imag * gi
+            lr, li = m_slope.real * er - m_slope.imag * ei, m_slope.real * ei + m_slope.imag * er
+            kr, ki = m_slope.real * er + m_slope.imag * ei, m_slope.real * ei - m_slope.imag * er
+            sr, si = pr - qi + lr * x_r - li * x_i, pi + qr + lr * x_i + li * x_r
+            tr, ti = pr + qi + kr * y_r - ki * y_i, pi - qr + kr * y_i + ki * y_r
+            x_r, x_i = sr * xr - si * xi, sr * xi + si * xr
+            y_r, y_i = tr * yr - ti * yi, tr * yi + ti * yr
+            x_r, x_i = a.real * x_r - a.imag * x_i, a.real * x_i + a.imag * x_r
+            y_r, y_i = a.real * y_r + a.imag * y_i, a.real * y_i - a.imag * y_r
+            slope_real[k] += 0.5 * (x_r + y_r)
+            slope_imaginary[k] += 0.5 * (x_i - y_i)

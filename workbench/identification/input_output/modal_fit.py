@@ -11,7 +11,7 @@ gives the Gauss-Newton matrix H; H^-1 in the noise of the outputs is the Cramér
 each mode is held at 1: the shape carries its scale.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -66,6 +66,10 @@ class Measurement(Protocol):
 
     def slopes(self, pole: complex, participation: np.ndarray) -> Pair:
         """∂/∂λ of Σ_p l_p x_p(λ), (n_rows,) each."""
+        ...
+
+    def tangents(self, pole: complex, participation: np.ndarray, real: np.ndarray, imaginary: np.ndarray) -> None:
+        """Write `slopes`, then `responses`, into columns (n_rows, 1 + n_excitations)."""
         ...
 
     def candidates(self, residual: np.ndarray) -> np.ndarray:
@@ -166,12 +170,10 @@ def regressors(data: Measurement, poles: np.ndarray, participation: np.ndarray) 
     n, q, (n_rows, n_fixed) = poles.size, participation.shape[1] + 1, data.fixed.shape
     x = np.empty((n_rows, 2 * n * q + n_fixed), order="F")
     x[:, 2 * n * q :] = data.fixed
+    real, imaginary = x[:, : n * q], x[:, n * q : 2 * n * q]
     for r, (pole, l_r) in enumerate(zip(poles, participation)):
-        responses, slopes = data.responses(pole), data.slopes(pole, l_r)
-        for part in (0, 1):
-            first = (part * n + r) * q
-            x[:, first] = slopes[part]
-            x[:, first + 1 : first + q] = responses[part]
+        of_mode = slice(r * q, (r + 1) * q)
+        data.tangents(pole, l_r, real[:, of_mode], imaginary[:, of_mode])
     return x
 
 
@@ -329,17 +331,20 @@ def search(
     most_steps: int = FIT.most_steps,
     budget: Budget | None = None,
     negligible: float = FIT.negligible,
+    is_vain: Callable[[Fit], bool] = lambda fit: False,
 ) -> Fit:
     """Least-squares fit over poles and participation factors, outputs in units of `noise`.
 
     Args:
         fit: to start from, of the same data.
         negligible: expected decrease of χ² per value below which the search ends.
+        is_vain: whether a fit ends the search, since what follows from it is of no use.
     """
     held = fit.participation[np.arange(fit.poles.size), np.argmax(_strength(fit), axis=1)]
     if (held != 1.0).any():
         fit = projected(data, fit.poles, fit.participation / held[:, None])
-    minimum = minimise(_OutputError(data, noise, negligible), fit, most_steps=most_steps, budget=budget)
+    problem = _OutputError(data, noise, negligible)
+    minimum = minimise(problem, fit, most_steps=most_steps, budget=budget, is_vain=is_vain)
     return replace(minimum.state, converged=minimum.converged, steps=minimum.steps)
 
 

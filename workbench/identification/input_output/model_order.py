@@ -234,7 +234,7 @@ class _Modes:
         pole, participation = self._alone(model, *candidate)
         poles, factors = np.append(model.poles, pole), np.vstack([model.participation, participation])
         start = projected(self.data, poles, factors)
-        return search(self.data, start, model.noise, ORDER.steps, self.budget, ORDER.decided)
+        return search(self.data, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
 
     def _alone(self, model: Fit, pole: complex, participation: np.ndarray) -> tuple[complex, np.ndarray]:
         """A candidate fitted to the residual of the other modes of a long record, unless it comes near to one of them.
@@ -246,7 +246,7 @@ class _Modes:
         residual = copy(self.data)
         residual.values = model.residual
         start = projected(residual, np.array([pole]), participation[None])
-        fit = search(residual, start, model.noise, ORDER.steps, self.budget, ORDER.decided)
+        fit = search(residual, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
         apart = np.abs(np.append(model.poles, pole) - fit.poles[0])
         near = ORDER.apart * max(abs(fit.poles[0].real), self.data.resolution)
         if not fit.converged or apart[-1] > near or (apart[:-1] < near).any():
@@ -306,6 +306,11 @@ class _Modes:
 
     def _is_near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:
         return any(abs(pole.imag - o.imag) < max(self.data.resolution, 0.5 * abs(o.real)) for o, _ in rejected)
+
+
+def _is_overdamped(fit: Fit) -> bool:
+    """Whether the last mode of a fit, a candidate, is damped too much to oscillate: it seldom returns from there."""
+    return bool(overdamped(fit.poles[-1]))
 
 
 def _candidates(data: Measurement, fit: Fit) -> np.ndarray:

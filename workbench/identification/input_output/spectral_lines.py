@@ -144,6 +144,10 @@ class Lines:
         below = participation.conj()[:, None] / (s - pole.conjugate()) ** 2
         return self.stacked_pair(above, below)
 
+    def tangents(self, pole: complex, participation: np.ndarray, real: np.ndarray, imaginary: np.ndarray) -> None:
+        real[:, 0], imaginary[:, 0] = self.slopes(pole, participation)
+        real[:, 1:], imaginary[:, 1:] = self.responses(pole)
+
     def stacked_pair(self, above: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows (n_rows,) of the real and the imaginary part of the factor of a pole pair.
 

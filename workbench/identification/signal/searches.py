@@ -208,7 +208,13 @@ class Minimum(Generic[State]):
 
 
 def minimise(
-    problem: LeastSquares[State], start: State, *, most_steps: int, round_off: float = 0.0, budget: Budget | None = None
+    problem: LeastSquares[State],
+    start: State,
+    *,
+    most_steps: int,
+    round_off: float = 0.0,
+    budget: Budget | None = None,
+    is_vain: Callable[[State], bool] = lambda state: False,
 ) -> Minimum[State]:
     """The local minimum of a problem next to `start`.
 
@@ -218,6 +224,7 @@ def minimise(
         most_steps: largest number of steps.
         round_off: of the cost; a step that raises it by no more is accepted.
         budget: time limit; none unless given.
+        is_vain: whether a state ends the search, since what follows from it is of no use.
     """
     state, cost, damping, small = start, problem.cost(start), DAMPING.first, False
     for taken in range(1, most_steps + 1):
@@ -242,7 +249,7 @@ def minimise(
         damping = max(DAMPING.lowered * damping, DAMPING.least)
         if small or damping > DAMPING.stuck:
             return Minimum(state, cost, small, taken)
-        if budget is not None and budget.spent("refinement"):
+        if is_vain(state) or (budget is not None and budget.spent("refinement")):
             return Minimum(state, cost, False, taken)
     return Minimum(state, cost, False, most_steps)
 
