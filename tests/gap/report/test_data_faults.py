@@ -70,10 +70,10 @@ def test_clipped_channels_are_said_with_their_limits_and_rounded_ones_are_not(ri
 
     record = measured(rig)
     clipped = altered(record, clip)
-    counts = np.count_nonzero(clipped.outputs[1] == 2e-4), np.count_nonzero(clipped.outputs[2] == 1e-4)
+    n, m = np.count_nonzero(clipped.outputs[1] == 2e-4), np.count_nonzero(clipped.outputs[2] == 1e-4)
     assert data_faults(rig, [clipped]) == (
-        f"Record 'high': output 'd2' is clipped above at 0.0002, {counts[0]} samples and output 'd3' is clipped above at"
-        f" 0.0001, {counts[1]} samples; the motion beyond is lost: lower the level, or measure with a larger range.",
+        f"Record 'high': output 'd2' is clipped above at 0.0002, {n} samples and output 'd3' is clipped above at"
+        f" 0.0001, {m} samples; the motion beyond is lost: lower the level, or measure with a larger range.",
     )
     step = record.outputs.std() / 4
     assert data_faults(rig, [altered(record, lambda y: np.round(y / step, out=y))]) == ()
