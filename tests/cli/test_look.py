@@ -173,3 +173,12 @@ def test_an_acceleration_to_the_north_is_no_input(run, tmp_path):
     told = run("look", path, "--page", tmp_path / "p.html").output
     assert "Acc: motions by name and forces by unit, so no inputs; does N mean north?" in told
     assert "--inputs" not in told
+
+
+def test_a_sensor_that_reads_noise_alone_may_be_dead_and_one_that_moves_little_is_not(run, tmp_path):
+    rng = np.random.default_rng(0)
+    time, tip = decay(rng)
+    columns = [time, tip, 0.5 * tip, 1e-6 * rng.standard_normal(N), 1e-5 * tip]
+    path = write(tmp_path / "four.csv", ["t [s]", *(f"a{j} [m/s^2]" for j in (1, 2, 3, 4))], columns)
+    told = " ".join(run("look", path, "--page", tmp_path / "p.html").output.split())
+    assert "output 'a3' has 1e-06 rms and no spectral peak, beside" in told and told.count("may be dead") == 1

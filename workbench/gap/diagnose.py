@@ -37,7 +37,7 @@ from workbench.gap.report.data_faults import data_faults
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.levels import steady_remainder
 from workbench.gap.report.record_checks import check_modes, check_records, detectability
-from workbench.gap.report.verdict import Verdict
+from workbench.gap.report.verdict import NEAR, Verdict
 from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.gap.search.finish import with_equals
 from workbench.gap.search.jointly import too_large
@@ -192,7 +192,8 @@ def diagnose(
         budget = budget_for(effects, logged=_input_noise(attribution, outcome))
         power = _residual_power(rig, (), validation or records, settle) / len(validation or records)
         if outcome == "explained" and _leaves_unexplained(budget, power, tolerance):
-            outcome, effects, attribution = "part", (), replace(attribution, outcome="part")
+            attribution = replace(attribution, outcome="part")
+            outcome, effects = _outcome(attribution, shrinkage, beyond, disagreeing), ()
             budget = budget_for(effects, logged=_input_noise(attribution, outcome))
         is_settled = outcome in ("none", "explained")
         in_records = () if is_settled else data_faults(rig, records, settle=settle)
@@ -307,11 +308,16 @@ def _power_of_difference(
 
 
 def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray, disagreeing: Sequence[str]) -> str:
-    """The outcome, after the test on held-out records."""
+    """The outcome, after the test on held-out records.
+
+    A gap is explained in part only by a nearest set that closes some of it there, as `Verdict.sentence` states it.
+    """
     if disagreeing:
         return "unknown"
-    fails = found.outcome == "explained" and _over_fits(found, shrinkage, beyond)
-    return "part" if fails else found.outcome
+    if found.outcome == "explained" and _over_fits(found, shrinkage, beyond):
+        return "part"
+    closes = shrinkage is None or shrinkage.overall >= NEAR or bool(_unpredictable(found))
+    return "unknown" if found.outcome == "part" and not (found.best.effects and closes) else found.outcome
 
 
 def _input_noise(found: Attribution, outcome: str) -> float:

@@ -63,7 +63,17 @@ def test_a_channel_that_is_stuck(rig, measured):
     said, *_ = data_faults(rig, [altered(measured(rig), hold)])
     assert "d3 reads" in said and "from 3 s to 7 s" in said
 
-    def clip(y):
-        y[2] = np.clip(y[2], -1e-4, 1e-4)
 
-    assert not any("without change" in said for said in data_faults(rig, [altered(measured(rig), clip)]))
+def test_clipped_channels_are_said_with_their_limits_and_rounded_ones_are_not(rig, measured):
+    def clip(y):
+        y[1], y[2] = np.clip(y[1], -np.inf, 2e-4), np.clip(y[2], -1e-4, 1e-4)
+
+    record = measured(rig)
+    clipped = altered(record, clip)
+    n, m = np.count_nonzero(clipped.outputs[1] == 2e-4), np.count_nonzero(clipped.outputs[2] == 1e-4)
+    assert data_faults(rig, [clipped]) == (
+        f"Record 'high': output 'd2' is clipped above at 0.0002, {n} samples and output 'd3' is clipped above at"
+        f" 0.0001, {m} samples; the motion beyond is lost: lower the level, or measure with a larger range.",
+    )
+    step = record.outputs.std() / 4
+    assert data_faults(rig, [altered(record, lambda y: np.round(y / step, out=y))]) == ()

@@ -154,3 +154,38 @@ def test_modes_of_a_structure_with_masses_on_it_are_mass_normalised():
         heavy = replace(modes, shapes=lambda at, derivative, shapes=modes.shapes: 1.1 * shapes(at, derivative))
         with pytest.raises(ValueError, match=r"mode 1 .* is 1\.21, not 1; divide its shape by 1\.1;"):
             check_modes(Rig(heavy, (), (), structure=structure))
+
+
+def test_a_sensor_that_is_dead_in_one_record_is_refused(rig, record_of):
+    rng = np.random.default_rng(8)
+    commands = 0.3 * np.repeat(rng.normal(size=(2, 100)), 10, axis=1)
+    levels = {"low": 1.0, "high": 4.0, "check": 3.0}
+    low, high, check = (record_of(rig, level * commands, rng, name=name) for name, level in levels.items())
+
+    def dead(record):
+        return replace(
+            record, outputs=np.vstack([record.outputs[:1], NOISE * rng.normal(size=(1, 1000)), record.outputs[2:]])
+        )
+
+    check_records(rig, [low, high], [check])
+    expected = high.outputs[1].std()
+    for fit, held, what in (([low, dead(high)], [check], "record 'high'"), ([low, high], [dead(check)], "validation")):
+        with pytest.raises(RecordsError, match=f"^{what}.*output 'd2' reads .*the sensor is dead in one record; leave"):
+            check_records(rig, fit, held)
+    with pytest.raises(RecordsError, match=f"predicts {expected:.3g}; in record 'low' it reads"):
+        check_records(rig, [low, dead(high)])
+    check_records(rig, [dead(low), high], [check])  # a dry friction may hold its place at the lowest level
+    (alone,) = (replace(rig, sensors=rig.sensors[1:2]),)
+    check_records(alone, [r.select_outputs(["d2"]) for r in (low, dead(high))])  # the drive may have been off
+
+
+def test_a_sensor_at_a_node_and_a_record_that_excites_nothing_are_not_called_dead(hinged_rig, record_of):
+    """In the middle the second mode, of π Hz, has its node; the true sensor is nearer to it than the model's."""
+    rig, rng = hinged_rig(6), np.random.default_rng(9)
+    near, true = (replace(rig, sensors=(*rig.sensors, replace(rig.sensors[0], name="m", at=x))) for x in (0.99, 1.0))
+    noise = 0.3 * np.repeat(rng.normal(size=(1, 100)), 10, axis=1)
+    tone = np.sin(2 * np.pi * np.pi * 0.01 * np.arange(1000))[None]
+    records = [
+        record_of(true, u, rng, name=name) for name, u in (("noise", noise), ("tone", tone), ("at rest", 1e-6 * noise))
+    ]
+    check_records(near, records)

@@ -193,3 +193,26 @@ def test_the_probability_of_the_set_named_and_of_its_alternatives_sum_to_one(hin
     assert shown.probability == pytest.approx(0.6) and shown.to_json()["probability"] == 0.6
     assert found.to_json()["probability"] is None
     assert dict(verdict_tables(shown.to_json())[-1][2])["the set named"] == 0.6
+
+
+def test_clipping_of_all_sensors_is_one_effect_only_where_their_limits_have_one_unit(hinged_rig, record_of):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
+    each = tuple(
+        Effect(kind_named("sensor_clipping"), s.name, {"limit": 0.01 * (i + 1)}) for i, s in enumerate(rig.sensors)
+    )
+    shown = replace(found, outcome="part", effects=each)
+    assert "clipping of a sensor (all: limit 0.025 m)" in shown.sentence
+    mixed = (replace(rig.sensors[0], quantity="acceleration"), *rig.sensors[1:])
+    named = replace(shown, nominal=replace(rig, sensors=mixed)).to_json()["nearest"]
+    assert [(e["output"], e["parameters"]["limit"]) for e in named] == [(f"d{i}", 0.01 * i) for i in (1, 2, 3, 4)]
+
+
+def test_a_single_force_that_leaves_little_beyond_the_noise_is_not_said_to_explain_all(hinged_rig, record_of):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
+    for share, words in ((0.99995, "all but 0.005 % of it"), (0.97, "97 % of it")):
+        place = replace(found.where.place, share=share, is_single_force=False)
+        assert replace(found, where=replace(found.where, place=place)).location_in_words.endswith(f"explains {words}")

@@ -1,13 +1,15 @@
-"""Faults of the records themselves: records that start in motion and channels that are stuck for a while."""
+"""Faults of the records themselves: a start in motion, channels that are stuck for a while, and clipped ones."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from workbench.arrays import Floats
+from workbench.identification.signal import data_quality
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
+from workbench.structure.printed import joined_in_words
 
 # a first reading farther than each of these from zero, from the mean and from the prediction shows motion
 NOISE_MULTIPLE = 10.0  # standard deviations of the noise
@@ -18,7 +20,7 @@ MOVES = 0.1  # of its standard deviation over the record: a working sensor moves
 
 
 def data_faults(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> tuple[str, ...]:
-    """One sentence for each record that starts in motion and each channel that is stuck, with the correction.
+    """One sentence for each record that starts in motion or is clipped and each stuck channel, with the correction.
 
     Args:
         rig: nominal.
@@ -29,6 +31,7 @@ def data_faults(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> 
     for record in records:
         found += [] if settle else _in_motion(rig, record)
         found += _stuck(record)
+        found += _clipped(record)
     return tuple(found)
 
 
@@ -72,6 +75,13 @@ def _stuck(record: Record) -> list[str]:
                 f" {seconds[1]:.4g} s while others move: leave that channel out, or cut the record."
             )
     return found
+
+
+def _clipped(record: Record) -> list[str]:
+    """A sentence on the outputs that are clipped; empty if none is."""
+    each = [f.message.partition(";")[0] for f in data_quality.data_faults(record) if f.kind == "clipped" and f.outputs]
+    beyond = "the motion beyond is lost: lower the level, or measure with a larger range."
+    return [f"Record {record.name!r}: {joined_in_words(each)}; {beyond}"] if each else []
 
 
 def _longest_run(y: Floats) -> tuple[int, int]:

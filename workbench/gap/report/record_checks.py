@@ -27,6 +27,10 @@ DETECTABLE = 25.0  # of chi-squared: five standard deviations
 WRONG_SIGN = -0.95  # correlation of a reading with the prediction
 WRONG_UNIT = 50.0  # ratio of a reading and the prediction, or its inverse
 NO_EFFECT = 500.0  # times smaller than the prediction, at all outputs: no effect reduces the response so much
+ALIVE = 5.0  # ratio of a reading and the prediction, or its inverse, that a working sensor has
+# relative level from which a record is louder than another: a dry friction that holds a point at one level leaves less
+# than 1 / ALIVE of its motion at a level no higher than that, so that a sensor at it is not taken for dead
+LOUDER = 1.2
 ABOVE_NOISE = 5.0  # times the noise: smaller signals are not compared
 CORRELATED = 0.5  # correlation of a reading with the prediction, whatever its unit
 SATURATED = 0.5  # share of the samples at the largest magnitude
@@ -37,6 +41,10 @@ SUBSTEPS = 2  # of a sample: detectability needs no more
 OFF_FREQUENCY, OFF_DAMPING, OFF_MASS = 1e-3, 0.02, 0.02
 QUADRATURE = 200  # points along a member for the integral of its modal mass
 DECADES = (1e2, 1e-2, 1e4, 1e-4)  # factors on a strength, tried one after the other
+
+
+# standard deviations (n_sensors,) of the readings and of the predictions, by record as a message names it
+Levels = dict[str, tuple[Floats, Floats]]
 
 
 class RecordsError(ValueError):
@@ -70,15 +78,16 @@ def check_records(
         settle: seconds at the start of each record that are not compared.
 
     Raises:
-        RecordsError: for a sensor with the wrong sign or in other units, a saturated or flat channel, a record shorter
-            than a period of the first mode, or no input that drives the rig.
+        RecordsError: for a sensor with the wrong sign or in other units, a saturated or flat channel, a sensor that is
+            dead in one record, a record shorter than a period of the first mode, or no input that drives the rig.
     """
     if not rig.actuators:
         raise RecordsError("the rig has no actuators, so nothing drives its model; a free decay is for wb.identify")
     check_alive(rig, records, validation, settle=settle)
-    if not _check_signs_and_units(rig, records, "record", settle):
+    levels = _check_signs_and_units(rig, records, "record", settle)
+    if not levels:
         raise RecordsError("every input of every record is at rest; there is nothing to compare")
-    _check_signs_and_units(rig, validation, "validation record", settle)
+    _check_dead(rig, levels | _check_signs_and_units(rig, validation, "validation record", settle))
 
 
 def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0) -> None:
@@ -109,13 +118,36 @@ def _is_driven(record: Record) -> bool:
     return bool(np.any(record.inputs))
 
 
-def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settle: float) -> bool:
-    """Refuse records that are too short or disagree in sign or unit with the model; return whether any is driven.
+def _check_dead(rig: Rig, levels: Levels) -> None:
+    """Refuse an output that reads next to nothing in one record, and as predicted in another that is no louder.
+
+    Other outputs must move there: otherwise the drive may have been off.
+    """
+    read, expected = (np.array(each) for each in zip(*levels.values(), strict=True))
+    shown = expected > ABOVE_NOISE * np.array([sensor.noise_std for sensor in rig.sensors])
+    ratios = np.divide(read, expected, out=np.ones_like(read), where=shown)
+    alive = shown & (np.abs(np.log(np.maximum(ratios, 1e-300))) < np.log(ALIVE))
+    dead = shown & (ratios < 1.0 / NO_EFFECT) & alive.any(axis=1, keepdims=True)
+    for i, j in np.argwhere(dead):
+        no_louder = np.flatnonzero(alive[:, j] & (expected[:, j] < LOUDER * expected[i, j]))
+        if no_louder.size:
+            what, other = (list(levels)[k] for k in (i, no_louder[0]))
+            raise RecordsError(
+                f"{what}: output {rig.sensors[j].name!r} reads {read[i, j]:.2g} rms where the model predicts"
+                f" {expected[i, j]:.3g}; in {other} it reads {read[no_louder[0], j]:.3g} where"
+                f" {expected[no_louder[0], j]:.3g} is predicted: the sensor is dead in one record; leave that record"
+                " out, or that output"
+            )
+
+
+def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settle: float) -> Levels:
+    """Refuse records that are too short or disagree in sign or unit with the model; return the levels of driven ones.
 
     Args:
         what: name of such records in a message.
     """
     elastic = rig.modes.omega[rig.modes.omega > 0]
+    levels: Levels = {}
     correlations, ratios = [], []
     for record in records:
         lead = lead_of(record, settle)
@@ -131,9 +163,10 @@ def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settl
         pairs = zip(outputs, predicted, strict=True)
         row = [float(np.corrcoef(y, p)[0, 1]) if np.ptp(p) > 0 else 0.0 for y, p in pairs]
         correlations.append(row)
+        levels[f"{what} {record.name!r}"] = outputs.std(axis=1), predicted.std(axis=1)
         ratios.append(_amplitude_ratios(rig, outputs, predicted, np.abs(row) > CORRELATED))
-    if not correlations:
-        return False
+    if not levels:
+        return levels
     _check_units(rig, records[0], np.array(ratios), np.abs(correlations) > CORRELATED, what)
     inverted = np.flatnonzero((np.array(correlations) < WRONG_SIGN).all(axis=0))
     if inverted.size and inverted.size < len(rig.sensors):
@@ -142,7 +175,7 @@ def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settl
             f"output {name!r} reads with the wrong sign: its correlation with the model is"
             f" {np.array(correlations)[:, inverted[0]].mean():.2f} in every {what}; reverse its sign"
         )
-    return True
+    return levels
 
 
 def _amplitude_ratios(rig: Rig, measured: np.ndarray, predicted: np.ndarray, is_correlated: np.ndarray) -> np.ndarray:

@@ -83,11 +83,15 @@ class Verdict:
 
     @property
     def _named(self) -> tuple[Effect, ...]:
-        """The effects without nominal errors; quantisation or clipping of all sensors is stated as one effect."""
+        """The effects without nominal errors; quantisation or clipping of all sensors is stated as one effect.
+
+        Its step or limit is in the unit of the readings, so they must be of one quantity.
+        """
         shown = [e for e in self.effects if e.kind is not NOMINAL_ERRORS]
+        is_one_quantity = len({sensor.quantity for sensor in self.nominal.sensors}) == 1
         for kind in dict.fromkeys(e.kind for e in shown if e.kind.found_in == "readings"):
             same = [e for e in shown if e.kind is kind]
-            if len(same) == len(self.nominal.sensors) > 1:
+            if is_one_quantity and len(same) == len(self.nominal.sensors) > 1:
                 shown = [e for e in shown if e.kind is not kind]
                 median = {name: float(np.median([e.values[name] for e in same])) for name in same[0].values}
                 shown.insert(0, Effect(kind, ALL, median))
@@ -116,7 +120,10 @@ class Verdict:
             return f"{at}, of the unmodelled point force, without a force law"
         if place.is_single_force is not False:
             return ""
-        return f"no single point force explains all of the gap; the best, {at}, explains {_percent(place.share)} of it"
+        explained = _percent(place.share)
+        if explained == "100 %":
+            explained = f"all but {100.0 * (1.0 - place.share):.1g} %"
+        return f"no single point force explains all of the gap; the best, {at}, explains {explained} of it"
 
     @property
     def nominal_errors(self) -> Effect | None:

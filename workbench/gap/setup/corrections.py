@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.records.band_limited import later
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
@@ -19,7 +20,7 @@ class SetupFault:
 
     Attributes:
         kind: "exchanged inputs", "exchanged outputs", "sign", "unit", "quantity", "sample rate", "damping",
-            "frequency", "copied channel" or "repeated record".
+            "frequency", "late record", "copied channel" or "repeated record".
         sentence: what is wrong, and the correction.
         closes: share of the closable power of the gap that the correction removes, on the channels that it concerns;
             NaN for a fault that is found without a prediction.
@@ -105,6 +106,20 @@ def quantity_set(names: frozenset[str], quantity: str, rig: Rig, records: Sequen
 def rate_times(factor: float, rig: Rig, records: Sequence[Record]) -> Corrected:
     """The sampling rates of the records multiplied by a factor."""
     return rig, tuple(replace(r, sample_time=r.sample_time / factor) for r in records)
+
+
+def outputs_earlier(samples: float, rig: Rig, records: Sequence[Record]) -> Corrected:
+    """All outputs of the records shifted by a number of samples, later if it is negative; ends without both are cut."""
+    whole = round(samples)
+    part, before, after = samples - whole, max(whole, 0), max(-whole, 0)
+    corrected = []
+    for record in records:
+        n, outputs = record.n_samples, record.outputs
+        moved = later(outputs, np.full(len(outputs), -part)) if part else outputs
+        corrected.append(
+            replace(record, outputs=moved[:, before : n - after], inputs=record.inputs[:, after : n - before])
+        )
+    return rig, tuple(corrected)
 
 
 def modes_times(omega: float, zeta: float, rig: Rig, records: Sequence[Record]) -> Corrected:

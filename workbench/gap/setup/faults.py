@@ -13,6 +13,7 @@ from workbench.gap.setup.corrections import SetupFault, records_alone, without_f
 from workbench.gap.setup.gains import largest_difference, log_gains_after, tolerated_difference
 from workbench.gap.setup.rates import modal_units, sampling_rates
 from workbench.gap.setup.repeats import check_names, copied, repeated
+from workbench.gap.setup.triggers import late_records
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
@@ -52,11 +53,17 @@ def setup_faults(
     (corrected, fit), (_, held_out) = (without_faults(found, rig, these) for these in (records, validation))
     together = Comparison.of(corrected, fit, settle)
     alone = [*together.by_record, *(Comparison.of(corrected, (record,), settle) for record in held_out)]
+    late = late_records(alone)
+    if late:
+        together, alone = _without_all(together, late), [_without_all(gap, late) for gap in alone]
+    found += late
     for fault in _in_rounds(together, DETECTORS):
         if fault.kind in BY_RECORD and fault.certain:
             fault = _for_agreeing_records(alone, fault)
         found.append(fault)
         alone = [gap.without(fault) for gap in alone]
+    if not late:  # a fault of the channels may have masked it
+        found += late_records(alone)
     for i, gap in enumerate(alone):
         if i == 0 and len(fit) == 1:  # a single fit record was tested above
             continue

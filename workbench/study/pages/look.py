@@ -29,6 +29,7 @@ PEAKS = 4  # per channel
 PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of 1/8 of all lines around the peak
 ABOVE = 1e-3  # of the mean power of an input: the power in the last tenth below Nyquist, behind an anti-alias filter
 MOST_ROWS = 100  # of the table
+QUIET = 1e-4  # rms over the median of its quantity: a sensor of so little, without a peak, may be dead
 MOST_FAULTS = 24  # messages per kind of fault; further faults are counted
 
 
@@ -81,7 +82,8 @@ def _record(record: Record, path: Path) -> Look:
         f"{outputs} output{'s' * (outputs != 1)} and {inputs} input{'s' * (inputs != 1)}, {record.n_samples} samples at"
         f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
     )
-    remarks = [*record.remarks, *_messages([*faults, *input_faults(record)])]
+    quiet = _quiet(record.select_outputs(kept)) if kept else []
+    remarks = [*record.remarks, *_messages([*faults, *quiet, *input_faults(record)])]
     if doubtful:
         remarks.append(f"{', '.join(doubtful)}: motions by name and forces by unit, so no inputs; does N mean north?")
     if len(channels) > MOST_ROWS:
@@ -132,6 +134,24 @@ def _messages(faults: Sequence[DataFault]) -> list[str]:
         if len(each) > MOST_FAULTS:
             messages.append(f"{len(each) - MOST_FAULTS} more channels are {kind}")
     return messages
+
+
+def _quiet(record: Record) -> list[DataFault]:
+    """Outputs that may be dead: their rms is next to nothing beside those of their quantity, and they have no peak."""
+    quantities, rms = np.array([channel.quantity for channel in record.output_channels]), record.outputs.std(axis=1)
+    faults = []
+    for quantity in np.unique(quantities) if record.n_samples >= 16 * SEGMENTS else ():
+        at = np.flatnonzero(quantities == quantity)
+        median = float(np.median(rms[at]))
+        for j in at[rms[at] < QUIET * median]:
+            if not _strongest(*power_spectrum(record.outputs[j], record.sample_rate_hz)):
+                name = record.output_names[j]
+                message = (
+                    f"output {name!r} has {rms[j]:.2g} rms and no spectral peak, beside {median:.3g} rms, the median of"
+                    f" the outputs of {quantity or 'unstated'} quantity: the sensor may be dead; check it"
+                )
+                faults.append(DataFault("quiet", (name,), message))
+    return faults
 
 
 def _with_inputs(record: Record, names: Sequence[str]) -> Record:

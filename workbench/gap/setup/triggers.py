@@ -1,0 +1,107 @@
+"""Faults of triggers: records whose outputs are late, or early, by times that differ from record to record."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from workbench.gap.setup.by_band import compared_bands
+from workbench.gap.setup.comparison import CLOSED, LARGEST_LEFT, Comparison
+from workbench.gap.setup.corrections import SetupFault, outputs_earlier
+from workbench.records.band_limited import angles
+
+FARTHEST = 20  # samples: largest delay that is tried, either way
+DIFFERING = 1.0  # sample times by which the delays of two records must differ; one of all records is an effect
+LEAST_DELAY = 0.25  # samples, beside the record of least delay, from which a record is corrected
+WHOLE = 0.1  # samples: a delay as near to a whole number is that number, since a trigger counts samples
+LEAST_MODES = 2  # that show the delay: in one mode, a shifted resonance delays too
+ALIKE = 0.95  # cosine of the levels of the inputs, each over its largest, from which the same inputs drive two records
+CLEAR = 4.0  # times the noise power: a smaller residual of an output shows no delay
+
+
+def late_records(gaps: Sequence[Comparison]) -> list[SetupFault]:
+    """Faults of records that are late or early beside others that the same inputs drive, where the delays differ.
+
+    A delay is one of all outputs, by which they agree best with the prediction; each of these records must show its
+    own. Where the inputs differ, so may the delays of their actuators.
+
+    Args:
+        gaps: each of one record.
+    """
+    driven = [gap for gap in gaps if np.any(gap.records[0].inputs)]
+    if not driven:
+        return []
+    rms = np.array([np.sqrt((gap.records[0].inputs ** 2).mean(axis=1)) for gap in driven])
+    shares = rms / np.maximum(rms.max(axis=0), 1e-300)
+    shares /= np.linalg.norm(shares, axis=1, keepdims=True)
+    left, faults = list(range(len(driven))), []
+    while left:
+        alike = [i for i in left if shares[i] @ shares[left[0]] > ALIKE]
+        faults += _late_among([driven[i] for i in alike])
+        left = [i for i in left if i not in alike]
+    return faults
+
+
+def _late_among(gaps: Sequence[Comparison]) -> list[SetupFault]:
+    """The faults of `late_records` of single records that the same inputs drive."""
+    delays = [delay for delay in map(_delay_of, gaps) if delay is not None] if len(gaps) > 1 else []
+    if not delays or len(delays) < len(gaps):
+        return []
+    sample_times = np.array([gap.records[0].sample_time for gap in gaps])
+    times = np.array(delays) * sample_times
+    if np.ptp(times) <= DIFFERING * sample_times.max():
+        return []
+    closed = [_closed(gap, delay) for gap, delay in zip(gaps, delays, strict=True)]
+    if min(closed) < CLOSED:
+        return []
+    least = int(np.argmin(np.abs(times)))
+    faults = []
+    for gap, beside, closes in zip(gaps, (times - times[least]) / sample_times, closed, strict=True):
+        (record,), late = gap.records, float(beside)
+        late = float(np.round(late)) if abs(late - np.round(late)) < WHOLE else late
+        if abs(late) > LEAST_DELAY:
+            how, remedy = ("late", "earlier") if late > 0 else ("early", "later")
+            by = f"{abs(late):.3g} sample{'s' * (abs(late) != 1.0)}"
+            sentence = (
+                f"The record {record.name} is {by} {how} beside {gaps[least].record_names[0]}, by its trigger: shift"
+                f" all its outputs {by} {remedy}."
+            )
+            correction = partial(outputs_earlier, late)
+            faults.append(SetupFault("late record", sentence, closes, correction, records=(record.name,)))
+    return faults
+
+
+def _delay_of(gap: Comparison) -> float | None:
+    """Delay of all outputs of one record by which they correlate best with the prediction, samples.
+
+    None where the correlation is largest at an end of the range, or too few modes show it.
+    """
+    if np.count_nonzero(compared_bands(gap.measured_spectra).any(axis=(0, 1))) < LEAST_MODES:
+        return None
+    (measured,), (predicted,) = gap.measured_spectra.lines, gap.predicted_spectra.lines
+    cross = np.sum(measured * predicted.conj() / gap.scale[:, None], axis=0)
+    if not np.isfinite(cross).all():
+        return None
+    n = gap.n_samples
+    at = angles(n)[: cross.size]
+    reach = max(min(FARTHEST, n // 2 - 1), 0)
+    tried = np.arange(-reach, reach + 1)
+    whole = int(tried[np.argmax(np.fft.irfft(cross, n)[tried])])
+    if whole in (tried[0], tried[-1]):
+        return None
+    found = minimize_scalar(
+        lambda delay: -float((cross * np.exp(1j * at * delay)).real.sum()),
+        bounds=(whole - 1.0, whole + 1.0),
+        method="bounded",
+    )
+    return float(found.x)
+
+
+def _closed(gap: Comparison, delay: float) -> float:
+    """Share of the gap of a record that its delay closes, the median over outputs; 1 without a delay and a gap."""
+    if abs(delay) <= LEAST_DELAY:
+        return float(np.median(gap.before) < LARGEST_LEFT)
+    clear = gap.before > CLEAR * gap.noise
+    after = gap.corrected(partial(outputs_earlier, delay)).before
+    return float(np.median(gap.closed(after)[clear])) if clear.any() else 0.0
