@@ -124,9 +124,8 @@ def diagnose(
     if seconds is not None and not seconds > 0:
         raise ValueError(f"a search needs time: seconds must be positive; got {seconds:g}")
     sharing = Workers.at_hand() if workers is None else Workers(workers)
-    if seconds is not None and sharing.number == 1:
-        seconds *= 2.0
-    deadline = Deadline(None if seconds is None else SEARCH_SHARE * seconds)
+    allowed = None if seconds is None else SEARCH_SHARE * seconds * (2.0 if sharing.number == 1 else 1.0)
+    deadline = Deadline(allowed)
     for record in (*records, *validation):
         _check_channels(rig, record)
     if not records:
@@ -508,7 +507,7 @@ def _notes(
     """General notes; `without_noise` are the sensors whose noise was not stated."""
     names = [sensor.name for sensor in found.search.rig.sensors if sensor.name in without_noise]
     taken = f"noise_std of {', '.join(names)} is not stated; it was estimated from the records."
-    cut = f"The search reached its limit of {seconds} s of processor time; a larger `seconds` lets it continue."
+    cut = f"The search reached its limit of time, `seconds` {seconds}; a larger one lets it continue."
     notes = (
         *([taken] if without_noise else []),
         *([cut] if found.is_cut else []),
