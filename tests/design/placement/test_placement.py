@@ -372,6 +372,13 @@ def test_every_limit_is_part_of_the_proof(limits, hinged_modes):
     assert certify(two, limits, placement=worse, gap=0.01).better is not None
 
 
+def test_the_peak_force_of_three_actuators_is_enough_of_a_limit(hinged_modes):
+    three = placement_task(hinged_modes(9), 3, impulse_at=6.3, weight=20.0)
+    limits = Limits(peak_force=0.33, spacing=0.5)
+    proof = certify(three, limits, placement=place_actuators(three, limits, starts=4), gap=0.05, max_cells=50_000)
+    assert proof.complete and proof.better is None
+
+
 def test_a_proof_needs_a_limit(task):
     with pytest.raises(DesignError, match="singular"):
         certify(task, Limits(), placement=even(task))
