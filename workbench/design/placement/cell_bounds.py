@@ -43,7 +43,8 @@ class Intervals:
     Attributes:
         centre, half: (n_intervals,) m.
         value, slope, bend: (n_intervals, n_modes) φ, φ' and φ'' at the centre.
-        most_bend, most_rate: (n_intervals, n_modes) largest |φ''| and |φ'''| on the interval.
+        most_bend, most_rate: (n_intervals, n_modes) largest |φ''| and |φ'''| on the interval; where φ'' jumps, as at a
+            step of a beam's stiffness, the second alone is far too large.
         most_fourth: (n_intervals, n_modes) largest |φ''''|, increased where a lower derivative jumps so that it bounds
             a cubic's error there too; None where the nodes are groups of candidates.
     """
