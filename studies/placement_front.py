@@ -120,7 +120,8 @@ def study(outcome, data=None):
         )
     outcome.table("certificates", proofs)
 
-    rule, best = nodes["an impulse at 6.3"], fronts["an impulse at 6.3"][4]
+    at_one_place = next(iter(disturbances))
+    rule, best = nodes[at_one_place], fronts[at_one_place][4]
     limits = Limits(effort=1.5 * rule.effort, spacing=SPACING)
     together = place_coupled(modes, 4, 4, impulse_at=6.3, weight=10.0, limits=limits)
     scans = []
