@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from workbench.design.placement.cell_bounds import SINGULAR, Intervals
+from workbench.design.placement.cell_bounds import SINGULAR, CellBounds, Intervals
 from workbench.design.placement.certificate import certify
 from workbench.design.placement.dual_bound import dual_bound
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import place_actuators, placement_task
 from workbench.design.placement.task import batch_costs
+from workbench.structure.member import Beam
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +72,26 @@ def test_a_cell_where_b_is_singular_to_round_off_is_refused(task):
     at = batch_costs(task, task.shapes(table.centre[cell][None]))
     assert not at.effort[0] < 1000.0
     assert np.isinf(bound_of(task, table, cell, table.half[cell], 1.0))
+
+
+def test_bounds_hold_where_two_rigid_modes_take_the_same_force():
+    """The forces have two directions for three modes, so that S has no inverse."""
+    free = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(8)
+    task, rng = placement_task(free, 3, impulse_at=6.3, weight=20.0), np.random.default_rng(0)
+    assert np.linalg.eigvalsh(task.force_gramian)[0] < 1e-15 * np.trace(task.force_gramian)
+    effort = 1.2 * task.placed([2.5, 5.0, 7.5], "").effort
+    bounds, counts = CellBounds(task, Limits(effort=effort)), {"informative": 0, "refused": 0, "kept": 0}
+    cells = np.sort(rng.integers(0, 64, (400, 3)), axis=1) + 63
+    cells = cells[(np.diff(cells, axis=1) > 0).all(axis=1)]
+    for cell, found in zip(cells, bounds(cells)[0], strict=True):
+        places = bounds.intervals.centre[cell] + bounds.intervals.half[cell] * rng.uniform(-1.0, 1.0, (200, 3))
+        costs = batch_costs(task, task.shapes(places))
+        kept = costs.effort <= effort
+        assert (np.sqrt(costs.work[kept]) >= found * (1 - 1e-9)).all()
+        counts["informative"] += 0 < found < np.inf
+        counts["refused"] += np.isinf(found)
+        counts["kept"] += kept.any()
+    assert counts["informative"] > 50 and counts["refused"] > 50 and counts["kept"] > 20
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from workbench.design.placement.placement import nodes_of_mode, place_actuators,
 from workbench.design.placement.task import batch_costs, batch_work
 from workbench.design.spillover.spillover import effort, finite_spillover, spillover
 from workbench.rig.actuators import Actuator, piezo_patch
-from workbench.structure.domain import NamedPoints, PlaceError
+from workbench.structure.domain import Between, NamedPoints, PlaceError
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
 
@@ -372,6 +372,13 @@ def test_every_limit_is_part_of_the_proof(limits, hinged_modes):
     assert certify(two, limits, placement=worse, gap=0.01).better is not None
 
 
+def test_the_peak_force_of_three_actuators_is_enough_of_a_limit(hinged_modes):
+    three = placement_task(hinged_modes(9), 3, impulse_at=6.3, weight=20.0)
+    limits = Limits(peak_force=0.33, spacing=0.5)
+    proof = certify(three, limits, placement=place_actuators(three, limits, starts=4), gap=0.05, max_cells=50_000)
+    assert proof.complete and proof.better is None
+
+
 def test_a_proof_needs_a_limit(task):
     with pytest.raises(DesignError, match="singular"):
         certify(task, Limits(), placement=even(task))
@@ -398,6 +405,12 @@ def test_all_of_a_patch_keeps_out_of_a_forbidden_stretch():
     limits = Limits(effort=1.0, forbidden=((2.0, 3.0), (9.5, 9.8)))
     assert limits.allowed(10.0) == [(0.0, 2.0), (3.0, 9.5), (9.8, 10.0)]
     assert limits.allowed(10.0, clear=0.25) == [(0.25, 1.75), (3.25, 9.25)]
+
+
+def test_both_orders_of_a_pair_stay_on_the_beam(hinged_modes):
+    for pair in (Between(5.5, 4.5), Between(4.5, 5.5)):
+        actuator = Actuator("P", pair, kind="moment")
+        assert placement_task(hinged_modes(5), 2, impulse_at=6.3, weight=1.0, actuator=actuator).reach == (0.5, 9.5)
 
 
 def test_a_zone_up_to_an_end_leaves_no_place_at_the_end():

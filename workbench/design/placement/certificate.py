@@ -15,17 +15,19 @@ import numpy as np
 
 from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError
-from workbench.design.placement.cell_bounds import CellBounds
-from workbench.design.placement.cell_tree import CellTree
+from workbench.design.placement.cell_bounds import LEVELS, CellBounds, Intervals
 from workbench.design.placement.limits import Limits, takes_former_limits
 from workbench.design.placement.placement import place_actuators
-from workbench.design.placement.scan import MOST_TRIED, allowed_places, scan
+from workbench.design.placement.places import as_places, coordinates, free_places
+from workbench.design.placement.scan import MOST_TRIED, allowed_places, rated, scan
 from workbench.design.placement.task import Placement, PlacementTask
 from workbench.renamed import former_arguments
 from workbench.structure.domain import NamedPoints, Rectangle, listed
+from workbench.structure.modes import frozen
 from workbench.structure.printed import place_text
 from workbench.threads import cores, one_blas_thread
 
+LEAST_LEVELS = 3  # halvings of candidates at least
 START_LEVEL = 3  # halvings of the length before the first bound
 BATCH = 50_000  # cells bounded at once
 SHELVES = 64  # groups of open cells by their bound; the lowest is halved first
@@ -184,11 +186,11 @@ class _Search:
         Args:
             rows: (n_cells, n_actuators + 2) nodes, lower bound, and axis to halve.
         """
-        cells, axis = rows[:, :-2], rows[:, -1].astype(np.int64)
-        left, right = cells.astype(np.int64), cells.astype(np.int64)
-        each = np.arange(len(cells))
-        left[each, axis] = 2 * left[each, axis] + 1
-        right[each, axis] = 2 * right[each, axis] + 2
+        left = rows[:, :-2].astype(np.int64)
+        halved = np.arange(len(left)), rows[:, -1].astype(np.int64)
+        left[halved] = 2 * left[halved] + 1
+        right = left.copy()
+        right[halved] += 1
         return np.concatenate([left, right])
 
     def _shelve(self, cells: np.ndarray, pool: ThreadPoolExecutor, workers: int) -> np.ndarray | None:
@@ -207,7 +209,7 @@ class _Search:
         smallest = 2**self._tree.levels - 1
         at_end = cells[np.arange(len(cells)), axis] >= smallest
         axis[at_end] = cells[at_end].argmin(axis=1)
-        stuck = cells.min(axis=1, initial=smallest) >= smallest if len(cells) else np.zeros(0, bool)
+        stuck = cells.min(axis=1) >= smallest
         if stuck.any() and self._tree.kept is not None:  # single candidates, whose W_R is known
             known = self._tree.kept(cells[stuck])
             better = self._better(cells[stuck], np.sqrt(known))
@@ -260,3 +262,94 @@ def _taken(shelf: list[np.ndarray]) -> np.ndarray:
         taken.append(rows)
         count += len(rows)
     return np.concatenate(taken)
+
+
+@dataclass(frozen=True, eq=False)
+class CellTree:
+    """Nodes of a binary tree of places; node i halves into 2i + 1 and 2i + 2.
+
+    Attributes:
+        table: the modal shapes on every node.
+        low, high: (n_nodes,) first and last place of each: m, or the numbers of its first and last candidate.
+        apart: least distance from the first place of an actuator's node to the last place of the next actuator's.
+        stands: (n_nodes,) whether a node contains an allowed place.
+        levels: below the root.
+        places: the places of the actuators of a cell (n_actuators,) of nodes, in the middle of each; None where one of
+            them is not allowed.
+        kept: W_R of cells (n_cells, n_actuators) of single candidates, inf where a limit is exceeded; None along an
+            interval, where a cell is never a single place.
+    """
+
+    table: Intervals
+    low: np.ndarray
+    high: np.ndarray
+    apart: float
+    stands: np.ndarray
+    levels: int
+    places: Callable[[np.ndarray], np.ndarray | None]
+    kept: Callable[[np.ndarray], np.ndarray] | None = None
+
+    @classmethod
+    def of(cls, task: PlacementTask, limits: Limits) -> "CellTree":
+        """The tree of the candidates where the limits name them, else of the interval.
+
+        Raises:
+            DesignError: no room for all actuators.
+        """
+        return _of_candidates(task, limits) if limits.candidates is not None else _of_interval(task, limits)
+
+
+def _of_interval(task: PlacementTask, limits: Limits) -> CellTree:
+    table, stretches = Intervals.of(task), limits.intervals(task.n_controlled, task.modes.length, task.reach[0])
+    low, high = table.centre - table.half, table.centre + table.half
+    stands = np.any([(high >= first) & (low <= last) for first, last in stretches], axis=0)
+
+    def places(cell: np.ndarray) -> np.ndarray | None:
+        x: np.ndarray = table.centre[cell]
+        return x if free_places(task.modes.domain, x, stretches).all() else None
+
+    return CellTree(table, low, high, limits.spacing, stands, LEVELS, places)
+
+
+def _of_candidates(task: PlacementTask, limits: Limits) -> CellTree:
+    """Candidates halved along the scaled shape that varies most within a node, down to single candidates."""
+    grid = allowed_places(task, limits, 0)
+    shapes = task.shapes(grid)
+    scaled = shapes / np.maximum(np.abs(shapes).max(axis=0), 1e-300)
+    levels = max(LEAST_LEVELS, int(np.ceil(np.log2(len(grid)))))
+    members: list[np.ndarray] = [np.arange(len(grid))]
+    for _ in range(2**levels - 1):
+        node = members[(len(members) - 1) // 2]
+        axis = int(np.argmax(np.ptp(scaled[node], axis=0))) if node.size else 0
+        order = node[np.argsort(scaled[node, axis], kind="stable")]
+        half = -(-node.size // 2)
+        members += [order[:half], order[half:]]
+    sizes = np.array([node.size for node in members])
+    # number the candidates in the order of the leaves, so that every node holds consecutive ones
+    leaves = np.concatenate(members[2**levels - 1 :])
+    number = np.argsort(leaves)
+    n_nodes, n_modes = len(members), task.modes.n_modes
+    middle, radius = np.zeros((n_nodes, n_modes)), np.zeros((n_nodes, n_modes))
+    first, last = np.full(n_nodes, -np.inf), np.full(n_nodes, -np.inf)
+    nearest = np.zeros(n_nodes, int)  # candidate whose shapes are nearest to the middle
+    for i in np.flatnonzero(sizes):
+        own = shapes[members[i]]
+        least, most = own.min(axis=0), own.max(axis=0)
+        middle[i], radius[i] = 0.5 * (least + most), 0.5 * (most - least)
+        first[i], last[i] = number[members[i]].min(), number[members[i]].max()
+        nearest[i] = members[i][np.argmin(np.linalg.norm(own - middle[i], axis=1))]
+    zero = frozen(np.zeros((n_nodes, n_modes)))
+    # φ'' is chosen so that ½ h² |φ''| with h = 1 is the largest difference of a node's shapes from their middle
+    half_width = np.where(sizes > 1, 1.0, 0.0)
+    bend = frozen(2.0 * radius)
+    table = Intervals(frozen(first), frozen(half_width), frozen(middle), zero, zero, bend, bend)
+    at = coordinates(task.modes.domain, grid)
+
+    def places(cell: np.ndarray) -> np.ndarray | None:
+        chosen = np.sort(nearest[cell])
+        return as_places(task.modes.domain, grid[chosen]) if (np.diff(chosen) > 0).all() else None
+
+    def kept(cells: np.ndarray) -> np.ndarray:
+        return rated(task, limits, shapes, at, np.sort(nearest[cells], axis=1))
+
+    return CellTree(table, first, last, 1.0, sizes > 0, levels, places, kept)

@@ -95,7 +95,7 @@ def place_coupled(
 
 
 def coupled_costs(
-    modes: Modes, n_controlled: int, positions: ArrayLike, *, impulse_at: float, weight: float, impulse: float = 1.0
+    modes: Modes, n_controlled: int, positions: ArrayLike, *, impulse_at: float, weight: float
 ) -> Placement:
     """The placement of coupled LQR with force actuators at the positions, and its costs; infinite where it is unstable.
 
@@ -105,7 +105,7 @@ def coupled_costs(
         modes: controlled first, then residual, at rest initially.
         n_controlled: number of controlled modes.
         positions: (n_actuators,) m; any number.
-        impulse_at: place of the impulse (N s).
+        impulse_at: place of the impulse of 1 N s.
         weight: R of the actuator forces.
 
     Raises:
@@ -116,7 +116,7 @@ def coupled_costs(
     shapes = modes.phi(positions).T
     states, a, scale = _scaled_states(modes, n)
     b = np.vstack([np.zeros((n, m)), shapes[:n]])[states]
-    start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]][states]
+    start = np.r_[np.zeros(n), modes.phi(impulse_at)[0, :n]][states]
     try:
         p = solve_continuous_are(a, b, np.eye(len(a)), weight * np.eye(m))
     except (LinAlgError, ValueError):
@@ -131,9 +131,10 @@ def coupled_costs(
     force = -(gain @ vectors) * coefficients @ (1.0 / (1j * modes.omega[None, n:] - values[:, None]))
     by_mode = 0.5 * np.abs(np.einsum("rj,jr->r", shapes[n:], force)) ** 2
     gramian = settled_moments(loop, start)
+    actuators = tuple(Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(positions))
     return Placement(
         positions=positions,
-        law=Law(full_gain, tuple(range(n)), forces_at(positions), "coupled LQR"),
+        law=Law(full_gain, tuple(range(n)), actuators, "coupled LQR"),
         residual_work=float(by_mode.sum()),
         by_mode=by_mode,
         effort=float(np.trace(gain @ gramian @ gain.T)),
@@ -155,18 +156,13 @@ def _scaled_states(modes: Modes, n: int) -> tuple[Integers, Floats, Floats]:
     return states, a * scale[states, None] / scale[states], scale[states]
 
 
-def forces_at(positions: np.ndarray) -> tuple[Actuator, ...]:
-    """Point forces F1, F2, ... at the places (n_actuators,), m."""
-    return tuple(Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(positions))
-
-
 def _infeasible(positions: np.ndarray, n_residual: int) -> Placement:
     inf = np.inf
     return Placement(positions, None, inf, np.full(n_residual, inf), inf, inf, inf, "no regulator stabilises from here")
 
 
 def coupled_batch(
-    modes: Modes, n_controlled: int, positions: np.ndarray, *, impulse_at: float, weight: float, impulse: float = 1.0
+    modes: Modes, n_controlled: int, positions: np.ndarray, *, impulse_at: float, weight: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """W_R and effort (n_placements,) of coupled LQR at many placements (n_placements, n_actuators), m.
 
@@ -189,7 +185,7 @@ def coupled_batch(
     stable = np.argsort(values.real, axis=1)[:, :size]
     poles = np.take_along_axis(values, stable, axis=1)
     vectors = np.take_along_axis(vectors, stable[:, None, :], axis=2)
-    start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]][states].astype(complex)
+    start = np.r_[np.zeros(n), modes.phi(impulse_at)[0, :n]][states].astype(complex)
     stabilised = poles.real.max(axis=1) < -ON_THE_AXIS * modes.omega[n - 1]
     upper = np.where(stabilised[:, None, None], vectors[:, :size], np.eye(size))
     coefficients = np.linalg.solve(upper, np.broadcast_to(start[:, None], (count, size, 1)))[:, :, 0]

@@ -9,6 +9,7 @@ from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.coupled_placement import coupled_batch, coupled_costs
 from workbench.design.placement.limits import Limits
+from workbench.design.placement.places import free_places
 from workbench.design.placement.task import Placement
 from workbench.structure.modes import Modes
 from workbench.threads import one_blas_thread
@@ -53,7 +54,7 @@ def scan_coupled(
         DesignError: limits that no placement on the grid meets.
     """
     length, settings = modes.length, {"impulse_at": impulse_at, "weight": weight}
-    stretches = np.array(limits.intervals(n_actuators, length))
+    stretches = limits.intervals(n_actuators, length)
     step = length / n_places
     grid = step * (0.5 + np.arange(n_places))
     index = np.array(list(combinations_with_replacement(range(n_places), n_actuators)))
@@ -62,10 +63,9 @@ def scan_coupled(
         for part in np.array_split(index, max(1, len(index) // BATCH))
     ]
     work, effort = (np.concatenate(parts) for parts in zip(*costs))
-    low, high = stretches.T
     at = grid[index]
     gaps = np.diff(at, axis=1).min(axis=1, initial=np.inf)
-    allowed = ((at[..., None] >= low) & (at[..., None] <= high)).any(axis=2).all(axis=1) & (gaps >= limits.spacing)
+    allowed = free_places(modes.domain, grid, stretches)[index].all(axis=1) & (gaps >= limits.spacing)
     best = None
     for i in np.argsort(np.where(allowed & (effort <= limits.effort), work, np.inf)):
         if not (allowed[i] and effort[i] <= limits.effort and np.isfinite(work[i])):
@@ -76,7 +76,8 @@ def scan_coupled(
             break
     if best is None:
         raise DesignError(f"none of {allowed.sum()} placements on the grid meets the limits; raise them")
-    near = ((at[..., None] + step / 2 >= low) & (at[..., None] - step / 2 <= high)).any(axis=2).all(axis=1)
+    widened = [(low - step / 2, high + step / 2) for low, high in stretches]
+    near = free_places(modes.domain, grid, widened)[index].all(axis=1)
     near &= gaps + step >= limits.spacing
     near &= _least(index, np.sqrt(effort), n_places) <= np.sqrt(limits.effort)
     bound = np.maximum(_least(index, np.sqrt(work), n_places), 0.0)[near].min() ** 2

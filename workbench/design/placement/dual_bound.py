@@ -6,7 +6,8 @@ unit norm and any Λ, with g(x) = Σ_r φ_r(x) V_rᵀ T_rᵀ,
     ‖Y‖ >= ⟨V, Y⟩ = tr Λ + Σ_j f_j (g(x_j) - Λᵀ b(x_j)) >= tr Λ - L (Σ_j max_x ‖S^-½ (g(x) - Λᵀ b(x))‖²)^½
 
 (a semi-infinite Lagrange dual), where each maximum is over one interval alone. With g = 0 it follows that a cell in
-which tr Λ > L (...)^½ holds no placement within the limit.
+which tr Λ > L (...)^½ holds no placement within the limit. If no force acts in some direction, as of two rigid modes
+moved alike, S and every T_r vanish there; S^-½ is then the pseudo-inverse, and the rows of Λ too have no part there.
 
 The bound holds for any V and Λ. Those used here are optimal if each interval is replaced by its two ends: with c the
 shapes at the centres above their changes to the ends, D = cᵀ c and T = tr D⁻¹ S, the least value of the limited square,
@@ -26,6 +27,26 @@ ROUND_OFF = 1e-8  # of g: a smaller residual g - c D⁻¹ cᵀ g is round-off, a
 
 # value, slope, bend, most bend and most rate, (n_nodes, n_modes)
 Tables = tuple[Floats, Floats, Floats, Floats, Floats]
+
+
+@njit(cache=True, nogil=True)
+def expanded(weights: Floats, node: int, h: float, tables: Tables) -> tuple[float, float, float]:
+    """Value and slope of Σ_i w_i φ_i(x) at the centre of an interval, and its largest distance from the tangent there.
+
+    Args:
+        weights: (n_modes or fewer,) w, of the first modes.
+        node, h: the interval and its half-width.
+        tables: of the shapes on all intervals.
+    """
+    value, slope, bend, most_bend, most_rate = tables
+    at, steep, bent, rate, most = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(weights.size):
+        at += weights[i] * value[node, i]
+        steep += weights[i] * slope[node, i]
+        bent += weights[i] * bend[node, i]
+        rate += abs(weights[i]) * most_rate[node, i]
+        most += abs(weights[i]) * most_bend[node, i]
+    return at, steep, 0.5 * h**2 * min(abs(bent) + h * rate, most)
 
 
 @njit(cache=True, nogil=True)
@@ -54,32 +75,24 @@ def _largest_residual(node: Integers, h: Floats, tables: Tables, both: Floats, r
         root: (n, n) S^-½.
         score: (n,) set to the increase by each interval's width.
     """
-    value, slope, bend, most_bend, most_rate = tables
     n_modes, n = both.shape
-    weighted, size = np.empty((n_modes, n)), np.empty((n_modes, n))
-    for i in range(n_modes):
-        for c in range(n):
-            weighted[i, c], size[i, c] = 0.0, 0.0
+    weighted = np.empty((n, n_modes))
+    for c in range(n):
+        for i in range(n_modes):
+            weighted[c, i] = 0.0
             for k in range(n):
-                weighted[i, c] += both[i, k] * root[c, k]
-                size[i, c] += abs(both[i, k] * root[c, k])
+                weighted[c, i] += both[i, k] * root[c, k]
     total = 0.0
     for j in range(n):
         at, low, high, beyond = 0.0, 0.0, 0.0, 0.0
         for c in range(n):
-            centre, steep, bent, rate, most = 0.0, 0.0, 0.0, 0.0, 0.0
-            for i in range(n_modes):
-                centre += value[node[j], i] * weighted[i, c]
-                steep += slope[node[j], i] * weighted[i, c]
-                bent += bend[node[j], i] * weighted[i, c]
-                rate += most_rate[node[j], i] * size[i, c]
-                most += most_bend[node[j], i] * size[i, c]
+            centre, steep, rest = expanded(weighted[c], node[j], h[j], tables)
             at += centre**2
             low += (centre - h[j] * steep) ** 2
             high += (centre + h[j] * steep) ** 2
-            beyond += min(abs(bent) + h[j] * rate, most) ** 2
+            beyond += rest**2
         # the linear part is largest at an end, since a norm is convex
-        largest = (np.sqrt(max(low, high)) + 0.5 * h[j] ** 2 * np.sqrt(beyond)) ** 2
+        largest = (np.sqrt(max(low, high)) + np.sqrt(beyond)) ** 2
         score[j] = largest - at
         total += largest
     return float(np.sqrt(total))

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from itertools import combinations
-from types import SimpleNamespace
 from typing import Any, ParamSpec, TypeVar
 from warnings import warn
 
@@ -14,7 +13,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
 from workbench.renamed import Renamed, former_arguments
-from workbench.structure.domain import SLACK, Interval, NamedPoints, Place, Rectangle, position, reach, same_place
+from workbench.structure.domain import Interval, NamedPoints, Place, Rectangle, position, reach, same_place
 
 TOLERANCE = 2e-6  # relative, of a limit
 APART = 1e-6  # of the length: least distance of two actuators
@@ -87,20 +86,9 @@ class Limits:
         Raises:
             DesignError: no allowed interval, or a zone outside the structure.
         """
-        margin = max(self.edge_distance, clear)
-        at, intervals = margin, []
-        zones = sorted((position(low), position(high)) for low, high in self.forbidden)
-        _check_overlap([(np.array([low]), np.array([high])) for low, high in zones], Interval(length))
-        for low, high in zones:
-            if low - clear > at:
-                intervals.append((at, min(low - clear, length - margin)))
-            at = max(at, high + clear)
-        if not self.forbidden or length - margin - at > SLACK * length:  # the last zone does not reach the end
-            intervals.append((at, length - margin))
-        intervals = [(low, high) for low, high in intervals if low <= high]
-        if not intervals:
-            raise DesignError(f"{margin:g} m from the ends and the forbidden intervals leave no place of {length:g} m")
-        return intervals
+        zones = tuple((np.array([position(low)]), np.array([position(high)])) for low, high in self.forbidden)
+        boxes = self._free(Interval(length), np.array([clear]), zones)
+        return sorted((low.item(), high.item()) for low, high in boxes)
 
     def boxes(self, task: PlacementTask) -> list[Box]:
         """Allowed boxes (low, high) of coordinates, m; none for named points.
@@ -122,9 +110,18 @@ class Limits:
         zones = tuple((np.atleast_1d(low), np.atleast_1d(high)) for low, high in self.forbidden)
         if any(part.shape != (2,) for zone in zones for part in zone):
             raise DesignError(f"a forbidden zone of a rectangle is ((x, y), (x, y)), m; got {self.forbidden}")
-        _check_overlap(zones, domain)
-        zones = tuple((low - half, high + half) for low, high in zones)
-        return free_boxes(domain, np.maximum(self.edge_distance, half), zones)
+        return self._free(domain, half, zones)
+
+    def _free(self, domain: Interval | Rectangle, half: np.ndarray, zones: Sequence[Box]) -> list[Box]:
+        """The boxes free of zones for actuators of half-extent (n_coordinates,), m, on a domain."""
+        for low, high in zones:
+            if (high <= 0).any() or (low >= domain.length).any():
+                raise DesignError(
+                    f"forbidden zone {low.tolist()} to {high.tolist()} lies outside the structure, {domain}; give it in"
+                    " m, or leave it out"
+                )
+        widened = [(low - half, high + half) for low, high in zones]
+        return free_boxes(domain, np.maximum(self.edge_distance, half), widened)
 
     def intervals(self, n: int, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
         """The intervals of `allowed`, checked to have room for n actuators.
@@ -162,19 +159,17 @@ class Limits:
         """
         return self._exceeded(least_distances(at), costs)
 
-    def _exceeded(self, gaps: np.ndarray, costs: Any) -> dict[str, np.ndarray]:
+    def _exceeded(self, gaps: Any, costs: Any) -> dict[str, Any]:
         return {
             "effort": _excess(costs.effort, self.effort),
             "peak force": _excess(costs.peak_force, self.peak_force),
             "condition": _excess(costs.condition, self.condition),
-            "spacing": (self.spacing - gaps) / self.spacing if self.spacing > 0 else np.zeros(len(gaps)),
+            "spacing": (self.spacing - gaps) / self.spacing if self.spacing > 0 else np.zeros(np.shape(gaps)),
         }
 
     def satisfied_by(self, placement: Placement) -> bool:
         """Whether a placement at allowed places meets all limits, with its peak force in continuous time."""
-        costs = {name: np.array([getattr(placement, name)]) for name in ("effort", "peak_force", "condition")}
-        violations = self._exceeded(np.array([placement.spacing]), SimpleNamespace(**costs))
-        return all(excess[0] <= TOLERANCE for excess in violations.values())
+        return all(excess <= TOLERANCE for excess in self._exceeded(placement.spacing, placement).values())
 
 
 Limits.__init__ = former_arguments(margin="edge_distance")(Limits.__init__)  # type: ignore[method-assign]
@@ -201,17 +196,8 @@ def takes_former_limits(function: Callable[P, R]) -> Callable[P, R]:
     return with_former
 
 
-def _check_overlap(zones: Sequence[Box], domain: Interval | Rectangle) -> None:
-    for low, high in zones:
-        if (high <= 0).any() or (low >= domain.length).any():
-            raise DesignError(
-                f"forbidden zone {low.tolist()} to {high.tolist()} lies outside the structure, {domain}; give it in m,"
-                " or leave it out"
-            )
-
-
-def _excess(values: np.ndarray, limit: float) -> np.ndarray:
-    return values / limit - 1.0 if np.isfinite(limit) else np.full(values.shape, -1.0)
+def _excess(values: Any, limit: float) -> Any:
+    return values / limit - 1.0 if np.isfinite(limit) else np.full(np.shape(values), -1.0)
 
 
 def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None) -> str:

@@ -244,20 +244,20 @@ def _solver(task: PlacementTask, limits: Limits) -> Solver:
     # objective and constraints, each of order one; those without a limit are left out
     scale = _typical_work(task)
     bounded = [effort / float(limits.effort)] if np.isfinite(limits.effort) else []
-    first_force = len(bounded)
+    is_force = [False] * len(bounded)
     if np.isfinite(limits.peak_force):
         forces = ca.reshape(inverse @ ca.DM(_extreme_instants(task.forces)), -1, 1) / float(limits.peak_force)
         bounded += [forces, -forces]
+        is_force += [True] * (2 * forces.shape[0])
     if np.isfinite(limits.condition):
         bounded.append(ca.sumsqr(inverse) * size / float(limits.condition) ** 2)
+        is_force.append(False)
     limited = ca.vertcat(*bounded) if bounded else ca.MX(0, 1)
     gaps, least_gap = _gaps(z, sides, limits.spacing)
     problem: dict[str, ca.MX] = {"x": z, "f": ca.log(work / scale + 1e-300), "g": ca.vertcat(limited, gaps)}
     options: dict[str, Any] = {"ipopt.print_level": 0, "print_time": 0, "ipopt.sb": "yes", **IPOPT}
     solver = ca.nlpsol("placement", "ipopt", problem, options)
-    count, n_gaps = limited.shape[0], gaps.shape[0]
-    n_forces = sum(part.shape[0] for part in bounded[first_force:]) - bool(np.isfinite(limits.condition))
-    is_force = (np.arange(count) >= first_force) & (np.arange(count) < first_force + n_forces)
+    count, n_gaps = len(is_force), gaps.shape[0]
 
     def solve(guess: np.ndarray, homes: Sequence[Box], share: float) -> tuple[np.ndarray, str]:
         low, high = (

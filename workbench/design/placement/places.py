@@ -1,5 +1,6 @@
 """Places on any domain: as arrays, their least distances, and boxes free of forbidden zones."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -48,14 +49,14 @@ def least_distances(at: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(at[:, first] - at[:, second], axis=2).min(axis=1, initial=np.inf))
 
 
-def free_boxes(domain: Rectangle, margin: np.ndarray, zones: tuple[Box, ...]) -> list[Box]:
-    """The largest boxes (low, high), m, within the margin of a rectangle, that overlap no forbidden zone.
+def free_boxes(domain: Interval | Rectangle, margin: np.ndarray, zones: Sequence[Box]) -> list[Box]:
+    """The largest boxes (low, high), m, within the margin of a domain, that overlap no forbidden zone.
 
     The boxes overlap one another; together they cover every allowed place.
 
     Args:
-        domain: the rectangle.
-        margin: (2,) from the edges along x and along y, m.
+        domain: an interval or a rectangle.
+        margin: (n_coordinates,) from the ends, or from the edges along x and along y, m.
         zones: forbidden boxes, m.
 
     Raises:
@@ -69,7 +70,9 @@ def free_boxes(domain: Rectangle, margin: np.ndarray, zones: tuple[Box, ...]) ->
             if (zone_low >= high).any() or (zone_high <= low).any():
                 parts.append((low, high))
                 continue
-            for axis in range(2):  # left and right of the zone, below and above it; strips thinner than slack are none
+            for axis in range(
+                margin.size
+            ):  # left and right of the zone, below and above it; strips thinner than slack are none
                 before, after = high.copy(), low.copy()
                 before[axis], after[axis] = zone_low[axis], zone_high[axis]
                 parts += [part for part in ((low, before), (after, high)) if part[1][axis] - part[0][axis] > slack]
@@ -87,11 +90,11 @@ def _inside(one: Box, other: Box) -> bool:
     return bool((one[0] >= other[0]).all() and (one[1] <= other[1]).all())
 
 
-def free_places(domain: Domain, places: np.ndarray, boxes: list[Box]) -> np.ndarray:
-    """Mask (n_places,) of the places that lie in one of the boxes; of named points, all."""
+def free_places(domain: Domain, places: np.ndarray, boxes: Sequence[tuple[Any, Any]]) -> np.ndarray:
+    """Mask (n_places,) of the places that lie in one of the boxes (low, high); of named points, all."""
     if isinstance(domain, NamedPoints):
         return np.ones(len(places), bool)
     at = places.reshape(len(places), -1)
-    slack = 1e-12 * (domain.length if isinstance(domain, Interval) else max(domain.length))
+    slack = 1e-12 * np.max(domain.length)
     inside = [((at >= low - slack) & (at <= high + slack)).all(axis=1) for low, high in boxes]
     return np.asarray(np.any(inside, axis=0))

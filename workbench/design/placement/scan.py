@@ -46,9 +46,7 @@ def scan(task: PlacementTask, limits: Limits, *, n_places: int = 60) -> tuple[Pl
         if not index.size:
             continue
         tried += len(index)
-        costs = batch_costs(task, shapes[index])
-        violations = limits.violations(at[index], costs)
-        work = np.where(np.all([v <= TOLERANCE for v in violations.values()], axis=0), costs.work, np.inf)
+        work = rated(task, limits, shapes, at, index)
         # batch costs sample the forces in time; the best must meet the limit of the peak between samples too
         while work[i := int(np.argmin(work))] < best:
             if limits.satisfied_by(task.placed(grid[index[i]], "")):

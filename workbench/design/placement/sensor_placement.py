@@ -201,8 +201,6 @@ def _exchanged(choice: tuple[int, ...], size: int, error: Callable[[tuple[int, .
             kept = better[:i] + better[i + 1 :]
             options = [tuple(sorted((*kept, k))) for k in range(size) if k not in kept]
             better = min(options, key=error)
-            if better == choice:
-                continue
         if error(better) >= error(choice):
             return choice
         choice = better

@@ -141,9 +141,7 @@ class PlacementTask(Printed):
         """
         domain, actuator = self.modes.domain, self.actuator
         if isinstance(domain, Interval):
-            positions = np.asarray(positions, float)
-            values = participation_along(self.modes, actuator, positions.ravel(), derivative)
-            return values.reshape(*positions.shape, self.modes.n_modes)
+            return participation_along(self.modes, actuator, np.asarray(positions, float), derivative)
         places = as_places(domain, positions)
         shape = places.shape[:-1] if isinstance(domain, Rectangle) else places.shape
         flat = places.reshape(-1, *places.shape[len(shape) :])
@@ -158,8 +156,7 @@ class PlacementTask(Printed):
     @property
     def reach(self) -> tuple[float, float]:
         """Range of the middle of an actuator along an interval, (from, to) m."""
-        half = 0.5 * extent(self.actuator)
-        return half, self.modes.length - half
+        return reach_along(self.modes, self.actuator)
 
     def law(self, positions: Any) -> Law:
         """The IMSC law with one actuator at each of the places.
@@ -406,12 +403,18 @@ def extent(actuator: Actuator) -> float:
     return float(actuator.at.first - actuator.at.second) if isinstance(actuator.at, Between) else 0.0  # type: ignore
 
 
+def reach_along(modes: Modes, actuator: Actuator) -> tuple[float, float]:
+    """Range of the middle of an actuator along an interval, (from, to) m."""
+    low, high = reach(modes.domain, actuator.at)  # type: ignore[arg-type]
+    return low.item(), high.item()
+
+
 def participation_along(modes: Modes, actuator: Actuator, x: Floats, derivative: int = 0) -> Floats:
-    """Participation (n_places, n_modes) of an actuator with its middle at x (n_places,), m, or its derivative in x."""
+    """Participation (..., n_modes) of an actuator with its middle at x (...), m, or its derivative in x."""
     half, order = 0.5 * extent(actuator), derivative + (actuator.kind == "moment")
-    if half == 0:
-        return actuator.gain * modes.phi(x, order)
-    return actuator.gain * (modes.phi(x + half, order) - modes.phi(x - half, order))
+    at = x.ravel()
+    values = modes.phi(at, order) if half == 0 else modes.phi(at + half, order) - modes.phi(at - half, order)
+    return actuator.gain * values.reshape(*x.shape, modes.n_modes)
 
 
 def _force_gramian(a: Floats, gains: Floats, rates: Floats, final_time: float) -> Floats:

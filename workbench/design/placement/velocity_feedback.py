@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 
 from workbench.arrays import Floats
 from workbench.design.laws.law import DesignError
-from workbench.design.placement.task import extent, participation_along
+from workbench.design.placement.task import participation_along, reach_along
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import Printed
@@ -71,8 +71,7 @@ class FeedbackTask:
     @property
     def reach(self) -> tuple[float, float]:
         """Range of the middle of a pair, (from, to) m."""
-        half = 0.5 * extent(self.actuator)
-        return half, self.modes.length - half
+        return reach_along(self.modes, self.actuator)
 
     @cached_property
     def _derivatives(self) -> tuple[Floats, Floats, Floats]:
@@ -219,7 +218,7 @@ class _Expansion:
         self._task, self._centres = task, centres
         modes, h = task.modes, task.gain
         n = modes.n_modes
-        b, slope = (self._participation(centres, derivative) for derivative in (0, 1))
+        b, slope = (participation_along(modes, task.actuator, centres, derivative) for derivative in (0, 1))
         self._b, self._slope = b, slope
         damping = modes.damping + np.einsum("ij,pir,pjs->prs", h, b, b)
         # states ω q and q', so that Q is the identity
@@ -235,11 +234,6 @@ class _Expansion:
         self._start = np.r_[modes.omega * task.state[:n], task.state[n:]]
         self._p = self._solved(np.broadcast_to(-eye, a.shape)[:, None])[:, 0]
         self.index = np.einsum("i,pij,j->p", self._start, self._p, self._start)
-
-    def _participation(self, places: np.ndarray, derivative: int) -> np.ndarray:
-        task = self._task
-        values = participation_along(task.modes, task.actuator, places.ravel(), derivative)
-        return values.reshape(*places.shape, task.modes.n_modes)
 
     def _solved(self, right: np.ndarray) -> np.ndarray:
         """P (n_cells, n_right, 2n, 2n) with Aᵀ P + P A = right."""
