@@ -108,7 +108,7 @@ def test_a_search_whose_time_is_spent_ends_with_what_it_has(nothing_hidden):
     drive = nothing_hidden.rig.actuators[0].name
     rig = kind_named("actuator_gain").apply(nothing_hidden.rig, drive, {"gain": 0.1})
     verdict = diagnose(rig, nothing_hidden.fit[:2], workers=1, seconds=1e-3)
-    assert verdict.outcome in ("part", "unknown") and any("limit of 0.002 s" in note for note in verdict.notes)
+    assert verdict.outcome in ("part", "unknown") and any("`seconds` 0.001;" in note for note in verdict.notes)
     assert verdict.sentence.startswith("None of the effects tried before the time was spent explains the gap")
 
 

@@ -178,7 +178,8 @@ def _one_parameter_kind(
         shown, scale = unit, 0.1
         if unit == SENSOR_UNIT:
             sensors = [s for s in rig.sensors if target in (s.name, "all")]
-            shown = QUANTITIES.get(sensors[0].quantity, "")
+            is_one_quantity = len({s.quantity for s in sensors}) == 1
+            shown = QUANTITIES.get(sensors[0].quantity, "") if is_one_quantity else ""
             scale = max(sensors[0].noise_std, 1e-300)
         bounds = low * size(rig), high * size(rig)
         return (Parameter(field, shown, *bounds, logarithmic=log, scale=scale, neutral=neutral),)
