@@ -704,8 +704,9 @@ def _report(
         data = data.as_measured()
         fit = settled(data, projected(data, fit.poles, fit.participation))
         noise = noise_levels(data, fit, records)
-        own = (noise.outputs / fit.noise)[:, None] ** 2
-        noise_ratio, fixed_ratio, shared = np.tile(own, n), np.tile(own.T, (data.fixed.shape[1], 1)), np.ones(n)
+        noise_ratio = (noise.sensors_at(fit.poles.imag * data.dt) / fit.noise[:, None]) ** 2
+        own = (noise.sensors_at(np.linspace(0.0, np.pi, data.size)) ** 2).mean(axis=1) / fit.noise**2
+        fixed_ratio, shared = np.tile(own, (data.fixed.shape[1], 1)), np.ones(n)
         all_samples = [np.ones(record.inputs.shape, bool) for record in records]
         from_inputs = spread_by_inputs(data, fit, noise.inputs, all_samples)
         remarks = (*noise_remarks(records, noise), *remarks)

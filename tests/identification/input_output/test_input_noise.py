@@ -1,5 +1,7 @@
 """Noise of logged inputs, by structures simulated with scipy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfilt
@@ -76,6 +78,17 @@ def test_the_noise_is_found_as_large_as_it_is():
     record, _, _ = record_of(4, band_limited=False)
     remark = next(r for r in identify_driven(record).remarks if "inputs contain measurement noise" in r)
     assert float(remark.split("u0 ")[1].split(" rms")[0]) == pytest.approx(0.01, rel=0.15)
+
+
+def test_it_is_told_from_coloured_noise_of_the_outputs_beside_it():
+    """Where that was taken for white, the level was 30 % too large."""
+    record, omega, zeta = record_of(2, input_noise=0.02)
+    noise = lfilter([1.0], [1.0, -0.95], np.random.default_rng(2).normal(size=record.outputs.shape), axis=1)
+    outputs = record.outputs + 0.003 * record.outputs.std(axis=1, keepdims=True) * noise
+    found = identify_driven(replace(record, outputs=outputs))
+    assert found.modes.n_modes == omega.size
+    assert np.abs(scores(found, omega, zeta)).max() < 3.5
+    assert float(found.remarks[0].split("u0 ")[1].split(" rms")[0]) == pytest.approx(0.02, rel=0.15)
 
 
 def test_exact_inputs_have_no_such_remark():

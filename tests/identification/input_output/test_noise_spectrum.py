@@ -112,10 +112,12 @@ def test_random_structures_are_told_rightly_in_noise_of_any_tail(tail, kind):
 TWO_CLOSE = 2 * np.pi * np.array([1.0, 3.0, 3.2, 20.0]), np.array([0.02, 0.01, 0.015, 0.01])
 
 
-def test_two_close_modes_in_noise_that_falls_with_frequency_are_two():
-    """Half the record did not tell them apart, and noise ten times above its median passed for what something does."""
+@pytest.mark.parametrize("tail", [0.8, 0.95])
+def test_two_close_modes_in_noise_that_falls_with_frequency_are_two(tail):
+    """Half the record did not tell them apart, noise ten times above its median passed for what something does, and
+    coloured noise of the outputs for noise of the inputs."""
     omega, zeta = TWO_CLOSE
-    found = identify_driven(driven(np.random.default_rng(0), omega, zeta, tails=(0.95,) * OUTPUTS, draw=11))
+    found = identify_driven(driven(np.random.default_rng(0), omega, zeta, tails=(tail,) * OUTPUTS, draw=11))
     assert told(found, omega, zeta)[0] == found.modes.n_modes == omega.size and not found.remarks
 
 

@@ -1,13 +1,15 @@
 """Noise of the measured inputs, which does not act on the structure: errors in variables, to first order.
 
 Inputs measured as u + v leave the residual y - G (u + v) = e - G v: noise with a peak at each mode, common to all
-outputs. In the lines of its cosine transform, output j has the power c_j + Σ_i σ_i² |G_ji|² (Whittle 1953), G the
-frequency response of the modes; c and σ² are estimated by maximum likelihood. A structure that changes leaves more at
-some modes than at others, so one σ_i must fit all modes; and no σ_i exceeds the minimum of the input's own spectrum.
+outputs. In the lines of its cosine transform, output j has the power c_j / |A_j|² + Σ_i σ_i² |G_ji|² (Whittle 1953), G
+the frequency response of the modes, A_j the filter of autoregressive noise of the sensor; c, A and σ² are estimated by
+maximum likelihood. There is noise of inputs if residuals are more likely so than as coloured noise of the outputs
+alone, whose peaks at modes each cost coefficients of A_j. A structure that changes leaves more at some modes than at
+others, so one σ_i must fit all modes; and no σ_i exceeds the minimum of the input's own spectrum.
 
-Modes are searched in outputs whose noise is whitened, y - (1 - C^½ S^-½) (y - G (u + v)) with C = diag(c) and
-S = C + G diag(σ²) G^H at each line. They are then fitted to the outputs as measured, by least squares, with the exact
-first-order covariance of these in the noise e - G v.
+Modes are searched in outputs without the part of the noise that the inputs add, y - (1 - C^½ S^-½) (y - G (u + v)) with
+C = diag(c / |A|²) and S = C + G diag(σ²) G^H at each line. They are then fitted to the outputs as measured, by least
+squares, with the exact first-order covariance of these in the noise e - G v.
 """
 
 from collections.abc import Sequence
@@ -23,7 +25,7 @@ from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, projected, tangent_weights
 from workbench.identification.input_output.model_order import sure_modes
-from workbench.identification.input_output.noise_spectrum import lines_of, samples_of
+from workbench.identification.input_output.noise_spectrum import autoregression, lines_of, samples_of
 from workbench.identification.signal.projection import PROJECTION
 from workbench.identification.signal.searches import FALSE_ALARM, Budget
 from workbench.records.record import Record
@@ -33,6 +35,7 @@ from workbench.records.record import Record
 class InputNoiseSettings:
     """Constants of the estimation of the noise of the inputs."""
 
+    same: float = 0.02  # relative change of the outputs' noise at any line, below which its estimation ends
     steps: int = 60  # of the iteration for the levels, at most
     settled: float = 1e-3  # relative change of the level of each input, below which the iteration ends
     band: int = 64  # lines over which the spectrum of an input is averaged for its minimum
@@ -48,10 +51,21 @@ INPUT_NOISE = InputNoiseSettings()
 
 @dataclass(frozen=True)
 class InputNoise:
-    """Standard deviations of white noise: of each input, (n_inputs,), and of each output's sensor, (n_outputs,)."""
+    """White noise of each input, and autoregressive noise of each output's sensor.
+
+    Attributes:
+        inputs: (n_inputs,) standard deviation.
+        innovations: (n_outputs,) standard deviation of the white noise that drives that of the sensor.
+        filters: of each output, the prediction error filter [1, -a_1, ...] of that noise.
+    """
 
     inputs: Floats
-    outputs: Floats
+    innovations: Floats
+    filters: tuple[Floats, ...]
+
+    def sensors_at(self, phase: Floats) -> Floats:
+        """Standard deviation of the sensors' noise at the phases ωΔt (n,): (n_outputs, n)."""
+        return self.innovations[:, None] / [np.abs(np.polyval(a[::-1], np.exp(-1j * phase))) for a in self.filters]
 
 
 def input_noise(data: KnownInputs, fit: Fit) -> InputNoise | None:
@@ -63,19 +77,21 @@ def input_noise(data: KnownInputs, fit: Fit) -> InputNoise | None:
     """
     if fit.poles.size < 2 or not _noise_bound(data.records).any():  # a single mode does not distinguish input noise
         return None
-    power, gain = _residual_spectra(data, fit)
-    noise = _likeliest_levels(power, gain, _noise_bound(data.records))
-    sensor_part, input_part = noise.outputs[:, None] ** 2, np.tensordot(noise.inputs**2, gain, 1)
-    white_level, total = power.mean(axis=1, keepdims=True), sensor_part + input_part
-    likelihood_gain = float((np.log(white_level / total) + power / white_level - power / total).sum())
-    if likelihood_gain < len(sensor_part) * chi2.isf(FALSE_ALARM, data.n_inputs):
+    lines, gain = _residual_spectra(data, fit)
+    noise = _likeliest_noise(data, lines, gain, _noise_bound(data.records))
+    power, frequencies = lines**2, _frequencies(data)
+    sensor_part, input_part = noise.sensors_at(frequencies * data.dt) ** 2, np.tensordot(noise.inputs**2, gain, 1)
+    total = sensor_part + input_part
+    coefficients = sum(a.size - 1 for a in noise.filters)
+    cost = float((np.log(total) + power / total - 1.0).sum()) + coefficients * np.log(frequencies.size)
+    cost_coloured = sum(autoregression(_by_record(data, output))[1] for output in lines)
+    if cost_coloured - cost < len(lines) * chi2.isf(FALSE_ALARM, data.n_inputs):
         return None
-    n_modes, each = 0, [np.linspace(0.0, data.highest, rows.stop - rows.start, endpoint=False) for rows in data.rows]
-    frequencies = np.concatenate(each)
+    n_modes = 0
     for pole in fit.poles:
         width = max(INPUT_NOISE.about * abs(pole.real), INPUT_NOISE.lines * 0.5 * data.resolution)
         near_mode = np.abs(frequencies - pole.imag) < width
-        if (input_part[:, near_mode].mean(axis=1) > sensor_part[:, 0]).any():
+        if (input_part[:, near_mode].mean(axis=1) > sensor_part[:, near_mode].mean(axis=1)).any():
             upper = chi2.isf(INPUT_NOISE.chance, near_mode.sum()) / near_mode.sum()
             if not INPUT_NOISE.faintest < (power[:, near_mode] / total[:, near_mode]).mean() < upper:
                 return None
@@ -84,18 +100,18 @@ def input_noise(data: KnownInputs, fit: Fit) -> InputNoise | None:
 
 
 def noise_levels(data: KnownInputs, fit: Fit, records: Sequence[Record]) -> InputNoise:
-    """Maximum likelihood noise levels of a fit to samples of equal weight, inputs as measured in `records`."""
-    return _likeliest_levels(*_residual_spectra(data, fit), _noise_bound(records))
+    """Maximum likelihood noise of a fit to samples of equal weight, inputs as measured in `records`."""
+    return _likeliest_noise(data, *_residual_spectra(data, fit), _noise_bound(records))
 
 
 def _residual_spectra(data: KnownInputs, fit: Fit) -> tuple[Floats, Floats]:
-    """Of all records, power of the residual (n_outputs, n_lines), and |G|² (n_inputs, n_outputs, n_lines)."""
+    """Of all records, lines of the residual (n_outputs, n_lines), and |G|² (n_inputs, n_outputs, n_lines)."""
     responses, leverage = _impulse_responses(data, fit), np.clip(data.leverage(fit), 0.0, PROJECTION.most_taken)
-    powers, gains = [], []
+    lines, gains = [], []
     for rows, residual in zip(data.rows, data.left(fit), strict=True):
-        powers.append(lines_of(residual) ** 2 / (1.0 - leverage[rows]))
+        lines.append(lines_of(residual) / np.sqrt(1.0 - leverage[rows]))
         gains.append(np.abs(np.fft.rfft(responses, 2 * len(residual))[..., : len(residual)]) ** 2)
-    return np.vstack(powers).T, np.concatenate(gains, axis=2)
+    return np.vstack(lines).T, np.concatenate(gains, axis=2)
 
 
 def _noise_bound(records: Sequence[Record]) -> Floats:
@@ -109,11 +125,43 @@ def _noise_bound(records: Sequence[Record]) -> Floats:
     return np.sqrt(INPUT_NOISE.least * lowest)
 
 
-def _likeliest_levels(power: Floats, gain: Floats, highest: Floats) -> InputNoise:
-    """Maximum likelihood levels from power (n_outputs, n_lines) and |G|² (n_inputs, n_outputs, n_lines).
+def _frequencies(data: KnownInputs) -> Floats:
+    """rad/s of the lines of all records, (n_lines,)."""
+    each = [np.linspace(0.0, data.highest, rows.stop - rows.start, endpoint=False) for rows in data.rows]
+    return np.concatenate(each)
 
-    Those of the inputs are at most `highest`. By multiplicative steps, which keep variances positive (Févotte, Bertin &
-    Durrieu, Neural Computation 21 (2009) 793).
+
+def _by_record(data: KnownInputs, lines: Floats) -> list[Floats]:
+    """The samples of each record from lines of all records, (n_lines,)."""
+    return [samples_of(lines[rows]) for rows in data.rows]
+
+
+def _likeliest_noise(data: KnownInputs, lines: Floats, gain: Floats, highest: Floats) -> InputNoise:
+    """Maximum likelihood noise from lines (n_outputs, n_lines) and |G|² (n_inputs, n_outputs, n_lines).
+
+    The sensors' noise has the spectrum c/|A|² and the share c/|A|² / S of the power S that is expected: lines times the
+    root of that share are its own, of which A is estimated, and c and σ² beside A in turn.
+    """
+    phase, colour = _frequencies(data) * data.dt, np.ones(lines.shape)
+    filters = tuple(np.ones(1) for _ in lines)
+    for most in range(1, PROJECTION.order + 1):
+        # a low order first: of a high one the filter takes the peaks that the inputs explain, and leaves them slowly
+        noise = InputNoise(*_likeliest_levels((lines / colour) ** 2, gain / colour**2, highest), filters)
+        sensor_part = noise.sensors_at(phase) ** 2
+        own = lines * np.sqrt(sensor_part / (sensor_part + np.tensordot(noise.inputs**2, gain, 1)))
+        filters = tuple(autoregression(_by_record(data, output), most)[0] for output in own)
+        before, colour = colour, replace(noise, innovations=np.ones(len(lines)), filters=filters).sensors_at(phase)
+        if np.allclose(colour, before, rtol=INPUT_NOISE.same):
+            break
+    return noise
+
+
+def _likeliest_levels(power: Floats, gain: Floats, highest: Floats) -> tuple[Floats, Floats]:
+    """Maximum likelihood levels, (n_inputs,) and (n_outputs,), where the sensors' noise is white.
+
+    From power (n_outputs, n_lines) and |G|² (n_inputs, n_outputs, n_lines). Those of the inputs are at most `highest`.
+    By multiplicative steps, which keep variances positive (Févotte, Bertin & Durrieu, Neural Computation 21 (2009)
+    793).
     """
     of_outputs = 0.5 * power.mean(axis=1)
     of_inputs = 0.5 * power.mean() / np.maximum(gain.mean(axis=(1, 2)), 1e-300) / len(gain)
@@ -127,20 +175,20 @@ def _likeliest_levels(power: Floats, gain: Floats, highest: Floats) -> InputNois
         of_inputs = of_inputs * step
         if np.abs(step - 1.0).max() < INPUT_NOISE.settled:
             break
-    return InputNoise(np.minimum(np.sqrt(of_inputs), highest), np.sqrt(of_outputs))
+    return np.minimum(np.sqrt(of_inputs), highest), np.sqrt(of_outputs)
 
 
 def with_white_noise(
     data: KnownInputs, fit: Fit, noise: InputNoise, false_alarm: float, budget: Budget
 ) -> tuple[KnownInputs, Fit]:
-    """The records with the expected inputs and the noise that these leave in the outputs whitened, and the modes.
+    """The records with the expected inputs and outputs without the noise that these leave, and the modes.
 
     Args:
         data, fit: as in `input_noise`.
     """
     data = data.with_inputs([_expected_inputs(record, noise) for record in data.records])
     gain = _residual_spectra(data, projected(data, fit.poles, fit.participation))[1]
-    std = np.sqrt(noise.outputs[:, None] ** 2 + np.tensordot(noise.inputs**2, gain, 1)).T
+    std = np.sqrt(noise.sensors_at(_frequencies(data) * data.dt) ** 2 + np.tensordot(noise.inputs**2, gain, 1)).T
     weighted = data.weighted_by([std[rows] / np.sqrt((std**2).mean(axis=0)) for rows in data.rows])
     # lines of equal weight may take the noise peak at a strong mode for a further mode; the weighted lines do not
     fit = sure_modes(weighted, projected(weighted, fit.poles, fit.participation), false_alarm, budget)
@@ -161,15 +209,16 @@ def _expected_inputs(record: Record, noise: InputNoise) -> Record:
 
 
 def _whitened(data: KnownInputs, fit: Fit, noise: InputNoise) -> KnownInputs:
-    """The records with outputs whose noise e - G v is whitened."""
+    """The records with outputs whose noise e - G v has the spectrum of e."""
     responses, records = _impulse_responses(data, fit), []
     for record, residual in zip(data.records, data.left(fit), strict=True):
         size = next_fast_len(len(residual) + responses.shape[2], real=True)
-        noise_gain = _spectra(responses, size) * noise.inputs / noise.outputs[:, None]
+        sensors = noise.sensors_at(np.linspace(0.0, np.pi, size // 2 + 1)).T
+        noise_gain = _spectra(responses, size) * noise.inputs / sensors[:, :, None]
         u, s, _ = np.linalg.svd(noise_gain, full_matrices=False)
-        lines = np.fft.rfft(residual / noise.outputs, size, axis=0)
+        lines = np.fft.rfft(residual, size, axis=0) / sensors
         shared = np.einsum("fji,fj->fi", u.conj(), lines) * (1.0 - 1.0 / np.sqrt(1.0 + s**2))
-        excess = np.fft.irfft(np.einsum("fji,fi->jf", u, shared), size)[:, : len(residual)] * noise.outputs[:, None]
+        excess = np.fft.irfft(sensors.T * np.einsum("fji,fi->jf", u, shared), size)[:, : len(residual)]
         outputs = record.outputs.copy()
         outputs[:, data.first :] -= excess
         records.append(replace(record, outputs=outputs))

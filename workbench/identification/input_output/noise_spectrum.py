@@ -59,7 +59,7 @@ def noise_spectrum(
     ]
     std = [np.tile(row, (len(each), 1)) for row, each in zip(levels, residuals, strict=True)]
     for j in np.flatnonzero(~flat):
-        filter_ = _burg([each[:, j] / row[j] for each, row in zip(corrected, levels, strict=True)])
+        filter_, _ = autoregression([each[:, j] / row[j] for each, row in zip(corrected, levels, strict=True)])
         for each in std:
             phasors = np.exp(-1j * np.pi / len(each) * np.arange(len(each)))
             each[:, j] /= np.abs(np.polyval(filter_[::-1], phasors))
@@ -74,14 +74,19 @@ def alike(one: Sequence[np.ndarray] | None, other: Sequence[np.ndarray] | None) 
     return bool(np.sqrt((np.log(np.vstack(one) / np.vstack(other)) ** 2).mean(axis=0)).max() < PROJECTION.spectra_alike)
 
 
-def _burg(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """The prediction error filter [1, -a_1, ...] of records of one noise (Burg 1967); order by minimum BIC."""
+def autoregression(rows: Sequence[np.ndarray], most: int = PROJECTION.order) -> tuple[np.ndarray, float]:
+    """The prediction error filter [1, -a_1, ...] of records of one noise (Burg 1967), and the BIC of its order, least.
+
+    Args:
+        rows: of each record, (n_samples,).
+        most: largest order.
+    """
     n = sum(row.size for row in rows)
     forward, backward = list(rows), list(rows)
     best = coefficients = np.ones(1)
     variance = sum(float(row @ row) for row in rows) / n
     least_criterion = n * np.log(variance)
-    for order in range(1, min(PROJECTION.order, n // PROJECTION.samples_each) + 1):
+    for order in range(1, min(most, n // PROJECTION.samples_each) + 1):
         forward, backward = [f[1:] for f in forward], [b[:-1] for b in backward]
         cross = sum(float(f @ b) for f, b in zip(forward, backward, strict=True))
         k = -2.0 * cross / sum(float(f @ f + b @ b) for f, b in zip(forward, backward, strict=True))
@@ -91,4 +96,4 @@ def _burg(rows: Sequence[np.ndarray]) -> np.ndarray:
         variance *= 1.0 - k**2
         if n * np.log(variance) + order * np.log(n) < least_criterion:
             best, least_criterion = coefficients, n * np.log(variance) + order * np.log(n)
-    return best
+    return best, float(least_criterion)
