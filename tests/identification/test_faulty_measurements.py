@@ -276,3 +276,12 @@ def test_outputs_that_stay_amid_forced_motion_are_named(shaken):
     outputs[2, 1000:1060] = outputs[2, 999]
     found = identify_driven(replace(shaken, outputs=outputs))
     assert any("output 'a3' stays at one value for 61 samples from 0.999 s on" in line for line in found.remarks)
+
+
+def test_a_driven_output_that_never_moves_is_refused():
+    rng = np.random.default_rng(0)
+    channels = (Channel("a"), Channel("b"))
+    record = Record(1e-3, np.vstack([rng.standard_normal(500), np.zeros(500)]), channels,
+                    inputs=rng.standard_normal((1, 500)), input_channels=(Channel("F"),))  # fmt: skip
+    with pytest.raises(ValueError, match="output 'b' stays at 0: the sensor is dead"):
+        identify_driven(record)

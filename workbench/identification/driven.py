@@ -241,7 +241,8 @@ def identify_driven(
         which is detected where two or more modes show it, with a remark.
 
     Raises:
-        ValueError: no inputs, inputs that never move or move alike; records that differ; too few samples; no mode.
+        ValueError: no inputs, inputs that never move or move alike; an output that never moves; records that differ;
+            too few samples; no mode.
     """
     check_count("max_modes", max_modes)
     budget = Budget(seconds, progress)
@@ -253,6 +254,7 @@ def identify_driven(
     if hold not in HOLDS:
         raise ValueError(f"input_hold is {' or '.join(map(repr, HOLDS))}; got {input_hold!r}")
     check_inputs(records)
+    _check_outputs_move(records)
     clipped = dict.fromkeys(fault.message for record in records for fault in input_faults(record))
     logged = records
     records, windowed = force_window(logged)
@@ -511,6 +513,13 @@ def _delay_remarks(data: KnownInputs) -> tuple[str, ...]:
     names = data.records[0].input_names
     late = [f"{names[i]} {d:.2f} samples ({d * data.dt:.3g} s)" for i, d in enumerate(data.delays) if d > 0]
     return (f"inputs act late, by {', '.join(late)}: the model takes the delayed inputs",) if late else ()
+
+
+def _check_outputs_move(records: Sequence[Record]) -> None:
+    """Refuse an output that is constant in every record."""
+    for name, *rows in zip(records[0].output_names, *(record.outputs for record in records), strict=True):
+        if not any(np.ptp(row) for row in rows):
+            raise ValueError(f"output {name!r} stays at {rows[0][0]:g}: the sensor is dead; leave it out")
 
 
 def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.ndarray | None:
