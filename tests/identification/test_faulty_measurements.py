@@ -278,10 +278,11 @@ def test_outputs_that_stay_amid_forced_motion_are_named(shaken):
     assert any("output 'a3' stays at one value for 61 samples from 0.999 s on" in line for line in found.remarks)
 
 
-def test_a_driven_output_that_never_moves_is_refused():
+def test_an_output_that_never_moves_is_refused():
     rng = np.random.default_rng(0)
     channels = (Channel("a"), Channel("b"))
     record = Record(1e-3, np.vstack([rng.standard_normal(500), np.zeros(500)]), channels,
                     inputs=rng.standard_normal((1, 500)), input_channels=(Channel("F"),))  # fmt: skip
-    with pytest.raises(ValueError, match="output 'b' stays at 0: the sensor is dead"):
-        identify_driven(record)
+    for identify in (identify_driven, identify_ambient):
+        with pytest.raises(ValueError, match="output 'b' stays at 0: the sensor is dead"):
+            identify(record)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.output_only.subspace import StablePole, Subspace
+from workbench.identification.signal.data_quality import check_outputs_move
 from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import (
     ModalEstimates,
@@ -89,8 +90,9 @@ def correlation_functions(
         is not white, so that standard errors of `refine` do not hold: use `identify_ambient` for these.
 
     Raises:
-        ValueError: an unknown reference; a record shorter than forty times `max_lag`.
+        ValueError: an output that never moves; an unknown reference; a record shorter than forty times `max_lag`.
     """
+    check_outputs_move([record])
     lags, rows = _lags(record, max_lag, references)
     return _as_records(record, _correlations(record, lags, rows) / record.n_samples, rows)
 
@@ -124,6 +126,7 @@ def identify_ambient(
         ValueError: as `correlation_functions`; no mode found, or fewer than asked for.
     """
     check_count("n_modes", n_modes)
+    check_outputs_move([record])
     budget = Budget(seconds, progress)
     lags, rows = _lags(record, max_lag, references)
     decays = _as_records(record, _correlations(record, lags, rows) / record.n_samples, rows)

@@ -58,7 +58,7 @@ from workbench.identification.input_output.residual_bursts import burst_remarks
 from workbench.identification.input_output.sensor_drift import beside_drift
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
-from workbench.identification.signal.data_quality import input_faults, of_same_sensors
+from workbench.identification.signal.data_quality import check_outputs_move, input_faults, of_same_sensors
 from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress, check_count
@@ -254,7 +254,7 @@ def identify_driven(
     if hold not in HOLDS:
         raise ValueError(f"input_hold is {' or '.join(map(repr, HOLDS))}; got {input_hold!r}")
     check_inputs(records)
-    _check_outputs_move(records)
+    check_outputs_move(records)
     clipped = dict.fromkeys(fault.message for record in records for fault in input_faults(record))
     logged = records
     records, windowed = force_window(logged)
@@ -513,13 +513,6 @@ def _delay_remarks(data: KnownInputs) -> tuple[str, ...]:
     names = data.records[0].input_names
     late = [f"{names[i]} {d:.2f} samples ({d * data.dt:.3g} s)" for i, d in enumerate(data.delays) if d > 0]
     return (f"inputs act late, by {', '.join(late)}: the model takes the delayed inputs",) if late else ()
-
-
-def _check_outputs_move(records: Sequence[Record]) -> None:
-    """Refuse an output that is constant in every record."""
-    for name, *rows in zip(records[0].output_names, *(record.outputs for record in records), strict=True):
-        if not any(np.ptp(row) for row in rows):
-            raise ValueError(f"output {name!r} stays at {rows[0][0]:g}: the sensor is dead; leave it out")
 
 
 def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.ndarray | None:

@@ -27,6 +27,15 @@ def bound_of(task, table, cell, half, effort):
     return dual_bound(cell, half, tables, transforms, square, root, np.sqrt(effort), SINGULAR, np.empty(cell.size))
 
 
+def hold(found, costs, effort, counts):
+    """Hold that no placement that keeps the limit is below the bound of its cell, and count what was shown."""
+    kept = costs.effort <= effort
+    assert (np.sqrt(costs.work[kept]) >= found * (1 - 1e-9)).all()
+    counts["informative"] += 0 < found < np.inf
+    counts["refused"] += np.isinf(found)
+    counts["kept"] += kept.any()
+
+
 def drawn(rng, level):
     centres = np.sort(rng.uniform(0.3, 9.7, 4))
     return (centres / 10.0 * 2**level).astype(int) + 2**level - 1
@@ -57,11 +66,7 @@ def test_no_placement_that_keeps_the_limit_is_below_the_bound(task):
             # limits that some placements in the cell just keep, and some that none keeps
             effort = np.quantile(costs.effort, 0.05) if rng.random() < 0.7 else 0.3 * costs.effort.min()
             found = bound_of(task, table, cell, half, effort)
-            kept = costs.effort <= effort
-            assert (np.sqrt(costs.work[kept]) >= found * (1 - 1e-9)).all()
-            counts["informative"] += 0 < found < np.inf
-            counts["refused"] += np.isinf(found)
-            counts["kept"] += kept.any()
+            hold(found, costs, effort, counts)
     assert counts["informative"] > 20 and counts["refused"] > 20 and counts["kept"] > 100
 
 
@@ -86,11 +91,7 @@ def test_bounds_hold_where_two_rigid_modes_take_the_same_force():
     for cell, found in zip(cells, bounds(cells)[0], strict=True):
         places = bounds.intervals.centre[cell] + bounds.intervals.half[cell] * rng.uniform(-1.0, 1.0, (200, 3))
         costs = batch_costs(task, task.shapes(places))
-        kept = costs.effort <= effort
-        assert (np.sqrt(costs.work[kept]) >= found * (1 - 1e-9)).all()
-        counts["informative"] += 0 < found < np.inf
-        counts["refused"] += np.isinf(found)
-        counts["kept"] += kept.any()
+        hold(found, costs, effort, counts)
     assert counts["informative"] > 50 and counts["refused"] > 50 and counts["kept"] > 20
 
 

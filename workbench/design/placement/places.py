@@ -70,9 +70,8 @@ def free_boxes(domain: Interval | Rectangle, margin: np.ndarray, zones: Sequence
             if (zone_low >= high).any() or (zone_high <= low).any():
                 parts.append((low, high))
                 continue
-            for axis in range(
-                margin.size
-            ):  # left and right of the zone, below and above it; strips thinner than slack are none
+            # left and right of the zone, below and above it; strips thinner than slack are none
+            for axis in range(margin.size):
                 before, after = high.copy(), low.copy()
                 before[axis], after[axis] = zone_low[axis], zone_high[axis]
                 parts += [part for part in ((low, before), (after, high)) if part[1][axis] - part[0][axis] > slack]

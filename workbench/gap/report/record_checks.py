@@ -163,8 +163,8 @@ def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settl
         pairs = zip(outputs, predicted, strict=True)
         row = [float(np.corrcoef(y, p)[0, 1]) if np.ptp(p) > 0 else 0.0 for y, p in pairs]
         correlations.append(row)
-        levels[f"{what} {record.name!r}"] = outputs.std(axis=1), predicted.std(axis=1)
-        ratios.append(_amplitude_ratios(rig, outputs, predicted, np.abs(row) > CORRELATED))
+        levels[f"{what} {record.name!r}"] = level = outputs.std(axis=1), predicted.std(axis=1)
+        ratios.append(_amplitude_ratios(rig, *level, np.abs(row) > CORRELATED))
     if not levels:
         return levels
     _check_units(rig, records[0], np.array(ratios), np.abs(correlations) > CORRELATED, what)
@@ -178,15 +178,14 @@ def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settl
     return levels
 
 
-def _amplitude_ratios(rig: Rig, measured: np.ndarray, predicted: np.ndarray, is_correlated: np.ndarray) -> np.ndarray:
+def _amplitude_ratios(rig: Rig, read: np.ndarray, expected: np.ndarray, is_correlated: np.ndarray) -> np.ndarray:
     """Standard deviation (n_sensors,) of each reading over that of its prediction; NaN where one is below the noise.
 
     Args:
-        measured, predicted: (n_sensors, n_samples).
+        read, expected: (n_sensors,) standard deviations of the readings and of the predictions.
         is_correlated: (n_sensors,) whether the two are correlated, which shows that the reading is not just noise.
     """
     least = ABOVE_NOISE * np.array([sensor.noise_std for sensor in rig.sensors])
-    expected, read = predicted.std(axis=1), measured.std(axis=1)
     comparable = (expected > least) & ((read > least) | is_correlated)
     return np.where(comparable, read / np.where(comparable, expected, 1.0), np.nan)
 

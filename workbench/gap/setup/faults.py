@@ -57,12 +57,13 @@ def setup_faults(
     if late:
         together, alone = _without_all(together, late), [_without_all(gap, late) for gap in alone]
     found += late
-    for fault in _in_rounds(together, DETECTORS):
+    of_all = _in_rounds(together, DETECTORS)
+    for fault in of_all:
         if fault.kind in BY_RECORD and fault.certain:
             fault = _for_agreeing_records(alone, fault)
         found.append(fault)
         alone = [gap.without(fault) for gap in alone]
-    if not late:  # a fault of the channels may have masked it
+    if of_all and not late:  # a fault of the channels may have masked it
         found += late_records(alone)
     for i, gap in enumerate(alone):
         if i == 0 and len(fit) == 1:  # a single fit record was tested above

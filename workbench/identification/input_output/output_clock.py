@@ -48,7 +48,8 @@ class OutputClock(NamedTuple):
 
 def output_clock(data: KnownInputs, fit: Fit) -> OutputClock:
     """The clock of the outputs that the residual of a fit shows, to first order."""
-    x, (real, imaginary) = regressors(data, fit.poles, fit.participation), slopes_in_time(data, fit)
+    x = regressors(data, fit.poles, fit.participation)
+    real, imaginary = slopes_in_time(data, fit, x)
     weights = np.ones((1, fit.noise.size)) if data.weights is None else data.weights
     motion = data.as_samples((data.values - fit.residual) / weights)
     time = [data.first + np.arange(len(samples)) for samples in motion]

@@ -75,7 +75,8 @@ class Change(NamedTuple):
 def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     """The change of every mode over the records, to first order about a fit of constant modes."""
     n, poles = fit.poles.size, fit.poles
-    x = np.hstack([regressors(data, poles, fit.participation), *slopes_in_time(data, fit)])
+    x = regressors(data, poles, fit.participation)
+    x = np.hstack([x, *slopes_in_time(data, fit, x)])
     known = slice(0, x.shape[1] - 2 * n)
     normal, right_side = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
     unweighted = products_of(x, np.ones((1, 1))) if data.weights is None else None
@@ -96,10 +97,14 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     return Change(change[n:] / omega, error / omega, sure)
 
 
-def slopes_in_time(data: KnownInputs, fit: Fit) -> tuple[Floats, Floats]:
-    """Real and imaginary part of (t - T/2) / T ∂z/∂λ of each mode, (n_rows, n_modes) each."""
-    slopes = [data.slopes(pole, l_r) for pole, l_r in zip(fit.poles, fit.participation, strict=True)]
-    real, imaginary = (data.modulated(np.column_stack([s[k] for s in slopes]), data.time) for k in (0, 1))
+def slopes_in_time(data: KnownInputs, fit: Fit, x: Floats) -> tuple[Floats, Floats]:
+    """Real and imaginary part of (t - T/2) / T ∂z/∂λ of each mode, (n_rows, n_modes) each.
+
+    Args:
+        x: `regressors` of the fit, which hold ∂z/∂λ.
+    """
+    n, q = fit.poles.size, 1 + fit.participation.shape[1]
+    real, imaginary = (data.modulated(x[:, part * n * q : (part + 1) * n * q : q], data.time) for part in (0, 1))
     return real, imaginary
 
 

@@ -117,6 +117,17 @@ def check_data_quality(record: Record) -> None:
         raise ValueError(f"record {record.name!r}: {fault.message}")
 
 
+def check_outputs_move(records: Sequence[Record]) -> None:
+    """Refuse an output that is constant in every record, of the same outputs.
+
+    Raises:
+        ValueError: naming the output.
+    """
+    for name, *rows in zip(records[0].output_names, *(record.outputs for record in records), strict=True):
+        if not any(np.ptp(row) for row in rows):
+            raise ValueError(f"output {name!r} stays at {rows[0][0]:g}: the sensor is dead; leave it out")
+
+
 def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
     """The records, or the one, as a list.
 
