@@ -31,7 +31,7 @@ def uncertain_rig(
     """
     from workbench.gap.diagnose import SECONDS, diagnose_case
     from workbench.gap.setup.faults import setup_faults
-    from workbench.gap.setup.repeats import check_disjoint
+    from workbench.gap.setup.records import check_disjoint
     from workbench.robust.posterior import UncertainRig
 
     if verdict is not None:

@@ -33,7 +33,6 @@ from workbench.gap.report.budget import (
     sizes_of,
     with_held_out,
 )
-from workbench.gap.report.data_faults import data_faults
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.levels import steady_remainder
 from workbench.gap.report.record_checks import check_modes, check_records, detectability
@@ -43,7 +42,7 @@ from workbench.gap.search.finish import with_equals
 from workbench.gap.search.jointly import too_large
 from workbench.gap.search.settings import JOINT
 from workbench.gap.setup.faults import setup_faults
-from workbench.gap.setup.repeats import check_disjoint
+from workbench.gap.setup.records import check_disjoint, data_faults
 from workbench.records.record import Record, as_records
 from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments

@@ -11,7 +11,7 @@ from workbench.gap.diagnose import diagnose
 from workbench.gap.setup import comparison
 from workbench.gap.setup.corrections import SetupFault, without_faults
 from workbench.gap.setup.faults import setup_faults
-from workbench.gap.setup.repeats import check_disjoint
+from workbench.gap.setup.records import check_disjoint
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
