@@ -47,6 +47,8 @@ GAIN_SHARE = 0.5
 GAIN_CHI2 = 25.0  # and differs from the factor by five standard errors, in white noise
 CALIBRATED = 1e-3  # relative: a gain closer to a factor is that factor (9.81 for 9.80665 is 3.4e-4)
 AMBIGUOUS = (G, 1.0 / G, TURN, 1.0 / TURN)  # factors that a wrong calibration may reach; others are too far from one
+OF_MEDIAN = 1.858  # standard error of a median by the median absolute deviation and the root of the number, if normal
+NEAREST = 0.22  # of the logarithm of a gain: half the smallest ratio of two factors
 NEAR_TEN = 0.01  # relative: if all gains are as near to 10, an amplifier is as likely as g, which differs by 2 %
 
 
@@ -151,6 +153,30 @@ def _candidates(gap: Comparison) -> Iterator[Candidate]:
             names = rig.actuators[p].name, rig.actuators[q].name
             crossed = gap.spectra_of(gap.predict(*exchanged("inputs", *names, rig, gap.records)))
             yield Candidate("exchanged inputs", names, (p, q), band_misfit(measured, crossed))
+
+
+def output_in_other_unit(gap: Comparison) -> list[SetupFault]:
+    """The fault of one output of several whose gain beside the others is the same factor of units in every band.
+
+    A missing effect shifts resonances, so it changes the amplitude of a band at all outputs, which may mask a factor.
+    An error of calibration near a factor differs from it significantly, and g from ten.
+    """
+    log_ratios = gap.log_ratios
+    found = []
+    for j in np.flatnonzero(gap.wide) if log_ratios.shape[1] > 2 else ():
+        own, others = log_ratios[:, j], np.moveaxis(np.delete(log_ratios, j, axis=1), 1, 2)
+        at = np.isfinite(own) & (np.isfinite(others).sum(axis=2) > 1)
+        if np.count_nonzero(at.any(axis=0)) < min(2, gap.rig.modes.n_modes):
+            continue
+        beside = own[at] - np.nanmedian(others[at], axis=1)
+        factor = min((f for f in FACTORS if f > 0), key=lambda f: abs(np.median(beside) - np.log(f)))
+        off = beside - np.log(factor)
+        error = GAIN_CHI2**0.5 * OF_MEDIAN * np.median(np.abs(off - np.median(off))) / np.sqrt(off.size)
+        from_ten = abs(abs(np.median(beside)) - np.log(10.0))
+        is_calibrated = factor not in AMBIGUOUS or abs(np.median(off)) < max(error, CALIBRATED) < from_ten
+        if (np.abs(off) < NEAREST).all() and is_calibrated:
+            found.append(with_doubt_by_record(gap, _fault(gap, "outputs", factor, (int(j),), True)))
+    return found if len(found) == 1 else []
 
 
 def _is_certain(gap: Comparison, candidate: Candidate) -> bool | None:

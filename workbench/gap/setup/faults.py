@@ -10,6 +10,7 @@ from workbench.gap.setup.channels import (
     channel_faults,
     largest_difference,
     log_gains_after,
+    output_in_other_unit,
     scaled_inputs,
     tolerated_difference,
 )
@@ -28,6 +29,7 @@ CANDIDATES = ("outputs", "inputs", "exchanged outputs", "exchanged inputs")  # o
 OF_ONE_RECORD: tuple[Detector, ...] = (partial(channel_faults, kinds=CANDIDATES), scaled_inputs, sampling_rates)
 DETECTORS: tuple[Detector, ...] = (
     partial(channel_faults, kinds=(*CANDIDATES, "quantity")),
+    output_in_other_unit,
     scaled_inputs,
     sampling_rates,
     modal_units,
