@@ -428,7 +428,11 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
     names = {a.name for a in rig.actuators} | {s.name for s in rig.sensors}
     missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
     if missing:
-        raise CaseError(f"{file}: channel {missing[0]!r} of case.toml is missing; the file has {shown(sorted(arrays))}")
+        unknown = [name for name in extra if name.startswith((f"{missing[0]} [", f"{missing[0]} ("))]
+        unit = f", where the unit of {shown(unknown[0])} is not known" if unknown else ""
+        raise CaseError(
+            f"{file}: channel {missing[0]!r} of case.toml is missing; the file has {shown(sorted(arrays))}{unit}"
+        )
     if extra:
         raise CaseError(f"{file}: channel {shown(extra[0])} is not named in case.toml; name it there or leave it out")
     if "t" not in arrays:
@@ -468,11 +472,11 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
         input_channels=in_units(record.input_channels, units),
         output_channels=in_units(record.output_channels, units),
     )
-    for channel in (*record.input_channels, *record.output_channels):
-        unit = stated.get(channel.name, "")
-        if unit not in ("", channel.unit):
+    for known in (*record.input_channels, *record.output_channels):
+        unit = stated.get(known.name, "")
+        if unit not in ("", known.unit):
             raise CaseError(
-                f"{file}: channel {channel.name!r} is in {unit}, by case.toml in {channel.unit}: correct one of them"
+                f"{file}: channel {known.name!r} is in {unit}, by case.toml in {known.unit}: correct one of them"
             )
     return record
 
