@@ -61,6 +61,7 @@ from workbench.identification.input_output.time_variance import beside_changing,
 from workbench.identification.signal.data_quality import check_outputs_move, input_faults, of_same_sensors
 from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, credible, time_derivatives
+from workbench.identification.signal.projection import correlation, disturbed
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress, check_count
 from workbench.records.record import HOLDS, Channel, Record
 from workbench.renamed import Renamed, former_arguments
@@ -264,7 +265,7 @@ def identify_driven(
         at_rest=at_rest,
         hold=hold,
         feedthrough=feedthrough,
-        delays=_checked_delays(records, delays),
+        delays=_checked_delays(records, 0.0 if delays is None else delays),
         distorted=by_amplitude.changing,
         free=by_amplitude.poles,
     )
@@ -515,14 +516,12 @@ def _delay_remarks(data: KnownInputs) -> tuple[str, ...]:
     return (f"inputs act late, by {', '.join(late)}: the model takes the delayed inputs",) if late else ()
 
 
-def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.ndarray | None:
-    """Delay of each input in samples, (n_inputs,), from delays in s; None where none are given.
+def _checked_delays(records: Sequence[Record], delays: ArrayLike) -> np.ndarray:
+    """Delay of each input in samples, (n_inputs,), from delays in s.
 
     Raises:
         ValueError: a delay that is negative or longer than a quarter of the shortest record.
     """
-    if delays is None:
-        return None
     dt, given = records[0].sample_time, np.broadcast_to(np.asarray(delays, float), (records[0].n_inputs,))
     longest = 0.25 * min(record.n_samples for record in records) * dt
     if not ((given >= 0) & (given <= longest)).all():
@@ -570,9 +569,9 @@ def _select(
         if further is None or budget.spent("search in outputs of uncorrelated noise"):
             break
         uncorrelated, strongest = further, selected
-    data = data.beside_as(uncorrelated)
+    data = replace(data, line_std=None, beside=uncorrelated.beside, changing=uncorrelated.changing)
     fit = settled(data, projected(data, selected.fit.poles, selected.fit.participation), budget=budget)
-    data = data.weighted_by(data.noise_spectrum(fit))
+    data = replace(data, line_std=data.noise_spectrum(fit))
     fit = settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget)
     return data, selected.refitted(fit)
 
@@ -590,7 +589,7 @@ def _select_weighted(data: KnownInputs, strongest: Selected, options: dict[str, 
     if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
         return data, selected
     sure = settled(data, only(data, selected.fit, ~doubtful), budget=budget)
-    other = data.weighted_by(data.noise_spectrum(sure))
+    other = replace(data, line_std=data.noise_spectrum(sure))
     other, fewer = _alternate_with_noise(other, select_modes(other, start=sure, **options), options, options, budget)
     if budget.spent("check of doubtful modes"):
         return data, selected
@@ -613,12 +612,12 @@ def _as_time_invariant(
     """
     if not data.changing:
         return data, selected, ()
-    plain, before = data.without_columns(), selected.fit
+    plain, before = replace(data, beside=None, changing=()), selected.fit
     fit = settled(plain, projected(plain, before.poles, before.participation), budget=budget)
     decrease = added_misfit(fit, before, before.noise)
     columns = (data.fixed.shape[1] - plain.fixed.shape[1]) * before.noise.size
     changing = data.changing if decrease > chi2.isf(FALSE_ALARM, columns) else ()
-    data = plain.weighted_by(plain.noise_spectrum(fit))
+    data = replace(plain, line_std=plain.noise_spectrum(fit))
     fit = settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget)
     return data, selected.refitted(fit), changing
 
@@ -680,7 +679,7 @@ def _alternate_with_noise(
             break
         if budget.spent("estimation of the noise spectrum"):
             break
-        weighted = data.with_distorted(selected.distorted).weighted_by(line_std)
+        weighted = replace(data.with_distorted(selected.distorted), line_std=line_std)
         reselected = _without_unpredictive(weighted, select_modes(weighted, start=selected.fit, **options), budget)
         # A search that the time limit ended early does not replace the one before.
         if budget.spent("estimation of the noise spectrum") and reselected.fit.poles.size < selected.fit.poles.size:
@@ -699,11 +698,12 @@ def _report(
     fit, n, from_inputs = selected.fit, selected.fit.poles.size, None
     if data.measured is None:
         noise_ratio, fixed_ratio = data.noise_ratios(fit)
-        shared, std = data.disturbed(fit), blow_noise(logged, records)
+        shared_noise = correlation([left.T for left in data.left(fit)])
+        shared, std = disturbed(shared_noise, fit.amplitudes / fit.noise[:, None]), blow_noise(logged, records)
         if std.any():
             from_inputs = spread_by_inputs(data, fit, std, [record.inputs != 0.0 for record in records])
     else:
-        data = data.as_measured()
+        data = replace(data, records=data.measured, measured=None, line_std=None)
         fit = settled(data, projected(data, fit.poles, fit.participation))
         noise = noise_levels(data, fit, records)
         noise_ratio = (noise.sensors_at(fit.poles.imag * data.dt) / fit.noise[:, None]) ** 2
@@ -718,7 +718,7 @@ def _report(
     vectors = vector_covariance(fit, noise_ratio, derivative, np.arange(n), shapes, n_inputs, from_inputs)
     direct = np.zeros((len(channels), n_inputs))
     direct_std = np.zeros_like(direct)
-    if data.feedthrough:
+    if data.has_direct:
         direct = fit.coefficients[2 * n : 2 * n + n_inputs].T
         direct_std = fixed_std(fit, noise_ratio, fixed_ratio, from_inputs)[:n_inputs].T
     return Driven(

@@ -305,19 +305,21 @@ def _select_in_band(
     # suppress modelling errors, which are smooth over the lines. The residual is scaled first, because a few large
     # lines among small ones would show some correlation in any case.
     scaled = residual if guessed is None else residual / guessed
-    lines.window_rate = window_rate(scaled, omega)
+    lines = replace(lines, window_rate=window_rate(scaled, omega))
     differences = np.diff(scaled, 2)
     mixing = mixing_of(correlation_of_lines([differences.reshape(len(h), -1)]))
     if mixing is None:
         return _select_weighted(lines, selected, options)
     # Correlated noise makes peaks in all outputs; modes are selected in combinations of uncorrelated noise.
     mixed = np.tensordot(mixing / np.sqrt((np.abs(residual) ** 2).mean(axis=(1, 2))), h, 1)
-    uncorrelated, selected = _select_weighted(*_select_with_changing(lines.of(mixed), few), options)
-    lines = uncorrelated.of(h)
+    uncorrelated, selected = _select_weighted(
+        *_select_with_changing(replace(lines, h=mixed, noise=None, guessed=False), few), options
+    )
+    lines = replace(uncorrelated, h=h, noise=None, guessed=False)
     fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
     guessed = relative_noise(lines.left(fit), lines.fitted(fit), lines.omega)
     if guessed is not None:
-        lines = lines.weighted_by(guessed)
+        lines = replace(lines, noise=guessed, guessed=True)
         fit = settled(lines, projected(lines, fit.poles, fit.participation), budget=budget)
     return lines, selected.refitted(fit)
 
@@ -346,7 +348,7 @@ def _select_weighted(lines: Lines, selected: Selected, options: dict[str, Any]) 
         if budget.spent("estimation of the noise"):
             return lines, selected
         before = guessed
-        weighted = lines.without_columns().weighted_by(guessed)
+        weighted = replace(lines, noise=guessed, guessed=True, beside=None, changing=())
         # The selection starts from the modes found: with noise proportional to the response, lines between modes have
         # the largest weights, and the least information.
         weighted, reselected = _select_with_changing(
@@ -429,15 +431,17 @@ def _residual_terms(
     The acceleration of a mode φ_j φ_i s² / (s² + ω²) is the sum of its pair of poles and of φ_j φ_i, which E of the fit
     includes. A pole below the band, a l / 2 (1/s + λ/s²) and its conjugate at the lines, is part of the residual term.
     """
-    n, size = 2 * fit.poles.size, lines.refs * len(lines.powers)
+    n, size = 2 * fit.poles.size, lines.n_inputs * len(lines.powers)
     scale = lines.omega[-1] ** -np.array(lines.powers, float)
     std = fixed_std(fit, noise_ratio, np.ones((fit.coefficients.shape[0] - n, len(derivative))))
     low = fit.poles.imag < lines.omega[0]
     if low.any():  # the error of the sum of these poles and E, as they are not determined separately
         weights = np.ones((len(lines.fixed), 1)) if lines.weights is None else lines.weights
         std = fit.noise / np.sqrt((lines.fixed**2).T @ weights**2)
-    terms, errors = (x[:size].reshape(lines.refs, len(scale), -1) * scale[:, None] for x in (fit.coefficients[n:], std))
-    below, below_std, above = (np.zeros((len(derivative), lines.refs)) for _ in range(3))
+    terms, errors = (
+        x[:size].reshape(lines.n_inputs, len(scale), -1) * scale[:, None] for x in (fit.coefficients[n:], std)
+    )
+    below, below_std, above = (np.zeros((len(derivative), lines.n_inputs)) for _ in range(3))
     # For each derivative: terms in s^(k - 2) of the poles below the band, less those of the poles within it.
     pole_terms = (
         np.stack([fit.amplitudes * x for x in (low * fit.poles, low, (low - 1.0) / fit.poles)]) @ fit.participation

@@ -7,7 +7,7 @@ modes improve the prediction, over-fitted ones make it worse.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import f as variance_ratio
@@ -17,6 +17,7 @@ from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, only, projected, settled
 from workbench.identification.input_output.time_variance import IS_MEAN, named_near
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget
+from workbench.records.record import Record
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,8 @@ def without_unpredictive(
     shortest = min(record.n_samples // 2 for record in data.records)
     if n < 2 or not (weaker_near.any() or undamped.any()) or shortest <= data.first:
         return fit, ()
-    whole = data.unweighted()
-    half = whole.first_half()
+    whole = replace(data, line_std=None, beside=None, changing=())
+    half = replace(whole, records=[_first_half(record) for record in whole.records])
     too_short = len(half.values) < HELD_OUT.rows * (2 * n + half.fixed.shape[1])
     if too_short or half.fixed.shape[1] != whole.fixed.shape[1]:  # inputs that are zero throughout a first half
         return fit, ()
@@ -110,6 +111,11 @@ def without_unpredictive(
     if kept.all():
         return fit, ()
     return settled(data, only(data, fit, kept), SELECTION.few_steps, budget), tuple(distorted)
+
+
+def _first_half(record: Record) -> Record:
+    n = record.n_samples // 2
+    return replace(record, outputs=record.outputs[:, :n], inputs=record.inputs[:, :n])
 
 
 def _is_in_both(data: KnownInputs, fit: Fit, r: int) -> bool:
@@ -178,7 +184,7 @@ def left_about(data: KnownInputs, fit: Fit) -> tuple[complex, ...]:
     Where the residual about one mode is very large, least squares leave a little about the others too; these do not
     count.
     """
-    whole = data.unweighted()
+    whole = replace(data, line_std=None, beside=None, changing=())
     spectra = _ResidualSpectra(whole, projected(whole, fit.poles, fit.participation))
     bands = fit.poles.imag[:, None] * (1.0 + 0.5 * HELD_OUT.reach * np.array([-1.0, 1.0]))
     residual, response = np.array([spectra.between(*band) for band in bands]).reshape(-1, 2).T

@@ -124,7 +124,7 @@ def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray
         expected = [np.real((l_r * factor[:, None]).T @ fit.amplitudes.T) for factor in (of_u, of_previous)]
         weight = (1.0 - f, f) if data.hold == "first" else (0.0, 1.0)
         deviation = columns - expected
-        if data.may_have_feedthrough:  # the direct term absorbs the component along its own column
+        if data.feedthrough:  # the direct term absorbs the component along its own column
             orthogonal = weight[1] * deviation[0] - weight[0] * deviation[1]
             cost[k] = (orthogonal**2 / ((weight[1] * noise[0]) ** 2 + (weight[0] * noise[1]) ** 2)).sum(axis=1)
         else:

@@ -100,7 +100,8 @@ def on_one_clock(
         rate += (1.0 + rate) * clock.rate
         if abs(rate) > OUTPUT_CLOCK.most or budget.spent("search for a clock of the outputs of its own"):
             return None
-        resampled = data.with_outputs([on_inputs_clock(record, rate) for record in data.records], rate)
+        on_one = [on_inputs_clock(record, rate) for record in data.records]
+        resampled = replace(data, records=on_one, clock=rate, line_std=None)
         other = fitted(resampled)
         if not other.poles.size:
             return None

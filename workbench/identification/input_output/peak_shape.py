@@ -59,7 +59,7 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
     n = fit.poles.size
     if not n:
         return Peaks(np.zeros(0, bool), np.zeros(0), np.zeros(0))
-    third = [_third_order_term(lines, pole, l_r) for pole, l_r in zip(fit.poles, fit.participation, strict=True)]
+    third = [lines.power_of_pole(pole, l_r, 3) for pole, l_r in zip(fit.poles, fit.participation, strict=True)]
     slopes = [lines.slopes(pole, l_r) for pole, l_r in zip(fit.poles, fit.participation, strict=True)]
     real, imaginary = (np.column_stack([s[k] for s in (*third, *slopes)]) for k in (0, 1))
     phi = columns(lines, fit.poles, fit.participation)[0]
@@ -93,14 +93,6 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
         significant = statistic[r] > noise_ratio * chi2.isf(PEAKS.false_alarm, 2)
         uneven[r] = significant and scatter[r] > PEAKS.matters * abs(pole.real)
     return Peaks(uneven, scatter, statistic)
-
-
-def _third_order_term(lines: Lines, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the real and of the imaginary part of the factor of l / (s - λ)³."""
-    s = 1j * lines.omega
-    above = participation[:, None] / (s - pole) ** 3
-    below = participation.conj()[:, None] / (s - pole.conjugate()) ** 3
-    return lines.stacked_pair(above, below)
 
 
 def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) -> dict[int, list[int]]:

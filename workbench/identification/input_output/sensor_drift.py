@@ -1,12 +1,15 @@
 """Drift of sensors in driven records: a test of polynomials of time against slow modes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from scipy.stats import chi2
 
+from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
+from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.model_order import Selected
 from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
@@ -49,16 +52,25 @@ def beside_drift(
     """
     if not may_drift(data.records):
         return data, None, ()
-    drifting = data.with_drift(DRIFT.degree)
+    drifting = replace(data, drift=DRIFT.degree)
     without, with_polynomials = selected(data), selected(drifting)
     n_outputs = data.values.shape[1]
     threshold = float(chi2.isf(FALSE_ALARM, n_outputs * (drifting.fixed.shape[1] - data.fixed.shape[1])))
     threshold_of_modes = without.limit * (without.fit.poles.size - with_polynomials.fit.poles.size)
     if drifting.cost(with_polynomials.fit) + threshold >= data.cost(without.fit) + threshold_of_modes:
         return data, without, ()
-    drift = drifting.drift_of(with_polynomials.fit)
+    drift = _range_of_drift(drifting, with_polynomials.fit)
     k, j = np.unravel_index(int(np.argmax(drift / with_polynomials.fit.noise)), drift.shape)
     record = data.records[int(k)]
     in_record = f" in record {record.name!r}" if len(data.records) > 1 else ""
     remark = f"outputs drift, {record.output_names[j]} by {drift[k, j]:.3g}{in_record}: fitted beside the modes"
     return drifting, with_polynomials, (remark,)
+
+
+def _range_of_drift(data: KnownInputs, fit: Fit) -> Floats:
+    """Range of the fitted polynomial of each output over each record, (n_records, n_outputs)."""
+    n_records, n_terms = len(data.records), data.drift + 1
+    first = 2 * fit.poles.size + data.fixed.shape[1] - n_terms * n_records
+    terms = fit.coefficients[first:].reshape(n_records, n_terms, -1)
+    powers = legvander(np.linspace(-1.0, 1.0, 50), data.drift)
+    return np.asarray(np.ptp(np.einsum("td,kdj->ktj", powers[:, 1:], terms[:, 1:]), axis=1))

@@ -192,7 +192,6 @@ def _beside_rivals(data: KnownInputs, fit: Fit, limit: float, budget: Budget) ->
         fit,
         alike,
         lambda data, cluster: in_place_of(data, fit, cluster, limit, budget),
-        lambda data, one: data.with_columns(one.columns, (one.pole,)),
         budget,
     )
 
