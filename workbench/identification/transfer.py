@@ -10,7 +10,6 @@ frequency.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +19,7 @@ from workbench.arrays import Floats
 from workbench.identification.input_output.changing_decay import beside_changing
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
-from workbench.identification.input_output.model_order import Selected, select_modes, statistic_of
+from workbench.identification.input_output.model_order import Selected, SelectionOptions, select_modes, statistic_of
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, relative_noise, window_rate
 from workbench.identification.signal.clocks import CLOCKS, late_outputs
@@ -186,14 +185,14 @@ def identify_transfer(
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
     turned = _is_acausal(h, f)
     h = h.conj() if turned else h
-    options: dict[str, Any] = {"channels": channels, "noise": noise, "max_modes": max_modes, "false_alarm": false_alarm}
-    estimate, s = _in_bands(h, f, budget, **options), 2j * np.pi * f
+    options = SelectionOptions(max_modes, false_alarm, budget)
+    estimate, s = _in_bands(h, f, noise, channels, options), 2j * np.pi * f
     for least in (CLOCKS.phase, CLOCKS.refined):
         late = _output_delays(estimate, channels, least)
         if not late.any() or budget.spent("search for delays of the outputs"):
             break
         delays = estimate.delays + late
-        estimate = _in_bands(h * np.exp(s * delays[:, None, None]), f, budget, **options)
+        estimate = _in_bands(h * np.exp(s * delays[:, None, None]), f, noise, channels, options)
         estimate = replace(
             estimate,
             delays=frozen(delays),
@@ -227,12 +226,9 @@ def identify_transfer(
 def _in_bands(
     h: np.ndarray,
     f: np.ndarray,
-    budget: Budget,
-    *,
-    channels: Sequence[Channel],
     noise: np.ndarray | None,
-    max_modes: int,
-    false_alarm: float,
+    channels: Sequence[Channel],
+    options: SelectionOptions,
 ) -> TransferModes:
     """The modes of all lines; more than `TRANSFER.most_lines` are fitted band by band."""
     n_bands, lines_a_mode = (
@@ -244,18 +240,17 @@ def _in_bands(
         first, last = round(k * share), round((k + 1) * share)
         inside = slice(max(first - TRANSFER.overlap_lines, 0), last + TRANSFER.overlap_lines)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
-        selected = _select_in_band(
-            band_budget,
+        lines = Lines(
             h[..., inside],
             2.0 * np.pi * f[inside],
             _residual_powers(channels),
             None if noise is None else noise[..., inside],
-            max_modes=min(max_modes, f[inside].size // lines_a_mode),
-            false_alarm=false_alarm / n_bands,
         )
+        most = min(options.max_modes, lines.omega.size // lines_a_mode)
+        selected = _select_in_band(lines, SelectionOptions(most, options.false_alarm / n_bands, band_budget))
         return _modes_of(*selected, channels, edges, f[first:last])
 
-    budgets, results = [], []
+    budget, budgets, results = options.budget, [], []
     for k in range(n_bands):
         budgets.append(budget.apart(1.0 / (n_bands - k)))
         results.append(band(k, budgets[k]))
@@ -287,15 +282,13 @@ def _delay_remarks(delays: Floats, channels: Sequence[Channel]) -> tuple[str, ..
     )
 
 
-def _select_in_band(
-    budget: Budget, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, **options: Any
-) -> tuple[Lines, Selected]:
+def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, Selected]:
     """The lines of a band with weights, and their modes; noise not stated is estimated from the strongest modes."""
-    lines, options = Lines(h, omega, powers, noise), {**options, "budget": budget}
-    if noise is not None:
+    if lines.noise is not None:
         return _select_with_changing(lines, options)
-    few = options | {"max_modes": min(TRANSFER.strongest, options["max_modes"])}
-    selected = select_modes(lines, **few)
+    h, budget = lines.h, options.budget
+    few = replace(options, max_modes=min(TRANSFER.strongest, options.max_modes))
+    selected = select_modes(lines, few)
     guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
     if guessed is None:  # noise proportional to the response would look like modes that change
         lines, selected = _select_with_changing(lines, few, selected)
@@ -305,7 +298,7 @@ def _select_in_band(
     # suppress modelling errors, which are smooth over the lines. The residual is scaled first, because a few large
     # lines among small ones would show some correlation in any case.
     scaled = residual if guessed is None else residual / guessed
-    lines = replace(lines, window_rate=window_rate(scaled, omega))
+    lines = replace(lines, window_rate=window_rate(scaled, lines.omega))
     differences = np.diff(scaled, 2)
     mixing = mixing_of(correlation_of_lines([differences.reshape(len(h), -1)]))
     if mixing is None:
@@ -325,19 +318,19 @@ def _select_in_band(
 
 
 def _select_with_changing(
-    lines: Lines, options: dict[str, Any], selected: Selected | None = None
+    lines: Lines, options: SelectionOptions, selected: Selected | None = None
 ) -> tuple[Lines, Selected]:
     """The lines with columns for the motion of modes that change, and the modes, one for each that changes."""
-    selected = select_modes(lines, **options) if selected is None else selected
-    while (change := beside_changing(lines, selected.fit, selected.limit, options["budget"])) is not None:
+    selected = select_modes(lines, options) if selected is None else selected
+    while (change := beside_changing(lines, selected.fit, selected.limit, options.budget)) is not None:
         lines, start = change
-        selected = select_modes(lines, start=start, **options)
+        selected = select_modes(lines, options, start)
     return lines, selected
 
 
-def _select_weighted(lines: Lines, selected: Selected, options: dict[str, Any]) -> tuple[Lines, Selected]:
+def _select_weighted(lines: Lines, selected: Selected, options: SelectionOptions) -> tuple[Lines, Selected]:
     """The lines and their modes, with alternating estimates of noise and modes, for outputs of uncorrelated noise."""
-    budget = options["budget"]
+    budget = options.budget
     before: np.ndarray | None = None
     for _ in range(TRANSFER.noise_rounds):
         guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
@@ -351,9 +344,7 @@ def _select_weighted(lines: Lines, selected: Selected, options: dict[str, Any]) 
         weighted = replace(lines, noise=guessed, guessed=True, beside=None, changing=())
         # The selection starts from the modes found: with noise proportional to the response, lines between modes have
         # the largest weights, and the least information.
-        weighted, reselected = _select_with_changing(
-            weighted, options, select_modes(weighted, start=selected.fit, **options)
-        )
+        weighted, reselected = _select_with_changing(weighted, options, select_modes(weighted, options, selected.fit))
         if budget.spent("estimation of the noise") and reselected.fit.poles.size < selected.fit.poles.size:
             return lines, selected
         lines, selected = weighted, reselected
@@ -395,7 +386,7 @@ def _modes_of(
     left_out = ", ".join(f"{f:.4g}" for f in damped_hz[within & ~sure])
     derivative, poles = time_derivatives(channels)[:, None], fit.poles[inside]
     shapes, participation = scaled_vectors(fit, inside, derivative)
-    vectors = vector_covariance(fit, noise_ratio, derivative, inside, shapes, participation.shape[1])
+    vectors = vector_covariance(fit, noise_ratio, derivative, inside, lines.n_inputs)
     kept = np.r_[inside, fit.poles.size + inside]
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
     below, below_std, above = _residual_terms(lines, fit, noise_ratio, derivative[:, 0])

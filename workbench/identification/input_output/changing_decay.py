@@ -24,11 +24,10 @@ from workbench.identification.free_decay.backbone import POWERS, backbone_integr
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.rivals import (
     RIVALS,
-    bases_of,
-    columns_beyond_linear,
+    bases_with_changes,
+    beyond_linear,
     diverged,
     in_place_of_clusters,
-    nearest_pole,
     projected_residual,
 )
 from workbench.identification.input_output.spectral_lines import Lines, rows_of_pair
@@ -109,8 +108,8 @@ def _beside(lines: Lines, decays: "_Decays", motions: np.ndarray) -> tuple[Lines
     mean = float(np.average(frequency, weights=power))
     scatter = float(np.sqrt(np.average((frequency - mean) ** 2, weights=power)))
     motion_rows = np.hstack(_Decays(lines, decays.pole, l_r).rows(motions))
-    pole = nearest_pole(lines, motion_rows[:, 0], decays.pole, l_r)
-    return lines.with_columns(columns_beyond_linear(lines, motion_rows, pole, l_r), (pole, scatter)), pole
+    further, pole = beyond_linear(lines, motion_rows, decays.pole, l_r)
+    return lines.with_columns(further, (pole, scatter)), pole
 
 
 class _Decays:
@@ -204,7 +203,7 @@ class _Peak:
         self.noise = fit.noise
         self.weights = (np.ones((1, fit.noise.size)) if lines.weights is None else lines.weights).T[:, :, None]
         others = np.setdiff1d(np.arange(fit.poles.size), cluster)
-        self.bases = bases_of(lines, fit, others, list(self.weights))
+        self.bases = bases_with_changes(lines, fit, others, list(self.weights))
         self.values = self._beyond_others(lines.values.T)
 
     def fitted(self, law: Law, starts: list[np.ndarray]) -> _Fitted | None:

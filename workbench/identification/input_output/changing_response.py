@@ -20,10 +20,9 @@ from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.noise_spectrum import lines_of
 from workbench.identification.input_output.rivals import (
     RIVALS,
-    bases_of,
-    columns_beyond_linear,
+    bases_with_changes,
+    beyond_linear,
     diverged,
-    nearest_pole,
     projected_residual,
 )
 from workbench.identification.signal.searches import Budget, Once
@@ -47,8 +46,9 @@ class ChangingResponseSettings:
 
 RESPONSE = ChangingResponseSettings()
 CHANGE_CHECK = "check of modes that change within the record"  # its name where the time is spent
-# (whether the rate changes with time, powers); λ is one coefficient more.
-LAWS = (
+Law = tuple[bool, tuple[float, ...]]  # whether the rate changes with time, and the powers
+# λ is one coefficient more.
+LAWS: tuple[Law, ...] = (
     (True, (1.0, 2.0)),
     (False, (1.0, 2.0)),
     (False, (0.5, 1.0)),
@@ -72,17 +72,18 @@ def in_place_of(
     n_excitations, n_outputs = fit.participation.shape[1], fit.noise.size
     threshold = np.log(_squares(linear, n_outputs)).sum() + limit * (cluster.size - 1) / (linear.size // n_outputs)
     n_coefficients = cluster.size * (n_excitations + n_outputs) - (n_excitations - 1 + n_outputs)
-    given_up: set[tuple[bool, tuple[float, ...]]] = set()
-    for by_time, powers in LAWS:
+    given_up: set[Law] = set()
+    for law in LAWS:
         if budget.spent(CHANGE_CHECK):
             break
-        parts = {law for law in LAWS if law[0] == by_time and set(law[1]) < set(powers)}
+        by_time, powers = law
+        parts = {other for other in LAWS if other[0] == by_time and set(other[1]) < set(powers)}
         if len(powers) + 1 > n_coefficients or (parts and parts <= given_up):
             continue
         try:
-            changing = response.fitted(by_time, np.array(powers), threshold, budget)
+            changing = response.fitted(law, threshold, budget)
         except _GivenUp:
-            given_up.add((by_time, powers))
+            given_up.add(law)
         else:
             if changing is not None:
                 return changing
@@ -191,13 +192,13 @@ class _Response:
         if data.weights is not None:
             self.weights = list(np.vstack([self._about(data.weights[part]) for part in data.rows]).T[:, :, None])
         others = np.setdiff1d(np.arange(fit.poles.size), cluster)
-        self.bases = bases_of(data, fit, others, self.weights, self._lines)
+        self.bases = bases_with_changes(data, fit, others, self.weights, self._lines)
         self.values = self._beyond(self.bases, self._lines(data.values).T)
 
     def linear_residual(self) -> Floats:
         """Residual of the linear modes in the lines about the cluster, (n,), all of them re-fitted to first order."""
         every_mode = np.arange(self.fit.poles.size)
-        bases = bases_of(self.data, self.fit, every_mode, self.weights, self._lines, poles_only=False)
+        bases = bases_with_changes(self.data, self.fit, every_mode, self.weights, self._lines, poles_only=False)
         return np.concatenate(self._beyond(bases, self._lines(self.fit.residual).T))
 
     def _beyond(self, bases: Sequence[Floats], outputs: Iterable[Floats]) -> list[Floats]:
@@ -205,9 +206,7 @@ class _Response:
         scaled = [x / noise for x, noise in zip(outputs, self.fit.noise, strict=True)]
         return [x - basis @ (basis.T @ x) for x, basis in zip(scaled, bases, strict=True)]
 
-    def fitted(
-        self, by_time: bool, powers: Floats, threshold: float, budget: Budget
-    ) -> tuple[KnownInputs, complex] | None:
+    def fitted(self, law: Law, threshold: float, budget: Budget) -> tuple[KnownInputs, complex] | None:
         """The records beside the changing mode of a law, and its pole; None where it leaves too large a residual.
 
         Args:
@@ -216,8 +215,8 @@ class _Response:
         Raises:
             _GivenUp: the first step leaves far more, or the time is spent.
         """
-        once = Once(lambda x: self._residual(self._motions(_with_neighbours(x), by_time, powers)))
-        start = self._start(by_time, powers)
+        once = Once(lambda x: self._residual(self._motions(_with_neighbours(x), law)))
+        start = self._start(law)
         unknowns = np.r_[start.real, start.imag]
         sensitivity = np.linalg.norm(once(unknowns)[1], axis=0)
         # After an impact, an initial state excites a mode as the input does.
@@ -233,7 +232,7 @@ class _Response:
         def among_active(x: Floats) -> tuple[Floats, Floats]:
             unknowns[active] = x
             if len(beyond) == 1:  # without the Jacobian, which takes most of the time
-                beyond.append(beyond_threshold(self._residual(self._motions(unknowns[None], by_time, powers))[0]))
+                beyond.append(beyond_threshold(self._residual(self._motions(unknowns[None], law))[0]))
             if (len(beyond) == 2 and min(beyond) > RESPONSE.hopeless) or budget.spent(CHANGE_CHECK):
                 raise _GivenUp
             residual, jacobian = once(unknowns)
@@ -244,14 +243,14 @@ class _Response:
         unknowns[active] = Once(among_active).least(unknowns[active], RESPONSE.most_tries)
         if beyond_threshold(once(unknowns)[0]) > 0.0:
             return None
-        motions = self._motions(_with_neighbours(unknowns), by_time, powers)
+        motions = self._motions(_with_neighbours(unknowns), law)
         rows = self.data.rows_of([np.hstack([z.real, z.imag]) for z in motions])
-        pole = nearest_pole(self.data, rows[:, 0], self.pole, self.participation)
-        return self.data.with_columns(columns_beyond_linear(self.data, rows, pole, self.participation), (pole,)), pole
+        further, pole = beyond_linear(self.data, rows, self.pole, self.participation)
+        return self.data.with_columns(further, (pole,)), pole
 
-    def _start(self, by_time: bool, powers: Floats) -> np.ndarray:
+    def _start(self, law: Law) -> np.ndarray:
         """Starting coefficients of a law: regression on the sum of the linear modes, from sample to sample."""
-        fit, dt = self.fit, self.data.dt
+        fit, dt, (by_time, powers) = self.fit, self.data.dt, law
         weighted_shape = fit.amplitudes[:, self.cluster[0]] / fit.noise**2
         strength = weighted_shape.conj() @ fit.amplitudes[:, self.cluster]
         participation = strength @ fit.participation[self.cluster]
@@ -268,22 +267,22 @@ class _Response:
             n = z.size
             time = np.minimum((np.arange(n - 1) / (n - 1) - self.middle) / self.width, RESPONSE.faded)
             size = time if by_time else np.maximum(np.abs(z[:-1]) / self.scale, RESPONSE.least)
-            regressor = np.column_stack([np.ones(n - 1), size[:, None] ** powers])
+            regressor = np.column_stack([np.ones(n - 1), size[:, None] ** np.array(powers)])
             regressors.append(regressor * z[:-1, None])
             rates.append((propagated * np.exp(-self.pole * dt) - z[:-1]) / dt / self.rate)
         coefficients = np.linalg.lstsq(np.vstack(regressors), np.concatenate(rates), rcond=None)[0]
         held_factors = self.participation[self.others]
         return np.asarray(np.r_[coefficients, (participation[self.others] / unit - held_factors) / self.units])
 
-    def _motions(self, cases: Floats, by_time: bool, powers: Floats) -> list[np.ndarray]:
+    def _motions(self, cases: Floats, law: Law) -> list[np.ndarray]:
         """z of each record at the first case, and its change to each other, (n_samples, n_cases) each.
 
         Args:
             cases: (n_cases, n_unknowns), as `_with_neighbours` gives, or the first of these alone.
         """
-        half = cases.shape[1] // 2
+        (by_time, powers), half = law, cases.shape[1] // 2
         coefficients = cases[:, :half] + 1j * cases[:, half:]
-        size = 1 + powers.size
+        size = 1 + len(powers)
         participation = np.tile(self.participation, (len(cases), 1))
         participation[:, self.others] += coefficients[:, size:] * self.units
         step, motions = np.exp(self.pole * self.data.dt), []
@@ -292,9 +291,9 @@ class _Response:
             drive = all_cases[1:] - step * all_cases[:-1]
             driven_samples = np.flatnonzero(np.abs(drive).max(axis=1) > RESPONSE.undriven * self.scale)
             simulated = _simulated(
-                np.ascontiguousarray(all_cases[0]), drive, self.rate * coefficients[:, :size], powers, by_time, step,
-                self.scale, RESPONSE.least, RESPONSE.largest, self.data.dt, self.middle, self.width, RESPONSE.faded,
-                int(driven_samples[-1]) + 1 if driven_samples.size else 0,
+                np.ascontiguousarray(all_cases[0]), drive, self.rate * coefficients[:, :size], np.array(powers),
+                by_time, step, self.scale, RESPONSE.least, RESPONSE.largest, self.data.dt, self.middle, self.width,
+                RESPONSE.faded, int(driven_samples[-1]) + 1 if driven_samples.size else 0,
                 max(int(RESPONSE.step / (self.rate * self.data.dt)), 1),
             )  # fmt: skip
             motions.append(np.column_stack([simulated[:, 0], (simulated[:, 1:] - simulated[:, :1]) / RIVALS.slightly]))

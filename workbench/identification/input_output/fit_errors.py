@@ -16,6 +16,7 @@ from workbench.identification.input_output.modal_fit import (
     Part,
     free_parameters,
     normal_equations,
+    scaled_vectors,
     tangent_weights,
 )
 from workbench.identification.signal.modal_estimates import by_poles
@@ -100,7 +101,6 @@ def vector_covariance(
     noise_ratio: np.ndarray,
     derivative: np.ndarray,
     kept: np.ndarray,
-    shapes: np.ndarray,
     n_inputs: int,
     further: Floats | None = None,
 ) -> np.ndarray:
@@ -112,7 +112,6 @@ def vector_covariance(
         noise_ratio: κ, (n_outputs, n_modes).
         derivative: (n_outputs, 1) order of the time derivative of displacement that each output measures.
         kept: (n_kept,) indices of the modes that are reported.
-        shapes: (n_outputs, n_kept) as reported, see `scaled_vectors`.
         n_inputs: number of excitations, the first ones, that are inputs.
         further: as in `propagated_covariance`.
 
@@ -124,7 +123,7 @@ def vector_covariance(
         return np.zeros((0, k, k))
     largest = np.abs(fit.amplitudes[:, kept] / fit.poles[kept] ** derivative).argmax(axis=0)
     modes = np.arange(kept.size)
-    scale = shapes[largest, modes]
+    scale = scaled_vectors(fit, kept, derivative)[0][largest, modes]
 
     def functions(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
         displacements = amplitudes[:, kept] / poles[kept] ** derivative
@@ -132,9 +131,8 @@ def vector_covariance(
         driven = participation[kept, :n_inputs] * (0.5 * displacements[largest, modes] / scale)[:, None]
         return np.concatenate([relative.real.T, driven.real, driven.imag], axis=1).ravel()
 
-    blocks = propagated_covariance(fit, functions, noise_ratio, further).reshape(kept.size, k, kept.size, k)[
-        modes, :, modes
-    ]
+    covariance_of_all = propagated_covariance(fit, functions, noise_ratio, further)
+    blocks = covariance_of_all.reshape(kept.size, k, kept.size, k)[modes, :, modes]
     blocks[modes, largest], blocks[modes, :, largest] = 0.0, 0.0  # one by definition
     return blocks
 

@@ -24,10 +24,10 @@ from workbench.arrays import Complexes, Flags, Floats
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, projected, tangent_weights
-from workbench.identification.input_output.model_order import sure_modes
+from workbench.identification.input_output.model_order import SelectionOptions, sure_modes
 from workbench.identification.input_output.noise_spectrum import autoregression, lines_of, samples_of
 from workbench.identification.signal.projection import PROJECTION
-from workbench.identification.signal.searches import FALSE_ALARM, Budget
+from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
 
 
@@ -179,7 +179,7 @@ def _likeliest_levels(power: Floats, gain: Floats, highest: Floats) -> tuple[Flo
 
 
 def with_white_noise(
-    data: KnownInputs, fit: Fit, noise: InputNoise, false_alarm: float, budget: Budget
+    data: KnownInputs, fit: Fit, noise: InputNoise, options: SelectionOptions
 ) -> tuple[KnownInputs, Fit]:
     """The records with the expected inputs and outputs without the noise that these leave, and the modes.
 
@@ -191,7 +191,7 @@ def with_white_noise(
     std = np.sqrt(noise.sensors_at(_frequencies(data) * data.dt) ** 2 + np.tensordot(noise.inputs**2, gain, 1)).T
     weighted = replace(data, line_std=[std[rows] / np.sqrt((std**2).mean(axis=0)) for rows in data.rows])
     # lines of equal weight may take the noise peak at a strong mode for a further mode; the weighted lines do not
-    fit = sure_modes(weighted, projected(weighted, fit.poles, fit.participation), false_alarm, budget)
+    fit = sure_modes(weighted, projected(weighted, fit.poles, fit.participation), options)
     return _whitened(weighted, fit, noise), fit
 
 
@@ -264,7 +264,7 @@ def spread_by_inputs(data: KnownInputs, fit: Fit, std: Floats, acts: Sequence[Fl
     return total
 
 
-def blow_noise(logged: Sequence[Record], windowed: Sequence[Record]) -> Floats:
+def noise_outside_impacts(logged: Sequence[Record], windowed: Sequence[Record]) -> Floats:
     """Standard deviation of the noise that force windows removed from each input, (n_inputs,).
 
     The impacts contain as much.

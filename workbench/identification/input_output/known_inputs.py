@@ -280,14 +280,9 @@ class KnownInputs:
         """Rows of the fit of one record as samples."""
         return samples_of(rows) if self.rows_are_lines else rows
 
-    def modulated(self, rows: Floats, factor: Floats) -> Floats:
-        """Columns (n_rows, k) times a factor at each sample, (n_samples,) of all records."""
-        return self.rows_of([self.samples(rows[part]) * factor[part, None] for part in self.rows])
-
-    @property
-    def time(self) -> Floats:
-        """Time of each sample within its record, from -1/2 at the first to 1/2 at the last, (n_samples,)."""
-        return np.concatenate([np.linspace(-0.5, 0.5, part.stop - part.start) for part in self.rows])
+    def times_time(self, rows: Floats) -> Floats:
+        """Columns (n_rows, k) times the time within each record, -1/2 at its first sample and 1/2 at its last."""
+        return self.rows_of([x * np.linspace(-0.5, 0.5, len(x))[:, None] for x in self.as_samples(rows)])
 
     def modal_coordinate(self, pole: complex, l_r: np.ndarray) -> list[np.ndarray]:
         """Modal coordinate z of a pole at the samples of each record, (n_samples,) complex each."""

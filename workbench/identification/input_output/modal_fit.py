@@ -253,6 +253,11 @@ def column_norms(columns: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(np.einsum("kc,kc->c", columns, columns)))
 
 
+def normalised_columns(rows: np.ndarray) -> np.ndarray:
+    """Columns scaled to unit length."""
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300))
+
+
 def orthonormal(columns: np.ndarray) -> Pair:
     """Q and R of columns: by two Cholesky factorisations where well conditioned, else by Householder reflections.
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from workbench.arrays import scaled_inverse
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, orthonormal, regressors
-from workbench.identification.input_output.rivals import normalised_columns
+from workbench.identification.input_output.modal_fit import Fit, normalised_columns, orthonormal, regressors
 from workbench.identification.input_output.time_variance import slopes_in_time
 from workbench.identification.signal.modal_estimates import time_derivatives
 from workbench.identification.signal.searches import Budget

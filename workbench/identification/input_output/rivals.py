@@ -17,6 +17,7 @@ from workbench.identification.input_output.modal_fit import (
     Pair,
     columns,
     modal_coordinate,
+    normalised_columns,
     projected,
 )
 from workbench.identification.input_output.model_order import statistic_of_each
@@ -88,23 +89,23 @@ def orthonormal_basis(rows: np.ndarray, least: float) -> Floats:
     return np.asarray(u[:, s > least])
 
 
-def normalised_columns(rows: np.ndarray) -> Floats:
-    """Columns scaled to unit length."""
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300))
+def beyond_linear(data: Measurement, motions: np.ndarray, pole: complex, l_r: np.ndarray) -> tuple[Floats, complex]:
+    """Orthonormal columns of a motion beyond the nearest linear mode, (n_rows, n_columns), and the pole of that mode.
 
+    Orthogonal to that mode, its slope by the pole, and the fixed columns.
 
-def columns_beyond_linear(data: Measurement, columns: np.ndarray, pole: complex, l_r: np.ndarray) -> Floats:
-    """Orthonormal columns of a motion, (n_rows, n_columns), beyond a linear mode and the fixed columns.
-
-    Orthogonal to the linear mode of the pole, its slope by the pole, and the fixed columns.
+    Args:
+        motions: (n_rows, n_motions) of a changing mode, and of its changes with the unknowns.
+        pole: from which the nearest linear mode, of participation factors l_r, is searched.
     """
-    constant = np.column_stack([*modal_coordinate(data.responses(pole), l_r), *data.slopes(pole, l_r)])
-    constant = orthonormal_basis(normalised_columns(np.hstack([constant, data.fixed])), RIVALS.collinear)
-    columns = normalised_columns(columns)
-    return orthonormal_basis(columns - constant @ (constant.T @ columns), RIVALS.significant)
+    pole = _nearest_pole(data, motions[:, 0], pole, l_r)
+    linear = np.column_stack([*modal_coordinate(data.responses(pole), l_r), *data.slopes(pole, l_r)])
+    linear = orthonormal_basis(normalised_columns(np.hstack([linear, data.fixed])), RIVALS.collinear)
+    motions = normalised_columns(motions)
+    return orthonormal_basis(motions - linear @ (linear.T @ motions), RIVALS.significant), pole
 
 
-def bases_of(
+def bases_with_changes(
     data: Measurement,
     fit: Fit,
     modes: np.ndarray,
@@ -160,7 +161,7 @@ def diverged(values: Sequence[Floats], n_unknowns: int) -> Pair:
     return residual, np.zeros((residual.size, n_unknowns))
 
 
-def nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:
+def _nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:
     """Pole of the linear mode, of given participation factors, nearest to a motion (n_rows,) in least squares."""
     rate, best, step, smallest = abs(pole.real), pole, 0j, np.inf
     for _ in range(RIVALS.most_poles):
