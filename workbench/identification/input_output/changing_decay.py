@@ -87,9 +87,10 @@ def _rival_of(lines: Lines, fit: Fit, cluster: np.ndarray, limit: float) -> tupl
     if linear is None:
         return None
     linear_decay = (strength * np.exp(np.outer(peak.decays.time, poles - mean))).sum(axis=1)
-    laws = (law for n_coefficients, law in LAWS if n_coefficients <= 2 * cluster.size - 1)
-    for law in laws:
-        changing = peak.fitted(law, peak.starts(law, linear_decay))
+    for n_coefficients, law in LAWS:
+        if n_coefficients > 2 * cluster.size - 1:
+            break
+        changing = peak.fitted(law, peak.starts(law, n_coefficients, linear_decay))
         # As in a free decay, two modes must be likelier than one by the threshold of a further mode.
         if changing is not None and changing.log_likelihood >= linear.log_likelihood - limit * (cluster.size - 1):
             return _beside(lines, peak.decays, changing.motions)
@@ -223,9 +224,8 @@ class _Peak:
         logs = np.log((residual**2).sum(axis=1) + floor).sum()
         return _Fitted(-residual.shape[1] * float(logs), self._motions(law, best))
 
-    def starts(self, law: Law, decay: np.ndarray) -> list[np.ndarray]:
-        """Two starting points of a law: a fit to the sum of the linear modes, m (n_knots,), and no change."""
-        size = next(n_coefficients for n_coefficients, each in LAWS if each is law)
+    def starts(self, law: Law, size: int, decay: np.ndarray) -> list[np.ndarray]:
+        """Two starts of a law of so many coefficients: a fit to m (n_knots,) of the linear modes, and no change."""
         decays, constant = self.decays, np.zeros(size, complex)
         base = np.log(law(decays, constant))
         steps = [np.log(law(decays, constant + step)) - base for turn in (0.1, 0.1j) for step in turn * np.eye(size)]
