@@ -289,10 +289,10 @@ def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, Sel
     h, budget = lines.h, options.budget
     few = replace(options, max_modes=min(TRANSFER.strongest, options.max_modes))
     selected = select_modes(lines, few)
-    guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
+    guessed = relative_noise(lines, selected.fit)
     if guessed is None:  # noise proportional to the response would look like modes that change
         lines, selected = _select_with_changing(lines, few, selected)
-        guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
+        guessed = relative_noise(lines, selected.fit)
     residual = lines.left(selected.fit)
     # Correlation of noise is tested in second differences over the lines (Hann's window of the impulse response): they
     # suppress modelling errors, which are smooth over the lines. The residual is scaled first, because a few large
@@ -310,7 +310,7 @@ def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, Sel
     )
     lines = replace(uncorrelated, h=h, noise=None, guessed=False)
     fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
-    guessed = relative_noise(lines.left(fit), lines.fitted(fit), lines.omega)
+    guessed = relative_noise(lines, fit)
     if guessed is not None:
         lines = replace(lines, noise=guessed, guessed=True)
         fit = settled(lines, projected(lines, fit.poles, fit.participation), budget=budget)
@@ -333,7 +333,7 @@ def _select_weighted(lines: Lines, selected: Selected, options: SelectionOptions
     budget = options.budget
     before: np.ndarray | None = None
     for _ in range(TRANSFER.noise_rounds):
-        guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
+        guessed = relative_noise(lines, selected.fit)
         if guessed is None or (
             before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < TRANSFER.alike  # up to a factor
         ):

@@ -8,6 +8,7 @@ modes improve the prediction, over-fitted ones make it worse.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.stats import f as variance_ratio
@@ -67,12 +68,12 @@ def without_unpredictive(
         return fit, ()
     all_modes = projected(whole, fit.poles, fit.participation)
     noise, residual_of_all = all_modes.noise, _ResidualSpectra(whole, all_modes)
-    errors_by_modes: dict[bytes, list[Floats] | None] = {}
 
-    def prediction_error(kept: Flags) -> list[Floats] | None:
+    @cache
+    def prediction_error(kept: tuple[int, ...]) -> list[Floats] | None:
         """Power of the prediction error in the second half of each record, (n_lines,), in units of the noise."""
         try:
-            start = projected(half, fit.poles[kept], fit.participation[kept])
+            start = projected(half, fit.poles[list(kept)], fit.participation[list(kept)])
             first_half = settled(half, start, SELECTION.few_steps, budget)
             with np.errstate(over="ignore", invalid="ignore"):
                 predicted = columns(whole, first_half.poles, first_half.participation)[0] @ first_half.coefficients
@@ -86,10 +87,7 @@ def without_unpredictive(
 
     def error(kept: Flags, lowest: float, highest: float) -> float:
         """Squared prediction error in the lines between two frequencies, rad/s."""
-        key = kept.tobytes()
-        if key not in errors_by_modes:
-            errors_by_modes[key] = prediction_error(kept)
-        powers = errors_by_modes[key]
+        powers = prediction_error(tuple(np.flatnonzero(kept).tolist()))
         return np.inf if powers is None else float(_between(powers, whole.highest, lowest, highest).sum())
 
     kept, distorted = np.ones(n, bool), []

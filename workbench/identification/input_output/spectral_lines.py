@@ -255,7 +255,7 @@ def window_rate(residual: np.ndarray, omega: np.ndarray) -> float:
     return float(WINDOWS[best] * step.mean() / (2.0 * np.pi)) if sure else 0.0
 
 
-def relative_noise(residual: np.ndarray, fitted: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
+def relative_noise(lines: Lines, fit: Fit) -> np.ndarray | None:
     """Relative noise of every line, (n_outputs, n_references, n_lines); None where it may be the same at all.
 
     s = c g(ω) (a² + b² |H|²)^½. c: level of each output and reference, where references differ. g: common to all,
@@ -265,26 +265,17 @@ def relative_noise(residual: np.ndarray, fitted: np.ndarray, omega: np.ndarray) 
     and r_k+1 is noise alone, of variance 3/2 s². H is the fitted one, since a measured H is correlated with its noise;
     where a mode is not yet fitted it is the running median of the measured one. g and b are estimated in both orders,
     and that of the smaller deviation is kept.
-
-    Args:
-        residual: (n_outputs, n_references, n_lines), complex.
-        fitted: the fit, of that shape.
-        omega: (n_lines,) rad/s.
     """
-    inner = np.arange(1, residual.shape[-1] - 1, 3)  # every third, so that no line is used twice
+    residual, fitted, omega = lines.left(fit), lines.fitted(fit), lines.omega
+    inner = np.arange(1, omega.size - 1, 3)  # every third, so that no line is used twice
     differences = np.abs(residual[..., inner] - 0.5 * (residual[..., inner - 1] + residual[..., inner + 1]))
-    smoothed = median_filter(np.abs(fitted + residual), (1, 1, LINES.smoothed))
-    size = np.maximum(np.abs(fitted), smoothed)
     nonzero = np.median(differences, axis=(1, 2)) > 0.0  # an output of zeros has no noise
     if not nonzero.any():
         return None
-    if not nonzero.all():
-        noise = np.ones(residual.shape)
-        of_nonzero = relative_noise(residual[nonzero], fitted[nonzero], omega)
-        noise[nonzero] = 1.0 if of_nonzero is None else of_nonzero
-        return None if of_nonzero is None else noise
+    smoothed = median_filter(np.abs(fitted + residual), (1, 1, LINES.smoothed))
+    size, differences = np.maximum(np.abs(fitted), smoothed)[nonzero], differences[nonzero]
     logs = np.log(np.maximum(differences, 1e-3 * np.median(differences, axis=-1, keepdims=True) + 1e-300))
-    levels = _reference_levels(logs)[..., None] * np.ones(residual.shape[-1])
+    levels = _reference_levels(logs)[..., None] * np.ones(omega.size)
     best, least_misfit = levels, np.inf
     for order in ((_frequency_trend, _response_trend), (_response_trend, _frequency_trend)):
         trial = levels
@@ -293,7 +284,11 @@ def relative_noise(residual: np.ndarray, fitted: np.ndarray, omega: np.ndarray) 
         error = logs - trial[..., inner]
         if (misfit := np.abs(error - np.median(error, axis=(1, 2), keepdims=True)).sum()) < least_misfit:
             best, least_misfit = trial, misfit
-    return np.exp(best) if best.any() else None
+    if not best.any():
+        return None
+    noise = np.ones(residual.shape)
+    noise[nonzero] = np.exp(best)
+    return noise
 
 
 def _reference_levels(logs: np.ndarray) -> np.ndarray:
