@@ -17,9 +17,9 @@ from scipy.linalg import block_diag
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.changing_decay import beside_changing
-from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
+from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, statistic_of, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
-from workbench.identification.input_output.model_order import Selected, SelectionOptions, select_modes, statistic_of
+from workbench.identification.input_output.model_order import Selected, SelectionOptions, select_modes
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, relative_noise, window_rate
 from workbench.identification.signal.clocks import CLOCKS, late_outputs

@@ -20,10 +20,10 @@ from scipy.stats import chi2
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.excitation import n_moving
-from workbench.identification.input_output.fit_errors import fixed_std
+from workbench.identification.input_output.fit_errors import fixed_std, statistic_of_each
 from workbench.identification.input_output.known_inputs import KnownInputs, sources
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
-from workbench.identification.input_output.model_order import ORDER, Selected, SelectionOptions, statistic_of_each
+from workbench.identification.input_output.model_order import ORDER, Selected, SelectionOptions
 from workbench.identification.input_output.selection import select, select_strongest, subspace_start
 from workbench.identification.signal.modal_estimates import time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget

@@ -7,14 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.arrays import scaled_inverse
-from workbench.identification.input_output.fit_errors import covariance
+from workbench.identification.input_output.fit_errors import marginal_statistics_of, statistic_of, statistic_of_each
 from workbench.identification.input_output.modal_fit import (
     MANY_ROWS,
     Fit,
     Measurement,
     column_norms,
-    free_parameters,
     modal_coordinate,
     normalised_columns,
     only,
@@ -23,7 +21,6 @@ from workbench.identification.input_output.modal_fit import (
     projected,
     search,
     settled,
-    tangent_weights,
 )
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget, Stepwise, overdamped
 from workbench.structure.modes import mac
@@ -433,44 +430,3 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     single_channel = shapes.shape[0] * data.n_inputs == 1
     splits = overlapping & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not single_channel)
     return np.asarray(splits.any(axis=1) | overdamped(poles) | _reaches_nyquist(data, poles))
-
-
-def statistic_of(fit: Fit, r: int) -> float:
-    """χ² of the shape of mode r in the noise, its pole and participation factors fixed."""
-    pair, noise, statistic = [r, fit.poles.size + r], fit.noise, 0.0
-    for part, outputs in fit.outputs():
-        c = part.coefficients[pair] / noise[outputs]
-        # a pole at Nyquist has no imaginary part at the samples: singular
-        statistic += float(np.einsum("ij,ik,kj->", c, scaled_inverse(part.spread[np.ix_(pair, pair)]), c))
-    return statistic
-
-
-def statistic_of_each(fit: Fit) -> np.ndarray:
-    """`statistic_of` each mode, (n_modes,)."""
-    return np.array([statistic_of(fit, r) for r in range(fit.poles.size)])
-
-
-def marginal_statistics_of(fit: Fit) -> np.ndarray:
-    """χ² of each mode's shape in the noise, (n_modes,), poles and participation factors of all modes unknown."""
-    n, bound, free = fit.poles.size, covariance(fit), free_parameters(fit)
-    statistics = np.zeros(n)
-    if n == 0:
-        return statistics
-    amplitudes = fit.coefficients[: 2 * n].reshape(2, n, -1)
-    effect = [np.einsum("ct,tkj->cjk", part.tilt[: 2 * n], tangent_weights(fit, part)[:, free]) for part in fit.parts]
-    for r in range(n):
-        pair = [r, n + r]
-        effects = np.concatenate([each[pair] for each in effect], axis=1)
-        size = 2 * effects.shape[1]
-        spread = effects.reshape(size, -1) @ bound @ effects.reshape(size, -1).T
-        spread = spread.reshape(2, size // 2, 2, size // 2)
-        for part, outputs in fit.outputs():
-            shape_covariance = part.spread[np.ix_(pair, pair)]
-            for j in range(outputs.start, outputs.stop):
-                spread[:, j, :, j] += shape_covariance * fit.noise[j] ** 2
-        c = amplitudes[:, r].ravel()
-        spread = spread.reshape(size, size)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))
-        # Nearly identical modes make it singular.
-        statistics[r] = c * scale @ np.linalg.pinv(spread * np.outer(scale, scale), hermitian=True) @ (c * scale)
-    return statistics

@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from workbench.arrays import Floats
+from workbench.identification.input_output.fit_errors import statistic_of_each
 from workbench.identification.input_output.modal_fit import (
     Fit,
     Measurement,
@@ -20,7 +21,6 @@ from workbench.identification.input_output.modal_fit import (
     normalised_columns,
     projected,
 )
-from workbench.identification.input_output.model_order import statistic_of_each
 from workbench.identification.signal.searches import Budget
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.identification.input_output.fit_errors import statistic_of_each
 from workbench.identification.input_output.held_out import without_unpredictive
 from workbench.identification.input_output.input_noise import input_noise, with_white_noise
 from workbench.identification.input_output.known_inputs import KnownInputs
@@ -15,7 +16,6 @@ from workbench.identification.input_output.model_order import (
     fit_of_poles,
     is_about_distorted,
     select_modes,
-    statistic_of_each,
     sure_modes,
 )
 from workbench.identification.input_output.noise_spectrum import alike

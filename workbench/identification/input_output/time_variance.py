@@ -22,6 +22,7 @@ from scipy.signal import lfilter
 
 from workbench.arrays import Floats, scaled_inverse
 from workbench.identification.input_output.changing_response import CHANGE_CHECK, in_place_of
+from workbench.identification.input_output.fit_errors import statistic_of, statistic_of_each
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import (
     Fit,
@@ -33,7 +34,6 @@ from workbench.identification.input_output.modal_fit import (
     regressors,
     settled,
 )
-from workbench.identification.input_output.model_order import statistic_of, statistic_of_each
 from workbench.identification.input_output.rivals import in_place_of_clusters, orthonormal_basis
 from workbench.identification.signal.searches import SELECTION, Budget
 from workbench.structure.modes import mac
