@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.arrays import Floats
-from workbench.identification.input_output.modal_fit import Fit, columns, normalised_columns
+from workbench.identification.input_output.modal_fit import Fit, changes_of, columns, normalised_columns
 from workbench.identification.input_output.spectral_lines import Lines
 
 
@@ -68,10 +68,7 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
     for j, (a, noise) in enumerate(zip(fit.amplitudes, fit.noise, strict=True)):
         weight = 1.0 if lines.weights is None else lines.weights[:, j : j + 1]
         q = np.linalg.qr(weight * phi)[0]
-        pair = np.tile(a, 2) / size
-        regressors = weight * np.hstack(
-            [pair.real * real - pair.imag * imaginary, -pair.imag * real - pair.real * imaginary]
-        )
+        regressors = weight * changes_of(np.tile(a, 2) / size, (real, imaginary))
         rows.append((regressors - q @ (q.T @ regressors)) / noise)
         residuals.append(fit.residual[:, j] / noise)
     m, y = np.vstack(rows), np.concatenate(residuals)

@@ -16,6 +16,7 @@ from workbench.identification.input_output.modal_fit import (
     Fit,
     Measurement,
     Pair,
+    changes_of,
     columns,
     modal_coordinate,
     normalised_columns,
@@ -128,8 +129,8 @@ def bases_with_changes(
     phi, real, imaginary = np.split(stacked, [phi.shape[1], phi.shape[1] + half // step], axis=1)
     bases = []
     for weight, a in zip(weights, np.repeat(fit.amplitudes[:, modes], of_mode // step, axis=1), strict=True):
-        changes = [a.real * real - a.imag * imaginary, -a.imag * real - a.real * imaginary]
-        bases.append(orthonormal_basis(normalised_columns(weight * np.hstack([phi, *changes])), RIVALS.collinear))
+        each = weight * np.hstack([phi, changes_of(a, (real, imaginary))])
+        bases.append(orthonormal_basis(normalised_columns(each), RIVALS.collinear))
     return bases
 
 
