@@ -7,9 +7,8 @@ from scipy.optimize import approx_fprime
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import binom
 
-from workbench.identification import driven
 from workbench.identification.driven import identify_driven
-from workbench.identification.input_output import time_variance
+from workbench.identification.input_output import selection, time_variance
 from workbench.identification.input_output.held_out import without_unpredictive
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import projected
@@ -643,10 +642,12 @@ def test_noise_is_estimated_beside_all_strong_modes(monkeypatch):
 
 def test_the_start_is_fitted_once_for_sure_and_for_strong_modes(monkeypatch):
     record = measured(system(1, 1), excitation("noise", 1, 6000), fraction=0.01)
-    starts, sure, strongest = [], driven.sure_modes, driven._select_strongest
-    monkeypatch.setattr(driven, "sure_modes", lambda data, fit, *rest: (starts.append(fit), sure(data, fit, *rest))[1])
+    starts, sure, strongest = [], selection.sure_modes, selection.select_strongest
     monkeypatch.setattr(
-        driven, "_select_strongest", lambda data, fit, **how: (starts.append(fit), strongest(data, fit, **how))[1]
+        selection, "sure_modes", lambda data, fit, *rest: (starts.append(fit), sure(data, fit, *rest))[1]
+    )
+    monkeypatch.setattr(
+        selection, "select_strongest", lambda data, how, fit: (starts.append(fit), strongest(data, how, fit))[1]
     )
     assert identify_driven(record, delays=0.0).modes.n_modes == 4
     assert starts[0] is starts[1] and starts[0].converged

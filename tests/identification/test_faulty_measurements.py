@@ -9,9 +9,9 @@ from scipy.signal import butter, cont2discrete, dlsim, firwin, lfilter
 from workbench.identification.ambient import identify_ambient
 from workbench.identification.driven import identify_driven
 from workbench.identification.input_output.excitation import unexcited_remarks
+from workbench.identification.input_output.fit_errors import statistic_of_each
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import projected
-from workbench.identification.input_output.model_order import statistic_of_each
 from workbench.identification.ring_down import ring_down
 from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.transfer import identify_transfer

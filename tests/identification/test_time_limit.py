@@ -7,11 +7,10 @@ import pytest
 from scipy.signal import lfilter
 
 import workbench as wb
-from workbench.identification import driven
 from workbench.identification.driven import _without_artefacts
-from workbench.identification.input_output import modal_fit
+from workbench.identification.input_output import modal_fit, selection
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.model_order import Selected
+from workbench.identification.input_output.model_order import Selected, SelectionOptions
 from workbench.identification.signal.modal_estimates import Identified, Refined, credible
 from workbench.identification.signal.searches import Budget
 from workbench.identification.signal.synthesis import free_decay
@@ -146,9 +145,11 @@ def test_the_strongest_modes_leave_time_for_the_check_of_those_that_change(monke
     moves = lfilter([0.0, z.imag], [1.0, -2.0 * z.real, abs(z) ** 2], force) + 0.01 * rng.standard_normal(n)
     record = Record(dt, moves[None], (Channel("v", "velocity"),), force[None], (Channel("f", "force"),))
     data, given = KnownInputs([record], at_rest=True, hold="zero", feedthrough=False), []
-    strongest = driven._select_strongest
+    strongest = selection.select_strongest
     monkeypatch.setattr(
-        driven, "_select_strongest", lambda *args, **how: given.append(how["budget"].seconds) or strongest(*args, **how)
+        selection,
+        "select_strongest",
+        lambda data, how, start: given.append(how.budget.seconds) or strongest(data, how, start),
     )
-    driven._select(data, Budget(20.0), None, max_modes=4, false_alarm=1e-3)
+    selection.select(data, SelectionOptions(4, budget=Budget(20.0)))
     assert 5.0 < given[0] <= 10.0

@@ -445,12 +445,12 @@ def test_a_band_that_ended_early_is_searched_in_the_time_that_others_leave(monke
     rng, searched, selected = np.random.default_rng(0), [], transfer._select_in_band
     h = h + 1e-4 * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
 
-    def ended_once(budget, h, omega, *args, **how):
+    def ended_once(lines, options):
         first = not searched
-        searched.append((omega[0], budget.seconds))
-        found = selected(budget, h, omega, *args, **how)
+        searched.append((lines.omega[0], options.budget.seconds))
+        found = selected(lines, options)
         if first:
-            budget.unfinished["search for further modes"] = 0.1
+            options.budget.unfinished["search for further modes"] = 0.1
         return found
 
     monkeypatch.setattr(transfer, "_select_in_band", ended_once)

@@ -7,7 +7,6 @@ of that noise is estimated from the residual, and the modes from it in turn (`in
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 from warnings import warn
 
 import control
@@ -21,16 +20,14 @@ from workbench.identification.input_output.changing_response import CHANGE_CHECK
 from workbench.identification.input_output.excitation import check_inputs, unexcited_remarks
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.force_window import force_window
-from workbench.identification.input_output.held_out import left_about, unpredictive_remarks, without_unpredictive
-from workbench.identification.input_output.input_delays import act_later, best_delays, first_lags, fractions
+from workbench.identification.input_output.held_out import left_about, unpredictive_remarks
+from workbench.identification.input_output.input_delays import delay_remarks, select_with_delays
 from workbench.identification.input_output.input_holds import hold_remarks
 from workbench.identification.input_output.input_noise import (
-    blow_noise,
-    input_noise,
     noise_levels,
+    noise_outside_impacts,
     noise_remarks,
     spread_by_inputs,
-    with_white_noise,
 )
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import (
@@ -42,25 +39,17 @@ from workbench.identification.input_output.modal_fit import (
     scaled_vectors,
     settled,
 )
-from workbench.identification.input_output.model_order import (
-    ORDER,
-    Selected,
-    fit_of_poles,
-    is_about_distorted,
-    select_modes,
-    statistic_of_each,
-    sure_modes,
-)
-from workbench.identification.input_output.noise_spectrum import alike
-from workbench.identification.input_output.output_clock import clock_remarks, on_inputs_clock, on_one_clock
+from workbench.identification.input_output.model_order import Selected, SelectionOptions
+from workbench.identification.input_output.output_clock import clock_remarks, on_inputs_clock
 from workbench.identification.input_output.peak_shape import overlap_remarks
 from workbench.identification.input_output.residual_bursts import burst_remarks
+from workbench.identification.input_output.selection import only_predictive, reweighted, select
 from workbench.identification.input_output.sensor_drift import beside_drift
-from workbench.identification.input_output.subspace_poles import subspace_poles
-from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
+from workbench.identification.input_output.time_variance import change_remarks, joined
 from workbench.identification.signal.data_quality import check_outputs_move, input_faults, of_same_sensors
 from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, credible, time_derivatives
+from workbench.identification.signal.projection import correlation, disturbed
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress, check_count
 from workbench.records.record import HOLDS, Channel, Record
 from workbench.renamed import Renamed, former_arguments
@@ -73,17 +62,11 @@ from workbench.threads import one_blas_thread
 class DrivenSettings:
     """Constants of the stages of an identification from known inputs."""
 
-    strongest: int = 8  # modes for the first estimate of the noise
-    noise_rounds: int = 4  # alternations between noise and modes
-    decorrelation_rounds: int = 2  # selections of modes in combinations of outputs whose noise is uncorrelated
-    spare_states: int = 20  # of a subspace model beyond two per mode: these fit noise
-    drift_share: float = 0.2  # of the time left, for each selection that decides on a drift
     driven_share: float = 0.3  # share of the motion of a mode due to the inputs, below which they do not drive it
     final_seconds: float = 5.0  # of processor time for the last check of modes, even after the search used up its time
 
 
 DRIVEN = DrivenSettings()
-DELAY_SEARCH = "search for delays of the inputs"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -264,7 +247,7 @@ def identify_driven(
         at_rest=at_rest,
         hold=hold,
         feedthrough=feedthrough,
-        delays=_checked_delays(records, delays),
+        delays=_checked_delays(records, 0.0 if delays is None else delays),
         distorted=by_amplitude.changing,
         free=by_amplitude.poles,
     )
@@ -273,19 +256,9 @@ def identify_driven(
         raise ValueError(
             f"record {records[0].name!r}: {rows} samples are too few for {records[0].n_inputs} inputs; measure longer"
         )
-    most_modes = min(max_modes, (rows - columns) // 6)
-    options = {"max_modes": most_modes, "false_alarm": false_alarm}
-    trials: list[Budget] = []
-
-    def selected_in(trial: KnownInputs) -> Selected:
-        trials.append(budget.aside(DRIVEN.drift_share))
-        return _select_strongest(trial, **options, budget=trials[-1])
-
-    data, strongest, drift = beside_drift(data, selected_in)
-    if any(trial.unfinished for trial in trials):
-        strongest = None
-    search = _select_with_delays if delays is None else _select
-    data, selected = search(data, budget, strongest, **options)
+    options = SelectionOptions(min(max_modes, (rows - columns) // 6), false_alarm, budget)
+    data, strongest, drift = beside_drift(data, options)
+    data, selected = (select_with_delays if delays is None else select)(data, options, strongest)
     if selected.fit.poles.size == 0:
         raise ValueError(
             f"record {records[0].name!r}: no mode between inputs {', '.join(records[0].input_names)} and outputs"
@@ -295,16 +268,16 @@ def identify_driven(
     if data.clock:
         logged, records = ([on_inputs_clock(record, data.clock) for record in each] for each in (logged, records))
     data, selected, changing = _as_time_invariant(data, selected, budget)
-    selected = _without_unpredictive(data, selected, Budget(DRIVEN.final_seconds))
+    selected = only_predictive(data, selected, Budget(DRIVEN.final_seconds))
     selected, remarks = _without_artefacts(data, selected, budget)
     if delays is None:
-        remarks = (*_delay_remarks(data), *remarks)
+        remarks = (*delay_remarks(data), *remarks)
     fit = joined(data, selected.fit, budget)
-    selected = selected if fit is selected.fit else selected.refitted(fit)
-    clocks = clock_remarks(data, selected.fit)
-    holds = hold_remarks(data, selected.fit, selected.limit, budget)
+    selected = selected.refitted(fit)
+    clocks = clock_remarks(data, fit)
+    holds = hold_remarks(data, fit, selected.limit, budget)
     bursts = burst_remarks(logged, data.left(fit), fit.noise)
-    overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
+    overlap = overlap_remarks(fit.poles, records[0].n_outputs * records[0].n_inputs)
     out_of_time = budget.spent(CHANGE_CHECK)
     in_decay = by_amplitude.among(fit.poles)
     changes, explained = ((), in_decay) if out_of_time else change_remarks(data, fit, changing, in_decay)
@@ -349,180 +322,12 @@ def _response_sizes(data: KnownInputs, fit: Fit) -> Floats:
     )
 
 
-def _select_with_delays(
-    data: KnownInputs, budget: Budget, strongest: Selected | None, **options: Any
-) -> tuple[KnownInputs, Selected]:
-    """The data with estimated input delays, and the modes.
-
-    A delay by a fraction of a sample is estimated where the first response to an input is later than without delay, or
-    where the input a sample earlier explains part of the residual.
-    """
-    first = first_lags(data.records)
-    if data.hold == "band-limited":
-        return _select_with_band_limited_delays(data, first, budget, strongest, **options)
-    whole = np.maximum(first - (0 if data.hold == "first" else 1), 0)
-    without_delay: tuple[KnownInputs, Selected] | None = None
-    if data.hold == "zero" and not first.any():
-        return _select(data, budget, strongest, **options)
-    delayed = data.delayed_by(whole, any_fraction=True)
-    strongest = _select_strongest(delayed, budget=budget, **options)
-    if not whole.any():
-        if strongest.fit.poles.size == 0:
-            return _select(data, budget, **options)
-        if not act_later(delayed, strongest.fit).any():
-            without_delay = undelayed, selected = _select(
-                data, budget, _select_strongest(data, strongest.fit, budget=budget, **options), **options
-            )
-            more_modes = selected.fit.poles.size > strongest.fit.poles.size
-            if not (more_modes and _any_acts_later(undelayed, selected, budget)) or budget.spent(DELAY_SEARCH):
-                return without_delay
-    undelayed = data
-    data, selected = _select(delayed, budget, strongest, **options)
-    fit = selected.fit
-    if fit.poles.size == 0:
-        return without_delay if without_delay is not None else (data.delayed_by(whole), selected)
-    whole, fraction = _whole_and_fraction(data, fit, whole, budget)
-    if not whole.any() and not fraction.any() and not budget.spent(DELAY_SEARCH):
-        if without_delay is not None:
-            return without_delay
-        return _select(undelayed, budget, _select_strongest(undelayed, fit, budget=budget, **options), **options)
-    delayed = data.delayed_by(whole + fraction)
-    return delayed, selected.refitted(settled(delayed, _for_other_delays(delayed, data, fit), budget=budget))
-
-
-def _select_with_band_limited_delays(
-    data: KnownInputs, first: Floats, budget: Budget, strongest: Selected | None, **options: Any
-) -> tuple[KnownInputs, Selected]:
-    """The data with estimated delays of band-limited inputs, and the modes.
-
-    The fraction of a sample is a parameter of its own here: no pair of fixed columns can represent it.
-    """
-    delayed = data.delayed_by(first) if first.any() else data
-    for _ in range(DRIVEN.noise_rounds):  # so that no mode is fitted to the effect of a delay
-        few, before = _subspace_start(delayed, **options), delayed
-        if few.poles.size:
-            delayed, _ = _with_best_delays(delayed, few, budget)
-        if delayed is before:
-            break
-    delayed, selected = _select(delayed, budget, strongest if delayed is data else None, **options)
-    if not selected.fit.poles.size:
-        return delayed, selected
-    improved, fit = _with_best_delays(delayed, selected.fit, budget)
-    if improved is delayed:
-        return delayed, selected
-    return improved, selected.refitted(settled(improved, fit, budget=budget))
-
-
-def _with_best_delays(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit]:
-    """The data with the most likely delays of band-limited inputs, and the fit with participation factors to match."""
-
-    def moved(delays: Floats) -> tuple[KnownInputs, Fit]:
-        other = data.delayed_by(delays)
-        return other, _for_other_delays(other, data, fit)
-
-    derivative = time_derivatives(data.records[0].output_channels)[:, None]
-    delays = best_delays(data.delays, moved, derivative, budget)
-    return (data, fit) if (delays == data.delays).all() else moved(delays)
-
-
-def _whole_and_fraction(data: KnownInputs, fit: Fit, whole: Floats, budget: Budget) -> tuple[Floats, Floats]:
-    """Delay of each input: whole samples, and the fraction of a sample, (n_inputs,) each, from a fit with any fraction.
-
-    The first response detected is a sample late where the response before it was below the noise.
-    """
-    fraction = _fractional_delays(data, fit)
-    doubtful = (whole > 0) & (fraction == 0)
-    while doubtful.any() and not budget.spent(DELAY_SEARCH):
-        data, fit = _with_free_fraction(data, fit, whole - doubtful, budget)
-        fraction_before = _fractional_delays(data, fit)
-        reduced = doubtful & (fraction_before < 1.0)
-        whole, fraction = whole - reduced, np.where(reduced, fraction_before, fraction)
-        doubtful = reduced & (whole > 0) & (fraction == 0)
-    return whole, fraction
-
-
-def _fractional_delays(data: KnownInputs, fit: Fit) -> Floats:
-    """Fraction of a sample by which each input acts later than in `data`, (n_inputs,); 0 where it does not."""
-    derivative = time_derivatives(data.records[0].output_channels)[:, None]
-    return np.where(act_later(data, fit), fractions(data, fit, derivative), 0.0)
-
-
-def _with_free_fraction(data: KnownInputs, fit: Fit, delays: Floats, budget: Budget) -> tuple[KnownInputs, Fit]:
-    """The data with inputs delayed by whole samples and any fraction, and a fit just precise enough for decisions."""
-    other = data.delayed_by(delays, any_fraction=True)
-    return other, settled(other, _for_other_delays(other, data, fit), SELECTION.few_steps, budget, ORDER.decided)
-
-
-def _for_other_delays(other: KnownInputs, data: KnownInputs, fit: Fit) -> Fit:
-    """The fit to `data` with participation factors changed to the input delays of `other`."""
-    turned = fit.participation.copy()
-    turned[:, : data.n_inputs] *= np.exp(np.outer(fit.poles, other.delays - data.delays) * data.dt)
-    return projected(other, fit.poles, turned)
-
-
-def _any_acts_later(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
-    """Whether any input acts later than in `data`, given the selected modes."""
-    other, trial = _with_free_fraction(data, selected.fit, data.delays, budget)
-    return bool(act_later(other, trial).any())
-
-
-def _select_strongest(data: KnownInputs, start: Fit | None = None, **options: Any) -> Selected:
-    """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN.strongest`.
-
-    As long as all are sure, as many more are searched: strong modes left out would be taken for noise.
-    """
-    fit, budget = _subspace_start(data, **options) if start is None else start, options["budget"]
-    few = _few_modes(options, fit.poles.size)
-    while True:
-        selected = _without_unpredictive(data, select_modes(data, start=fit, **few), budget)
-        fit, most = selected.fit, few["max_modes"]
-        if fit.poles.size < most or most == options["max_modes"]:
-            return selected
-        # beside the residual about each: noise of the inputs leaves peaks at the modes far above white noise
-        if sure_modes(data, fit, options["false_alarm"], budget).poles.size < fit.poles.size:
-            return selected
-        few = _few_modes(options, most + DRIVEN.strongest)
-
-
-def _subspace_start(data: KnownInputs, **options: Any) -> Fit:
-    """The significant modes of a subspace model, at most `max_modes`."""
-    poles = subspace_poles(data.records, data.whole, 2 * options["max_modes"] + DRIVEN.spare_states)
-    poles = np.append(poles[~is_about_distorted(data, poles)], data.free)
-    fit = fit_of_poles(data, poles, options["false_alarm"])
-    if fit.poles.size <= options["max_modes"]:
-        return fit
-    return only(data, fit, np.argsort(statistic_of_each(fit))[-options["max_modes"] :])
-
-
-def _without_unpredictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
-    """The selected modes without those that make the prediction of held-out data worse.
-
-    These are marked as distorted: no further mode is searched near them.
-    """
-    fit, distorted = without_unpredictive(data, selected.fit, selected.statistic, budget)
-    selected = selected if fit is selected.fit else selected.refitted(fit)
-    return replace(selected, distorted=(*data.distorted, *distorted))
-
-
-def _few_modes(options: dict[str, Any], fewest: int) -> dict[str, Any]:
-    """The options with at most `DRIVEN.strongest` modes, or `fewest` where these are more."""
-    return {**options, "max_modes": min(max(DRIVEN.strongest, fewest), options["max_modes"])}
-
-
-def _delay_remarks(data: KnownInputs) -> tuple[str, ...]:
-    names = data.records[0].input_names
-    late = [f"{names[i]} {d:.2f} samples ({d * data.dt:.3g} s)" for i, d in enumerate(data.delays) if d > 0]
-    return (f"inputs act late, by {', '.join(late)}: the model takes the delayed inputs",) if late else ()
-
-
-def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.ndarray | None:
-    """Delay of each input in samples, (n_inputs,), from delays in s; None where none are given.
+def _checked_delays(records: Sequence[Record], delays: ArrayLike) -> np.ndarray:
+    """Delay of each input in samples, (n_inputs,), from delays in s.
 
     Raises:
         ValueError: a delay that is negative or longer than a quarter of the shortest record.
     """
-    if delays is None:
-        return None
     dt, given = records[0].sample_time, np.broadcast_to(np.asarray(delays, float), (records[0].n_inputs,))
     longest = 0.25 * min(record.n_samples for record in records) * dt
     if not ((given >= 0) & (given <= longest)).all():
@@ -531,76 +336,6 @@ def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.n
         )
     whole = np.round(given / dt)
     return np.where(np.abs(given / dt - whole) < 1e-6, whole, given / dt)
-
-
-def _select(
-    data: KnownInputs, budget: Budget, strongest: Selected | None = None, **options: Any
-) -> tuple[KnownInputs, Selected]:
-    """The modes, estimated with the strongest first; where noise of the outputs is correlated, in combinations without.
-
-    Returns:
-        the data, weighted by their noise, and the modes.
-    """
-    options["budget"] = budget
-    start = _subspace_start(data, **options) if strongest is None else strongest.fit
-    start = settled(data, start, SELECTION.few_steps, budget, ORDER.decided)  # once for all searches from there
-    sure = sure_modes(data, start, options["false_alarm"], budget)
-
-    def sure_of(other: KnownInputs) -> Fit:
-        return sure_modes(other, _subspace_start(other, **options), options["false_alarm"], budget)
-
-    on_one = on_one_clock(data, sure, sure_of, budget)
-    if on_one is not None:
-        (data, sure), strongest = on_one, None
-        start = sure
-    noise = None if budget.spent("search for noise of the inputs") else input_noise(data, sure)
-    if noise is not None:
-        (data, start), strongest = with_white_noise(data, sure, noise, options["false_alarm"], budget), None
-    if strongest is None:
-        strongest = _select_strongest(data, start, **{**options, "budget": budget.share(SELECTION.search_share)})
-    data = data.with_distorted(strongest.distorted)
-    uncorrelated = data.apart(strongest.fit)
-    if uncorrelated is None:
-        return _select_weighted(data, strongest, options)
-    # Correlated noise makes peaks in all outputs. Modes not found yet add to its estimate, hence the repetition.
-    for _ in range(DRIVEN.decorrelation_rounds):
-        again = _select_strongest(uncorrelated, strongest.fit, **options)
-        uncorrelated, selected = _select_weighted(uncorrelated, again, options)
-        further = uncorrelated.apart(selected.fit)
-        if further is None or budget.spent("search in outputs of uncorrelated noise"):
-            break
-        uncorrelated, strongest = further, selected
-    data = data.beside_as(uncorrelated)
-    fit = settled(data, projected(data, selected.fit.poles, selected.fit.participation), budget=budget)
-    data = data.weighted_by(data.noise_spectrum(fit))
-    fit = settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget)
-    return data, selected.refitted(fit)
-
-
-def _select_weighted(data: KnownInputs, strongest: Selected, options: dict[str, Any]) -> tuple[KnownInputs, Selected]:
-    """The modes of outputs of uncorrelated noise, weighted by the spectrum of the residual.
-
-    Coloured noise may be taken for modes. A false mode fits noise at its lines, so that the noise there is
-    underestimated and the mode appears significant. The noise is therefore estimated again without all doubtful modes;
-    they stay if modes and noise together are less likely without them.
-    """
-    budget, few = options["budget"], _few_modes(options, strongest.fit.poles.size)
-    data, selected = _alternate_with_noise(data, strongest, few, options, budget)
-    doubtful = (selected.statistic < SELECTION.weak * selected.limit) | ~_are_oscillatory(data, selected)
-    if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
-        return data, selected
-    sure = settled(data, only(data, selected.fit, ~doubtful), budget=budget)
-    other = data.weighted_by(data.noise_spectrum(sure))
-    other, fewer = _alternate_with_noise(other, select_modes(other, start=sure, **options), options, options, budget)
-    if budget.spent("check of doubtful modes"):
-        return data, selected
-    threshold = selected.limit * (selected.fit.poles.size - fewer.fit.poles.size)
-    less_oscillatory = (~_are_oscillatory(data, selected)).sum() > (~_are_oscillatory(other, fewer)).sum()
-    return (
-        (other, fewer)
-        if less_oscillatory or other.cost(fewer.fit) - data.cost(selected.fit) <= threshold
-        else (data, selected)
-    )
 
 
 def _as_time_invariant(
@@ -613,14 +348,12 @@ def _as_time_invariant(
     """
     if not data.changing:
         return data, selected, ()
-    plain, before = data.without_columns(), selected.fit
+    plain, before = replace(data, beside=None, changing=()), selected.fit
     fit = settled(plain, projected(plain, before.poles, before.participation), budget=budget)
     decrease = added_misfit(fit, before, before.noise)
     columns = (data.fixed.shape[1] - plain.fixed.shape[1]) * before.noise.size
     changing = data.changing if decrease > chi2.isf(FALSE_ALARM, columns) else ()
-    data = plain.weighted_by(plain.noise_spectrum(fit))
-    fit = settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget)
-    return data, selected.refitted(fit), changing
+    return *reweighted(plain, selected, fit, budget), changing
 
 
 def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) -> tuple[Selected, tuple[str, ...]]:
@@ -645,50 +378,6 @@ def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) ->
     return selected.refitted(fit), (remark,)
 
 
-def _are_oscillatory(data: KnownInputs, selected: Selected) -> np.ndarray:
-    """Whether each mode oscillates within a record and does not grow, (n_modes,); others may be coloured noise."""
-    poles, span = selected.fit.poles, 2.0 * np.pi / data.resolution
-    return np.asarray((np.abs(poles) > data.resolution) & (poles.real * span < SELECTION.most_growth))
-
-
-def _alternate_with_noise(
-    data: KnownInputs, selected: Selected, first_options: dict[str, Any], options: dict[str, Any], budget: Budget
-) -> tuple[KnownInputs, Selected]:
-    """Modes and noise spectrum, estimated alternately until both settle.
-
-    Args:
-        data: known inputs and outputs.
-        selected: the modes to start from.
-        first_options: options by which `selected` was selected.
-        options: those of the selections that follow.
-        budget: of time.
-    """
-    for _ in range(DRIVEN.noise_rounds):
-        for _ in range(DRIVEN.noise_rounds):
-            changing = beside_changing(data, selected.fit, selected.limit, budget)
-            if changing is None:
-                break
-            fewer = select_modes(changing[0], start=changing[1], **first_options)
-            # Close modes fit better than one changing mode. With one input and output both models were compared before.
-            compared = data.values.shape[1] * data.n_inputs == 1
-            allowed = selected.limit * max(selected.fit.poles.size - fewer.fit.poles.size, 0) if compared else 0.0
-            if changing[0].cost(fewer.fit) >= data.cost(selected.fit) + allowed:
-                break
-            data, selected = changing[0], fewer
-        line_std = data.noise_spectrum(selected.fit)
-        if alike(line_std, data.line_std) and not (selected.full and first_options["max_modes"] < options["max_modes"]):
-            break
-        if budget.spent("estimation of the noise spectrum"):
-            break
-        weighted = data.with_distorted(selected.distorted).weighted_by(line_std)
-        reselected = _without_unpredictive(weighted, select_modes(weighted, start=selected.fit, **options), budget)
-        # A search that the time limit ended early does not replace the one before.
-        if budget.spent("estimation of the noise spectrum") and reselected.fit.poles.size < selected.fit.poles.size:
-            break
-        data, selected, first_options = weighted, reselected, options
-    return data, selected
-
-
 def _report(
     logged: Sequence[Record],
     records: Sequence[Record],
@@ -696,14 +385,22 @@ def _report(
     selected: Selected,
     remarks: tuple[str, ...],
 ) -> Driven:
+    """The result, with the noise of the inputs, where there is some, in its standard errors.
+
+    Args:
+        logged, records: as measured, and with the force window.
+        data: of the records, weighted by their noise.
+    """
     fit, n, from_inputs = selected.fit, selected.fit.poles.size, None
     if data.measured is None:
         noise_ratio, fixed_ratio = data.noise_ratios(fit)
-        shared, std = data.disturbed(fit), blow_noise(logged, records)
+        noise_of_outputs = correlation([left.T for left in data.left(fit)])
+        shared = disturbed(noise_of_outputs, fit.amplitudes / fit.noise[:, None])
+        std = noise_outside_impacts(logged, records)
         if std.any():
             from_inputs = spread_by_inputs(data, fit, std, [record.inputs != 0.0 for record in records])
     else:
-        data = data.as_measured()
+        data = replace(data, records=data.measured, measured=None, line_std=None)
         fit = settled(data, projected(data, fit.poles, fit.participation))
         noise = noise_levels(data, fit, records)
         noise_ratio = (noise.sensors_at(fit.poles.imag * data.dt) / fit.noise[:, None]) ** 2
@@ -715,10 +412,10 @@ def _report(
     channels, n_inputs = records[0].output_channels, records[0].n_inputs
     derivative = time_derivatives(channels)[:, None]
     shapes, participation = scaled_vectors(fit, np.arange(n), derivative)
-    vectors = vector_covariance(fit, noise_ratio, derivative, np.arange(n), shapes, n_inputs, from_inputs)
+    vectors = vector_covariance(fit, noise_ratio, derivative, np.arange(n), n_inputs, from_inputs)
     direct = np.zeros((len(channels), n_inputs))
     direct_std = np.zeros_like(direct)
-    if data.feedthrough:
+    if data.has_direct:
         direct = fit.coefficients[2 * n : 2 * n + n_inputs].T
         direct_std = fixed_std(fit, noise_ratio, fixed_ratio, from_inputs)[:n_inputs].T
     return Driven(

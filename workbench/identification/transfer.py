@@ -10,7 +10,6 @@ frequency.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,9 +17,9 @@ from scipy.linalg import block_diag
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.changing_decay import beside_changing
-from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
+from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, statistic_of, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
-from workbench.identification.input_output.model_order import Selected, select_modes, statistic_of
+from workbench.identification.input_output.model_order import Selected, SelectionOptions, select_modes
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, relative_noise, window_rate
 from workbench.identification.signal.clocks import CLOCKS, late_outputs
@@ -186,14 +185,14 @@ def identify_transfer(
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
     turned = _is_acausal(h, f)
     h = h.conj() if turned else h
-    options: dict[str, Any] = {"channels": channels, "noise": noise, "max_modes": max_modes, "false_alarm": false_alarm}
-    estimate, s = _in_bands(h, f, budget, **options), 2j * np.pi * f
+    options = SelectionOptions(max_modes, false_alarm, budget)
+    estimate, s = _in_bands(h, f, noise, channels, options), 2j * np.pi * f
     for least in (CLOCKS.phase, CLOCKS.refined):
         late = _output_delays(estimate, channels, least)
         if not late.any() or budget.spent("search for delays of the outputs"):
             break
         delays = estimate.delays + late
-        estimate = _in_bands(h * np.exp(s * delays[:, None, None]), f, budget, **options)
+        estimate = _in_bands(h * np.exp(s * delays[:, None, None]), f, noise, channels, options)
         estimate = replace(
             estimate,
             delays=frozen(delays),
@@ -227,12 +226,9 @@ def identify_transfer(
 def _in_bands(
     h: np.ndarray,
     f: np.ndarray,
-    budget: Budget,
-    *,
-    channels: Sequence[Channel],
     noise: np.ndarray | None,
-    max_modes: int,
-    false_alarm: float,
+    channels: Sequence[Channel],
+    options: SelectionOptions,
 ) -> TransferModes:
     """The modes of all lines; more than `TRANSFER.most_lines` are fitted band by band."""
     n_bands, lines_a_mode = (
@@ -244,18 +240,17 @@ def _in_bands(
         first, last = round(k * share), round((k + 1) * share)
         inside = slice(max(first - TRANSFER.overlap_lines, 0), last + TRANSFER.overlap_lines)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
-        selected = _select_in_band(
-            band_budget,
+        lines = Lines(
             h[..., inside],
             2.0 * np.pi * f[inside],
             _residual_powers(channels),
             None if noise is None else noise[..., inside],
-            max_modes=min(max_modes, f[inside].size // lines_a_mode),
-            false_alarm=false_alarm / n_bands,
         )
+        most = min(options.max_modes, lines.omega.size // lines_a_mode)
+        selected = _select_in_band(lines, SelectionOptions(most, options.false_alarm / n_bands, band_budget))
         return _modes_of(*selected, channels, edges, f[first:last])
 
-    budgets, results = [], []
+    budget, budgets, results = options.budget, [], []
     for k in range(n_bands):
         budgets.append(budget.apart(1.0 / (n_bands - k)))
         results.append(band(k, budgets[k]))
@@ -287,58 +282,58 @@ def _delay_remarks(delays: Floats, channels: Sequence[Channel]) -> tuple[str, ..
     )
 
 
-def _select_in_band(
-    budget: Budget, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, **options: Any
-) -> tuple[Lines, Selected]:
+def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, Selected]:
     """The lines of a band with weights, and their modes; noise not stated is estimated from the strongest modes."""
-    lines, options = Lines(h, omega, powers, noise), {**options, "budget": budget}
-    if noise is not None:
+    if lines.noise is not None:
         return _select_with_changing(lines, options)
-    few = options | {"max_modes": min(TRANSFER.strongest, options["max_modes"])}
-    selected = select_modes(lines, **few)
-    guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
+    h, budget = lines.h, options.budget
+    few = replace(options, max_modes=min(TRANSFER.strongest, options.max_modes))
+    selected = select_modes(lines, few)
+    guessed = relative_noise(lines, selected.fit)
     if guessed is None:  # noise proportional to the response would look like modes that change
         lines, selected = _select_with_changing(lines, few, selected)
-        guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
+        guessed = relative_noise(lines, selected.fit)
     residual = lines.left(selected.fit)
     # Correlation of noise is tested in second differences over the lines (Hann's window of the impulse response): they
     # suppress modelling errors, which are smooth over the lines. The residual is scaled first, because a few large
     # lines among small ones would show some correlation in any case.
     scaled = residual if guessed is None else residual / guessed
-    lines.window_rate = window_rate(scaled, omega)
+    lines = replace(lines, window_rate=window_rate(scaled, lines.omega))
     differences = np.diff(scaled, 2)
     mixing = mixing_of(correlation_of_lines([differences.reshape(len(h), -1)]))
     if mixing is None:
         return _select_weighted(lines, selected, options)
     # Correlated noise makes peaks in all outputs; modes are selected in combinations of uncorrelated noise.
     mixed = np.tensordot(mixing / np.sqrt((np.abs(residual) ** 2).mean(axis=(1, 2))), h, 1)
-    uncorrelated, selected = _select_weighted(*_select_with_changing(lines.of(mixed), few), options)
-    lines = uncorrelated.of(h)
+    uncorrelated, selected = _select_weighted(
+        *_select_with_changing(replace(lines, h=mixed, noise=None, guessed=False), few), options
+    )
+    lines = replace(uncorrelated, h=h, noise=None, guessed=False)
     fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
-    guessed = relative_noise(lines.left(fit), lines.fitted(fit), lines.omega)
+    guessed = relative_noise(lines, fit)
     if guessed is not None:
-        lines = lines.weighted_by(guessed)
+        lines = replace(lines, noise=guessed, guessed=True)
         fit = settled(lines, projected(lines, fit.poles, fit.participation), budget=budget)
     return lines, selected.refitted(fit)
 
 
 def _select_with_changing(
-    lines: Lines, options: dict[str, Any], selected: Selected | None = None
+    lines: Lines, options: SelectionOptions, selected: Selected | None = None
 ) -> tuple[Lines, Selected]:
     """The lines with columns for the motion of modes that change, and the modes, one for each that changes."""
-    selected = select_modes(lines, **options) if selected is None else selected
-    while (change := beside_changing(lines, selected.fit, selected.limit, options["budget"])) is not None:
+    selected = select_modes(lines, options) if selected is None else selected
+    while (change := beside_changing(lines, selected.fit, selected.limit, options.budget)) is not None:
         lines, start = change
-        selected = select_modes(lines, start=start, **options)
+        selected = select_modes(lines, options, start)
     return lines, selected
 
 
-def _select_weighted(lines: Lines, selected: Selected, options: dict[str, Any]) -> tuple[Lines, Selected]:
+def _select_weighted(lines: Lines, selected: Selected, options: SelectionOptions) -> tuple[Lines, Selected]:
     """The lines and their modes, with alternating estimates of noise and modes, for outputs of uncorrelated noise."""
-    budget = options["budget"]
+    budget = options.budget
     before: np.ndarray | None = None
     for _ in range(TRANSFER.noise_rounds):
-        guessed = relative_noise(lines.left(selected.fit), lines.fitted(selected.fit), lines.omega)
+        guessed = relative_noise(lines, selected.fit)
         if guessed is None or (
             before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < TRANSFER.alike  # up to a factor
         ):
@@ -346,12 +341,10 @@ def _select_weighted(lines: Lines, selected: Selected, options: dict[str, Any]) 
         if budget.spent("estimation of the noise"):
             return lines, selected
         before = guessed
-        weighted = lines.without_columns().weighted_by(guessed)
+        weighted = replace(lines, noise=guessed, guessed=True, beside=None, changing=())
         # The selection starts from the modes found: with noise proportional to the response, lines between modes have
         # the largest weights, and the least information.
-        weighted, reselected = _select_with_changing(
-            weighted, options, select_modes(weighted, start=selected.fit, **options)
-        )
+        weighted, reselected = _select_with_changing(weighted, options, select_modes(weighted, options, selected.fit))
         if budget.spent("estimation of the noise") and reselected.fit.poles.size < selected.fit.poles.size:
             return lines, selected
         lines, selected = weighted, reselected
@@ -393,7 +386,7 @@ def _modes_of(
     left_out = ", ".join(f"{f:.4g}" for f in damped_hz[within & ~sure])
     derivative, poles = time_derivatives(channels)[:, None], fit.poles[inside]
     shapes, participation = scaled_vectors(fit, inside, derivative)
-    vectors = vector_covariance(fit, noise_ratio, derivative, inside, shapes, participation.shape[1])
+    vectors = vector_covariance(fit, noise_ratio, derivative, inside, lines.n_inputs)
     kept = np.r_[inside, fit.poles.size + inside]
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
     below, below_std, above = _residual_terms(lines, fit, noise_ratio, derivative[:, 0])
@@ -429,15 +422,17 @@ def _residual_terms(
     The acceleration of a mode φ_j φ_i s² / (s² + ω²) is the sum of its pair of poles and of φ_j φ_i, which E of the fit
     includes. A pole below the band, a l / 2 (1/s + λ/s²) and its conjugate at the lines, is part of the residual term.
     """
-    n, size = 2 * fit.poles.size, lines.refs * len(lines.powers)
+    n, size = 2 * fit.poles.size, lines.n_inputs * len(lines.powers)
     scale = lines.omega[-1] ** -np.array(lines.powers, float)
     std = fixed_std(fit, noise_ratio, np.ones((fit.coefficients.shape[0] - n, len(derivative))))
     low = fit.poles.imag < lines.omega[0]
     if low.any():  # the error of the sum of these poles and E, as they are not determined separately
         weights = np.ones((len(lines.fixed), 1)) if lines.weights is None else lines.weights
         std = fit.noise / np.sqrt((lines.fixed**2).T @ weights**2)
-    terms, errors = (x[:size].reshape(lines.refs, len(scale), -1) * scale[:, None] for x in (fit.coefficients[n:], std))
-    below, below_std, above = (np.zeros((len(derivative), lines.refs)) for _ in range(3))
+    terms, errors = (
+        x[:size].reshape(lines.n_inputs, len(scale), -1) * scale[:, None] for x in (fit.coefficients[n:], std)
+    )
+    below, below_std, above = (np.zeros((len(derivative), lines.n_inputs)) for _ in range(3))
     # For each derivative: terms in s^(k - 2) of the poles below the band, less those of the poles within it.
     pole_terms = (
         np.stack([fit.amplitudes * x for x in (low * fit.poles, low, (low - 1.0) / fit.poles)]) @ fit.participation

@@ -55,7 +55,7 @@ def test_a_long_record_is_projected_as_by_least_squares(coloured):
     data = KnownInputs([record], at_rest=False, hold="zero", feedthrough=True)
     n = len(data.values)
     if coloured:
-        data = data.weighted_by([1.0 + 0.5 * np.sin(np.linspace(0.0, 9.0, n))[:, None]])
+        data = replace(data, line_std=[1.0 + 0.5 * np.sin(np.linspace(0.0, 9.0, n))[:, None]])
     fit = projected(data, poles, np.array([[1.0, 0.1], [0.5 + 0.5j, 1.0]]))
     weight = np.ones((1, 1)) if data.weights is None else data.weights
     excitation = np.vstack([record.inputs, np.zeros((1, n))])

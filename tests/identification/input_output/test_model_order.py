@@ -3,8 +3,8 @@ from scipy.signal import lfilter
 
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import projected
-from workbench.identification.input_output.model_order import _Modes, select_modes
-from workbench.identification.signal.searches import Budget, overdamped
+from workbench.identification.input_output.model_order import SelectionOptions, _Modes, select_modes
+from workbench.identification.signal.searches import overdamped
 from workbench.records.record import Channel, Record
 
 
@@ -20,7 +20,7 @@ def test_how_a_blow_runs_between_samples_is_no_mode():
     )
     moves = np.where(after[:, 0] > 0.0, rings, 0.0) + 1e-3 * np.random.default_rng(0).standard_normal(n)
     record = Record(dt, moves[None], (Channel("v", "velocity"),), force[None], (Channel("f", "force"),))
-    found = select_modes(KnownInputs([record], at_rest=True, hold="zero", feedthrough=True), max_modes=6)
+    found = select_modes(KnownInputs([record], at_rest=True, hold="zero", feedthrough=True), SelectionOptions(6))
     np.testing.assert_allclose(found.fit.poles.imag, omega, rtol=1e-3)
 
 
@@ -32,5 +32,5 @@ def test_a_candidate_that_ceases_to_oscillate_is_fitted_no_further():
     record = Record(dt, y + 0.01 * rng.standard_normal(y.shape), (Channel("y"),), u, (Channel("u"),))
     data = KnownInputs([record], at_rest=True, hold="zero", feedthrough=False)
     nothing = projected(data, np.zeros(0, complex), np.zeros((0, 1), complex))
-    trial = _Modes(data, 1e-3, Budget()).extended(nothing, (omega * (-0.1 + 1j), np.ones(1, complex)))
+    trial = _Modes(data, SelectionOptions(6)).extended(nothing, (omega * (-0.1 + 1j), np.ones(1, complex)))
     assert overdamped(trial.poles).all() and not trial.converged

@@ -12,7 +12,7 @@ model of the higher likelihood is preferred. All are compared in the lines about
 residual of the other modes there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
@@ -21,16 +21,16 @@ from scipy.interpolate import CubicSpline
 
 from workbench.arrays import Floats
 from workbench.identification.free_decay.backbone import POWERS, backbone_integrals
-from workbench.identification.input_output.modal_fit import Fit, columns
+from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.rivals import (
     RIVALS,
-    basis_of_others,
-    columns_beyond_linear,
+    bases_with_changes,
+    beyond_linear,
+    diverged,
     in_place_of_clusters,
-    nearest_pole,
     projected_residual,
 )
-from workbench.identification.input_output.spectral_lines import Lines
+from workbench.identification.input_output.spectral_lines import Lines, rows_of_pair
 from workbench.identification.signal.searches import Budget, Once
 from workbench.structure.modes import mac
 
@@ -48,21 +48,6 @@ class ChangingDecaySettings:
 
 
 DECAY = ChangingDecaySettings()
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A changing mode.
-
-    Attributes:
-        columns: (n_rows, n_columns) orthonormal columns of its motion beyond that of a linear mode.
-        pole: of the nearest linear mode, rad/s.
-        scatter: rms of its frequency about its mean over the decay, rad/s.
-    """
-
-    columns: Floats
-    pole: complex
-    scatter: float
 
 
 def beside_changing(lines: Lines, fit: Fit, limit: float, budget: Budget) -> tuple[Lines, Fit] | None:
@@ -85,13 +70,12 @@ def beside_changing(lines: Lines, fit: Fit, limit: float, budget: Budget) -> tup
         fit,
         alike & within & within[:, None],
         lambda lines, cluster: _rival_of(lines, fit, cluster, limit),
-        lambda lines, one: lines.with_columns(one.columns, (one.pole, one.scatter)),
         budget,
     )
 
 
-def _rival_of(lines: Lines, fit: Fit, cluster: np.ndarray, limit: float) -> Motion | None:
-    """The changing mode in place of a cluster, the strongest mode first; None where the linear modes are likelier."""
+def _rival_of(lines: Lines, fit: Fit, cluster: np.ndarray, limit: float) -> tuple[Lines, complex] | None:
+    """`in_place_of_clusters`, for one cluster: the lines beside the changing mode, and its pole."""
     weighted_shape, poles = fit.amplitudes[:, cluster[0]] / fit.noise**2, fit.poles[cluster]
     strength = weighted_shape.conj() @ fit.amplitudes[:, cluster]
     rates = np.maximum(-poles.real, RIVALS.slowest * lines.resolution)
@@ -103,25 +87,30 @@ def _rival_of(lines: Lines, fit: Fit, cluster: np.ndarray, limit: float) -> Moti
     if linear is None:
         return None
     linear_decay = (strength * np.exp(np.outer(peak.decays.time, poles - mean))).sum(axis=1)
-    laws = (law for n_coefficients, law in LAWS if n_coefficients <= 2 * cluster.size - 1)
-    for law in laws:
-        changing = peak.fitted(law, peak.starts(law, linear_decay))
+    for n_coefficients, law in LAWS:
+        if n_coefficients > 2 * cluster.size - 1:
+            break
+        changing = peak.fitted(law, peak.starts(law, n_coefficients, linear_decay))
         # As in a free decay, two modes must be likelier than one by the threshold of a further mode.
         if changing is not None and changing.log_likelihood >= linear.log_likelihood - limit * (cluster.size - 1):
-            return _motion(lines, peak.decays, changing.motions)
+            return _beside(lines, peak.decays, changing.motions)
     return None
 
 
-def _motion(lines: Lines, decays: "_Decays", motions: np.ndarray) -> Motion:
-    """The changing mode of m and its changes with the unknowns, (n_knots, 1 + n_unknowns)."""
+def _beside(lines: Lines, decays: "_Decays", motions: np.ndarray) -> tuple[Lines, complex]:
+    """The lines with the columns of the changing mode, and its pole.
+
+    Args:
+        motions: (n_knots, 1 + n_unknowns) m, and its changes with the unknowns.
+    """
     l_r, time, m = decays.participation, decays.time, motions[:, 0]
     power = np.abs(m) ** 2 * np.exp(2.0 * decays.pole.real * time)
     frequency = np.gradient(np.unwrap(np.angle(m)), time)
     mean = float(np.average(frequency, weights=power))
     scatter = float(np.sqrt(np.average((frequency - mean) ** 2, weights=power)))
     motion_rows = np.hstack(_Decays(lines, decays.pole, l_r).rows(motions))
-    pole = nearest_pole(lines, motion_rows[:, 0], decays.pole, l_r)
-    return Motion(columns_beyond_linear(lines, motion_rows, pole, l_r), pole, scatter)
+    further, pole = beyond_linear(lines, motion_rows, decays.pole, l_r)
+    return lines.with_columns(further, (pole, scatter)), pole
 
 
 class _Decays:
@@ -151,11 +140,7 @@ class _Decays:
     def rows(self, motions: np.ndarray) -> tuple[Floats, Floats]:
         """Rows (n_rows, k) of the real and of the imaginary part of the factor a, for m (n_knots, k)."""
         above, below, l_r = self.above @ motions, self.below @ motions.conj(), self.participation
-        pairs = [
-            self.lines.stacked_pair(np.outer(l_r, u), np.outer(l_r.conj(), v))
-            for u, v in zip(above.T, below.T, strict=True)
-        ]
-        return np.column_stack([p[0] for p in pairs]), np.column_stack([p[1] for p in pairs])
+        return rows_of_pair(l_r[:, None] * above.T[:, None], l_r.conj()[:, None] * below.T[:, None])
 
 
 # m at the knots, (n_knots,), from complex coefficients in units of the decay rate.
@@ -216,17 +201,11 @@ class _Peak:
 
     def __init__(self, lines: Lines, fit: Fit, cluster: np.ndarray, pole: complex) -> None:
         self.decays = _Decays(lines, pole, fit.participation[cluster[0]])
+        self.noise = fit.noise
+        self.weights = (np.ones((1, fit.noise.size)) if lines.weights is None else lines.weights).T[:, :, None]
         others = np.setdiff1d(np.arange(fit.poles.size), cluster)
-        phi, tangents = columns(lines, fit.poles[others], fit.participation[others])
-        each, half = fit.participation.shape[1] + 1, tangents.shape[1] // 2
-        real, imaginary = tangents[:, :half:each], tangents[:, half::each]
-        self.noise, self.values, self.bases = fit.noise, [], []
-        self.weights = np.ones((1, self.noise.size)) if lines.weights is None else lines.weights
-        for j, a in enumerate(fit.amplitudes[:, others]):
-            basis = basis_of_others(self.weights[:, j : j + 1], phi, (real, imaginary), a)
-            y = lines.values[:, j]
-            self.bases.append(basis)
-            self.values.append((y - basis @ (basis.T @ y)) / self.noise[j])
+        self.bases = bases_with_changes(lines, fit, others, list(self.weights))
+        self.values = self._beyond_others(lines.values.T)
 
     def fitted(self, law: Law, starts: list[np.ndarray]) -> _Fitted | None:
         once, best, smallest = Once(lambda x: self._residual(self._motions(law, x))), None, np.inf
@@ -245,9 +224,8 @@ class _Peak:
         logs = np.log((residual**2).sum(axis=1) + floor).sum()
         return _Fitted(-residual.shape[1] * float(logs), self._motions(law, best))
 
-    def starts(self, law: Law, decay: np.ndarray) -> list[np.ndarray]:
-        """Two starting points of a law: a fit to the sum of the linear modes, m (n_knots,), and no change."""
-        size = next(n_coefficients for n_coefficients, each in LAWS if each is law)
+    def starts(self, law: Law, size: int, decay: np.ndarray) -> list[np.ndarray]:
+        """Two starts of a law of so many coefficients: a fit to m (n_knots,) of the linear modes, and no change."""
         decays, constant = self.decays, np.zeros(size, complex)
         base = np.log(law(decays, constant))
         steps = [np.log(law(decays, constant + step)) - base for turn in (0.1, 0.1j) for step in turn * np.eye(size)]
@@ -267,13 +245,13 @@ class _Peak:
             return np.column_stack([m, *((motion(unknowns + step) - m) / RIVALS.slightly for step in steps)])
 
     def _residual(self, motions: np.ndarray) -> tuple[Floats, Floats]:
-        """Residual (n,) and its Jacobian (n, n_unknowns), the shape projected out (Kaufman 1975)."""
+        """Residual (n,) and its Jacobian (n, n_unknowns)."""
         if not (np.abs(motions) < DECAY.largest).all():
-            diverged = 10.0 * np.abs(np.concatenate(self.values))
-            return diverged, np.zeros((diverged.size, motions.shape[1] - 1))
-        rows, projected = np.hstack(self.decays.rows(motions)), []
-        each = zip(self.values, self.bases, self.weights.T[:, :, None], self.noise, strict=True)
-        for y, basis, weight, noise in each:
-            x = weight * rows
-            projected.append(projected_residual(y, (x - basis @ (basis.T @ x)) / noise))
-        return np.concatenate([r for r, _ in projected]), np.vstack([j for _, j in projected])
+            return diverged(self.values, motions.shape[1] - 1)
+        rows = np.hstack(self.decays.rows(motions))
+        return projected_residual(self.values, self._beyond_others([weight * rows for weight in self.weights]))
+
+    def _beyond_others(self, outputs: Iterable[Floats]) -> list[Floats]:
+        """What the other modes do not explain of each output, (n_rows,) or (n_rows, k), in units of its noise."""
+        each = zip(outputs, self.bases, self.noise, strict=True)
+        return [(x - basis @ (basis.T @ x)) / noise for x, basis, noise in each]

@@ -8,6 +8,7 @@ linear modes, so the model of the higher likelihood is preferred. All are compar
 about the modes.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,13 +16,13 @@ from numba import njit
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, columns
+from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.noise_spectrum import lines_of
 from workbench.identification.input_output.rivals import (
     RIVALS,
-    basis_of_others,
-    columns_beyond_linear,
-    nearest_pole,
+    bases_with_changes,
+    beyond_linear,
+    diverged,
     projected_residual,
 )
 from workbench.identification.signal.searches import Budget, Once
@@ -45,8 +46,9 @@ class ChangingResponseSettings:
 
 RESPONSE = ChangingResponseSettings()
 CHANGE_CHECK = "check of modes that change within the record"  # its name where the time is spent
-# (whether the rate changes with time, powers); λ is one coefficient more.
-LAWS = (
+Law = tuple[bool, tuple[float, ...]]  # whether the rate changes with time, and the powers
+# λ is one coefficient more.
+LAWS: tuple[Law, ...] = (
     (True, (1.0, 2.0)),
     (False, (1.0, 2.0)),
     (False, (0.5, 1.0)),
@@ -57,37 +59,31 @@ LAWS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A changing mode: orthonormal columns of its motion beyond a constant mode, (n_rows, n_columns), and its pole."""
-
-    columns: Floats
-    pole: complex
-
-
 class _GivenUp(Exception):
     """A law is hopeless after its first step, or the time is spent."""
 
 
-def in_place_of(data: KnownInputs, fit: Fit, cluster: np.ndarray, limit: float, budget: Budget) -> Motion | None:
-    """The changing mode in place of a cluster, the strongest mode first; None where the linear modes are likelier."""
+def in_place_of(
+    data: KnownInputs, fit: Fit, cluster: np.ndarray, limit: float, budget: Budget
+) -> tuple[KnownInputs, complex] | None:
+    """`in_place_of_clusters`, for one cluster: the records beside the changing mode, and its pole."""
     response = _Response(data, fit, cluster)
     linear = response.linear_residual()
-    n = linear.shape[0] // fit.noise.size
-    threshold = np.log(_squares(linear, fit.noise.size)).sum() + limit * (cluster.size - 1) / n
     n_excitations, n_outputs = fit.participation.shape[1], fit.noise.size
+    threshold = np.log(_squares(linear, n_outputs)).sum() + limit * (cluster.size - 1) / (linear.size // n_outputs)
     n_coefficients = cluster.size * (n_excitations + n_outputs) - (n_excitations - 1 + n_outputs)
-    given_up: set[tuple[bool, tuple[float, ...]]] = set()
-    for by_time, powers in LAWS:
+    given_up: set[Law] = set()
+    for law in LAWS:
         if budget.spent(CHANGE_CHECK):
             break
-        parts = {law for law in LAWS if law[0] == by_time and set(law[1]) < set(powers)}
+        by_time, powers = law
+        parts = {other for other in LAWS if other[0] == by_time and set(other[1]) < set(powers)}
         if len(powers) + 1 > n_coefficients or (parts and parts <= given_up):
             continue
         try:
-            changing = response.fitted(by_time, np.array(powers), threshold, budget)
+            changing = response.fitted(law, threshold, budget)
         except _GivenUp:
-            given_up.add((by_time, powers))
+            given_up.add(law)
         else:
             if changing is not None:
                 return changing
@@ -192,29 +188,35 @@ class _Response:
         share = np.concatenate([np.linspace(0.0, 1.0, each.size) for each in energy])
         self.middle = float(np.average(share, weights=np.concatenate(energy) + 1e-300))
         self.width = float(np.sqrt(np.average((share - self.middle) ** 2, weights=np.concatenate(energy) + 1e-300)))
-        self.weights = self._weights()
-        outside = np.setdiff1d(np.arange(fit.poles.size), cluster)
-        self.values = [y / noise for y, noise in zip(self._lines_about(data.values).T, fit.noise, strict=True)]
-        self.bases = self._bases(outside, poles_only=True)
-        self.values = [y - b @ (b.T @ y) for y, b in zip(self.values, self.bases, strict=True)]
+        self.weights = [np.ones((1, 1))] * fit.noise.size
+        if data.weights is not None:
+            self.weights = list(np.vstack([self._about(data.weights[part]) for part in data.rows]).T[:, :, None])
+        others = np.setdiff1d(np.arange(fit.poles.size), cluster)
+        self.bases = bases_with_changes(data, fit, others, self.weights, self._lines)
+        self.values = self._beyond(self.bases, self._lines(data.values).T)
 
     def linear_residual(self) -> Floats:
-        """Residual of the linear modes in the lines about the cluster, (n,).
+        """Residual of the linear modes in the lines about the cluster, (n,), all of them re-fitted to first order."""
+        every_mode = np.arange(self.fit.poles.size)
+        bases = bases_with_changes(self.data, self.fit, every_mode, self.weights, self._lines, poles_only=False)
+        return np.concatenate(self._beyond(bases, self._lines(self.fit.residual).T))
 
-        All poles and participation factors are re-fitted to first order.
-        """
-        bases = self._bases(np.arange(self.fit.poles.size), poles_only=False)
-        residuals = [y / noise for y, noise in zip(self._lines_about(self.fit.residual).T, self.fit.noise, strict=True)]
-        return np.concatenate([y - b @ (b.T @ y) for y, b in zip(residuals, bases, strict=True)])
+    def _beyond(self, bases: Sequence[Floats], outputs: Iterable[Floats]) -> list[Floats]:
+        """What bases do not explain of each output, (n_lines,) or (n_lines, k), in units of its noise."""
+        scaled = [x / noise for x, noise in zip(outputs, self.fit.noise, strict=True)]
+        return [x - basis @ (basis.T @ x) for x, basis in zip(scaled, bases, strict=True)]
 
-    def fitted(self, by_time: bool, powers: Floats, threshold: float, budget: Budget) -> Motion | None:
-        """The changing mode of a law; None where it leaves more than the threshold, a logarithm of the squares.
+    def fitted(self, law: Law, threshold: float, budget: Budget) -> tuple[KnownInputs, complex] | None:
+        """The records beside the changing mode of a law, and its pole; None where it leaves too large a residual.
+
+        Args:
+            threshold: largest logarithm of the squares of the residual.
 
         Raises:
             _GivenUp: the first step leaves far more, or the time is spent.
         """
-        once = Once(lambda x: self._residual(self._motions(_with_neighbours(x), by_time, powers)))
-        start = self._start(by_time, powers)
+        once = Once(lambda x: self._residual(self._motions(_with_neighbours(x), law)))
+        start = self._start(law)
         unknowns = np.r_[start.real, start.imag]
         sensitivity = np.linalg.norm(once(unknowns)[1], axis=0)
         # After an impact, an initial state excites a mode as the input does.
@@ -230,7 +232,7 @@ class _Response:
         def among_active(x: Floats) -> tuple[Floats, Floats]:
             unknowns[active] = x
             if len(beyond) == 1:  # without the Jacobian, which takes most of the time
-                beyond.append(beyond_threshold(self._residual(self._motions(unknowns[None], by_time, powers))[0]))
+                beyond.append(beyond_threshold(self._residual(self._motions(unknowns[None], law))[0]))
             if (len(beyond) == 2 and min(beyond) > RESPONSE.hopeless) or budget.spent(CHANGE_CHECK):
                 raise _GivenUp
             residual, jacobian = once(unknowns)
@@ -241,11 +243,14 @@ class _Response:
         unknowns[active] = Once(among_active).least(unknowns[active], RESPONSE.most_tries)
         if beyond_threshold(once(unknowns)[0]) > 0.0:
             return None
-        return self._motion(self._motions(_with_neighbours(unknowns), by_time, powers))
+        motions = self._motions(_with_neighbours(unknowns), law)
+        rows = self.data.rows_of([np.hstack([z.real, z.imag]) for z in motions])
+        further, pole = beyond_linear(self.data, rows, self.pole, self.participation)
+        return self.data.with_columns(further, (pole,)), pole
 
-    def _start(self, by_time: bool, powers: Floats) -> np.ndarray:
+    def _start(self, law: Law) -> np.ndarray:
         """Starting coefficients of a law: regression on the sum of the linear modes, from sample to sample."""
-        fit, dt = self.fit, self.data.dt
+        fit, dt, (by_time, powers) = self.fit, self.data.dt, law
         weighted_shape = fit.amplitudes[:, self.cluster[0]] / fit.noise**2
         strength = weighted_shape.conj() @ fit.amplitudes[:, self.cluster]
         participation = strength @ fit.participation[self.cluster]
@@ -262,22 +267,22 @@ class _Response:
             n = z.size
             time = np.minimum((np.arange(n - 1) / (n - 1) - self.middle) / self.width, RESPONSE.faded)
             size = time if by_time else np.maximum(np.abs(z[:-1]) / self.scale, RESPONSE.least)
-            regressor = np.column_stack([np.ones(n - 1), size[:, None] ** powers])
+            regressor = np.column_stack([np.ones(n - 1), size[:, None] ** np.array(powers)])
             regressors.append(regressor * z[:-1, None])
             rates.append((propagated * np.exp(-self.pole * dt) - z[:-1]) / dt / self.rate)
         coefficients = np.linalg.lstsq(np.vstack(regressors), np.concatenate(rates), rcond=None)[0]
         held_factors = self.participation[self.others]
         return np.asarray(np.r_[coefficients, (participation[self.others] / unit - held_factors) / self.units])
 
-    def _motions(self, cases: Floats, by_time: bool, powers: Floats) -> list[np.ndarray]:
+    def _motions(self, cases: Floats, law: Law) -> list[np.ndarray]:
         """z of each record at the first case, and its change to each other, (n_samples, n_cases) each.
 
         Args:
             cases: (n_cases, n_unknowns), as `_with_neighbours` gives, or the first of these alone.
         """
-        half = cases.shape[1] // 2
+        (by_time, powers), half = law, cases.shape[1] // 2
         coefficients = cases[:, :half] + 1j * cases[:, half:]
-        size = 1 + powers.size
+        size = 1 + len(powers)
         participation = np.tile(self.participation, (len(cases), 1))
         participation[:, self.others] += coefficients[:, size:] * self.units
         step, motions = np.exp(self.pole * self.data.dt), []
@@ -286,65 +291,27 @@ class _Response:
             drive = all_cases[1:] - step * all_cases[:-1]
             driven_samples = np.flatnonzero(np.abs(drive).max(axis=1) > RESPONSE.undriven * self.scale)
             simulated = _simulated(
-                np.ascontiguousarray(all_cases[0]), drive, self.rate * coefficients[:, :size], powers, by_time, step,
-                self.scale, RESPONSE.least, RESPONSE.largest, self.data.dt, self.middle, self.width, RESPONSE.faded,
-                int(driven_samples[-1]) + 1 if driven_samples.size else 0,
+                np.ascontiguousarray(all_cases[0]), drive, self.rate * coefficients[:, :size], np.array(powers),
+                by_time, step, self.scale, RESPONSE.least, RESPONSE.largest, self.data.dt, self.middle, self.width,
+                RESPONSE.faded, int(driven_samples[-1]) + 1 if driven_samples.size else 0,
                 max(int(RESPONSE.step / (self.rate * self.data.dt)), 1),
             )  # fmt: skip
             motions.append(np.column_stack([simulated[:, 0], (simulated[:, 1:] - simulated[:, :1]) / RIVALS.slightly]))
         return motions
 
     def _residual(self, motions: list[np.ndarray]) -> tuple[Floats, Floats]:
-        """Residual (n,) and its Jacobian (n, n_unknowns), the shape projected out (Kaufman 1975)."""
+        """Residual (n,) and its Jacobian (n, n_unknowns)."""
         if not all(np.isfinite(each).all() for each in motions):
-            diverged = 10.0 * np.abs(np.concatenate(self.values))
-            return diverged, np.zeros((diverged.size, motions[0].shape[1] - 1))
-        rows, fits = self._lines_of_samples([np.hstack([z.real, z.imag]) for z in motions]), []
-        each = zip(self.values, self.bases, self.weights, self.fit.noise, strict=True)
-        for y, basis, weight, noise in each:
-            x = weight[:, None] * rows / noise
-            fits.append(projected_residual(y, x - basis @ (basis.T @ x)))
-        return np.concatenate([r for r, _ in fits]), np.vstack([j for _, j in fits])
+            return diverged(self.values, motions[0].shape[1] - 1)
+        rows = np.vstack([self._about(lines_of(np.hstack([z.real, z.imag]))) for z in motions])
+        return projected_residual(self.values, self._beyond(self.bases, [weight * rows for weight in self.weights]))
 
-    def _motion(self, motions: list[np.ndarray]) -> Motion:
-        motion_rows = self.data.rows_of([np.hstack([z.real, z.imag]) for z in motions])
-        pole = nearest_pole(self.data, motion_rows[:, 0], self.pole, self.participation)
-        return Motion(columns_beyond_linear(self.data, motion_rows, pole, self.participation), pole)
-
-    def _bases(self, modes: np.ndarray, poles_only: bool) -> list[Floats]:
-        """Orthonormal columns of modes, fixed columns and tangents, one matrix per output.
-
-        Args:
-            modes: indices of the modes.
-            poles_only: whether only poles may change, or participation factors too.
-        """
-        fit = self.fit
-        phi, tangents = columns(self.data, fit.poles[modes], fit.participation[modes])
-        each, half = fit.participation.shape[1] + 1, tangents.shape[1] // 2
-        step = each if poles_only else 1
-        stacked = self._lines_about(np.hstack([phi, tangents[:, :half:step], tangents[:, half::step]]))
-        phi, real, imaginary = np.split(stacked, [phi.shape[1], phi.shape[1] + half // step], axis=1)
-        bases = []
-        for weight, a in zip(self.weights, fit.amplitudes[:, modes], strict=True):
-            a = a if poles_only else np.repeat(a, each)
-            bases.append(basis_of_others(weight[:, None], phi, (real, imaginary), a))
-        return bases
-
-    def _line_indices(self, n: int) -> np.ndarray:
-        line = np.pi / self.data.dt / n
-        return np.arange(max(int(self.low / line), 0), min(int(self.high / line) + 2, n))
-
-    def _lines_about(self, rows: Floats) -> Floats:
+    def _lines(self, rows: Floats) -> Floats:
         """Lines about the cluster, from rows of the fit."""
         parts = [rows[part] for part in self.data.rows]
-        return np.vstack([(x if self.data.rows_are_lines else lines_of(x))[self._line_indices(len(x))] for x in parts])
+        return np.vstack([self._about(x if self.data.rows_are_lines else lines_of(x)) for x in parts])
 
-    def _lines_of_samples(self, samples: list[np.ndarray]) -> Floats:
-        return np.vstack([lines_of(x)[self._line_indices(len(x))] for x in samples])
-
-    def _weights(self) -> list[Floats]:
-        data = self.data
-        if data.weights is None:
-            n = sum(self._line_indices(part.stop - part.start).size for part in data.rows)
-            return [np.ones(n)] * self.fit.noise.size
-        return list(np.vstack([data.weights[part][self._line_indices(part.stop - part.start)] for part in data.rows]).T)
+    def _about(self, lines: Floats) -> Floats:
+        """Those of the lines of one record that lie about the cluster."""
+        line = np.pi / self.data.dt / len(lines)
+        return lines[max(int(self.low / line), 0) : int(self.high / line) + 2]

@@ -1,4 +1,4 @@
-"""Checks of the inputs: whether they can distinguish modes, and which modes they hardly excite."""
+"""Checks of the inputs: whether they can distinguish modes, how long they act, and which modes they hardly excite."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ class ExcitationSettings:
     hardly: float = 1e-3  # of the mean power of a line, 3 % of its amplitude: less hardly excites a mode
     about: float = 0.02  # of the frequency of a mode, to either side, in which the lines count
     lines: int = 4  # to either side, at least
+    moves: float = 0.01  # of its peak, above which an input is nonzero
 
 
 EXCITATION = ExcitationSettings()
@@ -49,6 +50,12 @@ def check_inputs(records: Sequence[Record]) -> None:
             f"inputs {first.input_names[i]!r} and {first.input_names[k]!r} are the same signal up to a factor, so"
             " their effects cannot be distinguished; excite them one after the other, or by signals of their own"
         )
+
+
+def n_moving(records: Sequence[Record]) -> int:
+    """Number of samples at which an input is nonzero, the least of all inputs."""
+    sizes = np.abs(np.hstack([record.inputs for record in records]))
+    return int((sizes > EXCITATION.moves * sizes.max(axis=1, keepdims=True)).sum(axis=1).min())
 
 
 def unexcited_remarks(records: Sequence[Record], poles: Complexes) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Standard errors of a `modal_fit`, in noise of any smooth spectrum.
+"""Standard errors of a `modal_fit`, in noise of any smooth spectrum, and the χ² of its modes.
 
 A mode is affected by the noise near its own frequency. Where output j has κ_jr times its mean noise power there, a fit
 that assumes white noise has the covariance H^-1 M H^-1, M as H with the share of each mode in output j times κ_jr^½
@@ -16,6 +16,7 @@ from workbench.identification.input_output.modal_fit import (
     Part,
     free_parameters,
     normal_equations,
+    scaled_vectors,
     tangent_weights,
 )
 from workbench.identification.signal.modal_estimates import by_poles
@@ -100,7 +101,6 @@ def vector_covariance(
     noise_ratio: np.ndarray,
     derivative: np.ndarray,
     kept: np.ndarray,
-    shapes: np.ndarray,
     n_inputs: int,
     further: Floats | None = None,
 ) -> np.ndarray:
@@ -112,7 +112,6 @@ def vector_covariance(
         noise_ratio: κ, (n_outputs, n_modes).
         derivative: (n_outputs, 1) order of the time derivative of displacement that each output measures.
         kept: (n_kept,) indices of the modes that are reported.
-        shapes: (n_outputs, n_kept) as reported, see `scaled_vectors`.
         n_inputs: number of excitations, the first ones, that are inputs.
         further: as in `propagated_covariance`.
 
@@ -124,7 +123,7 @@ def vector_covariance(
         return np.zeros((0, k, k))
     largest = np.abs(fit.amplitudes[:, kept] / fit.poles[kept] ** derivative).argmax(axis=0)
     modes = np.arange(kept.size)
-    scale = shapes[largest, modes]
+    scale = scaled_vectors(fit, kept, derivative)[0][largest, modes]
 
     def functions(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
         displacements = amplitudes[:, kept] / poles[kept] ** derivative
@@ -132,9 +131,8 @@ def vector_covariance(
         driven = participation[kept, :n_inputs] * (0.5 * displacements[largest, modes] / scale)[:, None]
         return np.concatenate([relative.real.T, driven.real, driven.imag], axis=1).ravel()
 
-    blocks = propagated_covariance(fit, functions, noise_ratio, further).reshape(kept.size, k, kept.size, k)[
-        modes, :, modes
-    ]
+    covariance_of_all = propagated_covariance(fit, functions, noise_ratio, further)
+    blocks = covariance_of_all.reshape(kept.size, k, kept.size, k)[modes, :, modes]
     blocks[modes, largest], blocks[modes, :, largest] = 0.0, 0.0  # one by definition
     return blocks
 
@@ -156,6 +154,47 @@ def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray, further: Flo
     if further is not None:
         variance += np.diag(further)[free.size :].reshape(fit.noise.size, -1).T[n:]
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))  # rounding error of nearly collinear columns may be negative
+
+
+def statistic_of(fit: Fit, r: int) -> float:
+    """χ² of the shape of mode r in the noise, its pole and participation factors fixed."""
+    pair, noise, statistic = [r, fit.poles.size + r], fit.noise, 0.0
+    for part, outputs in fit.outputs():
+        c = part.coefficients[pair] / noise[outputs]
+        # a pole at Nyquist has no imaginary part at the samples: singular
+        statistic += float(np.einsum("ij,ik,kj->", c, scaled_inverse(part.spread[np.ix_(pair, pair)]), c))
+    return statistic
+
+
+def statistic_of_each(fit: Fit) -> np.ndarray:
+    """`statistic_of` each mode, (n_modes,)."""
+    return np.array([statistic_of(fit, r) for r in range(fit.poles.size)])
+
+
+def marginal_statistics_of(fit: Fit) -> np.ndarray:
+    """χ² of each mode's shape in the noise, (n_modes,), poles and participation factors of all modes unknown."""
+    n, bound, free = fit.poles.size, covariance(fit), free_parameters(fit)
+    statistics = np.zeros(n)
+    if n == 0:
+        return statistics
+    amplitudes = fit.coefficients[: 2 * n].reshape(2, n, -1)
+    effect = [np.einsum("ct,tkj->cjk", part.tilt[: 2 * n], tangent_weights(fit, part)[:, free]) for part in fit.parts]
+    for r in range(n):
+        pair = [r, n + r]
+        effects = np.concatenate([each[pair] for each in effect], axis=1)
+        size = 2 * effects.shape[1]
+        spread = effects.reshape(size, -1) @ bound @ effects.reshape(size, -1).T
+        spread = spread.reshape(2, size // 2, 2, size // 2)
+        for part, outputs in fit.outputs():
+            shape_covariance = part.spread[np.ix_(pair, pair)]
+            for j in range(outputs.start, outputs.stop):
+                spread[:, j, :, j] += shape_covariance * fit.noise[j] ** 2
+        c = amplitudes[:, r].ravel()
+        spread = spread.reshape(size, size)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))
+        # Nearly identical modes make it singular.
+        statistics[r] = c * scale @ np.linalg.pinv(spread * np.outer(scale, scale), hermitian=True) @ (c * scale)
+    return statistics
 
 
 def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@ modes improve the prediction, over-fitted ones make it worse.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.stats import f as variance_ratio
@@ -17,6 +18,7 @@ from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, only, projected, settled
 from workbench.identification.input_output.time_variance import IS_MEAN, named_near
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget
+from workbench.records.record import Record
 
 
 @dataclass(frozen=True)
@@ -59,19 +61,19 @@ def without_unpredictive(
     shortest = min(record.n_samples // 2 for record in data.records)
     if n < 2 or not (weaker_near.any() or undamped.any()) or shortest <= data.first:
         return fit, ()
-    whole = data.unweighted()
-    half = whole.first_half()
+    whole = replace(data, line_std=None, beside=None, changing=())
+    half = replace(whole, records=[_first_half(record) for record in whole.records])
     too_short = len(half.values) < HELD_OUT.rows * (2 * n + half.fixed.shape[1])
     if too_short or half.fixed.shape[1] != whole.fixed.shape[1]:  # inputs that are zero throughout a first half
         return fit, ()
     all_modes = projected(whole, fit.poles, fit.participation)
     noise, residual_of_all = all_modes.noise, _ResidualSpectra(whole, all_modes)
-    errors_by_modes: dict[bytes, list[Floats] | None] = {}
 
-    def prediction_error(kept: Flags) -> list[Floats] | None:
+    @cache
+    def prediction_error(kept: tuple[int, ...]) -> list[Floats] | None:
         """Power of the prediction error in the second half of each record, (n_lines,), in units of the noise."""
         try:
-            start = projected(half, fit.poles[kept], fit.participation[kept])
+            start = projected(half, fit.poles[list(kept)], fit.participation[list(kept)])
             first_half = settled(half, start, SELECTION.few_steps, budget)
             with np.errstate(over="ignore", invalid="ignore"):
                 predicted = columns(whole, first_half.poles, first_half.participation)[0] @ first_half.coefficients
@@ -85,10 +87,7 @@ def without_unpredictive(
 
     def error(kept: Flags, lowest: float, highest: float) -> float:
         """Squared prediction error in the lines between two frequencies, rad/s."""
-        key = kept.tobytes()
-        if key not in errors_by_modes:
-            errors_by_modes[key] = prediction_error(kept)
-        powers = errors_by_modes[key]
+        powers = prediction_error(tuple(np.flatnonzero(kept).tolist()))
         return np.inf if powers is None else float(_between(powers, whole.highest, lowest, highest).sum())
 
     kept, distorted = np.ones(n, bool), []
@@ -110,6 +109,11 @@ def without_unpredictive(
     if kept.all():
         return fit, ()
     return settled(data, only(data, fit, kept), SELECTION.few_steps, budget), tuple(distorted)
+
+
+def _first_half(record: Record) -> Record:
+    n = record.n_samples // 2
+    return replace(record, outputs=record.outputs[:, :n], inputs=record.inputs[:, :n])
 
 
 def _is_in_both(data: KnownInputs, fit: Fit, r: int) -> bool:
@@ -178,7 +182,7 @@ def left_about(data: KnownInputs, fit: Fit) -> tuple[complex, ...]:
     Where the residual about one mode is very large, least squares leave a little about the others too; these do not
     count.
     """
-    whole = data.unweighted()
+    whole = replace(data, line_std=None, beside=None, changing=())
     spectra = _ResidualSpectra(whole, projected(whole, fit.poles, fit.participation))
     bands = fit.poles.imag[:, None] * (1.0 + 0.5 * HELD_OUT.reach * np.array([-1.0, 1.0]))
     residual, response = np.array([spectra.between(*band) for band in bands]).reshape(-1, 2).T

@@ -6,6 +6,8 @@ residues by a false hold does not depend on the noise: a band-limited input take
 residue 1/sinc²(f Δt) times its true size.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from workbench.identification.input_output.known_inputs import KnownInputs
@@ -32,14 +34,14 @@ def hold_remarks(data: KnownInputs, fit: Fit, threshold: float, budget: Budget) 
     """
     costs: dict[str, float] = {}
     for hold in HOLDS:
-        if hold == data.hold or (data.feedthrough and "band-limited" not in (hold, data.hold)):
+        if hold == data.hold or (data.has_direct and "band-limited" not in (hold, data.hold)):
             continue
         # the delay may be an artefact of the false hold
         whole = np.floor(data.delays)
         for delays in np.unique([data.delays, whole, np.maximum(whole - 1.0, 0.0)], axis=0):
             if budget.spent("check of how inputs run between samples"):
                 return ()
-            other = data.with_hold(hold, delays)
+            other = replace(data, hold=hold).delayed_by(delays)
             try:
                 start = projected(other, fit.poles, fit.participation)
                 refitted = settled(other, start, SELECTION.few_steps, budget, ORDER.decided)

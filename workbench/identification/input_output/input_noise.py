@@ -24,10 +24,10 @@ from workbench.arrays import Complexes, Flags, Floats
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, projected, tangent_weights
-from workbench.identification.input_output.model_order import sure_modes
+from workbench.identification.input_output.model_order import SelectionOptions, sure_modes
 from workbench.identification.input_output.noise_spectrum import autoregression, lines_of, samples_of
 from workbench.identification.signal.projection import PROJECTION
-from workbench.identification.signal.searches import FALSE_ALARM, Budget
+from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
 
 
@@ -179,19 +179,19 @@ def _likeliest_levels(power: Floats, gain: Floats, highest: Floats) -> tuple[Flo
 
 
 def with_white_noise(
-    data: KnownInputs, fit: Fit, noise: InputNoise, false_alarm: float, budget: Budget
+    data: KnownInputs, fit: Fit, noise: InputNoise, options: SelectionOptions
 ) -> tuple[KnownInputs, Fit]:
     """The records with the expected inputs and outputs without the noise that these leave, and the modes.
 
     Args:
         data, fit: as in `input_noise`.
     """
-    data = data.with_inputs([_expected_inputs(record, noise) for record in data.records])
+    data = replace(data, records=[_expected_inputs(record, noise) for record in data.records], line_std=None)
     gain = _residual_spectra(data, projected(data, fit.poles, fit.participation))[1]
     std = np.sqrt(noise.sensors_at(_frequencies(data) * data.dt) ** 2 + np.tensordot(noise.inputs**2, gain, 1)).T
-    weighted = data.weighted_by([std[rows] / np.sqrt((std**2).mean(axis=0)) for rows in data.rows])
+    weighted = replace(data, line_std=[std[rows] / np.sqrt((std**2).mean(axis=0)) for rows in data.rows])
     # lines of equal weight may take the noise peak at a strong mode for a further mode; the weighted lines do not
-    fit = sure_modes(weighted, projected(weighted, fit.poles, fit.participation), false_alarm, budget)
+    fit = sure_modes(weighted, projected(weighted, fit.poles, fit.participation), options)
     return _whitened(weighted, fit, noise), fit
 
 
@@ -222,7 +222,7 @@ def _whitened(data: KnownInputs, fit: Fit, noise: InputNoise) -> KnownInputs:
         outputs = record.outputs.copy()
         outputs[:, data.first :] -= excess
         records.append(replace(record, outputs=outputs))
-    return data.with_white_noise(records)
+    return replace(data, records=records, measured=data.records, line_std=None)
 
 
 def spread_by_inputs(data: KnownInputs, fit: Fit, std: Floats, acts: Sequence[Flags]) -> Floats:
@@ -264,7 +264,7 @@ def spread_by_inputs(data: KnownInputs, fit: Fit, std: Floats, acts: Sequence[Fl
     return total
 
 
-def blow_noise(logged: Sequence[Record], windowed: Sequence[Record]) -> Floats:
+def noise_outside_impacts(logged: Sequence[Record], windowed: Sequence[Record]) -> Floats:
     """Standard deviation of the noise that force windows removed from each input, (n_inputs,).
 
     The impacts contain as much.
@@ -301,9 +301,9 @@ def _impulse_responses(data: KnownInputs, fit: Fit) -> Floats:
         inputs = np.zeros((m, n))
         inputs[i, 1] = 1.0  # the first sample of a record from rest has no effect
         records.append(replace(longest, inputs=inputs, outputs=np.zeros((longest.n_outputs, n))))
-    impulses = data.from_rest(records)
+    impulses = replace(data, records=records, line_std=None, at_rest=True, drift=0, beside=None, changing=())
     phi = columns(impulses, fit.poles, fit.participation[:, :m])[0]
-    k = 2 * fit.poles.size + (phi.shape[1] - 2 * fit.poles.size - m if data.feedthrough else 0)
+    k = 2 * fit.poles.size + (phi.shape[1] - 2 * fit.poles.size - m if data.has_direct else 0)
     return np.array([each[1:].T for each in impulses.as_samples(phi[:, :k] @ fit.coefficients[:k])])
 
 

@@ -19,7 +19,7 @@ line by line of the cosine transform of all columns.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from math import factorial
 from typing import Any
 
@@ -43,8 +43,6 @@ from workbench.identification.input_output.modal_fit import (
 )
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
 from workbench.identification.signal.projection import (
-    correlation,
-    disturbed,
     independent,
     noise_along,
     noise_near,
@@ -59,20 +57,22 @@ TERMS = 40
 SERIES = [np.array([1.0 / factorial(i + k) for i in range(TERMS)]) for k in (1, 2)]
 
 
+@dataclass(eq=False, repr=False)
 class KnownInputs:
-    """The `modal_fit.Measurement` of records with known inputs.
+    """The `modal_fit.Measurement` of records with known inputs; `dataclasses.replace` gives changed ones.
 
     Rows are the samples, one record after another, or the lines of each record: with `line_std` these over their noise,
     and of long records with held inputs without it, since lines of their responses take less time (`lines_of_poles`).
 
-    Args:
+    Attributes:
         records: with the same inputs and outputs at one rate.
         at_rest, hold, feedthrough: as in `identify_driven`; hold is its `input_hold`.
         delays: (n_inputs,) of each input, samples; none unless given.
         any_fraction: whether each input has a further, unknown delay of a fraction of a sample: it then has two
             columns, the input at its whole delay and a sample later.
         drift: degree of the polynomials of time that each output of each record holds; 0, a constant, unless given.
-        line_std: relative noise of each line, one (n_rows, n_outputs) a record, of unit rms over all.
+        line_std: relative noise of each line, one (n_rows, n_outputs) a record, of unit rms over all; without it all
+            have equal weight.
         beside: (n_samples, n_columns) of all records, fixed columns beside those of the inputs and the constants.
         changing: poles of the time- or amplitude-dependent modes whose columns `beside` holds.
         distorted: poles of nonlinear modes; no further mode is searched near these.
@@ -81,158 +81,95 @@ class KnownInputs:
         clock: ε of the clock of the outputs (`output_clock`), by which they were resampled; 0 where they were not.
     """
 
-    def __init__(
-        self,
-        records: Sequence[Record],
-        *,
-        at_rest: bool,
-        hold: str,
-        feedthrough: bool,
-        delays: np.ndarray | None = None,
-        any_fraction: bool = False,
-        drift: int = 0,
-        line_std: Sequence[np.ndarray] | None = None,
-        beside: Floats | None = None,
-        changing: tuple[complex, ...] = (),
-        distorted: tuple[complex, ...] = (),
-        free: tuple[complex, ...] = (),
-        measured: Sequence[Record] | None = None,
-        clock: float = 0.0,
-    ) -> None:
-        self.measured, self.clock = measured, clock
-        self.distorted, self.free = distorted, free
-        self.records, self.at_rest, self.hold, self.may_have_feedthrough = records, at_rest, hold, feedthrough
-        self.dt, self.places = records[0].sample_time, records[0].positions
-        self.delays = np.zeros(records[0].n_inputs) if delays is None else np.asarray(delays, float)
-        self.any_fraction = any_fraction
+    records: Sequence[Record]
+    _: KW_ONLY
+    at_rest: bool
+    hold: str
+    feedthrough: bool
+    delays: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    any_fraction: bool = False
+    drift: int = 0
+    line_std: Sequence[np.ndarray] | None = None
+    beside: Floats | None = None
+    changing: tuple[complex, ...] = ()
+    distorted: tuple[complex, ...] = ()
+    free: tuple[complex, ...] = ()
+    measured: Sequence[Record] | None = None
+    clock: float = 0.0
+
+    def __post_init__(self) -> None:
+        records = self.records
+        self.dt, self.places, self.n_inputs = records[0].sample_time, records[0].positions, records[0].n_inputs
+        self.n_excitations = self.n_inputs + (0 if self.at_rest else len(records))
+        self.delays = np.zeros(self.n_inputs) + self.delays
         self.whole = np.floor(self.delays).astype(int)
         self.fraction = self.delays - self.whole
         # Inputs before the record are unknown unless it begins at rest: the samples that need these are left out.
-        late = bool(any_fraction or self.fraction.any())
-        self.first = 0 if at_rest else int(self.whole.max()) + late
+        late = bool(self.any_fraction or self.fraction.any())
+        self.first = 0 if self.at_rest else int(self.whole.max()) + late
         self.driving, self.spectra = [record.inputs for record in records], [np.zeros((0, 0), complex)] * len(records)
-        if hold == "band-limited":
+        if self.hold == "band-limited":
             if self.fraction.any():
-                self.driving, self.fraction = (
-                    [later(u, self.fraction) for u in self.driving],
-                    np.zeros_like(self.delays),
-                )
+                self.driving = [later(u, self.fraction) for u in self.driving]
+                self.fraction = np.zeros_like(self.delays)
             self.spectra = [spectrum_of(u) for u in self.driving]
         lengths = [record.n_samples - self.first for record in records]
         ends = np.cumsum([0, *lengths])
         self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]
-        self.line_std = line_std
+
         # a delayed first-order hold has a corner at the first sample of the input, which no closed form has
-        held = not self.fraction.any() and (hold == "zero" or (hold == "first" and not self.whole.any()))
-        coloured = line_std is not None and any(np.ptp(size, axis=0).any() for size in line_std)
+        held = not self.fraction.any() and (self.hold == "zero" or (self.hold == "first" and not self.whole.any()))
+        coloured = self.line_std is not None and any(np.ptp(size, axis=0).any() for size in self.line_std)
         self.rows_are_lines = coloured or (held and sum(lengths) >= MANY_ROWS)
         self.of_poles = (
-            [LinesOfPoles(self._shifted(u), self.first, self.dt, at_rest) for u in self.driving]
+            [LinesOfPoles(self._shifted(u), self.first, self.dt, self.at_rest) for u in self.driving]
             if held and self.rows_are_lines
             else []
         )
-        self.weights = None if line_std is None else 1.0 / np.vstack(line_std)
+        self.weights = None if self.line_std is None else 1.0 / np.vstack(self.line_std)
         self.values = self._rows(np.vstack(self._measured()))
         if self.weights is not None:
             self.values = self.values * self.weights
-        self.drift = drift
-        slow = block_diag(*(legvander(np.linspace(-1.0, 1.0, length), drift) for length in lengths))
+
+        fixed = [block_diag(*(legvander(np.linspace(-1.0, 1.0, length), self.drift) for length in lengths))]
         direct = np.vstack([self.direct(k).T[self.first :] for k in range(len(records))])
-        self.n_inputs = records[0].n_inputs
-        self.n_excitations = self.n_inputs + (0 if at_rest else len(records))
         # A constant input is collinear with the offset of each output.
-        self.feedthrough = (feedthrough or any_fraction) and bool(np.ptp(direct, axis=0).all())
-        self.beside, self.changing = beside, changing
-        fixed = [direct, slow] if self.feedthrough else [slow]
-        if beside is not None:
+        self.has_direct = (self.feedthrough or self.any_fraction) and bool(np.ptp(direct, axis=0).all())
+        if self.has_direct:
+            fixed = [direct, *fixed]
+        if self.beside is not None:
             starts = np.cumsum([0, *(record.n_samples for record in records)])
-            fixed.append(np.vstack([beside[a + self.first : b] for a, b in zip(starts, starts[1:])]))
+            fixed.append(np.vstack([self.beside[a + self.first : b] for a, b in zip(starts, starts[1:])]))
         self.fixed = self._rows(np.hstack(fixed))
-        self.resolution = 2.0 * np.pi / (max(lengths) * self.dt)
+
+        span = max(lengths) * self.dt
+        self.resolution = 2.0 * np.pi / span
         self.highest = self.nyquist = np.pi / self.dt
         self.size = next_fast_len(2 * max(lengths))
-        span = max(lengths) * self.dt
         fastest = max(0.1 * np.pi / self.dt, 2.0 / span)
         self.rates = np.geomspace(0.5 / span, fastest, max(int(np.log(fastest * span)) + 2, 3))
         self.cells = self.rates.size * max(lengths)
         self._last: tuple[complex, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] | None = None
-
-    def weighted_by(self, line_std: Sequence[np.ndarray] | None) -> "KnownInputs":
-        """The same records with lines weighted by their noise; with None, samples of equal weight."""
-        return self._with(line_std=line_std)
 
     def with_columns(self, rows: Floats, changing: tuple[complex, ...]) -> "KnownInputs":
         """The same records with the fixed columns of changing modes, (n_rows, n_columns), rows as in `values`."""
         before = np.zeros((self.first, rows.shape[1]))
         samples = np.vstack([piece for part in self.rows for piece in (before, self.samples(rows[part]))])
         beside = samples if self.beside is None else np.hstack([self.beside, samples])
-        return self._with(beside=beside, changing=(*self.changing, *changing))
-
-    def without_columns(self) -> "KnownInputs":
-        """The same records without the fixed columns of changing modes."""
-        return self._with(beside=None, changing=())
-
-    def unweighted(self) -> "KnownInputs":
-        """The same records as samples of equal weight, without the fixed columns of changing modes."""
-        return self._with(line_std=None, beside=None, changing=())
-
-    def first_half(self) -> "KnownInputs":
-        """The first half of each record."""
-        halves = [
-            replace(r, outputs=r.outputs[:, : r.n_samples // 2], inputs=r.inputs[:, : r.n_samples // 2])
-            for r in self.records
-        ]
-        return self._with(records=halves)
-
-    def with_inputs(self, records: Sequence[Record]) -> "KnownInputs":
-        """The same records with other inputs, as samples of equal weight."""
-        return self._with(records=records, line_std=None)
-
-    def with_outputs(self, records: Sequence[Record], clock: float) -> "KnownInputs":
-        """Records with outputs resampled by this ε of their clock, as samples of equal weight."""
-        return self._with(records=records, clock=clock, line_std=None)
-
-    def with_white_noise(self, records: Sequence[Record]) -> "KnownInputs":
-        """Records in which the noise of the inputs was whitened, as samples of equal weight."""
-        return self._with(records=records, measured=self.records, line_std=None)
-
-    def as_measured(self) -> "KnownInputs":
-        """The records before their noise was whitened, as samples of equal weight."""
-        return self._with(records=self.measured, measured=None, line_std=None)
-
-    def from_rest(self, records: Sequence[Record]) -> "KnownInputs":
-        """Other records of the same inputs, from rest: samples of equal weight, fixed columns reset to a constant."""
-        return self._with(records=records, line_std=None, at_rest=True, drift=0, beside=None, changing=())
-
-    def with_drift(self, degree: int) -> "KnownInputs":
-        """The same records with polynomials of time of this degree."""
-        return self._with(drift=degree)
-
-    def drift_of(self, fit: Fit) -> Floats:
-        """Range of the fitted drift of each output over each record, (n_records, n_outputs)."""
-        degree = self.drift + 1
-        first = 2 * fit.poles.size + self.fixed.shape[1] - degree * len(self.records)
-        each = fit.coefficients[first:].reshape(len(self.records), degree, -1)
-        slow = legvander(np.linspace(-1.0, 1.0, 50), self.drift)[:, 1:]
-        return np.asarray(np.ptp(np.einsum("td,kdj->ktj", slow, each[:, 1:]), axis=1))
+        return replace(self, beside=beside, changing=(*self.changing, *changing))
 
     def with_distorted(self, poles: tuple[complex, ...]) -> "KnownInputs":
         """The same records with further poles near which no mode is searched."""
         new = tuple(pole for pole in poles if pole not in self.distorted)
-        return self._with(distorted=(*self.distorted, *new)) if new else self
+        return replace(self, distorted=(*self.distorted, *new)) if new else self
 
     def delayed_by(self, delays: np.ndarray, any_fraction: bool = False) -> "KnownInputs":
-        """The same records with inputs of these delays, samples; line weights are kept."""
-        delayed = self._with(delays=delays, any_fraction=any_fraction, line_std=None)
+        """The same records with inputs of these delays, samples; the noise is interpolated at the lines that remain."""
+        delayed = replace(self, delays=delays, any_fraction=any_fraction, line_std=None)
         if self.line_std is None:
             return delayed
-        # Another delay leaves fewer or more rows: noise is interpolated at the frequency of each line.
         lengths = [rows.stop - rows.start for rows in delayed.rows]
-        return delayed.weighted_by([_resampled(std, n) for std, n in zip(self.line_std, lengths, strict=True)])
-
-    def with_hold(self, hold: str, delays: np.ndarray) -> "KnownInputs":
-        """The same records with another course of the inputs between samples and these delays, samples."""
-        return self._with(hold=hold).delayed_by(delays)
+        return replace(delayed, line_std=[_resampled(std, n) for std, n in zip(self.line_std, lengths, strict=True)])
 
     def apart(self, fit: Fit) -> "KnownInputs | None":
         """Combinations of outputs with independent residuals of unit variance, lines of equal weight.
@@ -240,18 +177,7 @@ class KnownInputs:
         Poles and participation factors stay valid. None where the outputs' residuals are not significantly correlated.
         """
         mixed = independent(self.records, [left.T for left in self.left(fit)])
-        return None if mixed is None else self._with(records=mixed[0], line_std=None)
-
-    def disturbed(self, fit: Fit) -> Floats:
-        """Variance of each mode in noise that outputs share as the residual shows, over that in independent noise.
-
-        (n_modes,); see `projection.disturbed`.
-        """
-        return disturbed(correlation([left.T for left in self.left(fit)]), fit.amplitudes / fit.noise[:, None])
-
-    def beside_as(self, other: "KnownInputs") -> "KnownInputs":
-        """The same records, lines of equal weight, with the fixed columns of changing modes of `other`."""
-        return self._with(line_std=None, beside=other.beside, changing=other.changing)
+        return None if mixed is None else replace(self, records=mixed[0], line_std=None)
 
     def left(self, fit: Fit) -> list[np.ndarray]:
         """The residual of each record at its samples, (n_samples, n_outputs), in the unit of each output."""
@@ -260,25 +186,6 @@ class KnownInputs:
     def as_samples(self, rows: Floats) -> list[Floats]:
         """Rows of all records as the samples of each, (n_samples, k)."""
         return [self.samples(rows[part]) for part in self.rows]
-
-    def _with(self, **changed: Any) -> "KnownInputs":
-        same = {
-            "records": self.records,
-            "at_rest": self.at_rest,
-            "hold": self.hold,
-            "feedthrough": self.may_have_feedthrough,
-            "delays": self.delays,
-            "any_fraction": self.any_fraction,
-            "drift": self.drift,
-            "line_std": self.line_std,
-            "beside": self.beside,
-            "changing": self.changing,
-            "distorted": self.distorted,
-            "free": self.free,
-            "measured": self.measured,
-            "clock": self.clock,
-        }
-        return KnownInputs(**{**same, **changed})
 
     def noise(self, fit: Fit) -> np.ndarray:
         """Standard deviation of the residual of each output in each record, (n_records, n_outputs)."""
@@ -373,14 +280,9 @@ class KnownInputs:
         """Rows of the fit of one record as samples."""
         return samples_of(rows) if self.rows_are_lines else rows
 
-    def modulated(self, rows: Floats, factor: Floats) -> Floats:
-        """Columns (n_rows, k) times a factor at each sample, (n_samples,) of all records."""
-        return self.rows_of([self.samples(rows[part]) * factor[part, None] for part in self.rows])
-
-    @property
-    def time(self) -> Floats:
-        """Time of each sample within its record, from -1/2 at the first to 1/2 at the last, (n_samples,)."""
-        return np.concatenate([np.linspace(-0.5, 0.5, part.stop - part.start) for part in self.rows])
+    def times_time(self, rows: Floats) -> Floats:
+        """Columns (n_rows, k) times the time within each record, -1/2 at its first sample and 1/2 at its last."""
+        return self.rows_of([x * np.linspace(-0.5, 0.5, len(x))[:, None] for x in self.as_samples(rows)])
 
     def modal_coordinate(self, pole: complex, l_r: np.ndarray) -> list[np.ndarray]:
         """Modal coordinate z of a pole at the samples of each record, (n_samples,) complex each."""

@@ -177,6 +177,17 @@ def regressors(data: Measurement, poles: np.ndarray, participation: np.ndarray) 
     return x
 
 
+def changes_of(a: np.ndarray, tangents: Pair) -> np.ndarray:
+    """Changes of an output by the real, then by the imaginary parts of changes of unknowns, (n_rows, 2 n_unknowns).
+
+    Args:
+        a: (n_unknowns,) amplitude at the output of the mode of each unknown.
+        tangents: real and imaginary parts of ∂z by each unknown, (n_rows, n_unknowns) each.
+    """
+    real, imaginary = tangents
+    return np.hstack([a.real * real - a.imag * imaginary, -a.imag * real - a.real * imaginary])
+
+
 def combinations(participation: np.ndarray, n_fixed: int) -> np.ndarray:
     """K of Φ = [T, V] K, (n_tangents + n_fixed, n_columns): modal coordinates are combinations of responses."""
     n, q = participation.shape[0], participation.shape[1] + 1
@@ -251,6 +262,11 @@ def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
 def column_norms(columns: np.ndarray) -> np.ndarray:
     """Norm of each column, without a further table of their size."""
     return np.asarray(np.sqrt(np.einsum("kc,kc->c", columns, columns)))
+
+
+def normalised_columns(rows: np.ndarray) -> np.ndarray:
+    """Columns scaled to unit length."""
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300))
 
 
 def orthonormal(columns: np.ndarray) -> Pair:

@@ -2,27 +2,25 @@
 
 from collections.abc import Iterator
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.arrays import scaled_inverse
-from workbench.identification.input_output.fit_errors import covariance
+from workbench.identification.input_output.fit_errors import marginal_statistics_of, statistic_of, statistic_of_each
 from workbench.identification.input_output.modal_fit import (
     MANY_ROWS,
     Fit,
     Measurement,
     column_norms,
-    free_parameters,
     modal_coordinate,
+    normalised_columns,
     only,
     orthonormal,
     products_of,
     projected,
     search,
     settled,
-    tangent_weights,
 )
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget, Stepwise, overdamped
 from workbench.structure.modes import mac
@@ -47,6 +45,23 @@ class OrderSettings:
 
 
 ORDER = OrderSettings()
+
+
+@dataclass(frozen=True)
+class SelectionOptions:
+    """Options of a selection of modes.
+
+    Attributes:
+        max_modes: largest number of modes.
+        false_alarm: probability that noise alone is taken for a mode.
+        budget: of time.
+    """
+
+    max_modes: int
+    false_alarm: float = FALSE_ALARM
+    budget: Budget = field(default_factory=Budget)
+
+
 Scored = tuple[float, np.ndarray, complex]  # gain, participation factors and pole of a candidate
 
 
@@ -70,29 +85,17 @@ class Selected:
 
     def refitted(self, fit: Fit) -> "Selected":
         """The same selection with another fit, and the statistic of each mode in that fit."""
-        return replace(self, fit=fit, statistic=statistic_of_each(fit))
+        return self if fit is self.fit else replace(self, fit=fit, statistic=statistic_of_each(fit))
 
 
-def select_modes(
-    data: Measurement,
-    *,
-    max_modes: int,
-    false_alarm: float = FALSE_ALARM,
-    budget: Budget | None = None,
-    start: Fit | None = None,
-) -> Selected:
+def select_modes(data: Measurement, options: SelectionOptions, start: Fit | None = None) -> Selected:
     """The modes whose likelihood ratio exceeds the threshold for noise, by forward and backward stepwise selection.
 
     Args:
-        data: the measurement.
-        max_modes: maximum number of modes.
-        false_alarm: chance that noise alone is taken for a mode.
-        budget: of time; none unless given.
         start: modes to start from; none unless given.
     """
-    budget = Budget() if budget is None else budget
-    problem = _Modes(data, false_alarm, budget)
-    selection = Stepwise(problem, max_modes, ORDER.most_weak, None, forgets=True, budget=budget)
+    problem = _Modes(data, options)
+    selection = Stepwise(problem, options.max_modes, ORDER.most_weak, None, forgets=True, budget=options.budget)
     fit = projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex))
     if start is not None and start.poles.size:
         try:
@@ -106,7 +109,7 @@ def select_modes(
     return Selected(ordered, statistic_of_each(fit)[order], problem.limit, selection.full)
 
 
-def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALSE_ALARM) -> Fit:
+def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float) -> Fit:
     """The significant ones of given poles, unchanged, with their best participation factors.
 
     Backward elimination: the residues of all poles are fitted at once, of any rank, and the pole of the smallest χ² is
@@ -156,9 +159,9 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
     return projected(data, poles, np.array(participation, complex).reshape(poles.size, size // 2))
 
 
-def sure_modes(data: Measurement, start: Fit, false_alarm: float, budget: Budget) -> Fit:
+def sure_modes(data: Measurement, start: Fit, options: SelectionOptions) -> Fit:
     """The fitted modes of a start that exceed the threshold `SELECTION.weak` times, as coloured noise hardly does."""
-    return _Modes(data, false_alarm, budget).started(start, SELECTION.weak)
+    return _Modes(data, options).started(start, SELECTION.weak)
 
 
 def _rank_one_participation(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
@@ -182,11 +185,11 @@ def _rank_one_participation(residues: np.ndarray, norm: np.ndarray) -> np.ndarra
 class _Modes:
     """The `searches.Selection` of a measurement; a candidate is a pole and its participation factors."""
 
-    def __init__(self, data: Measurement, false_alarm: float, budget: Budget) -> None:
-        self.data, self.budget = data, budget
+    def __init__(self, data: Measurement, options: SelectionOptions) -> None:
+        self.data, self.budget = data, options.budget
         self.excitations = data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
         self._scored: tuple[Fit, list[Scored]] | None = None
-        self.limit = float(chi2.isf(false_alarm / data.cells, 2 * (data.values.shape[1] + self.excitations)))
+        self.limit = float(chi2.isf(options.false_alarm / data.cells, 2 * (data.values.shape[1] + self.excitations)))
 
     def n_modes(self, model: Fit) -> int:
         return model.poles.size
@@ -409,7 +412,7 @@ def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> 
     each = zip(fit.poles, fit.participation)
     coordinates = [part for pole, l_r in each for part in modal_coordinate(data.responses(pole), l_r)]
     phi = weights * (np.column_stack([*coordinates, data.fixed]) if coordinates else data.fixed)
-    return orthonormal(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))[0]
+    return orthonormal(normalised_columns(phi))[0]
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
@@ -427,44 +430,3 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     single_channel = shapes.shape[0] * data.n_inputs == 1
     splits = overlapping & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not single_channel)
     return np.asarray(splits.any(axis=1) | overdamped(poles) | _reaches_nyquist(data, poles))
-
-
-def statistic_of(fit: Fit, r: int) -> float:
-    """χ² of the shape of mode r in the noise, its pole and participation factors fixed."""
-    pair, noise, statistic = [r, fit.poles.size + r], fit.noise, 0.0
-    for part, outputs in fit.outputs():
-        c = part.coefficients[pair] / noise[outputs]
-        # a pole at Nyquist has no imaginary part at the samples: singular
-        statistic += float(np.einsum("ij,ik,kj->", c, scaled_inverse(part.spread[np.ix_(pair, pair)]), c))
-    return statistic
-
-
-def statistic_of_each(fit: Fit) -> np.ndarray:
-    """`statistic_of` each mode, (n_modes,)."""
-    return np.array([statistic_of(fit, r) for r in range(fit.poles.size)])
-
-
-def marginal_statistics_of(fit: Fit) -> np.ndarray:
-    """χ² of each mode's shape in the noise, (n_modes,), poles and participation factors of all modes unknown."""
-    n, bound, free = fit.poles.size, covariance(fit), free_parameters(fit)
-    statistics = np.zeros(n)
-    if n == 0:
-        return statistics
-    amplitudes = fit.coefficients[: 2 * n].reshape(2, n, -1)
-    effect = [np.einsum("ct,tkj->cjk", part.tilt[: 2 * n], tangent_weights(fit, part)[:, free]) for part in fit.parts]
-    for r in range(n):
-        pair = [r, n + r]
-        effects = np.concatenate([each[pair] for each in effect], axis=1)
-        size = 2 * effects.shape[1]
-        spread = effects.reshape(size, -1) @ bound @ effects.reshape(size, -1).T
-        spread = spread.reshape(2, size // 2, 2, size // 2)
-        for part, outputs in fit.outputs():
-            shape_covariance = part.spread[np.ix_(pair, pair)]
-            for j in range(outputs.start, outputs.stop):
-                spread[:, j, :, j] += shape_covariance * fit.noise[j] ** 2
-        c = amplitudes[:, r].ravel()
-        spread = spread.reshape(size, size)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))
-        # Nearly identical modes make it singular.
-        statistics[r] = c * scale @ np.linalg.pinv(spread * np.outer(scale, scale), hermitian=True) @ (c * scale)
-    return statistics

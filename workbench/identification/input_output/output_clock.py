@@ -16,8 +16,7 @@ import numpy as np
 
 from workbench.arrays import scaled_inverse
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, orthonormal, regressors
-from workbench.identification.input_output.rivals import normalised_columns
+from workbench.identification.input_output.modal_fit import Fit, changes_of, normalised_columns, orthonormal, regressors
 from workbench.identification.input_output.time_variance import slopes_in_time
 from workbench.identification.signal.modal_estimates import time_derivatives
 from workbench.identification.signal.searches import Budget
@@ -49,7 +48,7 @@ class OutputClock(NamedTuple):
 def output_clock(data: KnownInputs, fit: Fit) -> OutputClock:
     """The clock of the outputs that the residual of a fit shows, to first order."""
     x = regressors(data, fit.poles, fit.participation)
-    real, imaginary = slopes_in_time(data, fit, x)
+    in_time = slopes_in_time(data, fit, x)
     weights = np.ones((1, fit.noise.size)) if data.weights is None else data.weights
     motion = data.as_samples((data.values - fit.residual) / weights)
     time = [data.first + np.arange(len(samples)) for samples in motion]
@@ -60,8 +59,7 @@ def output_clock(data: KnownInputs, fit: Fit) -> OutputClock:
     for j, (a, noise, residual) in enumerate(zip(fit.amplitudes, fit.noise, fit.residual.T, strict=True)):
         weight = weights[:, j : j + 1]
         q = _basis(weight * x) if known is None else known
-        of_changes = real * a.real - imaginary * a.imag, -real * a.imag - imaginary * a.real
-        columns = weight * np.column_stack([*of_changes, late[:, j]]) / noise
+        columns = weight * np.column_stack([changes_of(a, in_time), late[:, j]]) / noise
         columns -= q @ (q.T @ columns)
         normal += columns.T @ columns
         right_side += columns.T @ residual / noise
@@ -100,7 +98,8 @@ def on_one_clock(
         rate += (1.0 + rate) * clock.rate
         if abs(rate) > OUTPUT_CLOCK.most or budget.spent("search for a clock of the outputs of its own"):
             return None
-        resampled = data.with_outputs([on_inputs_clock(record, rate) for record in data.records], rate)
+        on_one = [on_inputs_clock(record, rate) for record in data.records]
+        resampled = replace(data, records=on_one, clock=rate, line_std=None)
         other = fitted(resampled)
         if not other.poles.size:
             return None

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.arrays import Floats
-from workbench.identification.input_output.modal_fit import Fit, columns
+from workbench.identification.input_output.modal_fit import Fit, changes_of, columns, normalised_columns
 from workbench.identification.input_output.spectral_lines import Lines
 
 
@@ -59,20 +59,16 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
     n = fit.poles.size
     if not n:
         return Peaks(np.zeros(0, bool), np.zeros(0), np.zeros(0))
-    third = [_third_order_term(lines, pole, l_r) for pole, l_r in zip(fit.poles, fit.participation, strict=True)]
+    third = [lines.power_of_pole(pole, l_r, 3) for pole, l_r in zip(fit.poles, fit.participation, strict=True)]
     slopes = [lines.slopes(pole, l_r) for pole, l_r in zip(fit.poles, fit.participation, strict=True)]
     real, imaginary = (np.column_stack([s[k] for s in (*third, *slopes)]) for k in (0, 1))
-    phi = columns(lines, fit.poles, fit.participation)[0]
-    phi = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
+    phi = normalised_columns(columns(lines, fit.poles, fit.participation)[0])
     size = np.maximum(np.hypot(np.linalg.norm(real, axis=0), np.linalg.norm(imaginary, axis=0)), 1e-300)
     rows, residuals = [], []
     for j, (a, noise) in enumerate(zip(fit.amplitudes, fit.noise, strict=True)):
         weight = 1.0 if lines.weights is None else lines.weights[:, j : j + 1]
         q = np.linalg.qr(weight * phi)[0]
-        pair = np.tile(a, 2) / size
-        regressors = weight * np.hstack(
-            [pair.real * real - pair.imag * imaginary, -pair.imag * real - pair.real * imaginary]
-        )
+        regressors = weight * changes_of(np.tile(a, 2) / size, (real, imaginary))
         rows.append((regressors - q @ (q.T @ regressors)) / noise)
         residuals.append(fit.residual[:, j] / noise)
     m, y = np.vstack(rows), np.concatenate(residuals)
@@ -95,14 +91,6 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
     return Peaks(uneven, scatter, statistic)
 
 
-def _third_order_term(lines: Lines, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the real and of the imaginary part of the factor of l / (s - λ)³."""
-    s = 1j * lines.omega
-    above = participation[:, None] / (s - pole) ** 3
-    below = participation.conj()[:, None] / (s - pole.conjugate()) ** 3
-    return lines.stacked_pair(above, below)
-
-
 def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) -> dict[int, list[int]]:
     """The representative of each cluster, with its other members; modes in no cluster are absent.
 
@@ -111,8 +99,7 @@ def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) 
         collinearity: (n_modes,) modal phase collinearity, 1 where all points move in phase.
         strength: (n_modes,) the strongest of a cluster represents it.
     """
-    width = np.abs(poles.real)
-    overlap = np.abs(np.subtract.outer(poles.imag, poles.imag)) < width[:, None] + width
+    width, overlap = np.abs(poles.real), _overlap(poles)
     remaining, clusters = list(np.argsort(-strength)), dict[int, list[int]]()
     while remaining:
         first = remaining.pop(0)
@@ -135,9 +122,7 @@ def overlap_remarks(poles: np.ndarray, n_channels: int) -> tuple[str, ...]:
         poles: (n_modes,) rad/s, by rising frequency.
         n_channels: outputs times inputs; two and more distinguish modes by their shapes.
     """
-    width = np.abs(poles.real)
-    overlap = np.abs(np.subtract.outer(poles.imag, poles.imag)) < width[:, None] + width
-    first, second = np.nonzero(np.triu(overlap, 1))
+    first, second = np.nonzero(np.triu(_overlap(poles), 1))
     if n_channels > 1 or not first.size:
         return ()
     pairs = ", ".join(f"{r + 1} and {s + 1}" for r, s in zip(first, second, strict=True))
@@ -145,3 +130,9 @@ def overlap_remarks(poles: np.ndarray, n_channels: int) -> tuple[str, ...]:
         f"modes {pairs} overlap: one mode that drifts or depends on amplitude looks like that to a single input and"
         " output; compare parts of the record, or measure at another place",
     )
+
+
+def _overlap(poles: np.ndarray) -> np.ndarray:
+    """Whether the half-power bands of two modes overlap, (n_modes, n_modes)."""
+    width = np.abs(poles.real)
+    return np.asarray(np.abs(np.subtract.outer(poles.imag, poles.imag)) < width[:, None] + width)

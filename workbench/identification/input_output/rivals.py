@@ -4,15 +4,24 @@ To first order, its motion beyond that of a linear mode spans a few columns. Whe
 close linear modes, these are removed and the columns stay as fixed columns of the measurement.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.identification.input_output.modal_fit import Fit, Measurement, Pair, modal_coordinate, projected
-from workbench.identification.input_output.model_order import statistic_of_each
+from workbench.identification.input_output.fit_errors import statistic_of_each
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    Measurement,
+    Pair,
+    changes_of,
+    columns,
+    modal_coordinate,
+    normalised_columns,
+    projected,
+)
 from workbench.identification.signal.searches import Budget
 
 
@@ -36,30 +45,11 @@ RIVALS = RivalSettings()
 Data = TypeVar("Data", bound=Measurement)
 
 
-class Motion(Protocol):
-    """A changing mode.
-
-    Attributes:
-        columns: (n_rows, n_columns) orthonormal columns of its motion beyond that of a linear mode.
-        pole: of the nearest linear mode, rad/s.
-    """
-
-    @property
-    def columns(self) -> Floats: ...
-
-    @property
-    def pole(self) -> complex: ...
-
-
-One = TypeVar("One", bound=Motion)
-
-
 def in_place_of_clusters(
     data: Data,
     fit: Fit,
     alike: np.ndarray,
-    rival_of: Callable[[Data, np.ndarray], One | None],
-    beside: Callable[[Data, One], Data],
+    rival_of: Callable[[Data, np.ndarray], tuple[Data, complex] | None],
     budget: Budget,
 ) -> tuple[Data, Fit] | None:
     """The measurement with the columns of changing modes, and the fit with one mode for each cluster that one replaces.
@@ -68,9 +58,8 @@ def in_place_of_clusters(
         data: the measurement that `fit` describes.
         fit: of linear modes.
         alike: (n_modes, n_modes) whether two modes may be one, by their shapes.
-        rival_of: the changing mode in place of a cluster of modes, the strongest first; None where the linear modes are
-            likelier.
-        beside: the measurement with the columns of a changing mode.
+        rival_of: the measurement with the columns of a changing mode in place of a cluster of modes, the strongest
+            first, and the pole of the nearest linear mode, rad/s; None where the linear modes are likelier.
         budget: of time.
 
     Returns:
@@ -87,10 +76,10 @@ def in_place_of_clusters(
         for k in range(others.size, max(others.size - RIVALS.most_clusters, 0), -1):
             if budget.spent("check of modes that change"):
                 break
-            changing = rival_of(data, np.r_[r, others[:k]])
-            if changing is not None:
-                data = beside(data, changing)
-                removed[others[:k]], poles[r] = True, changing.pole
+            rival = rival_of(data, np.r_[r, others[:k]])
+            if rival is not None:
+                data, poles[r] = rival
+                removed[others[:k]] = True
                 break
     return (data, projected(data, poles[~removed], fit.participation[~removed])) if removed.any() else None
 
@@ -101,52 +90,79 @@ def orthonormal_basis(rows: np.ndarray, least: float) -> Floats:
     return np.asarray(u[:, s > least])
 
 
-def normalised_columns(rows: np.ndarray) -> Floats:
-    """Columns scaled to unit length."""
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300))
+def beyond_linear(data: Measurement, motions: np.ndarray, pole: complex, l_r: np.ndarray) -> tuple[Floats, complex]:
+    """Orthonormal columns of a motion beyond the nearest linear mode, (n_rows, n_columns), and the pole of that mode.
 
-
-def columns_beyond_linear(data: Measurement, columns: np.ndarray, pole: complex, l_r: np.ndarray) -> Floats:
-    """Orthonormal columns of a motion, (n_rows, n_columns), beyond a linear mode and the fixed columns.
-
-    Orthogonal to the linear mode of the pole, its slope by the pole, and the fixed columns.
-    """
-    constant = np.column_stack([*modal_coordinate(data.responses(pole), l_r), *data.slopes(pole, l_r)])
-    constant = orthonormal_basis(normalised_columns(np.hstack([constant, data.fixed])), RIVALS.collinear)
-    columns = normalised_columns(columns)
-    return orthonormal_basis(columns - constant @ (constant.T @ columns), RIVALS.significant)
-
-
-def basis_of_others(weight: np.ndarray, phi: Floats, tangents: Pair, a: np.ndarray) -> Floats:
-    """Orthonormal columns of one output spanned by the other modes and, to first order, by changes of their poles.
+    Orthogonal to that mode, its slope by the pole, and the fixed columns.
 
     Args:
-        weight: (n_rows, 1) inverse relative noise.
-        phi: (n_rows, n_columns) columns of the other modes.
-        tangents: real and imaginary parts, (n_rows, n_tangents) each.
-        a: (n_tangents,) amplitude of each tangent's mode at the output.
+        motions: (n_rows, n_motions) of a changing mode, and of its changes with the unknowns.
+        pole: from which the nearest linear mode, of participation factors l_r, is searched.
     """
-    real, imaginary = tangents
-    columns = [a.real * real - a.imag * imaginary, -a.imag * real - a.real * imaginary]
-    return orthonormal_basis(normalised_columns(weight * np.hstack([phi, *columns])), RIVALS.collinear)
+    pole = _nearest_pole(data, motions[:, 0], pole, l_r)
+    linear = np.column_stack([*modal_coordinate(data.responses(pole), l_r), *data.slopes(pole, l_r)])
+    linear = orthonormal_basis(normalised_columns(np.hstack([linear, data.fixed])), RIVALS.collinear)
+    motions = normalised_columns(motions)
+    return orthonormal_basis(motions - linear @ (linear.T @ motions), RIVALS.significant), pole
 
 
-def projected_residual(y: Floats, x: Floats) -> Pair:
-    """Residual of an output (n_rows,) with the shape of a motion projected out, and its Jacobian (Kaufman 1975).
+def bases_with_changes(
+    data: Measurement,
+    fit: Fit,
+    modes: np.ndarray,
+    weights: Sequence[Floats],
+    lines: Callable[[Floats], Floats] = lambda rows: rows,
+    poles_only: bool = True,
+) -> list[Floats]:
+    """Orthonormal columns of some modes, the fixed columns and first-order changes of the modes, one matrix per output.
 
     Args:
-        y: (n_rows,) of the output.
-        x: (n_rows, 2 (1 + n_unknowns)) real parts of the motion and of its slopes by the unknowns, then imaginary ones.
+        modes: their indices.
+        weights: (n_lines, 1) of each output, inverse relative noise.
+        lines: the lines that count, (n_lines, k), of rows of the measurement, (n_rows, k).
+        poles_only: whether only poles may change, or participation factors too.
     """
-    n = x.shape[1] // 2
-    q, r = np.linalg.qr(x[:, [0, n]])
-    in_motion = q.T @ y
-    a, b = np.linalg.lstsq(r, in_motion, rcond=1e-12)[0]
-    tangents = a * x[:, 1:n] + b * x[:, n + 1 :]
-    return y - q @ in_motion, -(tangents - q @ (q.T @ tangents))
+    phi, tangents = columns(data, fit.poles[modes], fit.participation[modes])
+    of_mode, half = fit.participation.shape[1] + 1, tangents.shape[1] // 2
+    step = of_mode if poles_only else 1
+    stacked = lines(np.hstack([phi, tangents[:, :half:step], tangents[:, half::step]]))
+    phi, real, imaginary = np.split(stacked, [phi.shape[1], phi.shape[1] + half // step], axis=1)
+    bases = []
+    for weight, a in zip(weights, np.repeat(fit.amplitudes[:, modes], of_mode // step, axis=1), strict=True):
+        each = weight * np.hstack([phi, changes_of(a, (real, imaginary))])
+        bases.append(orthonormal_basis(normalised_columns(each), RIVALS.collinear))
+    return bases
 
 
-def nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:
+def projected_residual(values: Sequence[Floats], motions: Sequence[Floats]) -> Pair:
+    """Residual of all outputs with the shape of a motion projected out, and its Jacobian (Kaufman 1975).
+
+    (n_outputs n_lines,) and (n_outputs n_lines, n_unknowns).
+
+    Args:
+        values: of each output, (n_lines,).
+        motions: of each output, (n_lines, 2 (1 + n_unknowns)) real parts of the motion and of its slopes by the
+            unknowns, then imaginary ones.
+    """
+    residuals, jacobians = [], []
+    for y, x in zip(values, motions, strict=True):
+        n = x.shape[1] // 2
+        q, r = np.linalg.qr(x[:, [0, n]])
+        in_motion = q.T @ y
+        a, b = np.linalg.lstsq(r, in_motion, rcond=1e-12)[0]
+        tangents = a * x[:, 1:n] + b * x[:, n + 1 :]
+        residuals.append(y - q @ in_motion)
+        jacobians.append(q @ (q.T @ tangents) - tangents)
+    return np.concatenate(residuals), np.vstack(jacobians)
+
+
+def diverged(values: Sequence[Floats], n_unknowns: int) -> Pair:
+    """In place of `projected_residual` where the motion diverges: a large residual that no unknown changes."""
+    residual = 10.0 * np.abs(np.concatenate(values))
+    return residual, np.zeros((residual.size, n_unknowns))
+
+
+def _nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:
     """Pole of the linear mode, of given participation factors, nearest to a motion (n_rows,) in least squares."""
     rate, best, step, smallest = abs(pole.real), pole, 0j, np.inf
     for _ in range(RIVALS.most_poles):

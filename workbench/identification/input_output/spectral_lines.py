@@ -1,6 +1,6 @@
 """Lines of measured FRFs, as a `modal_fit.Measurement`, and their noise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.special import hyp2f1
 from scipy.stats import chi2, f, kruskal, spearmanr
 
-from workbench.identification.input_output.modal_fit import Fit
+from workbench.identification.input_output.modal_fit import Fit, Pair
 from workbench.identification.input_output.model_order import bases_of, weights_of
 from workbench.identification.signal.searches import SELECTION
 
@@ -37,10 +37,13 @@ WINDOWS = np.r_[0.0, np.geomspace(0.1, 30.0, 60)]  # length of a record, in time
 SHARES = np.geomspace(1e-3, 1e3, 61)  # b |H| / a at the median line, from nothing to all
 
 
+@dataclass(eq=False, repr=False)
 class Lines:
-    """The `modal_fit.Measurement` of FRFs: rows are real, then imaginary parts, reference by reference.
+    """The `modal_fit.Measurement` of FRFs; `dataclasses.replace` gives changed ones.
 
-    Args:
+    Rows are real, then imaginary parts, reference by reference.
+
+    Attributes:
         h: (n_outputs, n_references, n_lines).
         omega: (n_lines,) rad/s.
         powers: of s, in the residual terms.
@@ -51,115 +54,82 @@ class Lines:
         window_rate: 1/τ of an exponential window, as far as noise shows one.
     """
 
-    def __init__(
-        self,
-        h: np.ndarray,
-        omega: np.ndarray,
-        powers: list[int],
-        noise: np.ndarray | None,
-        guessed: bool = False,
-        beside: np.ndarray | None = None,
-        changing: tuple[tuple[complex, float], ...] = (),
-        window_rate: float = 0.0,
-    ) -> None:
-        self.window_rate = window_rate
-        self.h, self.powers, self.stated = h, powers, noise
-        self.distorted: tuple[complex, ...] = ()
-        self.free: tuple[complex, ...] = ()
-        self.guessed, self.beside, self.changing = guessed, beside, changing
-        self.omega, (_, self.refs, self.lines) = omega, h.shape
-        self.n_inputs = self.refs
-        self.weights = None if noise is None else 1.0 / self._stacked(noise * (1 + 1j))
-        self.values = self._stacked(h) * (1.0 if self.weights is None else self.weights)
+    h: np.ndarray
+    omega: np.ndarray
+    powers: list[int]
+    noise: np.ndarray | None
+    guessed: bool = False
+    beside: np.ndarray | None = None
+    changing: tuple[tuple[complex, float], ...] = ()
+    window_rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        omega, (_, self.n_inputs, n_lines) = self.omega, self.h.shape
+        self.weights = None if self.noise is None else 1.0 / _rows_of(self.noise * (1 + 1j))
+        self.values = _rows_of(self.h) * (1.0 if self.weights is None else self.weights)
         s = 1j * omega / omega[-1]
-        self.fixed = self._stacked(np.array([self._of_reference(i, s**p) for i in range(self.refs) for p in powers]))
-        if beside is not None:
-            self.fixed = np.hstack([self.fixed, beside])
+        self.fixed = _rows_of(self._of_each_reference(np.array([s**p for p in self.powers])))
+        if self.beside is not None:
+            self.fixed = np.hstack([self.fixed, self.beside])
         self.resolution = float(np.diff(omega).min())
         # A pole close beyond the band is not constant in it, so such poles are searched too, as residual terms.
         self.highest, self.nyquist = 2.0 * float(omega[-1]), np.inf
         span = omega[-1] - omega[0]
         self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), LINES.rates)
-        self.cells = LINES.rates * self.lines
-
-    def of(self, h: np.ndarray) -> "Lines":
-        """The same lines of other outputs, of unknown noise."""
-        return Lines(h, self.omega, self.powers, None, False, self.beside, self.changing, self.window_rate)
-
-    def weighted_by(self, guessed: np.ndarray) -> "Lines":
-        """The same lines with their noise known up to a factor."""
-        return Lines(self.h, self.omega, self.powers, guessed, True, self.beside, self.changing, self.window_rate)
+        self.cells = LINES.rates * n_lines
+        self.distorted: tuple[complex, ...] = ()
+        self.free: tuple[complex, ...] = ()
 
     def with_columns(self, columns: np.ndarray, changing: tuple[complex, float]) -> "Lines":
         """The same lines with the fixed columns of a further changing mode."""
         beside = columns if self.beside is None else np.hstack([self.beside, columns])
-        changed = (*self.changing, changing)
-        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, beside, changed, self.window_rate)
-
-    def without_columns(self) -> "Lines":
-        """The same lines without the columns of changing modes."""
-        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, window_rate=self.window_rate)
+        return replace(self, beside=beside, changing=(*self.changing, changing))
 
     def only(self, which: np.ndarray, smooth: int) -> "Lines":
         """Some of the lines, by flag (n_lines,), with polynomials up to a degree as further fixed columns."""
-        omega = self.omega[which]
+        omega, noise = self.omega[which], None if self.noise is None else self.noise[..., which]
+        selected = replace(self, h=self.h[..., which], omega=omega, noise=noise, beside=None, changing=())
         middle = 0.5 * (omega[0] + omega[-1])
         scaled = (omega - middle) / max(omega[-1] - middle, 1e-300)
-        noise = None if self.stated is None else self.stated[..., which]
-        selected = Lines(self.h[..., which], omega, self.powers, noise, self.guessed, window_rate=self.window_rate)
-        polynomial_rows = [factor * scaled**k for k in range(smooth + 1) for factor in (1.0, 1j)]
-        polynomials = selected._stacked(
-            np.array([selected._of_reference(i, x) for i in range(self.refs) for x in polynomial_rows])
-        )
-        beside = [] if self.beside is None else [self.beside[np.tile(which, 2 * self.refs)]]
-        selected.fixed = np.hstack([selected.fixed, polynomials, *beside])
+        polynomials = np.array([factor * scaled**k for k in range(smooth + 1) for factor in (1.0, 1j)])
+        beside = [] if self.beside is None else [self.beside[np.tile(which, 2 * self.n_inputs)]]
+        selected.fixed = np.hstack([selected.fixed, _rows_of(self._of_each_reference(polynomials)), *beside])
         return selected
 
-    def _stacked(self, values: np.ndarray) -> np.ndarray:
-        """Rows of the fit, (2 n_references n_lines, n), from complex values (n, n_references, n_lines)."""
-        rows = values.reshape(values.shape[0], -1).T
-        return np.vstack([rows.real, rows.imag])
-
-    def _of_reference(self, reference: int, values: np.ndarray) -> np.ndarray:
-        """Values (n_lines,) of one reference, zero for the others, (n_references, n_lines)."""
-        rows = np.zeros((self.refs, self.lines), complex)
-        rows[reference] = values
-        return rows
+    def _of_each_reference(self, values: np.ndarray) -> np.ndarray:
+        """Values (k, n_lines) of each reference in turn, 0 for the others, (n_references k, n_references, n_lines)."""
+        each = np.zeros((self.n_inputs, len(values), self.n_inputs, values.shape[1]), complex)
+        for i in range(self.n_inputs):
+            each[i, :, i] = values
+        return each.reshape(-1, *each.shape[2:])
 
     def unstacked(self, rows: np.ndarray) -> np.ndarray:
-        """Complex values (n, n_references, n_lines) from rows of the fit, the inverse of `_stacked`."""
+        """Complex values (n, n_references, n_lines) from rows of the fit, (n_rows, n)."""
         real, imaginary = np.split(rows, 2)
-        return (real + 1j * imaginary).T.reshape(-1, self.refs, self.lines)
+        return (real + 1j * imaginary).T.reshape(-1, self.n_inputs, self.omega.size)
 
-    def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+    def responses(self, pole: complex) -> Pair:
         s = 1j * self.omega
-        above, below = 1.0 / (s - pole), 1.0 / (s - pole.conjugate())
-        pair = (0.5 * (above + below), -0.5j * (above - below))
-        real, imaginary = (self._stacked(np.array([self._of_reference(i, x) for i in range(self.refs)])) for x in pair)
-        return real, imaginary
+        above, below = (self._of_each_reference(1.0 / (s - p)[None]) for p in (pole, pole.conjugate()))
+        return rows_of_pair(above, below)
 
-    def slopes(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, pole: complex, participation: np.ndarray) -> Pair:
+        return self.power_of_pole(pole, participation, 2)
+
+    def power_of_pole(self, pole: complex, participation: np.ndarray, power: int) -> Pair:
+        """Rows (n_rows,) of the real and of the imaginary part of the factor of l / (s - λ)^power."""
         s = 1j * self.omega
-        above = participation[:, None] / (s - pole) ** 2
-        below = participation.conj()[:, None] / (s - pole.conjugate()) ** 2
-        return self.stacked_pair(above, below)
+        above = participation[:, None] / (s - pole) ** power
+        below = participation.conj()[:, None] / (s - pole.conjugate()) ** power
+        real, imaginary = rows_of_pair(above[None], below[None])
+        return real[:, 0], imaginary[:, 0]
 
     def tangents(self, pole: complex, participation: np.ndarray, real: np.ndarray, imaginary: np.ndarray) -> None:
         real[:, 0], imaginary[:, 0] = self.slopes(pole, participation)
         real[:, 1:], imaginary[:, 1:] = self.responses(pole)
 
-    def stacked_pair(self, above: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (n_rows,) of the real and the imaginary part of the factor of a pole pair.
-
-        Args:
-            above, below: (n_references, n_lines) terms of the pole and of its conjugate.
-        """
-        pair = (0.5 * (above + below), -0.5j * (above - below))
-        real, imaginary = (self._stacked(x[None])[:, 0] for x in pair)
-        return real, imaginary
-
     def candidates(self, residual: np.ndarray) -> np.ndarray:
-        raw = self.unstacked(residual if self.weights is None else residual * self.weights).reshape(-1, self.lines)
+        raw = self.unstacked(residual if self.weights is None else residual * self.weights).reshape(-1, self.omega.size)
         weight = 1.0 if self.weights is None else (np.abs(self.unstacked(self.weights)) ** 2).mean(axis=(0, 1)) / 2.0
         power = (np.abs(raw) ** 2).sum(axis=0)
         lines = np.sort(np.argsort(power)[-LINES.most_candidates :])
@@ -235,6 +205,21 @@ class Lines:
         return float(_mean_of_decay(window + of_pole) / (_mean_of_decay(window) * _mean_of_decay(of_pole)))
 
 
+def rows_of_pair(above: np.ndarray, below: np.ndarray) -> Pair:
+    """Rows of the fit (n_rows, n) of the real and of the imaginary part of the factor of pairs of poles.
+
+    Args:
+        above, below: (n, n_references, n_lines) terms of each pole and of its conjugate.
+    """
+    return _rows_of(0.5 * (above + below)), _rows_of(-0.5j * (above - below))
+
+
+def _rows_of(values: np.ndarray) -> np.ndarray:
+    """Rows of the fit, (2 n_references n_lines, n), from complex values (n, n_references, n_lines)."""
+    rows = values.reshape(values.shape[0], -1).T
+    return np.vstack([rows.real, rows.imag])
+
+
 def _mean_of_decay(total: float) -> float:
     """Mean of e^(-at) over a record at whose end it is e^(-total)."""
     return float(-np.expm1(-total) / total) if abs(total) > 1e-9 else 1.0
@@ -270,7 +255,7 @@ def window_rate(residual: np.ndarray, omega: np.ndarray) -> float:
     return float(WINDOWS[best] * step.mean() / (2.0 * np.pi)) if sure else 0.0
 
 
-def relative_noise(residual: np.ndarray, fitted: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
+def relative_noise(lines: Lines, fit: Fit) -> np.ndarray | None:
     """Relative noise of every line, (n_outputs, n_references, n_lines); None where it may be the same at all.
 
     s = c g(ω) (a² + b² |H|²)^½. c: level of each output and reference, where references differ. g: common to all,
@@ -280,26 +265,17 @@ def relative_noise(residual: np.ndarray, fitted: np.ndarray, omega: np.ndarray) 
     and r_k+1 is noise alone, of variance 3/2 s². H is the fitted one, since a measured H is correlated with its noise;
     where a mode is not yet fitted it is the running median of the measured one. g and b are estimated in both orders,
     and that of the smaller deviation is kept.
-
-    Args:
-        residual: (n_outputs, n_references, n_lines), complex.
-        fitted: the fit, of that shape.
-        omega: (n_lines,) rad/s.
     """
-    inner = np.arange(1, residual.shape[-1] - 1, 3)  # every third, so that no line is used twice
+    residual, fitted, omega = lines.left(fit), lines.fitted(fit), lines.omega
+    inner = np.arange(1, omega.size - 1, 3)  # every third, so that no line is used twice
     differences = np.abs(residual[..., inner] - 0.5 * (residual[..., inner - 1] + residual[..., inner + 1]))
-    smoothed = median_filter(np.abs(fitted + residual), (1, 1, LINES.smoothed))
-    size = np.maximum(np.abs(fitted), smoothed)
     nonzero = np.median(differences, axis=(1, 2)) > 0.0  # an output of zeros has no noise
     if not nonzero.any():
         return None
-    if not nonzero.all():
-        noise = np.ones(residual.shape)
-        of_nonzero = relative_noise(residual[nonzero], fitted[nonzero], omega)
-        noise[nonzero] = 1.0 if of_nonzero is None else of_nonzero
-        return None if of_nonzero is None else noise
+    smoothed = median_filter(np.abs(fitted + residual), (1, 1, LINES.smoothed))
+    size, differences = np.maximum(np.abs(fitted), smoothed)[nonzero], differences[nonzero]
     logs = np.log(np.maximum(differences, 1e-3 * np.median(differences, axis=-1, keepdims=True) + 1e-300))
-    levels = _reference_levels(logs)[..., None] * np.ones(residual.shape[-1])
+    levels = _reference_levels(logs)[..., None] * np.ones(omega.size)
     best, least_misfit = levels, np.inf
     for order in ((_frequency_trend, _response_trend), (_response_trend, _frequency_trend)):
         trial = levels
@@ -308,7 +284,11 @@ def relative_noise(residual: np.ndarray, fitted: np.ndarray, omega: np.ndarray) 
         error = logs - trial[..., inner]
         if (misfit := np.abs(error - np.median(error, axis=(1, 2), keepdims=True)).sum()) < least_misfit:
             best, least_misfit = trial, misfit
-    return np.exp(best) if best.any() else None
+    if not best.any():
+        return None
+    noise = np.ones(residual.shape)
+    noise[nonzero] = np.exp(best)
+    return noise
 
 
 def _reference_levels(logs: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from workbench.identification.input_output.input_delays import n_moving
+from workbench.identification.input_output.excitation import n_moving
 from workbench.records.record import Record
 
 

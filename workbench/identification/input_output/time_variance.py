@@ -13,7 +13,7 @@ drives the next,
 the modes are fitted with its terms up to the third order as fixed columns.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,19 +22,19 @@ from scipy.signal import lfilter
 
 from workbench.arrays import Floats, scaled_inverse
 from workbench.identification.input_output.changing_response import CHANGE_CHECK, in_place_of
+from workbench.identification.input_output.fit_errors import statistic_of, statistic_of_each
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import (
     Fit,
-    Measurement,
     added_misfit,
     columns,
+    normalised_columns,
     only,
     products_of,
     regressors,
     settled,
 )
-from workbench.identification.input_output.model_order import statistic_of, statistic_of_each
-from workbench.identification.input_output.rivals import in_place_of_clusters, normalised_columns, orthonormal_basis
+from workbench.identification.input_output.rivals import in_place_of_clusters, orthonormal_basis
 from workbench.identification.signal.searches import SELECTION, Budget
 from workbench.structure.modes import mac
 from workbench.structure.printed import mode_text
@@ -104,7 +104,7 @@ def slopes_in_time(data: KnownInputs, fit: Fit, x: Floats) -> tuple[Floats, Floa
         x: `regressors` of the fit, which hold ∂z/∂λ.
     """
     n, q = fit.poles.size, 1 + fit.participation.shape[1]
-    real, imaginary = (data.modulated(x[:, part * n * q : (part + 1) * n * q : q], data.time) for part in (0, 1))
+    real, imaginary = (data.times_time(x[:, part * n * q : (part + 1) * n * q : q]) for part in (0, 1))
     return real, imaginary
 
 
@@ -115,37 +115,16 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
     """
     if fit.noise.size * data.n_inputs == 1:
         return fit
-
-    def statistic(one: Fit, at: int) -> float:
-        change = changes_in_time(data, one)
-        return float((change.frequency[at] / change.deviation[at]) ** 2) if change.sure[at] else -np.inf
-
-    return one_for_two(data, fit, budget, statistic, CHANGE_CHECK)[0]
-
-
-def one_for_two(
-    data: Measurement, fit: Fit, budget: Budget, change: Callable[[Fit, int], float], check: str
-) -> tuple[Fit, np.ndarray]:
-    """The fit with one mode in place of two alike, where a change of the one explains the other.
-
-    Args:
-        change: χ² of the change of a mode of a fit, by its index; -inf where it does not count.
-        check: name of this check in the remark where the time is up.
-
-    Returns:
-        The fit, and the indices of the modes of the given fit that are left in it.
-    """
-    kept = np.arange(fit.poles.size)
     for pair in _pairs_alike(fit):
-        if budget.spent(check):
+        if budget.spent(CHANGE_CHECK):
             break
         weak, strong = sorted(pair, key=lambda r: statistic_of(fit, r))
-        remaining = np.delete(kept, weak)
-        one = settled(data, only(data, fit, remaining), budget=budget)
-        if change(one, int(np.searchsorted(remaining, strong))) > CHANGING.instead * added_misfit(one, fit, one.noise):
-            fewer, which = one_for_two(data, one, budget, change, check)
-            return fewer, remaining[which]
-    return fit, kept
+        one = settled(data, only(data, fit, np.delete(np.arange(fit.poles.size), weak)), budget=budget)
+        change, at = changes_in_time(data, one), strong - (weak < strong)
+        statistic = (change.frequency[at] / change.deviation[at]) ** 2
+        if change.sure[at] and statistic > CHANGING.instead * added_misfit(one, fit, one.noise):
+            return joined(data, one, budget)
+    return fit
 
 
 def beside_changing(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -> tuple[KnownInputs, Fit] | None:
@@ -192,7 +171,6 @@ def _beside_rivals(data: KnownInputs, fit: Fit, limit: float, budget: Budget) ->
         fit,
         alike,
         lambda data, cluster: in_place_of(data, fit, cluster, limit, budget),
-        lambda data, one: data.with_columns(one.columns, (one.pole,)),
         budget,
     )
 

@@ -1,0 +1,197 @@
+"""The modes of records with known inputs: the strongest first, and all in the noise that they leave."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from workbench.identification.input_output.fit_errors import statistic_of_each
+from workbench.identification.input_output.held_out import without_unpredictive
+from workbench.identification.input_output.input_noise import input_noise, with_white_noise
+from workbench.identification.input_output.known_inputs import KnownInputs
+from workbench.identification.input_output.modal_fit import Fit, only, projected, settled
+from workbench.identification.input_output.model_order import (
+    ORDER,
+    Selected,
+    SelectionOptions,
+    fit_of_poles,
+    is_about_distorted,
+    select_modes,
+    sure_modes,
+)
+from workbench.identification.input_output.noise_spectrum import alike
+from workbench.identification.input_output.output_clock import on_one_clock
+from workbench.identification.input_output.subspace_poles import subspace_poles
+from workbench.identification.input_output.time_variance import beside_changing
+from workbench.identification.signal.searches import SELECTION, Budget
+
+
+@dataclass(frozen=True)
+class DrivenSelectionSettings:
+    """Constants of the selection of modes of records with known inputs."""
+
+    strongest: int = 8  # modes for the first estimate of the noise
+    noise_rounds: int = 4  # alternations between noise and modes
+    decorrelation_rounds: int = 2  # selections of modes in combinations of outputs whose noise is uncorrelated
+    spare_states: int = 20  # of a subspace model beyond two per mode: these fit noise
+
+
+DRIVEN_SELECTION = DrivenSelectionSettings()
+
+
+def select(
+    data: KnownInputs, options: SelectionOptions, strongest: Selected | None = None
+) -> tuple[KnownInputs, Selected]:
+    """The modes, estimated with the strongest first; where noise of the outputs is correlated, in combinations without.
+
+    Returns:
+        the data, weighted by their noise, and the modes.
+    """
+    budget = options.budget
+    start = subspace_start(data, options) if strongest is None else strongest.fit
+    start = settled(data, start, SELECTION.few_steps, budget, ORDER.decided)  # once for all searches from there
+    sure = sure_modes(data, start, options)
+    on_one = on_one_clock(data, sure, lambda other: sure_modes(other, subspace_start(other, options), options), budget)
+    if on_one is not None:
+        (data, sure), strongest = on_one, None
+        start = sure
+    noise = None if budget.spent("search for noise of the inputs") else input_noise(data, sure)
+    if noise is not None:
+        (data, start), strongest = with_white_noise(data, sure, noise, options), None
+    if strongest is None:
+        share = replace(options, budget=budget.share(SELECTION.search_share))
+        strongest = select_strongest(data, share, start)
+    data = data.with_distorted(strongest.distorted)
+    uncorrelated = data.apart(strongest.fit)
+    if uncorrelated is None:
+        return _select_weighted(data, strongest, options)
+    # Correlated noise makes peaks in all outputs. Modes not found yet add to its estimate, hence the repetition.
+    for _ in range(DRIVEN_SELECTION.decorrelation_rounds):
+        again = select_strongest(uncorrelated, options, strongest.fit)
+        uncorrelated, selected = _select_weighted(uncorrelated, again, options)
+        further = uncorrelated.apart(selected.fit)
+        if further is None or budget.spent("search in outputs of uncorrelated noise"):
+            break
+        uncorrelated, strongest = further, selected
+    data = replace(data, line_std=None, beside=uncorrelated.beside, changing=uncorrelated.changing)
+    fit = settled(data, projected(data, selected.fit.poles, selected.fit.participation), budget=budget)
+    return reweighted(data, selected, fit, budget)
+
+
+def reweighted(data: KnownInputs, selected: Selected, fit: Fit, budget: Budget) -> tuple[KnownInputs, Selected]:
+    """The data weighted by the noise spectrum of a fit, and the modes refitted to them, by rising frequency."""
+    data = replace(data, line_std=data.noise_spectrum(fit))
+    return data, selected.refitted(settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget))
+
+
+def subspace_start(data: KnownInputs, options: SelectionOptions) -> Fit:
+    """The significant modes of a subspace model, at most `max_modes`."""
+    poles = subspace_poles(data.records, data.whole, 2 * options.max_modes + DRIVEN_SELECTION.spare_states)
+    poles = np.append(poles[~is_about_distorted(data, poles)], data.free)
+    fit = fit_of_poles(data, poles, options.false_alarm)
+    if fit.poles.size <= options.max_modes:
+        return fit
+    return only(data, fit, np.argsort(statistic_of_each(fit))[-options.max_modes :])
+
+
+def select_strongest(data: KnownInputs, options: SelectionOptions, start: Fit | None = None) -> Selected:
+    """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN_SELECTION.strongest`.
+
+    As long as all are sure, as many more are searched: strong modes left out would be taken for noise.
+    """
+    fit = subspace_start(data, options) if start is None else start
+    few = _few_of(options, fit.poles.size)
+    while True:
+        selected = only_predictive(data, select_modes(data, few, fit), options.budget)
+        fit = selected.fit
+        if fit.poles.size < few.max_modes or few.max_modes == options.max_modes:
+            return selected
+        # beside the residual about each: noise of the inputs leaves peaks at the modes far above white noise
+        if sure_modes(data, fit, options).poles.size < fit.poles.size:
+            return selected
+        few = _few_of(options, few.max_modes + DRIVEN_SELECTION.strongest)
+
+
+def _few_of(options: SelectionOptions, fewest: int) -> SelectionOptions:
+    """The options with at most `DRIVEN_SELECTION.strongest` modes, or `fewest` where these are more."""
+    return replace(options, max_modes=min(max(DRIVEN_SELECTION.strongest, fewest), options.max_modes))
+
+
+def only_predictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
+    """The selected modes without those that make the prediction of held-out data worse.
+
+    These are marked as distorted: no further mode is searched near them.
+    """
+    fit, distorted = without_unpredictive(data, selected.fit, selected.statistic, budget)
+    return replace(selected.refitted(fit), distorted=(*data.distorted, *distorted))
+
+
+def _select_weighted(data: KnownInputs, strongest: Selected, options: SelectionOptions) -> tuple[KnownInputs, Selected]:
+    """The modes of outputs of uncorrelated noise, weighted by the spectrum of the residual.
+
+    Coloured noise may be taken for modes. A false mode fits noise at its lines, so that the noise there is
+    underestimated and the mode appears significant. The noise is therefore estimated again without all doubtful modes;
+    they stay if modes and noise together are less likely without them.
+    """
+    budget, check = options.budget, "check of doubtful modes"
+    data, selected = _alternate_with_noise(data, strongest, _few_of(options, strongest.fit.poles.size), options)
+    doubtful = (selected.statistic < SELECTION.weak * selected.limit) | ~_are_oscillatory(data, selected)
+    if data.line_std is None or not doubtful.any() or budget.spent(check):
+        return data, selected
+    sure = settled(data, only(data, selected.fit, ~doubtful), budget=budget)
+    other = replace(data, line_std=data.noise_spectrum(sure))
+    other, fewer = _alternate_with_noise(other, select_modes(other, options, sure), options, options)
+    if budget.spent(check):
+        return data, selected
+    threshold = selected.limit * (selected.fit.poles.size - fewer.fit.poles.size)
+    less_oscillatory = (~_are_oscillatory(data, selected)).sum() > (~_are_oscillatory(other, fewer)).sum()
+    as_likely = other.cost(fewer.fit) - data.cost(selected.fit) <= threshold
+    return (other, fewer) if less_oscillatory or as_likely else (data, selected)
+
+
+def _are_oscillatory(data: KnownInputs, selected: Selected) -> np.ndarray:
+    """Whether each mode oscillates within a record and does not grow, (n_modes,); others may be coloured noise."""
+    poles, span = selected.fit.poles, 2.0 * np.pi / data.resolution
+    return np.asarray((np.abs(poles) > data.resolution) & (poles.real * span < SELECTION.most_growth))
+
+
+def _alternate_with_noise(
+    data: KnownInputs, selected: Selected, first_options: SelectionOptions, options: SelectionOptions
+) -> tuple[KnownInputs, Selected]:
+    """Modes and noise spectrum, estimated alternately until both settle.
+
+    Args:
+        data: known inputs and outputs.
+        selected: the modes to start from.
+        first_options: those by which `selected` was selected.
+        options: those of the selections that follow.
+    """
+    budget, estimation = options.budget, "estimation of the noise spectrum"
+    for _ in range(DRIVEN_SELECTION.noise_rounds):
+        data, selected = _with_changing(data, selected, first_options)
+        line_std = data.noise_spectrum(selected.fit)
+        may_be_more = selected.full and first_options.max_modes < options.max_modes
+        if (alike(line_std, data.line_std) and not may_be_more) or budget.spent(estimation):
+            break
+        weighted = replace(data.with_distorted(selected.distorted), line_std=line_std)
+        reselected = only_predictive(weighted, select_modes(weighted, options, selected.fit), budget)
+        # A search that the time limit ended early does not replace the one before.
+        if budget.spent(estimation) and reselected.fit.poles.size < selected.fit.poles.size:
+            break
+        data, selected, first_options = weighted, reselected, options
+    return data, selected
+
+
+def _with_changing(data: KnownInputs, selected: Selected, options: SelectionOptions) -> tuple[KnownInputs, Selected]:
+    """The data with the columns of changing modes, and the modes, as long as these are likelier than close modes."""
+    # With one input and output both models were compared before.
+    compared = data.values.shape[1] * data.n_inputs == 1
+    for _ in range(DRIVEN_SELECTION.noise_rounds):
+        changing = beside_changing(data, selected.fit, selected.limit, options.budget)
+        if changing is None:
+            break
+        fewer = select_modes(changing[0], options, changing[1])
+        allowed = selected.limit * max(selected.fit.poles.size - fewer.fit.poles.size, 0) if compared else 0.0
+        if changing[0].cost(fewer.fit) >= data.cost(selected.fit) + allowed:
+            break
+        data, selected = changing[0], fewer
+    return data, selected
