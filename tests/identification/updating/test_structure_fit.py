@@ -100,6 +100,16 @@ def test_a_series_that_dips_between_the_points_of_integration_is_no_structure():
         structure("beam", 1.0, lambda x: 1.0 - 1.1 * trough.functions(np.ravel(x))[:, 0].reshape(np.shape(x)))
 
 
+def test_without_terms_the_nominal_structure_is_compared_with_the_modes():
+    """It has no free parameter; this ended in an error of numpy."""
+    none = {"mass": Basis.polynomial(0), "stiffness": Basis.polynomial(0)}
+    found = fit_structure(measured("beam"), structure("beam"), **none)
+    assert found.n_terms == (0, 0) and found.explains and found.stiffness.std(X).max() < 1e-12
+    with pytest.warns(UserWarning, match="the modes are not explained"):
+        stiffer = fit_structure(measured("beam"), structure("beam", stiffness=lambda x: 1.1 * stiffness(x)), **none)
+    np.testing.assert_allclose(stiffer.check.frequency_errors, np.sqrt(1.1) - 1.0, rtol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["beam", pytest.param("bar", marks=pytest.mark.slow)])
 def test_intervals_hold_the_truth_as_often_as_they_say(kind):

@@ -171,13 +171,14 @@ class SolvedSeries:
         diagonal = (r, np.arange(r.size))
         gaps[diagonal] = np.inf
         omega, at_sensors = np.sqrt(self.eigenvalues[r]), self.at_sensors
-        omega_by, shapes_by = [], []
-        for g, mass_change in changes:
+        omega_by = np.zeros((r.size, len(changes)))
+        shapes_by = np.zeros((*at_sensors[:, r].shape, len(changes)))
+        for j, (g, mass_change) in enumerate(changes):
             mixed = g / gaps
             mixed[diagonal] = -0.5 * mass_change[diagonal]
-            omega_by.append(g[diagonal] / (2.0 * omega))
-            shapes_by.append(at_sensors @ mixed)
-        return Sensitivity(omega, at_sensors[:, r], np.stack(omega_by, -1), np.stack(shapes_by, -1))
+            omega_by[:, j] = g[diagonal] / (2.0 * omega)
+            shapes_by[..., j] = at_sensors @ mixed
+        return Sensitivity(omega, at_sensors[:, r], omega_by, shapes_by)
 
     def _by_loss(self, strains: np.ndarray, r: np.ndarray, loss: LocalLoss) -> list[np.ndarray]:
         """∂K_sr by share, centre and width."""
