@@ -197,7 +197,8 @@ def mass_and_stiffness(
         prior_mass, prior_stiffness: first estimates, kg/m and N (N m²), which the series corrects.
 
     Raises:
-        ValueError: no known mass, more terms than relations, known values that the series cannot take.
+        ValueError: no known mass, one that is not positive or off the structure, more terms than relations, known
+            values that the series cannot take.
         UserWarning: mass or stiffness of a standard error above a tenth or unknown; modes that are not orthogonal.
     """
     return distributions_of(modes, kind, (mass_basis, stiffness_basis), known_mass, (prior_mass, prior_stiffness))
@@ -258,7 +259,9 @@ def _mass(modes: Modes, basis: Basis, prior: Profile, known: Sequence[tuple[floa
     if len(known) == 0:
         raise ValueError("orthogonality determines the mass only up to a factor; give the mass at one point or more")
     shapes, weights, x = _sampled(modes, 0, (*basis.breaks, *prior.breaks))
-    places, values = np.array(known, float).T
+    places, values = modes.domain.locate([x for x, _ in known]), np.array([value for _, value in known], float)
+    if not (np.isfinite(values) & (values > 0)).all():
+        raise ValueError(f"a known mass must be positive and finite, kg/m; got {values}")
     coefficients, misfit = mass_series(
         shapes, weights, basis.functions(x), prior(x), basis.functions(places), values - prior(places)
     )
