@@ -19,8 +19,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from workbench.arrays import Floats, scaled_inverse, symmetric_root
 from workbench.identification.signal.searches import Once
-from workbench.identification.updating.distributions import Basis, held_exactly
-from workbench.identification.updating.self_check import SelfCheck
+from workbench.identification.updating.distributions import Basis, SelfCheck, held_exactly
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
 from workbench.identification.updating.structure_task import TASK, FittedStructure, Task, UncertainProfile
 from workbench.structure.member import Beam

@@ -9,8 +9,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.shapes.eigenfunctions import check_along
 from workbench.identification.signal.modal_estimates import Refined, normalised_shapes
-from workbench.identification.updating.distributions import Basis, columns
-from workbench.identification.updating.self_check import SelfCheck
+from workbench.identification.updating.distributions import Basis, SelfCheck, columns
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
 from workbench.renamed import Renamed
 from workbench.structure.member import Bar, Beam
