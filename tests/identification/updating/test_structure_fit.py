@@ -93,9 +93,9 @@ def test_as_many_terms_as_there_are():
 def test_a_series_that_dips_between_the_points_of_integration_is_no_structure():
     """A trough of one thousandth of the length, where a finished structure is checked."""
     trough = Basis(lambda x: np.exp(-(((np.asarray(x)[:, None] - 2.0 * 0.98804) / 1e-3) ** 2)), 1)
-    series = SeriesStructure(structure("beam", 1.0, 1.0), Basis.polynomial(0), trough, SENSORS)
-    assert series.solve(np.zeros(0), np.array([-0.9]), n_modes=3) is not None
-    assert series.solve(np.zeros(0), np.array([-1.1]), n_modes=3) is None
+    series = SeriesStructure(structure("beam", 1.0, 1.0), Basis.polynomial(0), trough, SENSORS, 3)
+    assert series.solve(np.zeros(0), np.array([-0.9])) is not None
+    assert series.solve(np.zeros(0), np.array([-1.1])) is None
     with pytest.raises(ValueError, match="must be positive inside"):
         structure("beam", 1.0, lambda x: 1.0 - 1.1 * trough.functions(np.ravel(x))[:, 0].reshape(np.shape(x)))
 

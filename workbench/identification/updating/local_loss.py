@@ -22,7 +22,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.signal.modal_estimates import Refined
 from workbench.identification.updating.distributions import Basis
-from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
+from workbench.identification.updating.sensitivity import LocalLoss
 from workbench.identification.updating.structure_fit import MOST_TERMS, choose, with_spare_terms
 from workbench.identification.updating.structure_problem import PROBLEM, Problem
 from workbench.identification.updating.structure_task import LACKING, FittedStructure, Task, unexplained
@@ -267,7 +267,7 @@ def _with_point_mass(problem: Problem, at: float, mass: float) -> Problem:
     return replace(
         problem,
         task=replace(problem.task, nominal=heavier),
-        series=SeriesStructure(heavier, series.mass, series.stiffness, series.positions),
+        series=replace(series, nominal=heavier),
     )
 
 
@@ -402,7 +402,7 @@ def scan(problem: Problem, undamaged: FittedStructure) -> tuple[np.ndarray, np.n
     stiffness_held = np.r_[particular, np.zeros(LOSS.places)], block_diag(free, np.eye(LOSS.places))
     trial = replace(
         problem,
-        series=SeriesStructure(task.nominal, series.mass, with_hats, series.positions),
+        series=replace(series, stiffness=with_hats),
         stiffness_held=stiffness_held,
     )
     residuals, slopes = trial.residuals(np.r_[problem.free_of(d, e), np.zeros(LOSS.places)])

@@ -68,7 +68,9 @@ class Problem:
                     "modes determine mass and stiffness only up to a common factor; give known_mass at a point,"
                     " known_stiffness, or a prior"
                 )
-        series = SeriesStructure(task.nominal, mass, stiffness, task.measured.modes.positions)
+        series = SeriesStructure(
+            task.nominal, mass, stiffness, task.measured.modes.positions, int(task.which.max()) + 1
+        )
         known = (
             (mass, task.known_mass, task.nominal.mass_per_length, "masses"),
             (stiffness, task.known_stiffness, series.nominal_stiffness, "stiffnesses"),
@@ -145,7 +147,7 @@ class Problem:
         """Residuals of frequencies, shapes and priors in standard errors, (n_rows,), and their Jacobian by z."""
         task = self.task
         d, e, loss = self.parts(z)
-        solved = self.series.solve(d, e, n_modes=int(task.which.max()) + 1, loss=loss)
+        solved = self.series.solve(d, e, loss)
         coefficient_jacobian = self.coefficient_jacobian(z)
         priors = [
             (task.mass_prior, self.series.mass, d, slice(0, d.size)),
@@ -199,7 +201,7 @@ class Problem:
         )
         name = "bending_stiffness" if isinstance(task.nominal, Beam) else "axial_stiffness"
         changes: dict[str, Any] = {"mass_per_length": mass.profile, name: stiffness.profile}
-        solved = series.solve(d, e, n_modes=int(task.which.max()) + 1, loss=loss)
+        solved = series.solve(d, e, loss)
         if solved is None:
             raise ValueError(
                 "no positive mass and stiffness of this many terms were found; use fewer terms, a prior, or a nominal"
@@ -293,7 +295,7 @@ class Problem:
                 scale[i] = np.mean(pairs[:, 1] / nominal(pairs[:, 0]))
         z = self._nearest(x, np.full(x.size, scale[0]), np.full(x.size, scale[1]))
         d, e, _ = self.parts(z)
-        solved = series.solve(d, e, n_modes=int(task.which.max()) + 1)
+        solved = series.solve(d, e)
         if solved is None:
             return z
         ratio = np.median(task.measured.modes.omega**2 / solved.eigenvalues[solved.n_rigid + task.which])

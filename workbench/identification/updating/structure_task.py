@@ -137,7 +137,7 @@ def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
     modes = measured.modes
     none = Basis.polynomial(0)
     n = modes.n_modes + 4
-    solved = SeriesStructure(nominal, none, none, modes.positions).solve(np.zeros(0), np.zeros(0), n_modes=n)
+    solved = SeriesStructure(nominal, none, none, modes.positions, n).solve(np.zeros(0), np.zeros(0))
     assert solved is not None, "a nominal structure has positive mass and stiffness"
     shapes = solved.at_sensors[:, solved.n_rigid : solved.n_rigid + n]
     agreement = mac(normalised_shapes(modes.shapes).real, shapes)
