@@ -10,7 +10,7 @@ from workbench.identification.signal.synthesis import free_decay, impulse_respon
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.sensitivity import SeriesStructure
 from workbench.identification.updating.structure_fit import choose_structure, fit_structure
-from workbench.identification.updating.structure_task import GaussianPrior
+from workbench.identification.updating.structure_problem import GaussianPrior
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Bar, Beam
 from workbench.structure.supports import End, PointMass
@@ -156,7 +156,7 @@ def test_refusals():
         fit_structure(exact, nominal, mass=one, stiffness=one, known_mass=[(0.0, 1.5), (2.0, 2.1)])
     with pytest.raises(ValueError, match="51 terms cannot be found from 50 data"):
         fit_structure(exact, nominal, mass=one, stiffness=Basis.splines(51, length=2.0), known_mass=[(1.0, 1.8)])
-    with pytest.raises(ValueError, match="known mass -1 at x = 1: it must be positive"):
+    with pytest.raises(ValueError, match="a known mass must be positive and finite; got -1 at x = 1"):
         fit_structure(exact, nominal, mass=one, stiffness=one, known_mass=[(1.0, -1.0)])
     with pytest.raises(ValueError, match="resembles no mode of the nominal"):
         scrambled = replace(exact.modes, shapes=exact.modes.shapes[::-1] * np.arange(1, 11)[:, None] ** 2)

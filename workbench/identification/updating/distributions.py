@@ -229,7 +229,7 @@ def _distributions(
     def identified(some: Modes) -> tuple[Distribution, Distribution, Floats]:
         """Mass, stiffness, and ∫ m φ_r φ_s dx (n_modes, n_modes)."""
         x, weights = _quadrature(some, (*bases[0].breaks, *m0.breaks))
-        places, values = known_masses(some.domain, known, "kg/m")
+        places, values = known_masses(some.domain, known)
         held = bases[0].functions(places), values - m0(places)
         c, misfit, gram = mass_series(some.phi(x), weights, bases[0].functions(x), m0(x), *held)
         mass = Distribution(frozen(c), bases[0], m0, misfit)
@@ -257,18 +257,28 @@ def _quadrature(modes: Modes, breaks: Sequence[float]) -> tuple[Floats, Floats]:
     return gauss_between(nodes, 12)
 
 
-def known_masses(domain: Domain, known: Sequence[tuple[Any, float]], unit: str) -> tuple[np.ndarray, Floats]:
-    """Places, as `domain.locate` returns them, and the masses (n_known,) known there.
+def known_masses(domain: Domain, known: Sequence[tuple[Any, float]]) -> tuple[np.ndarray, Floats]:
+    """`known_values` of a mass, at least one.
 
     Raises:
-        ValueError: none is known, one is not positive, or at a place that the domain does not have.
+        ValueError: none; as `known_values`.
     """
     if len(known) == 0:
         raise ValueError("orthogonality determines the mass only up to a factor; give the mass at one point or more")
-    values = np.array([value for _, value in known], float)
-    if not (np.isfinite(values) & (values > 0)).all():
-        raise ValueError(f"a known mass must be positive and finite, {unit}; got {values}")
-    return np.concatenate([domain.locate(place) for place, _ in known]), values
+    return known_values(domain, known, "mass")
+
+
+def known_values(domain: Domain, known: Sequence[tuple[Any, float]], what: str) -> tuple[np.ndarray, Floats]:
+    """Places, as `domain.locate` returns them, and the values (n_known,) of a distribution there.
+
+    Raises:
+        ValueError: a value that is not positive, or a place that the domain does not have.
+    """
+    places, values = domain.locate([place for place, _ in known]), np.array([value for _, value in known], float)
+    for (place, _), value in zip(known, values, strict=True):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"a known {what} must be positive and finite; got {value:g} at {domain.text(place)}")
+    return places, values
 
 
 def mass_series(

@@ -97,14 +97,21 @@ class SeriesStructure:
         return 2 if isinstance(self.nominal, Beam) else 1
 
     @property
-    def nominal_stiffness(self) -> Profile:
-        """k_0."""
-        return self.nominal.bending_stiffness if isinstance(self.nominal, Beam) else self.nominal.axial_stiffness
+    def bases(self) -> tuple[Basis, Basis]:
+        """M_j and K_j."""
+        return self.mass, self.stiffness
+
+    @property
+    def nominal_profiles(self) -> tuple[Profile, Profile]:
+        """m_0 and k_0."""
+        nominal = self.nominal
+        stiffness = nominal.bending_stiffness if isinstance(nominal, Beam) else nominal.axial_stiffness
+        return nominal.mass_per_length, stiffness
 
     def solve(self, d: np.ndarray, e: np.ndarray, loss: LocalLoss | None = None) -> "SolvedSeries | None":
         """The modes with these coefficients; None if mass or stiffness is negative."""
         length = self.nominal.length
-        mesh = self._intact_mesh if loss is None else _Mesh.of(self, loss.edges(length))
+        mesh = self._intact_mesh if loss is None else _Mesh(self, loss.edges(length))
         mass = mesh.nominal_mass * (1.0 + mesh.mass_terms @ d)
         stiffness = mesh.nominal_stiffness * (1.0 + mesh.stiffness_terms @ e)
         # a series of many terms may be negative between the integration points
@@ -128,7 +135,7 @@ class SeriesStructure:
 
     @cached_property
     def _intact_mesh(self) -> "_Mesh":
-        return _Mesh.of(self, ())
+        return _Mesh(self, ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,10 +150,14 @@ class SolvedSeries:
     n_rigid: int
     loss: LocalLoss | None
 
-    @property
+    @cached_property
     def at_sensors(self) -> np.ndarray:
         """All shapes at the sensors, (n_sensors, n_all)."""
         return np.asarray(self.mesh.segments.evaluation(self.series.positions) @ self.coefficients)
+
+    def modes(self, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Frequencies (n_modes,), rad/s, and shapes at the sensors (n_sensors, n_modes) of elastic modes, from 0."""
+        return np.sqrt(self.eigenvalues[self.n_rigid + which]), self.at_sensors[:, self.n_rigid + which]
 
     def sensitivity(self, which: np.ndarray) -> Sensitivity:
         """Elastic modes `which` (from 0), and their derivatives by d, e and share, centre and width of a loss."""
@@ -164,15 +175,14 @@ class SolvedSeries:
         changes += [(change, np.zeros(r.size)) for change in by_stiffness]
         gaps = self.eigenvalues[r] - self.eigenvalues[:, None]
         gaps[diagonal] = np.inf
-        omega, at_sensors = np.sqrt(self.eigenvalues[r]), self.at_sensors
-        omega_by = np.zeros((r.size, len(changes)))
-        shapes_by = np.zeros((*at_sensors[:, r].shape, len(changes)))
+        omega, at_sensors = self.modes(which)
+        omega_by, shapes_by = np.zeros((r.size, len(changes))), np.zeros((*at_sensors.shape, len(changes)))
         for j, (g, mass_change) in enumerate(changes):
             mixed = g / gaps
             mixed[diagonal] = -0.5 * mass_change
             omega_by[:, j] = g[diagonal] / (2.0 * omega)
-            shapes_by[..., j] = at_sensors @ mixed
-        return Sensitivity(omega, at_sensors[:, r], omega_by, shapes_by)
+            shapes_by[..., j] = self.at_sensors @ mixed
+        return Sensitivity(omega, at_sensors, omega_by, shapes_by)
 
     def _by_loss(self, strains: np.ndarray, r: np.ndarray, loss: LocalLoss) -> list[np.ndarray]:
         """∂K_sr by share, centre and width."""
@@ -190,60 +200,43 @@ class SolvedSeries:
         return [by_share, by_edge[0] + by_edge[1], 0.5 * (by_edge[1] - by_edge[0])]
 
 
-@dataclass(frozen=True, eq=False)
 class _Mesh:
-    """The discretisation: functions and their highest derivatives at Gauss points, and the fixed matrices."""
+    """The discretisation, with nodes at all places where something jumps, and at the edges of a loss.
 
-    segments: Segments
-    x: np.ndarray
-    weights: np.ndarray
-    values: np.ndarray  # (n_points, n_functions)
-    strains: np.ndarray
-    nominal_mass: np.ndarray
-    nominal_stiffness: np.ndarray
-    mass_terms: np.ndarray  # (n_points, n_terms)
-    stiffness_terms: np.ndarray
-    checked_mass: np.ndarray  # (n_places, n_terms) at the places where `member` checks that it is positive
-    checked_stiffness: np.ndarray
-    fixed_mass: np.ndarray  # of attachments
-    fixed_stiffness: np.ndarray  # of springs and of the tension
-    free: np.ndarray  # indices of the functions that the ends do not hold
+    Attributes:
+        segments: the functions.
+        x, weights: (n_points,) Gauss points and weights.
+        values, strains: (n_points, n_functions) functions and their highest derivatives there.
+        nominal_mass, nominal_stiffness: (n_points,) m_0 and k_0.
+        mass_terms, stiffness_terms: (n_points, n_terms) M_j and K_j.
+        checked_mass, checked_stiffness: the same where `member` checks that mass and stiffness are positive.
+        fixed_mass, fixed_stiffness: matrices of attachments, springs and tension.
+        free: indices of the functions that the ends do not hold.
+    """
 
-    @classmethod
-    def of(cls, series: SeriesStructure, edges: tuple[float, ...]) -> "_Mesh":
-        """The mesh with nodes at all places where something jumps, and at the edges of a loss."""
+    def __init__(self, series: SeriesStructure, edges: tuple[float, ...]) -> None:
         nominal, order, length = series.nominal, series.order, series.nominal.length
-        m, k = nominal.mass_per_length, series.nominal_stiffness
+        m, k = series.nominal_profiles
         of_mass, of_stiffness = (*m.breaks, *series.mass.breaks), (*k.breaks, *series.stiffness.breaks, *edges)
         at_parts = (position(part.at) for part in nominal.attachments)
         nodes = segment_ends((*of_mass, *of_stiffness, *at_parts), length, APART)
         degree = int(np.ceil(1.7 * series.n_modes * np.diff(nodes).max() / length)) + 12 + EXTRA_DEGREES
-        segments = Segments(nodes, (degree,) * (nodes.size - 1), order - 1)
-        x, weights, (values, slopes, strains) = segments.tables((0, 1, order))
-        fixed_mass, fixed_stiffness = np.zeros((2, segments.n_functions, segments.n_functions))
-        for mass, row in nominal.point_masses(segments):
-            fixed_mass += mass * row.T @ row
-        held, _, springs = nominal.restraints(segments)
+        self.segments = Segments(nodes, (degree,) * (nodes.size - 1), order - 1)
+        self.x, self.weights, (self.values, slopes, self.strains) = self.segments.tables((0, 1, order))
+        self.nominal_mass, self.nominal_stiffness = m(self.x), k(self.x)
+        self.mass_terms, self.stiffness_terms = series.mass.functions(self.x), series.stiffness.functions(self.x)
+        self.checked_mass = series.mass.functions(checked_places(of_mass, length))
+        self.checked_stiffness = series.stiffness.functions(checked_places(of_stiffness, length))
+        n = self.segments.n_functions
+        self.fixed_mass, self.fixed_stiffness = np.zeros((n, n)), np.zeros((n, n))
+        for mass, row in nominal.point_masses(self.segments):
+            self.fixed_mass += mass * row.T @ row
+        held, _, springs = nominal.restraints(self.segments)
         for spring, row in springs:
-            fixed_stiffness += spring * row.T @ row
+            self.fixed_stiffness += spring * row.T @ row
         if isinstance(nominal, Beam) and nominal.tension:
-            fixed_stiffness += nominal.tension * (slopes.T * weights) @ slopes
-        return cls(
-            segments=segments,
-            x=x,
-            weights=weights,
-            values=values,
-            strains=strains,
-            nominal_mass=m(x),
-            nominal_stiffness=k(x),
-            mass_terms=series.mass.functions(x),
-            stiffness_terms=series.stiffness.functions(x),
-            checked_mass=series.mass.functions(checked_places(of_mass, length)),
-            checked_stiffness=series.stiffness.functions(checked_places(of_stiffness, length)),
-            fixed_mass=fixed_mass,
-            fixed_stiffness=fixed_stiffness,
-            free=np.setdiff1d(np.arange(segments.n_functions), held),
-        )
+            self.fixed_stiffness += nominal.tension * (slopes.T * self.weights) @ slopes
+        self.free = np.setdiff1d(np.arange(n), held)
 
     def inside(self, loss: LocalLoss) -> np.ndarray:
         """Whether each point lies within the loss, (n_points,)."""

@@ -172,7 +172,7 @@ def plate_mass_and_stiffness(
     x, y = at.T
     shapes = modes.phi(at)
     size = np.sqrt((shapes**2).mean(axis=0))
-    places, values = known_masses(modes.domain, known_mass, "kg/m²")
+    places, values = known_masses(modes.domain, known_mass)
     held = mass_basis.functions(*places.T)
     coefficients, misfit, gram = mass_series(
         shapes / size,
