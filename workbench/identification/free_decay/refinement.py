@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from workbench.arrays import scaled_inverse, symmetric_root
 from workbench.identification.signal.data_quality import of_same_sensors
@@ -46,7 +47,12 @@ def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
 
 
 def identified(
-    refined: Refined, statistic: np.ndarray, limit: float, rejected: Sequence[tuple[complex, float]], record: Record
+    refined: Refined,
+    statistic: np.ndarray,
+    limit: float,
+    rejected: Sequence[tuple[complex, float]],
+    record: Record,
+    remarks: tuple[str, ...],
 ) -> Identified:
     """The result of an identification: refined modes with their test statistics, and the poles rejected as noise.
 
@@ -56,10 +62,48 @@ def identified(
         limit: threshold of the statistic.
         rejected: pole, rad/s, and statistic of each rejected candidate.
         record: for the positions of its sensors.
+        remarks: of the result.
     """
     noise = sorted(rejected, key=lambda pair: abs(pair[0]))
     modes = unshaped(np.array([pole for pole, _ in noise], complex), record)
-    return Identified(refined, frozen(statistic), limit, modes, frozen([strength for _, strength in noise]))
+    return Identified(refined, frozen(statistic), limit, modes, frozen([strength for _, strength in noise]), remarks)
+
+
+def thresholds(false_alarm: float, n_cells: int, n_signals: int) -> tuple[float, float]:
+    """χ² from which on a candidate enters, and from which on it stays, among so many in white noise.
+
+    Args:
+        false_alarm: probability that noise alone is taken for a mode.
+        n_cells: number of candidates.
+        n_signals: number of outputs of all records, each with two amplitudes of a mode; the pole adds two parameters.
+    """
+    enter = chi2.isf(min(20.0 * false_alarm, 0.5) / n_cells, 2 * n_signals)
+    return float(enter), float(chi2.isf(false_alarm / n_cells, 2 * n_signals + 2))
+
+
+def over_noise(fits: Sequence[Projection], weights: np.ndarray) -> np.ndarray:
+    """Amplitudes over the noise, (n_signals, n_modes), a signal being an output of a record."""
+    return np.vstack([fit.complex_amplitudes * weight[:, None] for fit, weight in zip(fits, weights, strict=True)])
+
+
+def amplitude_statistic(
+    fits: Sequence[Projection], weights: np.ndarray, r: int, without: np.ndarray | None = None
+) -> float:
+    """χ² of the amplitudes of mode r at fixed poles.
+
+    Args:
+        fits: one per record.
+        weights: (n_records, n_outputs) 1 / noise.
+        r: index of the mode.
+        without: orthonormal directions (n_outputs, n_directions) that are left out; none unless given.
+    """
+    strength, rows = 0.0, [r, fits[0].poles.size + r]
+    for fit, weight in zip(fits, weights, strict=True):
+        a = fit.coefficients[rows] * weight
+        if without is not None:
+            a = a - (a @ without) @ without.T
+        strength += float((a * np.linalg.solve(fit.spread[np.ix_(rows, rows)], a)).sum())
+    return strength
 
 
 def in_coloured_noise(
