@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import exprel
 from scipy.stats import chi2
 
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine
@@ -140,8 +141,8 @@ def _segments(
     for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
         span, decay = (last - first) * record.sample_time, -modes.poles.real
         initial = size * np.exp(-decay * first * record.sample_time)
-        # Mean over the segment of the squared envelope.
-        mean_square = initial**2 * _mean_of_decay(2.0 * decay * span)
+        # mean over the segment of the squared envelope
+        mean_square = initial**2 * exprel(-2.0 * decay * span)
         statistic = (0.5 * (last - first) * mean_square / noise[:, None] ** 2).sum(axis=0)
         significant = np.flatnonzero(statistic > ASSUMPTIONS.least_statistic)
         begins, ends = record.start_time + record.sample_time * np.array([first, last - 1])
@@ -176,12 +177,6 @@ def _segments(
         figures[0, w, significant[sure]] = np.sqrt(mean_square[:, significant[sure]].max(axis=0))
         figures[1:, w, significant[sure]] = np.stack(values)[:, sure]
     return record.start_time + record.sample_time * edges[:-1], figures
-
-
-def _mean_of_decay(x: np.ndarray) -> np.ndarray:
-    """Mean of e^-t over 0 < t < x: (1 - e^-x) / x, 1 at 0."""
-    near = np.abs(x) < 1e-9
-    return np.where(near, 1.0, -np.expm1(-x) / np.where(near, 1.0, x))
 
 
 def _equality(values: np.ndarray, std: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import lstsq, svd
 
 from workbench.identification.signal.data_quality import of_same_sensors
@@ -98,7 +99,9 @@ def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None
     """
     m, shortest = records[0].n_outputs, min(r.n_samples for r in records)
     if delays is None:
-        delays = min(_default_delays(m, [r.n_samples for r in records], order), shortest - 2)
+        # a third of the shortest record, fewer where the matrix would be too large
+        fitting = LARGEST_MATRIX // (m * sum(r.n_samples for r in records))
+        delays = min(max(min(shortest // 3, fitting), int(np.ceil(2 * order / m)) + 2), shortest - 2)
     columns = sum(r.n_samples - delays + 1 for r in records)
     if m * (delays - 1) < order or columns < order or delays < 2:
         least = int(np.ceil(order / m)) + 1
@@ -107,7 +110,9 @@ def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None
             f" delays and {order + least - 1} samples; record {records[0].name!r} has {shortest} samples and"
             f" {delays} delays were taken. Measure longer or ask for fewer modes"
         )
-    hankel = np.hstack([_hankel(r.outputs, delays) for r in records])
+    # delayed copies stacked, delay by delay
+    windows = [sliding_window_view(r.outputs, r.n_samples - delays + 1, axis=1) for r in records]
+    hankel = np.hstack([each.transpose(1, 0, 2).reshape(m * delays, -1) for each in windows])
     if min(hankel.shape) < 4 * order:
         return np.asarray(svd(hankel, full_matrices=False, lapack_driver="gesdd")[0][:, :order])
     # An orthogonal factorisation first makes the matrix square.
@@ -134,20 +139,6 @@ def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 
     order = np.argsort(np.abs(poles))
     shapes = normalised_shapes(vectors / poles ** time_derivatives(record.output_channels)[:, None])
     return SampledModes.of_poles(poles[order], shapes[:, order], record.positions)
-
-
-def _default_delays(m: int, lengths: Sequence[int], order: int) -> int:
-    """A third of the shortest record, fewer where the matrix would grow beyond `LARGEST_MATRIX` entries."""
-    third = min(lengths) // 3
-    fits = LARGEST_MATRIX // (m * sum(lengths))
-    least = int(np.ceil(2 * order / m)) + 2
-    return max(min(third, fits), least, 2)
-
-
-def _hankel(outputs: np.ndarray, delays: int) -> np.ndarray:
-    """Delayed copies stacked, delay by delay: (n_outputs * delays, n_samples - delays + 1)."""
-    columns = outputs.shape[1] - delays + 1
-    return np.vstack([outputs[:, d : d + columns] for d in range(delays)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,26 +212,22 @@ def stable_modes(
         keep = (modes.zeta > 0) & (modes.zeta < largest_damping) & (modes.phase_collinearity >= standing)
         taken = set()
         # The most collinear shapes are assigned first: a mode precedes poles that split off it.
-        for r in sorted(np.flatnonzero(keep), key=lambda r: -modes.phase_collinearity[r]):
-            near = _nearest(groups, modes, int(r), frequency, shape)
+        for r in sorted(np.flatnonzero(keep).tolist(), key=lambda r: -modes.phase_collinearity[r]):
+            near = _nearest(groups, modes, r, frequency, shape)
             if near is None:
-                groups.append([(modes, int(r))])
-                taken.add(len(groups) - 1)
-            elif near not in taken:
-                groups[near].append((modes, int(r)))
+                near = len(groups)
+                groups.append([])
+            if near not in taken:
+                groups[near].append((modes, r))
                 taken.add(near)
-    stayed = [g for g in groups if len(g) >= presence * len(diagram.orders)]
-    best = [max(g, key=lambda item: item[0].phase_collinearity[item[1]]) for g in stayed]
-    order = np.argsort([modes.omega[r] for modes, r in best])
-    best, stayed = [best[i] for i in order], [stayed[i] for i in order]
-    positions = diagram.found[0].positions
-    modes = SampledModes(
-        np.array([m.omega[r] for m, r in best]),
-        np.array([m.zeta[r] for m, r in best]),
-        np.array([m.shapes[:, r] for m, r in best]).reshape(len(best), len(positions)).T,
-        positions,
-    )
-    return StableModes(modes, np.array([len(g) for g in stayed]) / len(diagram.orders))
+    stayed = [group for group in groups if len(group) >= presence * len(diagram.orders)]
+    best = [max(group, key=lambda item: item[0].phase_collinearity[item[1]]) for group in stayed]
+    n_outputs, positions = len(diagram.found[0].positions), diagram.found[0].positions
+    omega, zeta = np.array([(modes.omega[r], modes.zeta[r]) for modes, r in best]).reshape(-1, 2).T
+    shapes = np.array([modes.shapes[:, r] for modes, r in best]).reshape(-1, n_outputs).T
+    share = np.array([len(group) for group in stayed]) / len(diagram.orders)
+    order = np.argsort(omega)
+    return StableModes(SampledModes(omega[order], zeta[order], shapes[:, order], positions), share[order])
 
 
 def _nearest(

@@ -1,4 +1,4 @@
-"""Preparation of a record for identification: start of the free decay, repair of spikes, removal of drift.
+"""Preparation of a record for identification: whether and since when it is a free decay, spikes, and drift.
 
 A free decay satisfies a backward linear prediction y(t) = Σ_k c_k y(t + kΔt), with the same c_k for every output, for
 any modes with constants and drifts. The c_k are estimated from the end of the record backwards, by recursive least
@@ -18,6 +18,8 @@ from scipy.signal import upfirdn
 from scipy.signal.windows import blackman
 from scipy.stats import chi2
 
+from workbench.identification.free_decay.ibrahim import stacked_delays
+from workbench.identification.signal.projection import project
 from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
@@ -52,7 +54,22 @@ class StartSettings:
     leaps: float = 6.0  # interpolation error of a spike, in standard deviations
 
 
-START = StartSettings()
+@dataclass(frozen=True)
+class DecayingSettings:
+    """Constants of the test for a free decay."""
+
+    decayed: float = 0.1  # rms of the last tenth over the largest of any tenth, below which a record has decayed
+    falling: int = 6  # tenths of decreasing level: by chance in 1 of 720 stationary records
+    # Share of the energy that decaying modes leave of a short free decay, at most: 0.05 where noise is a tenth of the
+    # motion. Of 28 random vibrations of one to five decay times they leave 0.14 to 0.96, as accelerations; as
+    # displacements, one of one decay time may leave less.
+    left: float = 0.05
+    modes: int = 8  # of that fit
+    instants: int = 600  # of that fit: fewer than the samples alias frequencies, and leave decays as they are
+    signals: int = 8  # of that fit, evenly spaced among the outputs
+
+
+START, DECAYING = StartSettings(), DecayingSettings()
 HIGHEST_DEGREE = 8  # of a drift; polynomials of higher degree oscillate like modes
 PART = 65_536  # samples of a part of a record in the fit of drifts
 # Least number of samples to estimate the predictor and to test it.
@@ -98,6 +115,45 @@ def decay_start(record: Record) -> float:
         starts = np.r_[starts, broken[~known] + window.size // 2 + 1]
         step *= START.coarser
     return float(record.start_time + record.sample_time * min(starts.max(initial=0), n - 1))
+
+
+def decays(record: Record) -> bool:
+    """Whether the outputs are a free decay: at rest in the end, falling all the time, or explained by decaying modes.
+
+    The level of a short decay need not fall from tenth to tenth, as these hold few periods.
+    """
+    about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
+    tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
+    falling = tenths[int(np.argmax(tenths)) :]
+    if tenths[-1] < DECAYING.decayed**2 * max(tenths):
+        return True
+    return (len(falling) >= DECAYING.falling and bool(np.all(np.diff(falling) < 0))) or _explained(record)
+
+
+def _explained(record: Record) -> bool:
+    """Whether the record falls from the start of a decay on, and decaying modes leave little of it."""
+    after = record.between(decay_start(record))
+    stride = -(-after.n_samples // DECAYING.instants)
+    sensors = slice(None, None, -(-after.n_outputs // DECAYING.signals))
+    outputs = after.outputs[sensors, ::stride]
+    outputs = outputs - outputs.mean(axis=1, keepdims=True)
+    energy = [float((part**2).sum()) for part in np.array_split(outputs, 2, axis=1)]
+    if not energy[1] < energy[0]:
+        return False
+    part = replace(
+        after,
+        outputs=outputs,
+        inputs=np.zeros((0, 0)),
+        input_channels=(),
+        output_channels=after.output_channels[sensors],
+        sample_time=stride * after.sample_time,
+    )
+    try:
+        poles = stacked_delays(part, n_modes=DECAYING.modes).poles
+    except ValueError:  # too short
+        return False
+    left = project(part, poles[poles.real < 0], True).residual
+    return float((left**2).sum()) < DECAYING.left * float((outputs**2).sum())
 
 
 def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
@@ -313,11 +369,9 @@ def _removed(
     time_constant: float | None = None,
 ) -> Drift:
     """A record without its drift, from the factored columns R and Q^T y of constant, modes and drift."""
-    weights = np.linalg.solve(r, along)[fixed:]
     m = record.n_outputs
     outputs, lowest, highest = record.outputs.copy(), np.full(m, np.inf), np.full(m, -np.inf)
-    for part in _parts(record.n_samples):
-        drift = (drift_columns(np.arange(part.start, part.stop)) @ weights).T
+    for part, drift in _series(drift_columns, np.linalg.solve(r, along)[fixed:], record.n_samples):
         outputs[:, part] -= drift
         lowest, highest = (np.minimum(lowest, drift.min(axis=1)), np.maximum(highest, drift.max(axis=1)))
     return Drift(replace(record, outputs=outputs), frozen(highest - lowest), time_constant)
@@ -325,12 +379,13 @@ def _removed(
 
 def without_polynomial(outputs: np.ndarray) -> np.ndarray:
     """Outputs (n_outputs, n_samples) without the best polynomial of `HIGHEST_DEGREE` in time."""
-    n = outputs.shape[1]
-    degree = min(HIGHEST_DEGREE, n - 1)
-    r, along = _factored(lambda at: _polynomials(at, n, degree), outputs)
-    weights, remainder = np.linalg.solve(r, along), outputs.copy()
-    for part in _parts(n):
-        remainder[:, part] -= (_polynomials(np.arange(part.start, part.stop), n, degree) @ weights).T
+    n, remainder = outputs.shape[1], outputs.copy()
+
+    def columns(at: np.ndarray) -> np.ndarray:
+        return _polynomials(at, n, min(HIGHEST_DEGREE, n - 1))
+
+    for part, polynomial in _series(columns, np.linalg.solve(*_factored(columns, outputs)), n):
+        remainder[:, part] -= polynomial
     return remainder
 
 
@@ -342,6 +397,14 @@ def _polynomials(at: np.ndarray, n: int, degree: int) -> np.ndarray:
 def _parts(n: int) -> Iterator[slice]:
     for first in range(0, n, PART):
         yield slice(first, min(first + PART, n))
+
+
+def _series(
+    columns: Callable[[np.ndarray], np.ndarray], weights: np.ndarray, n: int
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """Parts of n samples, and the sum of weighted columns there, (n_outputs, n_part)."""
+    for part in _parts(n):
+        yield part, (columns(np.arange(part.start, part.stop)) @ weights).T
 
 
 def _factored(columns: Callable[[np.ndarray], np.ndarray], outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

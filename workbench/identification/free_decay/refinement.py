@@ -70,12 +70,9 @@ def identified(
 
 
 def thresholds(false_alarm: float, n_cells: int, n_signals: int) -> tuple[float, float]:
-    """χ² from which on a candidate enters, and from which on it stays, among so many in white noise.
+    """χ² from which on the strongest of `n_cells` candidates enters, and from which on it stays, in white noise.
 
-    Args:
-        false_alarm: probability that noise alone is taken for a mode.
-        n_cells: number of candidates.
-        n_signals: number of outputs of all records, each with two amplitudes of a mode; the pole adds two parameters.
+    A mode has two amplitudes per signal, an output of a record, and a pole.
     """
     enter = chi2.isf(min(20.0 * false_alarm, 0.5) / n_cells, 2 * n_signals)
     return float(enter), float(chi2.isf(false_alarm / n_cells, 2 * n_signals + 2))
@@ -89,14 +86,7 @@ def over_noise(fits: Sequence[Projection], weights: np.ndarray) -> np.ndarray:
 def amplitude_statistic(
     fits: Sequence[Projection], weights: np.ndarray, r: int, without: np.ndarray | None = None
 ) -> float:
-    """χ² of the amplitudes of mode r at fixed poles.
-
-    Args:
-        fits: one per record.
-        weights: (n_records, n_outputs) 1 / noise.
-        r: index of the mode.
-        without: orthonormal directions (n_outputs, n_directions) that are left out; none unless given.
-    """
+    """χ² of the amplitudes of mode r at fixed poles, without those along some directions (n_outputs, n_directions)."""
     strength, rows = 0.0, [r, fits[0].poles.size + r]
     for fit, weight in zip(fits, weights, strict=True):
         a = fit.coefficients[rows] * weight
@@ -385,9 +375,9 @@ def search(
     Returns:
         poles, projections (one per record), whether the search converged, and the number of steps.
     """
-    problem = _Poles(records, weights, offset, hold, enough)
     start = _Fitted(poles, [project(record, poles, offset) for record in records])
-    minimum = minimise(problem, start, most_steps=most_steps, round_off=problem.start_from(start), budget=budget)
+    problem = _Poles(start, records, weights, offset, hold, enough)
+    minimum = minimise(problem, start, most_steps=most_steps, round_off=problem.round_off, budget=budget)
     return minimum.state.poles, minimum.state.fits, minimum.converged, minimum.steps
 
 
@@ -398,18 +388,28 @@ class _Fitted:
 
 
 class _Poles:
-    """The `searches.LeastSquares` of free decays."""
+    """The `searches.LeastSquares` of free decays.
 
-    def __init__(self, records: Sequence[Record], weights: np.ndarray, offset: bool, hold: bool, enough: float) -> None:
+    Attributes:
+        free: degrees of freedom.
+        signal: energy of the records over the noise.
+        round_off: of the cost.
+    """
+
+    def __init__(
+        self,
+        start: _Fitted,
+        records: Sequence[Record],
+        weights: np.ndarray,
+        offset: bool,
+        hold: bool,
+        enough: float,
+    ) -> None:
         self.records, self.weights, self.offset, self.hold, self.enough = records, weights, offset, hold, enough
-
-    def start_from(self, start: _Fitted) -> float:
-        """The round-off error of the cost; also sets the degrees of freedom and the weighted signal energy."""
         coefficients = sum(fit.coefficients.size for fit in start.fits)
-        self.free = sum(r.outputs.size for r in self.records) - 2 * start.poles.size - coefficients
-        self.signal = float((self.weights**2 * _squares(self.records)).sum())
+        self.free = sum(r.outputs.size for r in records) - 2 * start.poles.size - coefficients
+        self.signal = float((weights**2 * _squares(records)).sum())
         self.round_off = max(fit.round_off for fit in start.fits) * self.signal
-        return self.round_off
 
     def cost(self, state: _Fitted) -> float:
         each = zip(state.fits, self.weights, strict=True)
