@@ -86,9 +86,7 @@ def stacked_delays(
         ValueError: too few samples, records that differ in sensors or rate.
     """
     records = of_same_sensors(records)
-    basis = signal_subspace(records, 2 * n_modes, delays=delays)
-    mu, vectors = shift_eigenpairs(basis, records[0].n_outputs)
-    return as_modes(mu, vectors, records[0], branch)
+    return _modes_of(signal_subspace(records, 2 * n_modes, delays=delays), records[0], branch)
 
 
 def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None = None) -> np.ndarray:
@@ -121,11 +119,11 @@ def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None
     return np.asarray(svd(hankel, full_matrices=False)[0][:, :order])
 
 
-def shift_eigenpairs(basis: np.ndarray, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues (order,) of one step in time, and shapes (n_outputs, order), from a signal subspace."""
-    transition = lstsq(basis[:-n_outputs], basis[n_outputs:])[0]
-    mu, vectors = np.linalg.eig(transition)
-    return mu, basis[:n_outputs] @ vectors
+def _modes_of(basis: np.ndarray, record: Record, branch: int = 0) -> SampledModes:
+    """Modes from a signal subspace: its shift by one sample has their eigenvalues, its first block their shapes."""
+    m = record.n_outputs
+    mu, vectors = np.linalg.eig(lstsq(basis[:-m], basis[m:])[0])
+    return as_modes(mu, basis[:m] @ vectors, record, branch)
 
 
 def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 0) -> SampledModes:
@@ -181,11 +179,7 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
     """
     records = of_same_sensors(records)
     basis = signal_subspace(records, 2 * max(orders), delays=delays)
-    by_order = []
-    for n in orders:
-        mu, shapes = shift_eigenpairs(basis[:, : 2 * n], records[0].n_outputs)
-        by_order.append(as_modes(mu, shapes, records[0]))
-    return Stabilisation(tuple(orders), tuple(by_order))
+    return Stabilisation(tuple(orders), tuple(_modes_of(basis[:, : 2 * n], records[0]) for n in orders))
 
 
 def stable_modes(

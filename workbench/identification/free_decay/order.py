@@ -189,7 +189,7 @@ def _identify_stepwise(
             fewer = other.fitted(all_modes, fewer.weights)
         problem, model = other, fewer
     problem.budget = budget
-    return problem.report(model, records) if model.poles.size else None
+    return problem.report(model) if model.poles.size else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +210,11 @@ class _Model:
     def residuals(self) -> list[Floats]:
         """Residual (n_samples, n_outputs) of each record."""
         return [fit.residual for fit in self.fits]
+
+    @property
+    def statistic(self) -> np.ndarray:
+        """χ² of the amplitudes of each mode at fixed poles, (n_modes,)."""
+        return np.array([amplitude_statistic(self.fits, self.weights, r) for r in range(self.poles.size)])
 
     @cached_property
     def residual_power(self) -> Floats:
@@ -345,7 +350,7 @@ class _FreeDecay:
 
     def suspects(self, model: _Model) -> Iterator[tuple[complex, _Model, bool]]:
         """Modes to leave out on trial: the weakest spurious one, or else those that are weak or close to another."""
-        statistic, spurious = self.statistic(model), self._spurious(model, model)
+        statistic, spurious = model.statistic, self._spurious(model, model)
         if spurious.any():
             r = int(np.argmin(np.where(spurious, statistic, np.inf)))
             yield complex(model.poles[r]), self._without(model, r), True
@@ -357,8 +362,8 @@ class _FreeDecay:
 
     def explains(self, model: _Model) -> bool:
         """Whether the modes explain most of the energy of every record."""
-        left = _squares(model.residuals).sum(axis=1)
-        return bool((left < ORDER.most_residual * _squares([grid.centred for grid in self.grids]).sum(axis=1)).all())
+        energy = [record.n_samples * record.outputs.var(axis=1).sum() for record in self.records]
+        return bool((_squares(model.residuals).sum(axis=1) < ORDER.most_residual * np.array(energy)).all())
 
     def oscillating(self, model: _Model) -> Complexes:
         """The poles that oscillate within a record and do not grow, rad/s; others may be coloured noise."""
@@ -366,13 +371,9 @@ class _FreeDecay:
         span = max(record.n_samples * record.sample_time for record in self.records)
         return poles[(poles.real * span < SELECTION.most_growth) & (np.abs(poles) * span > 2.0 * np.pi)]
 
-    def statistic(self, model: _Model) -> np.ndarray:
-        """χ² of the amplitudes of each mode at fixed poles, (n_modes,)."""
-        return np.array([amplitude_statistic(model.fits, model.weights, r) for r in range(model.poles.size)])
-
-    def report(self, model: _Model, records: Sequence[Record]) -> Identified:
+    def report(self, model: _Model) -> Identified:
         """The modes refined in the records as measured: whitening filters lose the first samples, the strongest."""
-        poles = model.poles
+        poles, records = model.poles, self.measured
         if self.budget.unfinished:  # perhaps before all modes were tested
             spurious = self._spurious(model, model)
             poles = poles[~spurious] if not spurious.all() else poles
@@ -381,7 +382,7 @@ class _FreeDecay:
         while (lost := self._lost(poles, refined.modes.poles)).any() and not lost.all():
             poles = poles[~lost]
             refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
-        statistic = self.statistic(replace(model, poles=poles, fits=self._projected(poles)))[np.argsort(np.abs(poles))]
+        statistic = replace(model, poles=poles, fits=self._projected(poles)).statistic[np.argsort(np.abs(poles))]
         refined = in_coloured_noise(refined, records)
         return identified(refined, statistic, self.limit, self.rejected, records[0], self.budget.remarks)
 
@@ -459,7 +460,6 @@ class _Grid:
 
     def __init__(self, record: Record, n: int) -> None:
         self.record, dt = record, record.sample_time
-        self.centred = (record.outputs - record.outputs.mean(axis=1, keepdims=True)).T
         self.size = 1 << int(np.ceil(np.log2(2 * n)))
         omega = 2.0 * np.pi * np.fft.rfftfreq(self.size, dt)
         span = n * dt
