@@ -95,17 +95,18 @@ def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None
     Raises:
         ValueError: fewer samples than the order needs.
     """
-    m, shortest = records[0].n_outputs, min(r.n_samples for r in records)
+    m, shortest = records[0].n_outputs, min(records, key=lambda record: record.n_samples)
     if delays is None:
         # a third of the shortest record, fewer where the matrix would be too large
         fitting = LARGEST_MATRIX // (m * sum(r.n_samples for r in records))
-        delays = min(max(min(shortest // 3, fitting), int(np.ceil(2 * order / m)) + 2), shortest - 2)
+        least = int(np.ceil(2 * order / m)) + 2
+        delays = min(max(min(shortest.n_samples // 3, fitting), least), shortest.n_samples - 2)
     columns = sum(r.n_samples - delays + 1 for r in records)
-    if m * (delays - 1) < order or columns < order or delays < 2:
+    if m * (delays - 1) < order or columns < order or not 2 <= delays <= shortest.n_samples:
         least = int(np.ceil(order / m)) + 1
         raise ValueError(
             f"{order // 2} modes need at least {order} delayed signals and {order} instants: with {m} sensors {least}"
-            f" delays and {order + least - 1} samples; record {records[0].name!r} has {shortest} samples and"
+            f" delays and {order + least - 1} samples; record {shortest.name!r} has {shortest.n_samples} samples and"
             f" {delays} delays were taken. Measure longer or ask for fewer modes"
         )
     # delayed copies stacked, delay by delay
