@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial.legendre import legvander
 from scipy.linalg.lapack import dgeqrf, dtrtrs
 from scipy.signal import upfirdn
@@ -188,7 +189,7 @@ def _repair(row: np.ndarray, at: int) -> bool:
     if at < START.order or at + START.order >= row.size:
         return False
     part, centre = row[max(at - near, 0) : at + near + 1], min(at, near) - k
-    windows = np.lib.stride_tricks.sliding_window_view(part - part.mean(), 2 * k + 1)
+    windows = sliding_window_view(part - part.mean(), 2 * k + 1)
     both = windows[:, :k] + windows[:, :k:-1]
     others = np.abs(np.arange(len(windows)) - centre) > k
     c = np.linalg.lstsq(both[others], windows[others, k], rcond=None)[0]
@@ -346,35 +347,25 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     rate, settling = best_rate
     criterion = settling - penalty * (m + 1)
     of_polynomial = ratio[degree] - penalty * m * degree if likely else 0.0
+    time_constant = None
     if criterion > of_polynomial and settling > chi2.isf(FALSE_ALARM / START.rates, m + 1):
-        decay = _decays(dt * rate)
-        return _removed(record, fixed, *factored_with(decay), decay, 1.0 / float(rate))
-    if not likely:
+        drift_columns, time_constant = _decays(dt * rate), 1.0 / float(rate)
+        r, along = factored_with(drift_columns)
+    elif likely:
+        drift_columns, kept = (lambda at: _polynomials(at, n, degree)[:, 1:]), fixed + degree
+        r, along = r[:kept, :kept], along[:kept]
+    else:
         return no_drift
-    kept = fixed + degree
-    return _removed(record, fixed, r[:kept, :kept], along[:kept], lambda at: _polynomials(at, n, degree)[:, 1:])
+    outputs, extremes = record.outputs.copy(), []
+    for part, drift in _series(drift_columns, np.linalg.solve(r, along)[fixed:], n):
+        outputs[:, part] -= drift
+        extremes.append((drift.min(axis=1), drift.max(axis=1)))
+    return Drift(replace(record, outputs=outputs), frozen(np.ptp(extremes, axis=(0, 1))), time_constant)
 
 
 def _decays(rates: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """The exponentials e^{-rate n} as a function of samples n (n_at,), (n_at, n_rates); rates per sample."""
     return lambda at: np.asarray(np.exp(-np.outer(at, rates)))
-
-
-def _removed(
-    record: Record,
-    fixed: int,
-    r: np.ndarray,
-    along: np.ndarray,
-    drift_columns: Callable[[np.ndarray], np.ndarray],
-    time_constant: float | None = None,
-) -> Drift:
-    """A record without its drift, from the factored columns R and Q^T y of constant, modes and drift."""
-    m = record.n_outputs
-    outputs, lowest, highest = record.outputs.copy(), np.full(m, np.inf), np.full(m, -np.inf)
-    for part, drift in _series(drift_columns, np.linalg.solve(r, along)[fixed:], record.n_samples):
-        outputs[:, part] -= drift
-        lowest, highest = (np.minimum(lowest, drift.min(axis=1)), np.maximum(highest, drift.max(axis=1)))
-    return Drift(replace(record, outputs=outputs), frozen(highest - lowest), time_constant)
 
 
 def without_polynomial(outputs: np.ndarray) -> np.ndarray:
