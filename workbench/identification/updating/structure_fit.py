@@ -222,12 +222,10 @@ def report(problem: Problem, z: np.ndarray) -> FittedStructure:
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     root = symmetric_root(covariance / np.outer(std, std))
     standard_normal = np.random.default_rng(0).standard_normal((STRUCTURE.draws, parameters.size))
-    of_mass, of_stiffness, of_loss = np.split(
-        parameters + std * (standard_normal @ root.T), [d.size, d.size + e.size], 1
-    )
+    draws = parameters + std * (standard_normal @ root.T)
     m, k = series.nominal_profiles
-    mass = _uncertain(m, series.mass, d, of_mass, length=length)
-    stiffness = _uncertain(k, series.stiffness, e, of_stiffness, loss, of_loss, length=length)
+    mass = _uncertain(m, series.mass, d, draws[:, : d.size], length)
+    stiffness = _uncertain(k, series.stiffness, e, draws[:, d.size :], length, loss)
     name = "bending_stiffness" if isinstance(nominal, Beam) else "axial_stiffness"
     changes: dict[str, Any] = {"mass_per_length": mass.profile, name: stiffness.profile}
     try:
@@ -256,27 +254,25 @@ def _uncertain(
     basis: Basis,
     coefficients: np.ndarray,
     draws: np.ndarray,
-    loss: LocalLoss | None = None,
-    loss_draws: np.ndarray | None = None,
-    *,
     length: float,
+    loss: LocalLoss | None = None,
 ) -> UncertainProfile:
-    """The distribution nominal (1 + series) (1 - loss), with its Monte Carlo samples."""
+    """The distribution nominal (1 + series) (1 - loss), with Monte Carlo samples of coefficients and loss."""
 
-    def values(x: Floats, coefficients: Floats, losses: Floats | None) -> Floats:
-        series: Floats = nominal(x) * (1.0 + coefficients @ basis.functions(x).T)
-        if losses is None:
-            return series
-        share, centre, width = losses[:, :, None].transpose(1, 0, 2)
+    def series(x: Floats, coefficients: Floats) -> Floats:
+        return np.asarray(nominal(x) * (1.0 + coefficients @ basis.functions(x).T))
+
+    def samples(x: Floats) -> Floats:
+        values = series(x, draws[:, : basis.n_terms])
+        if loss is None:
+            return values
+        share, centre, width = draws[:, basis.n_terms :, None].transpose(1, 0, 2)
         inside = np.abs(x - centre) < 0.5 * np.maximum(width, 0.0)
-        return np.where(inside, 1.0 - share, 1.0) * series
+        return np.where(inside, 1.0 - share, 1.0) * values
 
-    smooth = Profile(
-        lambda x: values(np.ravel(x), coefficients, None).reshape(np.shape(x)),
-        tuple(sorted({*nominal.breaks, *basis.breaks})),
-    )
-    profile = smooth if loss is None else loss.of(smooth, length)
-    return UncertainProfile(profile, lambda x: values(x, draws, None if loss is None else loss_draws), length)
+    breaks = tuple(sorted({*nominal.breaks, *basis.breaks}))
+    smooth = Profile(lambda x: series(np.ravel(x), coefficients).reshape(np.shape(x)), breaks)
+    return UncertainProfile(smooth if loss is None else loss.of(smooth, length), samples, length)
 
 
 @warns_of_remarks
