@@ -33,7 +33,7 @@ from workbench.identification.free_decay.refinement import (
     thresholds,
 )
 from workbench.identification.signal.modal_estimates import Identified
-from workbench.identification.signal.projection import Projection, forget_transforms, independent
+from workbench.identification.signal.projection import forget_transforms, independent, project
 from workbench.identification.signal.searches import FALSE_ALARM, FIT, FURTHER, SELECTION, Budget, spurious_modes
 from workbench.records.record import Record
 from workbench.threads import cores
@@ -142,15 +142,14 @@ class _Search:
 
     def settle(self, poles: np.ndarray, most_steps: int) -> None:
         """Fit all poles together, outputs weighted by the residual of the fit before."""
-        self.converged, self.steps = True, 0
+        self.poles, self.converged, self.steps = poles, True, 0
         if poles.size:
-            poles, fits, self.converged, self.steps = search(
+            self.poles, self.fits, self.converged, self.steps = search(
                 self.records, poles, self.weights, True, most_steps, hold=True, budget=self.budget
             )
         else:
-            fits = [_nothing(record) for record in self.records]
-        self.poles, self.fits = poles, fits
-        self.noise = np.maximum(noise_level(self.records, fits, self.weights), self.floor)
+            self.fits = [project(record, poles, True) for record in self.records]
+        self.noise = np.maximum(noise_level(self.records, self.fits, self.weights), self.floor)
         self.weights = 1.0 / self.noise
 
     def peaks(self) -> np.ndarray:
@@ -319,10 +318,3 @@ class _Search:
         _, with_it, *_ = search(projected, self.poles[near], alone, False, SELECTION.few_steps)
         _, without, *_ = search(projected, self.poles[near[near != r]], alone, False, SELECTION.few_steps)
         return float(sum((a.residual**2).sum() - (b.residual**2).sum() for a, b in zip(without, with_it, strict=True)))
-
-
-def _nothing(record: Record) -> Projection:
-    """The projection of a record on constants alone."""
-    level, none = record.outputs.mean(axis=1), np.zeros((0, 0))
-    power = ((record.outputs - level[:, None]) ** 2).sum(axis=1)
-    return Projection(record, np.zeros(0, complex), power, 0.0, level[None], none, none, none, none)
