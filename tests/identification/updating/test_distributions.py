@@ -136,6 +136,17 @@ def test_self_check_tells_a_wrong_answer(case):
     assert "must be positive" in self_check(nowhere, modes, **ends).refusal
 
 
+@pytest.mark.parametrize("basis", [Basis.polynomial(3), Basis.legendre(3, length=2.0), Basis.splines(3, length=2.0)])
+def test_values_have_the_shape_of_the_places(case, basis):
+    """A table of places was refused by polynomials, or multiplied wrongly."""
+    ends, modes = case
+    found = mass_and_stiffness(
+        modes, kind=ends["kind"], mass_basis=basis, stiffness_basis=basis, known_mass=[(1.0, 1.3)]
+    )
+    np.testing.assert_allclose(found.mass(X.reshape(9, 9)), mass(X).reshape(9, 9), rtol=1e-8)
+    assert found.mass(0.5).shape == () and found.stiffness.profile(X.reshape(9, 9)).shape == (9, 9)
+
+
 CLAMPED = BoundaryConditions.of("beam", length=2.0, left="clamped", right="free")
 
 

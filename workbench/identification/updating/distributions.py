@@ -111,7 +111,7 @@ class Distribution:
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Values at x, in the shape of x."""
         x = np.asarray(x, float)
-        series = self.basis.functions(np.atleast_1d(x)) @ self.coefficients
+        series = self.basis.functions(x.ravel()) @ self.coefficients
         return np.asarray(self.prior(x) + series.reshape(x.shape))
 
     @property
