@@ -45,13 +45,13 @@ class AmplitudeDependence:
     """Frequency and damping of each mode by segment of the decays; nan where a segment does not determine them.
 
     Attributes:
-        record: (n_stretches,) index of the record of each segment, from 0.
-        start: (n_stretches,) start of each segment, s.
-        amplitude: (n_stretches, n_modes) root mean square of the mode's envelope in a segment, largest output.
-        omega: (n_stretches, n_modes) rad/s.
-        omega_std: (n_stretches, n_modes) standard errors.
-        zeta: (n_stretches, n_modes) damping ratios.
-        zeta_std: (n_stretches, n_modes) standard errors.
+        record: (n_segments,) index of the record of each segment, from 0.
+        start: (n_segments,) start of each segment, s.
+        amplitude: (n_segments, n_modes) root mean square of the mode's envelope in a segment, largest output.
+        omega: (n_segments, n_modes) rad/s.
+        omega_std: (n_segments, n_modes) standard errors.
+        zeta: (n_segments, n_modes) damping ratios.
+        zeta_std: (n_segments, n_modes) standard errors.
         probability: (2, n_modes) that frequencies, and damping ratios, of a linear structure differ so much; 1 where
             fewer than two segments determine them.
     """
@@ -127,7 +127,7 @@ def amplitude_dependence(
 def _segments(
     record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int, budget: Budget
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Starts of the segments of a record, (n_stretches,) s, and the modes in each, (5, n_stretches, n_modes).
+    """Starts of the segments of a record, (n_segments,) s, and the modes in each, (5, n_segments, n_modes).
 
     These are amplitude, ω and its standard error, ζ and its standard error.
     """

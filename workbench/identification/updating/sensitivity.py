@@ -24,7 +24,7 @@ from workbench.structure.member import Bar, Beam, checked_places, segment_ends
 from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile
 
-EXTRA_DEGREES = 4  # margin of the degree of the polynomials
+DEGREES = 1.7, 16  # of the polynomials, for each half wave and beyond
 RIGID = 1e-10  # of the eigenvalue of a half wave, below which a mode is a rigid-body mode
 ROUND_OFF = 1e-15
 APART = 1e-6  # least distance of nodes over the length
@@ -220,7 +220,7 @@ class _Mesh:
         of_mass, of_stiffness = (*m.breaks, *series.mass.breaks), (*k.breaks, *series.stiffness.breaks, *edges)
         at_parts = (position(part.at) for part in nominal.attachments)
         nodes = segment_ends((*of_mass, *of_stiffness, *at_parts), length, APART)
-        degree = int(np.ceil(1.7 * series.n_modes * np.diff(nodes).max() / length)) + 12 + EXTRA_DEGREES
+        degree = int(np.ceil(DEGREES[0] * series.n_modes * np.diff(nodes).max() / length)) + DEGREES[1]
         self.segments = Segments(nodes, (degree,) * (nodes.size - 1), order - 1)
         self.x, self.weights, (self.values, slopes, self.strains) = self.segments.tables((0, 1, order))
         self.nominal_mass, self.nominal_stiffness = m(self.x), k(self.x)

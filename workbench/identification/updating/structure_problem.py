@@ -293,7 +293,8 @@ class Problem:
             return z
         ratios = self.task.measured.modes.omega**2 / solved.eigenvalues[solved.n_rigid + self.task.which]
         ratio = float(np.median(ratios))
-        if self.held[1][1].shape[1] and not self.task.known[1][0].size:
+        (_, free), (known_at, _) = self.held[1], self.task.known[1]
+        if free.shape[1] and not known_at.size:  # the stiffness is free to be scaled
             return self.nearest(mass, stiffness * ratio)
         return self.nearest(mass / ratio, stiffness)
 
