@@ -119,6 +119,12 @@ def test_refusals(bar_modes):
         two_delays(record)
     with pytest.raises(ValueError, match="Measure longer or ask for fewer"):
         stacked_delays(record, n_modes=20)
+    for n_modes in (0, -1):
+        with pytest.raises(ValueError, match=f"n_modes is a number of modes, 1 or more; got {n_modes}"):
+            stacked_delays(record, n_modes=n_modes)
+    for instants in ({"first": -3}, {"spacing": 0}):
+        with pytest.raises(ValueError, match="the first instant is sample 0 or later"):
+            two_delays(record, columns=12, **instants)
     short = replace(record.between(0.0, 0.19), name="short")
     with pytest.raises(ValueError, match="record 'short' has 20 samples and 25 delays were taken"):
         stacked_delays([record, short], n_modes=2, delays=25)

@@ -23,6 +23,7 @@ from scipy.linalg import lstsq, svd
 
 from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import normalised_shapes, time_derivatives
+from workbench.identification.signal.searches import check_count
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, mac
 from workbench.threads import one_blas_thread
@@ -43,8 +44,10 @@ def two_delays(record: Record, *, first: int = 0, spacing: int = 1, columns: int
         At most m modes; fewer where eigenvalues come out real. Shapes are of displacement, largest entry 1.
 
     Raises:
-        ValueError: a record too short for its sensors.
+        ValueError: a record too short for its sensors, instants before the record or at one sample.
     """
+    if first < 0 or spacing < 1:
+        raise ValueError(f"the first instant is sample 0 or later, the next 1 or more after it; got {first}, {spacing}")
     m = record.n_outputs
     columns = 6 * m if columns is None else columns
     needed = first + (columns - 1) * spacing + 3
@@ -83,8 +86,9 @@ def stacked_delays(
         At most n_modes modes with 0 < ω < π/Δt (k = 0). Shapes are of displacement, largest entry 1.
 
     Raises:
-        ValueError: too few samples, records that differ in sensors or rate.
+        ValueError: less than one mode, too few samples, records that differ in sensors or rate.
     """
+    check_count("n_modes", n_modes)
     records = of_same_sensors(records)
     return _modes_of(signal_subspace(records, 2 * n_modes, delays=delays), records[0], branch)
 
@@ -176,8 +180,9 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
         delays: as in `stacked_delays`.
 
     Raises:
-        ValueError: fewer samples than the highest order needs.
+        ValueError: no order, one below 1, fewer samples than the highest order needs.
     """
+    check_count("the lowest of orders", min(orders, default=0))
     records = of_same_sensors(records)
     basis = signal_subspace(records, 2 * max(orders), delays=delays)
     return Stabilisation(tuple(orders), tuple(_modes_of(basis[:, : 2 * n], records[0]) for n in orders))

@@ -321,13 +321,19 @@ def cramer_rao_bound(modes: SampledModes, record: Record, *, noise_std: float | 
 
     Returns:
         `Refined` with the true modes and the standard errors of an efficient estimate.
+
+    Raises:
+        ValueError: noise that is not positive, or of another number of outputs.
     """
+    noise = np.asarray(noise_std, float)
+    if noise.shape not in ((), (record.n_outputs,)) or not (np.isfinite(noise) & (noise > 0)).all():
+        raise ValueError(f"noise_std is positive, one for all outputs or one each, ({record.n_outputs},); got {noise}")
     derivative = time_derivatives(record.output_channels)[:, None]
     amplitude = modes.shapes * modes.poles**derivative
     clean = replace(record, outputs=(amplitude @ np.exp(modes.poles[:, None] * record.time)).real)
-    noise = np.broadcast_to(np.asarray(noise_std, float), (1, record.n_outputs))
     fits = [project(clean, modes.poles, False)]
-    return as_refined([clean], modes.poles, fits, noise, converged=True, steps=0)
+    each = np.broadcast_to(noise, (1, record.n_outputs))
+    return as_refined([clean], modes.poles, fits, each, converged=True, steps=0)
 
 
 def modal_amplitudes(record: Record, modes: SampledModes) -> SampledModes:
