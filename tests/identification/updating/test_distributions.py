@@ -192,6 +192,8 @@ def test_what_noisy_shapes_and_a_mass_at_a_point_leave_unknown_is_said():
 
 
 def test_refusals(case):
+    with pytest.raises(ValueError, match="a series has 0 terms or more; got -1"):
+        Basis.polynomial(-1)
     ends, modes = case
     kind = ends["kind"]
     one = {"mass_basis": Basis.polynomial(1), "stiffness_basis": Basis.polynomial(1)}

@@ -52,11 +52,18 @@ class Basis:
         functions: x (n_points,) -> (n_points, n_terms).
         n_terms: number of functions.
         breaks: places where they are not smooth, m.
+
+    Raises:
+        ValueError: a negative number of functions.
     """
 
     functions: Callable[[np.ndarray], np.ndarray] = field(repr=False)
     n_terms: int
     breaks: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.n_terms < 0:
+            raise ValueError(f"a series has 0 terms or more; got {self.n_terms}")
 
     @classmethod
     def polynomial(cls, n_terms: int) -> "Basis":
