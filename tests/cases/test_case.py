@@ -1,6 +1,7 @@
 """Case folders: read, written, refused."""
 
 import os
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -272,6 +273,49 @@ def test_units_that_a_file_states_become_those_of_the_case(case, tmp_path, heads
     assert [c.unit for c in read.output_channels] == ["mm", "mm/s^2"]
 
 
+@pytest.mark.parametrize(
+    ("heads", "words"),
+    [
+        (["d1", "a1 [mm/s]"], r"channel 'a1' is in m/s, by case.toml in m/s\^2: correct one of them"),
+        (["d1 [N]", "a1"], "channel 'd1' is in N, by case.toml in m: correct one of them"),
+    ],
+)
+def test_a_file_whose_units_are_of_another_quantity_is_refused(case, tmp_path, heads, words):
+    folder = write_case(case, tmp_path / "case").parent
+    known = read_case(folder).fit[0]
+    file = folder / tomllib.loads((folder / "case.toml").read_text())["record"][0]["file"]
+    header = ",".join(["t", *known.input_names, *heads])
+    table = np.vstack([known.time, known.inputs, known.outputs]).T
+    np.savetxt(file.with_suffix(".csv"), table, "%.17g", ",", header=header, comments="")
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text(text.replace(file.name, file.with_suffix(".csv").name))
+    with pytest.raises(CaseError, match=words):
+        read_case(folder)
+
+
+@pytest.mark.parametrize(
+    ("units", "ratio"),
+    [
+        (("mm", "kg", "s", "N"), "0.001 N"),
+        (("m", "kg", "ms", "N"), "1e+06 N"),
+        (("in", "slug", "s", "lbf"), "0.0833333 lbf"),
+    ],
+)
+def test_units_whose_force_is_not_that_of_the_others_are_refused(case, tmp_path, units, ratio):
+    folder = write_case(replace(case, units=Units(*units)), tmp_path / "case").parent
+    with pytest.raises(CaseError, match="must be consistent: a force of 1 .* is " + re.escape(ratio)):
+        read_case(folder)
+    assert Units("mm", "t", "s", "N").consistency == pytest.approx(1.0)
+    assert Units("ft", "slug", "s", "lbf").consistency == pytest.approx(1.0)
+    assert Units("mm", "kg", "ms", "kN").consistency == pytest.approx(1.0)
+
+
+def test_sample_instants_in_milliseconds_are_told_how_to_be_named(folder):
+    _spoiled(folder, t=lambda t: 1000.0 * t)
+    with pytest.raises(CaseError, match=r"if it is in ms, name it 't \[ms\]'"):
+        read_case(folder)
+
+
 def test_units_of_a_file_that_nobody_can_tell_in_those_of_the_case_are_refused(tmp_path):
     (tmp_path / "r.csv").write_text("t,y [mm]\n" + "".join(f"{0.1 * i:.1f},{i}\n" for i in range(20)))
     assert read_record(tmp_path / "r.csv", units=Units("in", "t", "s", "N")).outputs[0, -1] == pytest.approx(19 / 25.4)
@@ -298,7 +342,7 @@ def test_units_are_named_all_four_or_none(case, tmp_path):
     assert read.units == millimetres and [c.unit for c in read.fit[0].output_channels] == ["mm", "mm/s^2"]
     file = tmp_path / "in mm" / "case.toml"
     file.write_text(file.read_text().replace('force = "N"\n', ""))
-    with pytest.raises(CaseError, match=r"\[units\]: force must be a text"):
+    with pytest.raises(CaseError, match=r"\[units\]: force is missing; name all of length, mass, time, force"):
         read_case(tmp_path / "in mm")
     write_case(case, tmp_path / "in m")
     assert read_case(tmp_path / "in m").units == Units() and "[units]" not in (tmp_path / "in m/case.toml").read_text()

@@ -66,10 +66,10 @@ def test_a_kalman_filter_asks_for_the_noise_of_its_outputs(run, rig, tmp_path):
 
 
 def test_a_controller_is_told_in_the_units_of_the_case(run, rig, tmp_path):
-    rig.write_text(RIG + '[units]\nlength = "mm"\nmass = "t"\ntime = "s"\nforce = "kN"\n')
+    rig.write_text(RIG + '[units]\nlength = "mm"\nmass = "t"\ntime = "s"\nforce = "N"\n')
     assert run("export", rig, "--rate-hz", 100, "--to", tmp_path / "one.c").exit_code == 0
     header = (tmp_path / "one.h").read_text()
-    for told in ("displacement at x = 0.3, mm", "force at x = 0.45, kN", "displacement of mode 1, t^0.5 mm"):
+    for told in ("displacement at x = 0.3, mm", "force at x = 0.45, N", "displacement of mode 1, t^0.5 mm"):
         assert told in header
 
 

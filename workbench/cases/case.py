@@ -121,14 +121,25 @@ def files_of(folder: str | Path) -> list[Path]:
 
 
 def _units(table: dict[str, Any], path: Path) -> Units:
-    """Units of a case, SI unless given; all four must be given, as they need not be consistent (N with mm, kg, s)."""
+    """Units of a case, SI unless given; all four must be given, and the unit of force must be that of the others."""
     if "units" not in table:
         return SI
     units, where = table["units"], f"{path}: [units]"
     if not isinstance(units, dict):
         raise CaseError(f"{where} must be a table of {', '.join(UNITS)}; got {shown(units)}")
     check_keys(units, UNITS, where)
-    return Units(**{name: text(units, name, where) for name in UNITS})
+    missing = [name for name in UNITS if name not in units]
+    if missing:
+        raise CaseError(f"{where}: {missing[0]} is missing; name all of {', '.join(UNITS)}")
+    found = Units(**{name: text(units, name, where) for name in UNITS})
+    ratio = found.consistency
+    if ratio is not None and abs(ratio - 1.0) > 1e-3:
+        product = f"{found.mass} {found.length}/{found.time}^2"
+        raise CaseError(
+            f"{where} must be consistent: a force of 1 {product} is {ratio:.6g} {found.force}; with m, kg, s it is 1 N,"
+            " with mm, t, s too"
+        )
+    return found
 
 
 def in_units(channels: Sequence[Channel], units: Units) -> tuple[Channel, ...]:
@@ -413,11 +424,15 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
     if sample_time <= 0:
         raise CaseError(f"{where}: sample_time must be positive; got {sample_time:g}")
     file = inside(folder, text(entry, "file", where), where)
-    arrays = _arrays(file, where, units)
+    arrays, stated = _arrays(file, where, units)
     names = {a.name for a in rig.actuators} | {s.name for s in rig.sensors}
     missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
     if missing:
-        raise CaseError(f"{file}: channel {missing[0]!r} of case.toml is missing; the file has {shown(sorted(arrays))}")
+        unknown = [name for name in extra if name.startswith((f"{missing[0]} [", f"{missing[0]} ("))]
+        unit = f", where the unit of {shown(unknown[0])} is not known" if unknown else ""
+        raise CaseError(
+            f"{file}: channel {missing[0]!r} of case.toml is missing; the file has {shown(sorted(arrays))}{unit}"
+        )
     if extra:
         raise CaseError(f"{file}: channel {shown(extra[0])} is not named in case.toml; name it there or leave it out")
     if "t" not in arrays:
@@ -431,10 +446,12 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
             raise CaseError(f"{file}: channel {channel!r}, sample {int(np.argmax(bad))} is {values[bad][0]}")
     steps = np.diff(arrays["t"])
     if n_samples < LEAST_SAMPLES or np.abs(steps - sample_time).max() > 0.01 * sample_time:
+        is_in_ms = steps.size and np.abs(1e-3 * steps - sample_time).max() < 0.01 * sample_time
+        in_ms = "; if it is in ms, name it 't [ms]'" if is_in_ms else ""
         raise CaseError(
             f"{file}: t must rise by sample_time = {sample_time:g} over at least {LEAST_SAMPLES} samples;"
             f" it has {n_samples} and steps from {steps.min() if steps.size else np.nan:g} to"
-            f" {steps.max() if steps.size else np.nan:g}"
+            f" {steps.max() if steps.size else np.nan:g}{in_ms}"
         )
     elastic = rig.modes.omega[rig.modes.omega > 0]
     if elastic.size and n_samples * sample_time < 2.0 * np.pi / elastic[0]:
@@ -450,11 +467,18 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
             )
     inputs, outputs = (np.array([arrays[port.name] for port in ports]) for ports in (rig.actuators, rig.sensors))
     record = rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=_hold(entry, where))
-    return replace(
+    record = replace(
         record,
         input_channels=in_units(record.input_channels, units),
         output_channels=in_units(record.output_channels, units),
     )
+    for known in (*record.input_channels, *record.output_channels):
+        unit = stated.get(known.name, "")
+        if unit not in ("", known.unit):
+            raise CaseError(
+                f"{file}: channel {known.name!r} is in {unit}, by case.toml in {known.unit}: correct one of them"
+            )
+    return record
 
 
 def signals_of(record: Record) -> dict[str, np.ndarray]:
@@ -463,15 +487,22 @@ def signals_of(record: Record) -> dict[str, np.ndarray]:
     return {"t": record.time, **dict(channels)}
 
 
-def _arrays(file: Path, where: str, units: Units) -> dict[str, np.ndarray]:
+def _arrays(file: Path, where: str, units: Units) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """The arrays of a file by name, and the units that it states."""
     if not file.is_file():
         raise CaseError(f"{where}: there is no file {file}")
+    stated: dict[str, str] = {}
     try:
         check_file(file)
-        arrays = load_arrays(file) if file.suffix == ".npz" else signals_of(read_record(file, units=units))
+        if file.suffix == ".npz":
+            arrays = load_arrays(file)
+        else:
+            record = read_record(file, units=units)
+            arrays = signals_of(record)
+            stated = {channel.name: channel.unit for channel in (*record.input_channels, *record.output_channels)}
     except RecordFileError as error:
         raise CaseError(str(error)) from error
     for name, values in arrays.items():
         if values.dtype.kind not in "fiu" or values.size > MOST_SAMPLES:
             raise CaseError(f"{file}: array {name!r} must hold at most {MOST_SAMPLES} real numbers")
-    return {name: values.astype(float) for name, values in arrays.items()}
+    return {name: values.astype(float) for name, values in arrays.items()}, stated

@@ -62,7 +62,7 @@ def diagnose(
     from workbench.gap.report.record_checks import check_alive
     from workbench.gap.setup.corrections import without_faults
     from workbench.gap.setup.faults import setup_faults
-    from workbench.gap.setup.repeats import check_disjoint
+    from workbench.gap.setup.records import check_disjoint
     from workbench.study.measured_case import measured_case
     from workbench.study.pages.verdict_page import verdict_page
 

@@ -31,7 +31,7 @@ def uncertain_rig(
     """
     from workbench.gap.diagnose import SECONDS, diagnose_case
     from workbench.gap.setup.faults import setup_faults
-    from workbench.gap.setup.repeats import check_disjoint
+    from workbench.gap.setup.records import check_disjoint
     from workbench.robust.posterior import UncertainRig
 
     if verdict is not None:
@@ -101,7 +101,7 @@ def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...]
         posterior, noise = content["posterior"], content.get("noise", {}).get("found")
     except (OSError, json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
         raise ValueError(
-            f"{path} is not a verdict with uncertainty: write one by `workbench diagnose CASE --json {path.name}`"
+            f"{path} is not a verdict with uncertainty: write one by `workbench diagnose CASE --json verdict.json`"
         ) from None
     try:
         return UncertainRig.from_json(rig, posterior), tuple(noise) if noise else None

@@ -33,7 +33,6 @@ from workbench.gap.report.budget import (
     sizes_of,
     with_held_out,
 )
-from workbench.gap.report.data_faults import data_faults
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.levels import steady_remainder
 from workbench.gap.report.record_checks import check_modes, check_records, detectability
@@ -43,7 +42,7 @@ from workbench.gap.search.finish import with_equals
 from workbench.gap.search.jointly import too_large
 from workbench.gap.search.settings import JOINT
 from workbench.gap.setup.faults import setup_faults
-from workbench.gap.setup.repeats import check_disjoint
+from workbench.gap.setup.records import check_disjoint, data_faults
 from workbench.records.record import Record, as_records
 from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
@@ -257,11 +256,13 @@ def _validated(rig: Rig, found: Attribution, held_out: Sequence[Record], settle:
     """The attribution without effects that act on held-out records but do not reduce their residual.
 
     Any law fits some of the residual of the fitted records. An effect stays if only implausibly large nominal errors
-    would make it unnecessary. Of a set that explains the gap in part, effects that enlarge the residual are dropped.
+    would make it unnecessary. Of a set that explains the gap in part, effects that enlarge the residual are dropped,
+    and those without any parameter beyond its standard deviation.
     """
     effects = found.best.effects
     if found.outcome in ("part", "unknown") and not _unpredictable(found):
-        with_none, kept = _residual_power(rig, found.seen, held_out, settle), effects
+        with_none = _residual_power(rig, found.seen, held_out, settle)
+        kept = tuple(e for e in effects if e in found.seen or e.stands_out(rig))
         while len(kept) > len(found.seen) and _residual_power(rig, kept, held_out, settle) > with_none:
             fewer = [tuple(e for e in kept if e is not one) for one in kept if one not in found.seen]
             kept = min(fewer, key=lambda rest: _residual_power(rig, rest, held_out, settle))

@@ -48,6 +48,7 @@ BY_QUANTITY: dict[str, tuple[str, dict[str, float]]] = {
     "pressure": ("Pa", {"Pa": 1, "kPa": 1e3, "MPa": 1e6, "bar": 1e5}),
     "": ("counts", {"counts": 1, "count": 1, "Counts": 1, "cts": 1, "ADC": 1}),
 }  # fmt: skip
+MASSES = {"kg": 1.0, "g": 1e-3, "t": 1e3, "lb": 0.45359237, "slug": POUND_FORCE / 0.3048}  # kg
 UNITS = {
     name: Unit(float(factor), si, quantity)
     for quantity, (si, names) in BY_QUANTITY.items()
@@ -150,6 +151,15 @@ class Units:
             if own.get(name, name) != name:
                 factor *= _in_si(own[name], name) ** (int(power or 1) * (1 if below else -1))
         return replace(unit, factor=factor, si=self.named(unit.si))
+
+    @property
+    def consistency(self) -> float | None:
+        """A force of mass · length / time² in the unit of force; None where a name's factor to SI is not known."""
+        units = [unit_named(name) for name in (self.length, self.time, self.force)]
+        if self.mass not in MASSES or not all(units):
+            return None
+        length, time, force = (unit.factor for unit in units if unit)
+        return MASSES[self.mass] * length / time**2 / force
 
     def _by_si(self) -> dict[str, str]:
         hertz = "Hz" if self.time == "s" else f"1/{self.time}"

@@ -48,7 +48,8 @@ def measured_case(
     names = _names((*records, *validation))
     low = read(nominal, nominal.stem)
     if not low.n_inputs:
-        raise ValueError(f"{nominal}: no channel is an input, so no model can be simulated; name inputs by --inputs")
+        forces = ",".join(channel.name for channel in low.output_channels if channel.quantity == "force") or "NAME"
+        raise ValueError(f"{nominal}: no channel is an input, so no model can be simulated; give --inputs {forces}")
     unknown = [channel.name for channel in low.output_channels if channel.quantity not in MEASURED]
     if unknown:
         raise ValueError(f"{nominal}: the quantity of {', '.join(unknown)} is not stated; give --quantity acceleration")

@@ -11,7 +11,7 @@ from workbench.gap.diagnose import diagnose
 from workbench.gap.setup import comparison
 from workbench.gap.setup.corrections import SetupFault, without_faults
 from workbench.gap.setup.faults import setup_faults
-from workbench.gap.setup.repeats import check_disjoint
+from workbench.gap.setup.records import check_disjoint
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -372,8 +372,12 @@ def chain(springs):
 
 def chain_with_a_wrong_spring(times):
     """Driven by noise; the second spring is so many times as stiff as the model says."""
+    return driven_chain([1.0, times, 1.0, 1.0])
+
+
+def driven_chain(springs):
     rng = np.random.default_rng(6)
-    rig, record = chain([1.0, times, 1.0, 1.0])
+    rig, record = chain(springs)
     records = []
     for name, share in (("one", [1.0, 0.3]), ("other", [0.3, 1.0])):
         forces = np.array(share)[:, None] * rng.standard_normal((2, 3000))
@@ -470,3 +474,14 @@ def test_a_sensor_beyond_a_node_that_reads_some_modes_turned_has_no_wrong_sign()
     """It stands where the second and the third mode are as strong and turned, the first is not."""
     case, _ = make_trial(1016, kinds=("sensor_misplacement",))
     assert setup_faults(case.rig, case.fit) == ()
+
+
+@pytest.mark.parametrize(("at", "name"), [(0, "a1"), (1, "a2")])
+def test_one_output_in_g_is_found_where_every_resonance_is_shifted(at, name):
+    """A softer structure leaves a residual of the size of the signal, so the factor closes little of it."""
+    rig, records = driven_chain([0.94] * 4)
+    assert setup_faults(rig, records) == ()
+    (fault,) = setup_faults(rig, change(records, outputs=diagonal(4, at, 1.0 / 9.80665)))
+    assert fault.sentence == f"The output {name} looks like g where m/s² is meant: multiply by 9.80665."
+    # a gain of 0.1 differs from that by 2 %, and is an error of calibration
+    assert not any(f.certain for f in setup_faults(rig, change(records, outputs=diagonal(4, at, 0.1))))

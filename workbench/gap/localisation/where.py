@@ -402,7 +402,7 @@ def _by_mode(frequencies: Floats, scaled: Sequence[tuple[Record, Floats]], noise
     """
     elastic = frequencies[frequencies > 0]
     first = WHERE.rigid * elastic[:1] * (elastic.size < frequencies.size)  # zero: an empty band
-    # geometric means, as the width of a peak is proportional to its frequency; `setup.by_band`, which compares whole
+    # geometric means, as the width of a peak is proportional to its frequency; `setup.comparison`, which compares whole
     # signals, takes arithmetic means
     edges = np.r_[0.0, first, np.sqrt(elastic[1:] * elastic[:-1]), WHERE.above * elastic[-1:], np.inf]
     rigid, *others = _shares_between(edges, scaled, noise)

@@ -102,7 +102,7 @@ def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record
             if counted < LEAST_SAMPLES:
                 raise RecordsError(
                     f"{what} {record.name!r} has {counted} samples to compare{' once settled' * (settle > 0)}; at least"
-                    f" {LEAST_SAMPLES} are needed: take a longer record"
+                    f" {LEAST_SAMPLES} are needed: take a longer record{' or a smaller settle' * (settle > 0)}"
                 )
         for record in filter(_is_driven, these):
             for sensor, measured in zip(rig.sensors, record.outputs[:, lead_of(record, settle) :], strict=True):

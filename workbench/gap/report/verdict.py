@@ -22,6 +22,7 @@ from workbench.structure.printed import joined_in_words, rounded
 
 NEAR = 0.05  # of the gap: a set that closes less is not stated as the nearest
 SHOWN = 0.005  # of the gap: smaller shares are not stated
+NEARLY_ALL = 0.99  # of the gap: a single force that explains more lacks only what noise shows
 SAME_PLACE = 0.02  # of the extent: places as close as this agree
 
 
@@ -113,17 +114,21 @@ class Verdict:
 
     @property
     def location_in_words(self) -> str:
-        """Where the unmodelled point force acts, or that no single one does; empty if neither is certain."""
+        """Where the unmodelled point force acts, or that no single one does; empty if neither is certain.
+
+        Small errors of the model act all over the structure, so nothing is said where they cause most of the gap.
+        """
         place = self.where.place
+        if self.outcome == "explained" and self.budget.nominal > 0.5:
+            return ""
         at = place_in_words(place.at, dict.fromkeys(COORDINATES, place.at_std))
         if self.is_located:
             return f"{at}, of the unmodelled point force, without a force law"
         if place.is_single_force is not False:
             return ""
-        explained = _percent(place.share)
-        if explained == "100 %":
-            explained = f"all but {100.0 * (1.0 - place.share):.1g} %"
-        return f"no single point force explains all of the gap; the best, {at}, explains {explained} of it"
+        if place.share > NEARLY_ALL:
+            return f"a single point force, {at}, leaves {100.0 * (1.0 - place.share):.1g} % of the gap, more than noise"
+        return f"no single point force explains all of the gap; the best, {at}, explains {_percent(place.share)} of it"
 
     @property
     def nominal_errors(self) -> Effect | None:
@@ -146,11 +151,12 @@ class Verdict:
             return f"In the records that were fitted, {text[0].lower()}{text[1:-1]}; but {self._disagreement}."
         if not self.shows_gap:
             return self._no_gap_in_words
-        named = [_described(effect, self.nominal, self.units) for effect in self._named]
+        stated = sorted(self._named, key=self._share_of, reverse=True)
+        named = [_described(effect, self.nominal, self.units) for effect in stated]
         words = joined_in_words(named)
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of its rms"
         if self.outcome == "explained":
-            shares = [self._share_of(effect) for effect in self._named]
+            shares = [self._share_of(effect) for effect in stated]
             if len(named) == 1:
                 text = f"{words} causes {_percent(shares[0])} of the gap"
             else:

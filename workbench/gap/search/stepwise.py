@@ -292,7 +292,7 @@ class Stepwise:
             if self.search.is_over:
                 break
             before = self.last
-            step = self._at_another_place(before) or self._with_one_more(before)
+            step = self._at_another_place(before) or self._with_an_absorbed(before) or self._with_one_more(before)
             if step is None:
                 break
             self.steps.append(step)
@@ -493,6 +493,23 @@ class Stepwise:
             return None
         found = self._fitted_to_all(best)
         return found if self._loss(found) < self._loss(step) else None
+
+    def _with_an_absorbed(self, step: Step) -> Step | None:
+        """The step with one linear effect more that makes its implausible nominal errors much smaller, or None.
+
+        Errors as large as those of the step may have absorbed that effect, and then leave no evidence of it. So the
+        best ones without nominal errors are tried, with errors that start from zero.
+        """
+        if step.is_plausible or not step.effects or self.search.by_mode:
+            return None
+        self.search.report("effects that errors of the model have absorbed", 0.6)
+        named = {effect.kind for effect in step.effects}
+        singles = [f.effects for f in self._linear_singles if f.effects[0].kind not in named][: STEPWISE.finalists]
+        tried = self.search.workers.map(self.fit_from_zero, [(*step.effects, *each) for each in singles])
+        noise = step.noise_power
+        longest = step.description(noise) - STEPWISE.shorter
+        found = [s for s in tried if s.description(noise) < longest and self._are_noticeable(s.effects, s.fit.effects)]
+        return replace(min(found, key=lambda s: s.description(noise)), others=tuple(found)) if found else None
 
     def _with_one_more(self, step: Step) -> Step | None:
         """The best set with one more effect, if it removes enough of the residual; else None."""

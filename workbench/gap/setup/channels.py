@@ -1,19 +1,54 @@
-"""Faults of channels: exchanged, of the wrong sign, in another unit, or of another quantity than stated."""
+"""Faults of channels: exchanged, of the wrong sign, in another unit, or of another quantity than stated.
 
-from collections.abc import Collection, Sequence
+A missing effect changes some bands, up or down; a fault of a channel changes all of its bands alike. So a candidate is
+accepted if its correction lowers the misfit of most bands, and by more than any other correction.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from workbench.arrays import Flags, Floats
-from workbench.gap.setup.by_band import compared_bands
-from workbench.gap.setup.candidates import Candidate, accepted
-from workbench.gap.setup.comparison import AFFECTED, CLOSED, Comparison
-from workbench.gap.setup.corrections import SetupFault, exchanged, inputs_times, outputs_times, quantity_set
-from workbench.gap.setup.gains import AMBIGUOUS, NEAR, factor_near, is_calibration_error, with_doubt_by_record
-from workbench.gap.setup.sentences import G, agreeing, sentence_of_inputs, sentence_of_outputs, subject
+from workbench.gap.setup.comparison import AFFECTED, CLOSED, MOST_CHANNELS, Comparison, band_misfit, compared_bands
+from workbench.gap.setup.corrections import (
+    FACTORS,
+    TURN,
+    G,
+    SetupFault,
+    agreeing,
+    exchanged,
+    inputs_times,
+    outputs_times,
+    quantity_set,
+    relabelled,
+    sentence_of_inputs,
+    sentence_of_outputs,
+    subject,
+    with_may,
+)
 
+# decrease of the mean misfit over affected bands: a factor of 1.8 or more has it, and a wrong sign has 2
+LEAST_DECREASE = 0.4
+UNCORRELATED = 0.9  # largest mean misfit that may remain there: uncorrelated signals have at least 1
+LEAST_SHARE = 0.5  # of the mean misfit there, which must go: the changes by a missing effect stay
+LEAST_BANDS = 0.8  # share of these bands in which the misfit must decrease
+MARGIN = 0.25  # mean misfit by which it must be better than any rival, where they differ: 2π and 9.81 differ by 0.44
+LEAST_DIFFERING = 0.1  # share of the affected bands in which it must differ from any rival
+QUANTITIES = ("displacement", "velocity", "acceleration")
+NEAR = 0.15  # largest relative difference of a gain from a factor near it: the smallest ratio of two factors is 1.56
+# of a factor's logarithm: largest difference of the log gains of two records (2π: a factor 1.2 between them)
+SAME_GAIN = 0.1
+# an error of calibration removes a larger share of the residual power beyond the noise that the factor leaves
+GAIN_SHARE = 0.5
+GAIN_CHI2 = 25.0  # and differs from the factor by five standard errors, in white noise
+CALIBRATED = 1e-3  # relative: a gain closer to a factor is that factor (9.81 for 9.80665 is 3.4e-4)
+AMBIGUOUS = (G, 1.0 / G, TURN, 1.0 / TURN)  # factors that a wrong calibration may reach; others are too far from one
+OF_MEDIAN = 1.858  # standard error of a median by the median absolute deviation and the root of the number, if normal
+NEAREST = 0.22  # of the logarithm of a gain: half the smallest ratio of two factors
 NEAR_TEN = 0.01  # relative: if all gains are as near to 10, an amplifier is as likely as g, which differs by 2 %
 
 
@@ -37,6 +72,111 @@ def channel_faults(gap: Comparison, kinds: Collection[str]) -> list[SetupFault]:
         for (kind, value, certain), same in alike.items()
     ]
     return [fault for fault in faults if fault.certain][:1] or faults
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A candidate fault of one channel, of two exchanged ones or of all outputs, and the misfit once it is corrected.
+
+    Attributes:
+        kind: "outputs" or "inputs" for a factor, "quantity", "exchanged outputs" or "exchanged inputs".
+        value: the factor, the stated and the true quantity, or the names of the two channels.
+        at: indices of the channels.
+        misfit: (n_records, n_outputs, n_modes) after the correction.
+    """
+
+    kind: str
+    value: Any
+    at: tuple[int, ...]
+    misfit: Floats
+
+
+def accepted(gap: Comparison) -> list[Candidate]:
+    """The candidates whose correction removes most of the misfit where it acts, and more than any rival, best first.
+
+    A rival affects at least half of the same bands: a fault elsewhere may be present too. An input without any effect
+    is among the rivals, since an unmodelled effect may have changed its response altogether.
+    """
+    compared = compared_bands(gap.measured_spectra)
+    before = gap.misfit[compared]
+    better = [candidate for candidate in _candidates(gap) if candidate.misfit[compared].sum() < before.sum()]
+    better.sort(key=lambda candidate: float(candidate.misfit[compared].sum()))
+    after = np.array([candidate.misfit[compared] for candidate in better]).reshape(-1, before.size)
+    affected = np.abs(after - before) > AFFECTED
+    chosen = []
+    for i, candidate in enumerate(better):
+        at = affected[i]
+        if not at.any():
+            continue
+        decrease = (before - after[i])[at]
+        least = max(LEAST_DECREASE, LEAST_SHARE * before[at].mean(), before[at].mean() - UNCORRELATED)
+        if decrease.mean() < least or (decrease > 0).mean() < LEAST_BANDS:
+            continue
+        rivals = affected[:, at].mean(axis=1) >= 0.5
+        rivals[i] = False
+        differs = np.abs(after[rivals] - after[i]) > AFFECTED
+        margin = np.where(differs, after[rivals] - after[i], 0.0).sum(axis=1)
+        if (margin > MARGIN * np.maximum(differs.sum(axis=1), LEAST_DIFFERING * at.sum())).all():
+            chosen.append(candidate)
+    return chosen
+
+
+def _candidates(gap: Comparison) -> Iterator[Candidate]:
+    """Every candidate fault of one input, one output with a wide gap, two exchanged ones, and all outputs alike."""
+    rig, measured, predicted = gap.rig, gap.measured_spectra, gap.predicted_spectra
+    n, wide = len(rig.sensors), [int(j) for j in np.flatnonzero(gap.wide)]
+    for factor in FACTORS:
+        misfit = band_misfit(measured, predicted, factor)
+        yield Candidate("outputs", factor, tuple(range(n)), misfit)
+        for j in wide if n > 1 else ():
+            yield Candidate("outputs", factor, (j,), gap.misfit_with((j,), misfit[:, [j]]))
+    for i, j in combinations(wide, 2):
+        misfit = band_misfit(measured.select((i, j)), predicted.select((j, i)))
+        names = rig.sensors[i].name, rig.sensors[j].name
+        yield Candidate("exchanged outputs", names, (i, j), gap.misfit_with((i, j), misfit))
+    for quantity in QUANTITIES:
+        others = [j for j in wide if rig.sensors[j].quantity in set(QUANTITIES) - {quantity}]
+        if others:
+            with_quantity = relabelled(rig, [rig.sensors[j].name for j in others], quantity)
+            misfit = band_misfit(measured, gap.spectra_of(gap.predict(with_quantity, gap.records)))
+            for j in others:
+                stated_and_true = (rig.sensors[j].quantity, quantity)
+                yield Candidate("quantity", stated_and_true, (j,), gap.misfit_with((j,), misfit[:, [j]]))
+    for p, alone in enumerate(gap.by_input):
+        own = gap.spectra_of(alone)
+        for factor in (*FACTORS, 0.0) if any(np.any(lines) for lines in own.lines) else ():
+            lines = [every + (factor - 1.0) * part for every, part in zip(predicted.lines, own.lines, strict=True)]
+            yield Candidate("inputs", factor, (p,), band_misfit(measured, predicted.with_lines(lines)))
+    m = len(rig.actuators)
+    for p, q in combinations(range(m), 2):
+        if m <= MOST_CHANNELS or q == p + 1:
+            names = rig.actuators[p].name, rig.actuators[q].name
+            crossed = gap.spectra_of(gap.predict(*exchanged("inputs", *names, rig, gap.records)))
+            yield Candidate("exchanged inputs", names, (p, q), band_misfit(measured, crossed))
+
+
+def output_in_other_unit(gap: Comparison) -> list[SetupFault]:
+    """The fault of one output of several whose gain beside the others is the same factor of units in every band.
+
+    A missing effect shifts resonances, so it changes the amplitude of a band at all outputs, which may mask a factor.
+    An error of calibration near a factor differs from it significantly, and g from ten.
+    """
+    log_ratios = gap.log_ratios
+    found = []
+    for j in np.flatnonzero(gap.wide) if log_ratios.shape[1] > 2 else ():
+        own, others = log_ratios[:, j], np.moveaxis(np.delete(log_ratios, j, axis=1), 1, 2)
+        at = np.isfinite(own) & (np.isfinite(others).sum(axis=2) > 1)
+        if np.count_nonzero(at.any(axis=0)) < min(2, gap.rig.modes.n_modes):
+            continue
+        beside = own[at] - np.nanmedian(others[at], axis=1)
+        factor = min((f for f in FACTORS if f > 0), key=lambda f: abs(np.median(beside) - np.log(f)))
+        off = beside - np.log(factor)
+        error = GAIN_CHI2**0.5 * OF_MEDIAN * np.median(np.abs(off - np.median(off))) / np.sqrt(off.size)
+        from_ten = abs(abs(np.median(beside)) - np.log(10.0))
+        is_calibrated = factor not in AMBIGUOUS or abs(np.median(off)) < max(error, CALIBRATED) < from_ten
+        if (np.abs(off) < NEAREST).all() and is_calibrated:
+            found.append(with_doubt_by_record(gap, _fault(gap, "outputs", factor, (int(j),), True)))
+    return found if len(found) == 1 else []
 
 
 def _is_certain(gap: Comparison, candidate: Candidate) -> bool | None:
@@ -152,3 +292,64 @@ def scaled_inputs(gap: Comparison) -> list[SetupFault]:
 
 def _sum_of_squares(values: Floats) -> float:
     return float(values @ values)
+
+
+def factor_near(gain: float) -> float | None:
+    """The factor of `FACTORS` nearest to a gain; None if none is near."""
+    near = [factor for factor in FACTORS if gain * factor > 0 and abs(gain / factor - 1.0) < NEAR]
+    return min(near, key=lambda factor: abs(gain / factor - 1.0), default=None)
+
+
+def is_calibration_error(
+    gain: float, factor: float, with_factor: float, with_gain: float, noise: float, n_samples: int
+) -> bool:
+    """Whether a gain is near a factor of units by chance: it differs significantly, and explains far more.
+
+    Args:
+        gain: estimated by least squares.
+        factor: of units.
+        with_factor, with_gain: sums of squared residuals with the factor and with the gain.
+        noise: sum of squares of the noise.
+        n_samples: number of samples in each sum.
+    """
+    if factor not in AMBIGUOUS or abs(gain / factor - 1.0) < CALIBRATED:
+        return False
+    removed = with_factor - with_gain
+    return bool(removed > GAIN_SHARE * (with_factor - noise) and removed * n_samples > GAIN_CHI2 * with_gain)
+
+
+def with_doubt_by_record(gap: Comparison, fault: SetupFault) -> SetupFault:
+    """The fault, marked as in doubt if the gains of the records that its correction improves differ.
+
+    A factor of units is the same in all records; the gain of an amplifier that saturates depends on the level.
+    """
+    if not fault.certain:
+        return fault
+    improved = []
+    for was, gains in zip(gap.log_ratios, log_gains_after(gap, fault), strict=True):
+        at = np.isfinite(gains)
+        if at.any() and np.median(np.abs(gains[at])) < np.median(np.abs(was[at])):
+            improved.append(gains)
+    difference = largest_difference(improved)
+    if difference <= tolerated_difference(fault):
+        return fault
+    but = f"from record to record the gain differs by a factor {np.exp(difference):.2g}"
+    what = with_may(fault.sentence.split(": multiply")[0])
+    return replace(fault, certain=False, sentence=f"{what}; but {but}, as where an amplifier saturates.")
+
+
+def log_gains_after(gap: Comparison, fault: SetupFault) -> Floats:
+    """Log gains (n_records, n_outputs, n_modes) after a correction; NaN in bands that it does not affect."""
+    after = gap.corrected(fault.correction).log_ratios
+    return np.where(np.abs(after - gap.log_ratios) > AFFECTED, after, np.nan)
+
+
+def largest_difference(log_gains: Iterable[Floats]) -> float:
+    """Largest difference of the log gains of two records, each the median over the bands that both have."""
+    differences = [both[np.isfinite(both)] for both in (one - other for one, other in combinations(log_gains, 2))]
+    return max((float(abs(np.median(both))) for both in differences if both.size), default=0.0)
+
+
+def tolerated_difference(fault: SetupFault) -> float:
+    """Difference of the log gains of two records that a fault allows; infinite if it is not one of units."""
+    return SAME_GAIN * abs(np.log(fault.factor)) if fault.factor != 1.0 else np.inf

@@ -1,4 +1,4 @@
-"""Comparison of records with the predictions of a rig, before and after a fault of the set-up is corrected."""
+"""Comparison of records with the predictions of a rig, in frequency bands of one mode each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -6,14 +6,16 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.arrays import Flags, Floats
+from workbench.arrays import Complexes, Flags, Floats, Integers
 from workbench.gap.prediction.residuals import lead_of
-from workbench.gap.setup.by_band import Spectra, band_misfit, log_ratios
 from workbench.gap.setup.corrections import Correction, SetupFault, without_faults
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, predict
 
+LEAST_POWER = 1e-2  # of a channel's power: a band with less holds noise and leakage, and is not compared
+LARGEST_LOG_RATIO = 3.0  # bound of |log amplitude ratio|, so that one band that an effect changes does not dominate
+FADE = 0.25  # of a record: its end is faded out over it; its beginning, from rest, holds the response to a hammer
 # rms residual, in standard deviations of the channel, from which it may be connected wrongly: a wrong sign leaves 2, an
 # exchange about 1.4, a factor of 2π at least 0.84
 WIDE_GAP = 0.3
@@ -22,6 +24,81 @@ NOISY = 0.5  # share of noise in a channel's measured power from which it shows 
 CLOSED = 0.9  # share of the closable power that a correction must remove, on the channels that it concerns
 AFFECTED = 0.2  # change of the misfit from which a correction affects a band
 MOST_CHANNELS = 12  # inputs that are simulated one by one, and exchanged in pairs; beyond, only neighbours are
+
+
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """Spectra of the signals of several records, with the bands of the modes.
+
+    Attributes:
+        lines: (n_signals, n_lines) of each record.
+        edges: (n_modes + 1,) of each record: the line at which each mode's band starts, and at which the last ends.
+    """
+
+    lines: list[Complexes]
+    edges: list[Integers]
+
+    @staticmethod
+    def of_signals(signals: Sequence[Floats], records: Sequence[Record], frequencies_hz: Floats) -> "Spectra":
+        """Spectra of signals, (n_signals, n_samples) a record; bands end halfway between two natural frequencies."""
+        # every line is compared in some band; `localisation.where` shares a gap among modes, and takes geometric means
+        edges_hz = np.r_[0.0, (frequencies_hz[1:] + frequencies_hz[:-1]) / 2.0, np.inf]
+        lines, edges = [], []
+        for signal, record in zip(signals, records, strict=True):
+            n = signal.shape[1]
+            fade = np.minimum(1.0, np.arange(n, 0, -1) / (FADE * n))
+            lines.append(np.fft.rfft((signal - signal.mean(axis=1, keepdims=True)) * np.sin(0.5 * np.pi * fade) ** 2))
+            edges.append(np.asarray(np.searchsorted(np.fft.rfftfreq(n, record.sample_time), edges_hz)))
+        return Spectra(lines, edges)
+
+    def with_lines(self, lines: list[Complexes]) -> "Spectra":
+        """Spectra of other signals of the same records."""
+        return Spectra(lines, self.edges)
+
+    def select(self, at: Sequence[int]) -> "Spectra":
+        """Spectra of some of the signals, in this order."""
+        return self.with_lines([lines[list(at)] for lines in self.lines])
+
+    @cached_property
+    def power(self) -> Floats:
+        """Power (n_records, n_signals, n_modes) of each signal in each band."""
+        return self.cross_power(self)
+
+    def cross_power(self, other: "Spectra") -> Floats:
+        """Real part of the cross-power (n_records, n_signals, n_modes) of each signal and its counterpart, by band."""
+        in_bands = []
+        for one, two, edges in zip(self.lines, other.lines, self.edges, strict=True):
+            up_to = np.cumsum((one * two.conj()).real, axis=1)
+            in_bands.append(np.diff(np.hstack([np.zeros((len(up_to), 1)), up_to])[:, edges], axis=1))
+        return np.array(in_bands)
+
+
+def compared_bands(measured: Spectra) -> Flags:
+    """Whether each band (n_records, n_signals, n_modes) holds enough of its signal to be compared."""
+    return np.asarray(measured.power > LEAST_POWER * measured.power.sum(axis=2, keepdims=True))
+
+
+def band_misfit(measured: Spectra, predicted: Spectra, factor: float = 1.0) -> Floats:
+    """|log amplitude ratio| + 1 - correlation (n_records, n_signals, n_modes), with the prediction scaled by `factor`.
+
+    A missing effect shifts resonances and changes the amplitudes of some bands, up or down; a fault of the set-up
+    changes all bands alike.
+    """
+    tiny = 1e-300
+    with np.errstate(over="ignore", invalid="ignore"):
+        of_y, of_p, both = measured.power, predicted.power, measured.cross_power(predicted)
+        ratio = 0.5 * (np.log(np.maximum(of_y, tiny)) - np.log(np.maximum(of_p * factor**2, tiny)))
+        correlation = np.sign(factor) * both / np.sqrt(np.maximum(of_y * of_p, tiny))
+        misfit = np.minimum(np.abs(ratio), LARGEST_LOG_RATIO) + 1.0 - correlation
+        return np.asarray(np.nan_to_num(misfit, nan=LARGEST_LOG_RATIO + 1.0))
+
+
+def log_ratios(measured: Spectra, predicted: Spectra) -> Floats:
+    """Log of measured over predicted amplitude (n_records, n_signals, n_modes); NaN in bands that are not compared."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        of_y, of_p = (np.log(np.maximum(each.power, 1e-300)) for each in (measured, predicted))
+        ratio = 0.5 * (of_y - of_p)
+    return np.where(compared_bands(measured) & np.isfinite(ratio), ratio, np.nan)
 
 
 @dataclass(frozen=True, eq=False)

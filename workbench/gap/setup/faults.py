@@ -6,14 +6,18 @@ from functools import partial
 
 import numpy as np
 
-from workbench.gap.setup.by_band import compared_bands
-from workbench.gap.setup.channels import channel_faults, scaled_inputs
-from workbench.gap.setup.comparison import AFFECTED, CLOSED, Comparison
+from workbench.gap.setup.channels import (
+    channel_faults,
+    largest_difference,
+    log_gains_after,
+    output_in_other_unit,
+    scaled_inputs,
+    tolerated_difference,
+)
+from workbench.gap.setup.comparison import AFFECTED, CLOSED, Comparison, compared_bands
 from workbench.gap.setup.corrections import SetupFault, records_alone, without_faults
-from workbench.gap.setup.gains import largest_difference, log_gains_after, tolerated_difference
-from workbench.gap.setup.rates import modal_units, sampling_rates
-from workbench.gap.setup.repeats import check_names, copied, repeated
-from workbench.gap.setup.triggers import late_records
+from workbench.gap.setup.records import check_names, copied, repeated
+from workbench.gap.setup.sampling import late_records, modal_units, sampling_rates
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
@@ -25,6 +29,7 @@ CANDIDATES = ("outputs", "inputs", "exchanged outputs", "exchanged inputs")  # o
 OF_ONE_RECORD: tuple[Detector, ...] = (partial(channel_faults, kinds=CANDIDATES), scaled_inputs, sampling_rates)
 DETECTORS: tuple[Detector, ...] = (
     partial(channel_faults, kinds=(*CANDIDATES, "quantity")),
+    output_in_other_unit,
     scaled_inputs,
     sampling_rates,
     modal_units,

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.polynomial.legendre import legvander
+from numpy.polynomial.legendre import leggauss, legvander
+from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgeqrf, dtrtrs
 from scipy.signal import upfirdn
 from scipy.signal.windows import blackman
@@ -72,7 +73,7 @@ class DecayingSettings:
 
 START, DECAYING = StartSettings(), DecayingSettings()
 HIGHEST_DEGREE = 8  # of a drift; polynomials of higher degree oscillate like modes
-PART = 65_536  # samples of a part of a record in the fit of drifts
+PART = 16_384  # most samples of a part of a record in the fit of drifts
 # Least number of samples to estimate the predictor and to test it.
 SHORTEST = (4 + START.level_memory) * START.order
 UPPER = np.triu(np.ones((START.order + 1, START.order + 1)))
@@ -269,6 +270,83 @@ def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
+class _Columns:
+    """Functions of time whose span is the same after a shift in time: one table serves all parts of a long record.
+
+    Attributes:
+        table: (at most PART, n_columns) functions of the samples of a part.
+        shift: T(s), (n_columns, n_columns), of the first sample s of a part: the columns there are table @ T(s).
+    """
+
+    table: np.ndarray
+    shift: Callable[[int], np.ndarray]
+
+    @staticmethod
+    def modes(poles: np.ndarray, n: int) -> "_Columns":
+        """Real and imaginary parts of e^{λt} over n samples; poles λ (n_modes,) per sample."""
+
+        def shift(first: int) -> np.ndarray:
+            factor = np.exp(first * poles)
+            re, im = np.diag(factor.real), np.diag(factor.imag)
+            return np.block([[re, im], [-im, re]])
+
+        decay = np.exp(np.outer(np.arange(_part(n)), poles))
+        return _Columns(np.hstack([decay.real, decay.imag]), shift)
+
+    @staticmethod
+    def settling(rates: np.ndarray, n: int) -> "_Columns":
+        """The exponentials e^{-rt} over n samples; rates r (n_rates,) per sample."""
+        return _Columns(np.exp(-np.outer(np.arange(_part(n)), rates)), lambda first: np.diag(np.exp(-first * rates)))
+
+    @staticmethod
+    def polynomials(degree: int, n: int) -> "_Columns":
+        """Legendre polynomials over n samples, to a degree. Those over a part span the same."""
+        size = _part(n)
+        nodes, weights = leggauss(degree + 1)
+        own = legvander(nodes, degree)
+
+        def shift(first: int) -> np.ndarray:
+            at = first + (nodes + 1.0) / 2.0 * (size - 1)
+            whole = legvander(-1.0 + 2.0 * at / max(n - 1, 1), degree)
+            return (np.arange(degree + 1)[:, None] + 0.5) * (own.T * weights) @ whole
+
+        return _Columns(legvander(-1.0 + 2.0 * np.arange(size) / max(size - 1, 1), degree), shift)
+
+    def beside(self, other: "_Columns") -> "_Columns":
+        """These columns, then those of another."""
+        return _Columns(
+            np.hstack([self.table, other.table]), lambda first: block_diag(self.shift(first), other.shift(first))
+        )
+
+    def combined(self, part: slice, weights: np.ndarray) -> np.ndarray:
+        """(n_outputs, n_part) sums of the columns over a part; weights (n_columns, n_outputs)."""
+        return np.asarray((self.table[: part.stop - part.start] @ (self.shift(part.start) @ weights)).T)
+
+    def factored(self, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """R and Q^T y of a QR factorisation of the columns, part by part; outputs y (n_outputs, n_samples)."""
+        k = self.table.shape[1]
+        found = np.zeros((0, k + len(outputs)))
+        q, r = np.linalg.qr(self.table)
+        for part in _parts(outputs.shape[1]):
+            size = part.stop - part.start
+            if size < len(self.table):
+                q, r = np.linalg.qr(self.table[:size])
+            rows = np.hstack([r @ self.shift(part.start), (outputs[:, part] @ q).T])
+            found = np.asarray(np.linalg.qr(np.vstack([found, rows]), mode="r"))
+        return found[:k, :k], found[:k, k:]
+
+
+def _part(n: int) -> int:
+    """Samples of each part of n, the last of which may be shorter by fewer than there are parts."""
+    return -(-n // -(-n // PART))
+
+
+def _parts(n: int) -> Iterator[slice]:
+    for first in range(0, n, _part(n)):
+        yield slice(first, min(first + _part(n), n))
+
+
+@dataclass(frozen=True, eq=False)
 class Drift:
     """A drift slower than any mode, or the exponential settling of sensors with a high-pass.
 
@@ -310,15 +388,8 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     if highest < 1:
         return no_drift
 
-    def factored_with(drift_columns: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """R and Q^T y of a constant, the modes and the columns of the drift."""
-
-        def columns(at: np.ndarray) -> np.ndarray:
-            decay = np.exp(np.outer(dt * at, poles))
-            return np.hstack([np.ones((at.size, 1)), decay.real, decay.imag, drift_columns(at)])
-
-        return _factored(columns, record.outputs)
-
+    modes = _Columns.modes(dt * poles, n)
+    with_constant = modes.beside(_Columns.polynomials(0, n))
     fixed = 1 + 2 * poles.size
     power = (record.outputs**2).sum(axis=1)
     penalty = np.log(n * m)
@@ -330,14 +401,14 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
         return np.asarray(n * np.log(before / after).sum(axis=1))
 
     # Each column after those of the constant and the modes adds one degree.
-    r, along = factored_with(lambda at: _polynomials(at, n, highest)[:, 1:])
+    _, along = modes.beside(_Columns.polynomials(highest, n)).factored(record.outputs)
     ratio = gain(np.vstack([np.zeros(m), along[fixed:] ** 2]).cumsum(axis=0), along)
     degree = int(np.argmax(ratio - penalty * m * np.arange(highest + 1)))
     likely = degree > 0 and ratio[degree] >= chi2.isf(FALSE_ALARM / highest, m * degree)
 
     rates = np.geomspace(2.0, START.fastest * n, START.rates) / (n * dt)
     for _ in range(START.rounds):
-        decays, tried = factored_with(_decays(dt * rates))
+        decays, tried = with_constant.beside(_Columns.settling(dt * rates, n)).factored(record.outputs)
         drift_part = decays[fixed:, fixed:]
         each = (drift_part.T @ tried[fixed:]) ** 2 / np.maximum((drift_part**2).sum(axis=0), 1e-300)[:, None]
         settles = gain(each, tried)
@@ -349,60 +420,26 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     of_polynomial = ratio[degree] - penalty * m * degree if likely else 0.0
     time_constant = None
     if criterion > of_polynomial and settling > chi2.isf(FALSE_ALARM / START.rates, m + 1):
-        drift_columns, time_constant = _decays(dt * rate), 1.0 / float(rate)
-        r, along = factored_with(drift_columns)
+        columns, time_constant = with_constant.beside(_Columns.settling(np.array([dt * rate]), n)), 1.0 / float(rate)
     elif likely:
-        drift_columns, kept = (lambda at: _polynomials(at, n, degree)[:, 1:]), fixed + degree
-        r, along = r[:kept, :kept], along[:kept]
+        columns = modes.beside(_Columns.polynomials(degree, n))
     else:
         return no_drift
+    weights = np.linalg.solve(*columns.factored(record.outputs))
+    weights[:fixed] = 0.0  # the modes and a constant stay
     outputs, extremes = record.outputs.copy(), []
-    for part, drift in _series(drift_columns, np.linalg.solve(r, along)[fixed:], n):
+    for part in _parts(n):
+        drift = columns.combined(part, weights)
         outputs[:, part] -= drift
         extremes.append((drift.min(axis=1), drift.max(axis=1)))
     return Drift(replace(record, outputs=outputs), frozen(np.ptp(extremes, axis=(0, 1))), time_constant)
 
 
-def _decays(rates: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """The exponentials e^{-rate n} as a function of samples n (n_at,), (n_at, n_rates); rates per sample."""
-    return lambda at: np.asarray(np.exp(-np.outer(at, rates)))
-
-
 def without_polynomial(outputs: np.ndarray) -> np.ndarray:
     """Outputs (n_outputs, n_samples) without the best polynomial of `HIGHEST_DEGREE` in time."""
-    n, remainder = outputs.shape[1], outputs.copy()
-
-    def columns(at: np.ndarray) -> np.ndarray:
-        return _polynomials(at, n, min(HIGHEST_DEGREE, n - 1))
-
-    for part, polynomial in _series(columns, np.linalg.solve(*_factored(columns, outputs)), n):
-        remainder[:, part] -= polynomial
-    return remainder
-
-
-def _polynomials(at: np.ndarray, n: int, degree: int) -> np.ndarray:
-    """Legendre polynomials over n samples at the samples `at`, (n_at, degree + 1)."""
-    return np.asarray(legvander(-1.0 + 2.0 * at / max(n - 1, 1), degree))
-
-
-def _parts(n: int) -> Iterator[slice]:
-    for first in range(0, n, PART):
-        yield slice(first, min(first + PART, n))
-
-
-def _series(
-    columns: Callable[[np.ndarray], np.ndarray], weights: np.ndarray, n: int
-) -> Iterator[tuple[slice, np.ndarray]]:
-    """Parts of n samples, and the sum of weighted columns there, (n_outputs, n_part)."""
+    n = outputs.shape[1]
+    columns = _Columns.polynomials(min(HIGHEST_DEGREE, n - 1), n)
+    weights, remainder = np.linalg.solve(*columns.factored(outputs)), outputs.copy()
     for part in _parts(n):
-        yield part, (columns(np.arange(part.start, part.stop)) @ weights).T
-
-
-def _factored(columns: Callable[[np.ndarray], np.ndarray], outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R and Q^T y of columns over time, part by part, as all columns of a long record would fill the memory."""
-    r = np.zeros((0, 0))
-    for part in _parts(outputs.shape[1]):
-        rows = np.hstack([columns(np.arange(part.start, part.stop)), outputs[:, part].T])
-        r = np.asarray(np.linalg.qr(np.vstack([r.reshape(-1, rows.shape[1]), rows]), mode="r"))
-    k = r.shape[1] - len(outputs)
-    return r[:k, :k], r[:k, k:]
+        remainder[:, part] -= columns.combined(part, weights)
+    return remainder

@@ -113,7 +113,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
             label_in_words(effect["kind"]),
             name.replace("_", " "),
             *to_its_error(value, effect.get("parameters_std", {}).get(name)),
-            effect.get("at", ""),
+            " to ".join(effect["between"]) if "between" in effect else effect.get("at", ""),
             effect.get("input", effect.get("output", "")),
         ]
         for effect in [*content["effects"], *nearest]
@@ -131,7 +131,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     if rivals and content.get("probability") is not None:
         rivals.insert(0, ["the set named", content["probability"]])
     tables = [
-        (title, ("effect", "parameter", "value", "standard error", f"x [{length}]", "input or output"), effects),
+        (title, ("effect", "parameter", "value", "standard error", f"place [{length}]", "input or output"), effects),
         ("Gap (rms error / rms signal)", ("record", "before", "after", "floor", "share closed"), gaps),
         ("Alternatives that the records do not exclude", ("set of effects", "probability"), rivals),
     ]
@@ -169,7 +169,7 @@ def case_inputs(folder: Path) -> dict[str, str]:
     """The text of case.toml and checksums of the other files that the case reads, by title."""
     digests = [f"{hashlib.sha256(f.read_bytes()).hexdigest()}  {f.relative_to(folder)}" for f in files_of(folder)]
     text = (folder / "case.toml").read_text(encoding="utf-8")
-    return {f"{folder.name}/case.toml": text, "files (SHA-256)": "\n".join(digests)}
+    return {f"{folder.resolve().name}/case.toml": text, "files (SHA-256)": "\n".join(digests)}
 
 
 def _could_show(verdict: Verdict) -> str:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from workbench.gap.setup.by_band import LARGEST_LOG_RATIO, Spectra, band_misfit, compared_bands
+from workbench.gap.setup.comparison import LARGEST_LOG_RATIO, Spectra, band_misfit, compared_bands
 
 F = np.array([2.0, 6.0, 11.0])  # Hz: bands end at 4 and 8.5
 T = np.arange(4000) * 0.01

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.gap.report.data_faults import data_faults
+from workbench.gap.setup.records import data_faults
 from workbench.rig.elements import CoulombFriction, OneSidedStop
 
 
