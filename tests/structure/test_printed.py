@@ -6,7 +6,7 @@ import pytest
 import workbench as wb
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import filter_on
-from workbench.identification.updating.self_check import SelfCheck
+from workbench.identification.updating.distributions import SelfCheck
 from workbench.structure.domain import NamedPoints
 from workbench.structure.printed import warns_of_remarks
 

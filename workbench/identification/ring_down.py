@@ -253,8 +253,6 @@ def _settles_within_a_period(drift: Drift) -> bool:
 def _identify(records: list[Record], n_modes: int | None, budget: Budget) -> Identified:
     if n_modes is None:
         return identify_within(records, budget)
-    if n_modes < 1:
-        raise ValueError(f"at least one mode must be asked for; got {n_modes}")
     return _refine_given(stacked_delays(records, n_modes=n_modes), records, budget)
 
 

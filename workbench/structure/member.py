@@ -1,7 +1,7 @@
 """Bars and beams, with profiles, end conditions and attachments, and their modes by finite elements of high degree."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
@@ -82,7 +82,7 @@ class _Member(Printed):
 
     def _segments(self, n_modes: int, stiffness: Profile, continuity: int, extra: int) -> Segments:
         """Segments that represent n_modes half waves, with `extra` degrees more than estimated."""
-        nodes = _nodes((*self.mass_per_length.breaks, *stiffness.breaks), self.length)
+        nodes = segment_ends((*self.mass_per_length.breaks, *stiffness.breaks), self.length)
         for part in self.attachments:
             # a node at an attachment, where a derivative of the shapes jumps
             if np.abs(nodes - part.at).min() >= self._thinnest(continuity):
@@ -172,12 +172,9 @@ class _Member(Printed):
         rigidity = segments.assemble(stiffness, order)
         if tension:
             rigidity += segments.assemble(lambda x: np.full(x.shape, tension), 1)
-        held, essential, springs = self._restraints(segments)
-        for part in self.attachments:
-            if isinstance(part, PointMass):
-                for derivative, value in enumerate(part.pair):
-                    row = self._motion_at(segments, position(part.at), derivative)
-                    mass += value * row.T @ row
+        held, essential, springs = self.restraints(segments)
+        for value, row in self.point_masses(segments):
+            mass += value * row.T @ row
         for spring, row in springs:
             rigidity += spring * row.T @ row
         free = np.delete(np.arange(segments.n_functions), held)
@@ -215,7 +212,17 @@ class _Member(Printed):
         coefficients *= self._signs(segments, coefficients)
         return omega, coefficients, tuple(essential)
 
-    def _restraints(
+    def point_masses(self, segments: Segments) -> list[tuple[float, np.ndarray]]:
+        """Attached masses and rotary inertias with the rows of their motions."""
+        return [
+            (value, self._motion_at(segments, position(part.at), derivative))
+            for part in self.attachments
+            if isinstance(part, PointMass)
+            for derivative, value in enumerate(part.pair)
+            if value
+        ]
+
+    def restraints(
         self, segments: Segments
     ) -> tuple[list[int], list[tuple[float, int]], list[tuple[float, np.ndarray]]]:
         """Functions held by the ends, their (x, derivative), and springs with the rows of their elongations."""
@@ -265,7 +272,7 @@ class _Member(Printed):
 
 def checked_places(breaks: tuple[float, ...], length: float) -> np.ndarray:
     """Places (n_places,) where mass and stiffness with these breaks must be positive, m."""
-    nodes = _nodes(breaks, length)
+    nodes = segment_ends(breaks, length)
     return np.asarray((nodes[:-1, None] + np.diff(nodes)[:, None] * np.linspace(0.002, 0.998, 101)).ravel())
 
 
@@ -281,8 +288,9 @@ def _check_positive(name: str, profile: Profile, length: float) -> None:
         )
 
 
-def _nodes(breaks: tuple[float, ...], length: float) -> np.ndarray:
-    slack = NO_SLIVER * length
+def segment_ends(breaks: Iterable[float], length: float, slack: float = NO_SLIVER) -> np.ndarray:
+    """The ends of a structure and the breaks between them, at least `slack` of the length apart, m."""
+    slack *= length
     inside = sorted(b for b in breaks if slack < b < length - slack)
     nodes = [0.0]
     for b in [*inside, length]:
@@ -417,7 +425,7 @@ class Beam(_Member):
         segments = self._segments(BUCKLED, self.bending_stiffness, 1, 0)
         rigidity = segments.assemble(self.bending_stiffness, 2)
         slopes = segments.assemble(lambda x: np.ones(x.shape), 1)
-        held, _, springs = self._restraints(segments)
+        held, _, springs = self.restraints(segments)
         for spring, row in springs:
             rigidity += spring * row.T @ row
         on_ground = [part.pair[0] for part in self.attachments if isinstance(part, PointSpring)]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
 
-from workbench.identification.free_decay.decaying import decays
+from workbench.identification.free_decay.preparation import decays
 from workbench.records.record import Channel, Record
 
 RATE = 500.0

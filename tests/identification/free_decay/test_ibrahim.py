@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -64,8 +66,6 @@ def test_six_sensors_find_twenty_modes(bar_modes, quantity):
 
 
 def test_shapes_of_mixed_sensors_are_of_displacement(bar_modes):
-    from dataclasses import replace
-
     few = bar_modes.select(range(3))
     records = [ring_down(few, 4, sample_time=0.02, n_samples=400, quantity=q) for q in ("displacement", "acceleration")]
     mixed = replace(
@@ -119,6 +119,15 @@ def test_refusals(bar_modes):
         two_delays(record)
     with pytest.raises(ValueError, match="Measure longer or ask for fewer"):
         stacked_delays(record, n_modes=20)
+    for n_modes in (0, -1):
+        with pytest.raises(ValueError, match=f"n_modes is a number of modes, 1 or more; got {n_modes}"):
+            stacked_delays(record, n_modes=n_modes)
+    for instants in ({"first": -3}, {"spacing": 0}):
+        with pytest.raises(ValueError, match="the first instant is sample 0 or later"):
+            two_delays(record, columns=12, **instants)
+    short = replace(record.between(0.0, 0.19), name="short")
+    with pytest.raises(ValueError, match="record 'short' has 20 samples and 25 delays were taken"):
+        stacked_delays([record, short], n_modes=2, delays=25)
     with pytest.raises(ValueError, match="same outputs"):
         stacked_delays([record, record.select_outputs(["y1"])], n_modes=1)
 

@@ -153,14 +153,14 @@ def search_of(poles, amplitudes):
     outputs = (np.array(amplitudes) @ np.exp(np.outer(poles, time))).real
     outputs = outputs + 0.01 * np.random.default_rng(0).standard_normal(time.size)
     record = Record(0.02, outputs[None], (Channel("a", "velocity"),))
-    problem = _FreeDecay([record], 0.001, [record], Budget())
+    problem = _FreeDecay([record], 0.001, [record], Budget(), [])
     return problem, lambda *which: problem.settled(replace(problem.nothing, poles=np.array(poles)[list(which)]))
 
 
 def test_a_mode_is_not_blamed_for_a_pair_elsewhere(monkeypatch):
     """Two modes in one sensor may come to look like one when a third, far off, has entered."""
     problem, of = search_of([-0.2 + 20.0j, -0.2 + 20.4j, -0.3 + 60.0j], [1.0, 0.8, 0.1])
-    monkeypatch.setattr(problem, "_distinct", lambda model, poles, r, s: poles.size == 2)
+    monkeypatch.setattr(problem, "_distinct", lambda poles, r, s: poles.size == 2)
     assert not problem.splits(of(0, 1), of(0, 1, 2))
     assert problem.splits(of(0, 2), of(0, 2, 1))
 

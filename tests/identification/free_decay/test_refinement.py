@@ -151,6 +151,9 @@ def test_refusals(truth):
         refine(record, truth)
     with pytest.raises(ValueError, match="no mode to refine"):
         refine(record, truth.select([]))
+    for noise in (0.0, -1.0, [0.1] * (record.n_outputs + 1)):
+        with pytest.raises(ValueError, match="noise_std is positive, one for all outputs or one each"):
+            cramer_rao_bound(truth, record, noise_std=noise)
 
 
 def test_the_covariance_of_a_shape_of_many_outputs_is_made_where_it_is_asked_for():

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.identification.shapes.mode_pairing import pair_modes
@@ -26,6 +27,13 @@ def test_travelling_shapes_are_not_counted():
     diagram = stabilise(free_decay(truth, sample_time=0.05, n_samples=400), orders=[2], delays=40)
     assert np.allclose(stable_modes(diagram).modes.omega, [10.0])
     assert stable_modes(diagram, standing=0.0).modes.n_modes == 2
+
+
+@pytest.mark.parametrize("orders", [[], [0, 2]])
+def test_orders_are_numbers_of_modes(orders):
+    record = free_decay(SampledModes([10.0], [0.01], [[1.0]], [0.0]), sample_time=0.05, n_samples=100)
+    with pytest.raises(ValueError, match="the lowest of orders is a number of modes, 1 or more; got 0"):
+        stabilise(record, orders=orders)
 
 
 def test_each_measured_mode_is_at_most_one_of_the_model():

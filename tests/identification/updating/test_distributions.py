@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
-from workbench.identification.updating.distributions import Basis, mass_and_stiffness
-from workbench.identification.updating.self_check import choose_terms, self_check
+from workbench.identification.updating.distributions import Basis, choose_terms, mass_and_stiffness, self_check
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
 from workbench.structure.supports import PointMass
@@ -137,6 +136,17 @@ def test_self_check_tells_a_wrong_answer(case):
     assert "must be positive" in self_check(nowhere, modes, **ends).refusal
 
 
+@pytest.mark.parametrize("basis", [Basis.polynomial(3), Basis.legendre(3, length=2.0), Basis.splines(3, length=2.0)])
+def test_values_have_the_shape_of_the_places(case, basis):
+    """A table of places was refused by polynomials, or multiplied wrongly."""
+    ends, modes = case
+    found = mass_and_stiffness(
+        modes, kind=ends["kind"], mass_basis=basis, stiffness_basis=basis, known_mass=[(1.0, 1.3)]
+    )
+    np.testing.assert_allclose(found.mass(X.reshape(9, 9)), mass(X).reshape(9, 9), rtol=1e-8)
+    assert found.mass(0.5).shape == () and found.stiffness.profile(X.reshape(9, 9)).shape == (9, 9)
+
+
 CLAMPED = BoundaryConditions.of("beam", length=2.0, left="clamped", right="free")
 
 
@@ -182,11 +192,17 @@ def test_what_noisy_shapes_and_a_mass_at_a_point_leave_unknown_is_said():
 
 
 def test_refusals(case):
+    with pytest.raises(ValueError, match="a series has 0 terms or more; got -1"):
+        Basis.polynomial(-1)
     ends, modes = case
     kind = ends["kind"]
     one = {"mass_basis": Basis.polynomial(1), "stiffness_basis": Basis.polynomial(1)}
     with pytest.raises(ValueError, match="give the mass at one point"):
         mass_and_stiffness(modes, kind=kind, known_mass=[], **one)
+    with pytest.raises(ValueError, match=r"a known mass must be positive and finite; got -1\.3 at x = 1"):
+        mass_and_stiffness(modes, kind=kind, known_mass=[(1.0, -1.3)], **one)
+    with pytest.raises(ValueError, match=r"x = 2\.5 lies outside the structure"):  # the series would be extrapolated
+        mass_and_stiffness(modes, kind=kind, known_mass=[(2.5, 1.3)], **one)
     with pytest.raises(ValueError, match="use more terms or fewer known places"):
         mass_and_stiffness(modes, kind=kind, known_mass=[(0.0, 1.0), (2.0, 1.6)], **one)
     with pytest.raises(ValueError, match="use more modes or fewer terms"):

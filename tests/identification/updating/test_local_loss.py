@@ -12,8 +12,8 @@ from workbench.identification.signal.synthesis import free_decay
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.local_loss import LOSS, locate_damage, scan
 from workbench.identification.updating.sensitivity import LocalLoss
-from workbench.identification.updating.structure_problem import Problem
-from workbench.identification.updating.structure_task import Task
+from workbench.identification.updating.structure_fit import fitted
+from workbench.identification.updating.structure_problem import Problem, Task
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
 
@@ -127,7 +127,7 @@ def test_what_a_loss_leaves_unexplained_is_not_told_as_damage():
 def test_the_first_look_points_at_the_place():
     task = Task.of(measured("beam", lost=0.02, centre=0.4), NOMINAL["beam"], known_mass=[(0.5, 1.0)])
     problem = Problem.of(task, Basis.polynomial(2), Basis.polynomial(3))
-    places, gains = scan(problem, problem.fit())
+    places, gains = scan(problem, fitted(problem))
     assert abs(places[np.argmax(gains[LOSS.widths.index(0.1)])] - 0.4) < 0.05
 
 
@@ -140,8 +140,8 @@ def beside_the_end():
 def test_an_edge_that_passes_the_end_comes_back(beside_the_end):
     task = Task.of(beside_the_end, NOMINAL["beam"], known_mass=[(0.5, 1.0)])
     problem = Problem.of(task, Basis.polynomial(2), Basis.polynomial(3))
-    from_truth = problem.fit(loss=LocalLoss(0.2, 0.92, 0.1))
-    from_beyond = problem.fit(loss=LocalLoss(0.2, 0.98, 0.2))
+    from_truth = fitted(problem, loss=LocalLoss(0.2, 0.92, 0.1))
+    from_beyond = fitted(problem, loss=LocalLoss(0.2, 0.98, 0.2))
     assert from_beyond.chi2 == pytest.approx(from_truth.chi2, abs=0.1)
 
 

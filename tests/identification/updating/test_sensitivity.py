@@ -30,7 +30,7 @@ NOMINAL = {
 @pytest.fixture(params=NOMINAL)
 def series(request):
     basis = Basis.polynomial(2), Basis.splines(4, length=LENGTH)
-    return SeriesStructure(NOMINAL[request.param], *basis, SENSORS)
+    return SeriesStructure(NOMINAL[request.param], *basis, SENSORS, 4)
 
 
 def reference(series, d, e, loss):
@@ -45,7 +45,7 @@ def reference(series, d, e, loss):
 
 
 def test_modes_are_those_of_the_structure(series):
-    found = series.solve(D, E, n_modes=4, loss=LOSS).sensitivity(ELASTIC)
+    found = series.solve(D, E, LOSS).sensitivity(ELASTIC)
     omega, shapes = reference(series, D, E, LOSS)
     np.testing.assert_allclose(found.omega, omega, rtol=1e-9)
     np.testing.assert_allclose(np.abs(found.shapes), np.abs(shapes), atol=1e-8)
@@ -53,7 +53,7 @@ def test_modes_are_those_of_the_structure(series):
 
 @pytest.mark.parametrize("series", ["beam", "bar"], indirect=True)
 def test_derivatives_by_differences_of_the_structure_own_eigensolution(series):
-    found = series.solve(D, E, n_modes=4, loss=LOSS).sensitivity(ELASTIC)
+    found = series.solve(D, E, LOSS).sensitivity(ELASTIC)
     at = np.r_[D, E, LOSS.share, LOSS.centre, LOSS.width]
     for j in range(at.size):
         sides = []
@@ -71,4 +71,4 @@ def test_derivatives_by_differences_of_the_structure_own_eigensolution(series):
 
 
 def test_a_stiffness_below_zero_is_no_structure(series):
-    assert series.solve(D, E - 3.0, n_modes=4) is None
+    assert series.solve(D, E - 3.0) is None

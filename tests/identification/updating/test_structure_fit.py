@@ -10,7 +10,7 @@ from workbench.identification.signal.synthesis import free_decay, impulse_respon
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.sensitivity import SeriesStructure
 from workbench.identification.updating.structure_fit import choose_structure, fit_structure
-from workbench.identification.updating.structure_task import GaussianPrior
+from workbench.identification.updating.structure_problem import GaussianPrior
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Bar, Beam
 from workbench.structure.supports import End, PointMass
@@ -93,11 +93,21 @@ def test_as_many_terms_as_there_are():
 def test_a_series_that_dips_between_the_points_of_integration_is_no_structure():
     """A trough of one thousandth of the length, where a finished structure is checked."""
     trough = Basis(lambda x: np.exp(-(((np.asarray(x)[:, None] - 2.0 * 0.98804) / 1e-3) ** 2)), 1)
-    series = SeriesStructure(structure("beam", 1.0, 1.0), Basis.polynomial(0), trough, SENSORS)
-    assert series.solve(np.zeros(0), np.array([-0.9]), n_modes=3) is not None
-    assert series.solve(np.zeros(0), np.array([-1.1]), n_modes=3) is None
+    series = SeriesStructure(structure("beam", 1.0, 1.0), Basis.polynomial(0), trough, SENSORS, 3)
+    assert series.solve(np.zeros(0), np.array([-0.9])) is not None
+    assert series.solve(np.zeros(0), np.array([-1.1])) is None
     with pytest.raises(ValueError, match="must be positive inside"):
         structure("beam", 1.0, lambda x: 1.0 - 1.1 * trough.functions(np.ravel(x))[:, 0].reshape(np.shape(x)))
+
+
+def test_without_terms_the_nominal_structure_is_compared_with_the_modes():
+    """It has no free parameter; this ended in an error of numpy."""
+    none = {"mass": Basis.polynomial(0), "stiffness": Basis.polynomial(0)}
+    found = fit_structure(measured("beam"), structure("beam"), **none)
+    assert found.n_terms == (0, 0) and found.explains and found.stiffness.std(X).max() < 1e-12
+    with pytest.warns(UserWarning, match="the modes are not explained"):
+        stiffer = fit_structure(measured("beam"), structure("beam", stiffness=lambda x: 1.1 * stiffness(x)), **none)
+    np.testing.assert_allclose(stiffer.check.frequency_errors, np.sqrt(1.1) - 1.0, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -146,7 +156,7 @@ def test_refusals():
         fit_structure(exact, nominal, mass=one, stiffness=one, known_mass=[(0.0, 1.5), (2.0, 2.1)])
     with pytest.raises(ValueError, match="51 terms cannot be found from 50 data"):
         fit_structure(exact, nominal, mass=one, stiffness=Basis.splines(51, length=2.0), known_mass=[(1.0, 1.8)])
-    with pytest.raises(ValueError, match="known mass -1 at x = 1: it must be positive"):
+    with pytest.raises(ValueError, match="a known mass must be positive and finite; got -1 at x = 1"):
         fit_structure(exact, nominal, mass=one, stiffness=one, known_mass=[(1.0, -1.0)])
     with pytest.raises(ValueError, match="resembles no mode of the nominal"):
         scrambled = replace(exact.modes, shapes=exact.modes.shapes[::-1] * np.arange(1, 11)[:, None] ** 2)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import exprel
 from scipy.stats import chi2
 
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine
@@ -44,13 +45,13 @@ class AmplitudeDependence:
     """Frequency and damping of each mode by segment of the decays; nan where a segment does not determine them.
 
     Attributes:
-        record: (n_stretches,) index of the record of each segment, from 0.
-        start: (n_stretches,) start of each segment, s.
-        amplitude: (n_stretches, n_modes) root mean square of the mode's envelope in a segment, largest output.
-        omega: (n_stretches, n_modes) rad/s.
-        omega_std: (n_stretches, n_modes) standard errors.
-        zeta: (n_stretches, n_modes) damping ratios.
-        zeta_std: (n_stretches, n_modes) standard errors.
+        record: (n_segments,) index of the record of each segment, from 0.
+        start: (n_segments,) start of each segment, s.
+        amplitude: (n_segments, n_modes) root mean square of the mode's envelope in a segment, largest output.
+        omega: (n_segments, n_modes) rad/s.
+        omega_std: (n_segments, n_modes) standard errors.
+        zeta: (n_segments, n_modes) damping ratios.
+        zeta_std: (n_segments, n_modes) standard errors.
         probability: (2, n_modes) that frequencies, and damping ratios, of a linear structure differ so much; 1 where
             fewer than two segments determine them.
     """
@@ -126,7 +127,7 @@ def amplitude_dependence(
 def _segments(
     record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int, budget: Budget
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Starts of the segments of a record, (n_stretches,) s, and the modes in each, (5, n_stretches, n_modes).
+    """Starts of the segments of a record, (n_segments,) s, and the modes in each, (5, n_segments, n_modes).
 
     These are amplitude, ω and its standard error, ζ and its standard error.
     """
@@ -140,8 +141,8 @@ def _segments(
     for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
         span, decay = (last - first) * record.sample_time, -modes.poles.real
         initial = size * np.exp(-decay * first * record.sample_time)
-        # Mean over the segment of the squared envelope.
-        mean_square = initial**2 * _mean_of_decay(2.0 * decay * span)
+        # mean over the segment of the squared envelope
+        mean_square = initial**2 * exprel(-2.0 * decay * span)
         statistic = (0.5 * (last - first) * mean_square / noise[:, None] ** 2).sum(axis=0)
         significant = np.flatnonzero(statistic > ASSUMPTIONS.least_statistic)
         begins, ends = record.start_time + record.sample_time * np.array([first, last - 1])
@@ -176,12 +177,6 @@ def _segments(
         figures[0, w, significant[sure]] = np.sqrt(mean_square[:, significant[sure]].max(axis=0))
         figures[1:, w, significant[sure]] = np.stack(values)[:, sure]
     return record.start_time + record.sample_time * edges[:-1], figures
-
-
-def _mean_of_decay(x: np.ndarray) -> np.ndarray:
-    """Mean of e^-t over 0 < t < x: (1 - e^-x) / x, 1 at 0."""
-    near = np.abs(x) < 1e-9
-    return np.where(near, 1.0, -np.expm1(-x) / np.where(near, 1.0, x))
 
 
 def _equality(values: np.ndarray, std: np.ndarray) -> np.ndarray:

@@ -185,40 +185,32 @@ def _least_squares(once: Once, start: Floats, most_tries: int = BACKBONE.most_tr
     return once.least(start, most_tries, ftol=BACKBONE.settled)
 
 
-class _Modes:
-    """The fit of linear modes of the same poles to all records."""
-
-    def __init__(self, bands: Sequence[_Band], weights: Floats) -> None:
-        self.bands, self.weights = bands, weights
-
-    def residuals(self, unknowns: Floats) -> list[tuple[Floats, Floats]]:
-        """Residual and Jacobian of each record, without weights."""
-        poles, results = unknowns[: unknowns.size // 2] + 1j * unknowns[unknowns.size // 2 :], []
-        for band in self.bands:
-            with np.errstate(over="ignore", invalid="ignore"):
-                motions = np.exp(np.outer(poles, band.time))
-                slopes = band.time * motions
-                results.append(band.residual(motions, np.vstack([slopes, 1j * slopes]), [*range(poles.size)] * 2))
-        return results
-
-    def fitted(self, unknowns: Floats) -> tuple[Floats, Floats]:
-        """Weighted residual and Jacobian of all records."""
-        each = self.residuals(unknowns)
-        return (
-            np.concatenate([w * left for w, (left, _) in zip(self.weights, each, strict=True)]),
-            np.vstack([w * slopes for w, (_, slopes) in zip(self.weights, each, strict=True)]),
-        )
-
-
 def _modes_misfit(bands: Sequence[_Band], poles: Complexes) -> Floats:
     """Residual sum of squares of each record, (n_records,), at the most likely linear modes near some poles."""
-    at = np.r_[poles.real, poles.imag]
-    model = _Modes(bands, np.ones(len(bands)))
+    weights: Floats = np.ones(len(bands))
+
+    def residuals(unknowns: Floats) -> list[tuple[Floats, Floats]]:
+        """Residual of each record and its Jacobian by the real and imaginary parts of the poles, without weights."""
+        real, imaginary = np.split(unknowns, 2)
+        results = []
+        for band in bands:
+            with np.errstate(over="ignore", invalid="ignore"):
+                motions = np.exp(np.outer(real + 1j * imaginary, band.time))
+                slopes = band.time * motions
+                results.append(band.residual(motions, np.vstack([slopes, 1j * slopes]), [*range(real.size)] * 2))
+        return results
+
+    def weighted(unknowns: Floats) -> tuple[Floats, Floats]:
+        each = list(zip(weights, residuals(unknowns), strict=True))
+        return np.concatenate([w * e for w, (e, _) in each]), np.vstack([w * slopes for w, (_, slopes) in each])
+
+    def squares(unknowns: Floats) -> Floats:
+        return np.array([float(e @ e) for e, _ in residuals(unknowns)])
+
+    start = np.r_[poles.real, poles.imag]
     if len(bands) > 1:
-        squares = np.array([float(e @ e) for e, _ in model.residuals(at)])
-        model.weights = np.sqrt([band.size for band in bands] / (squares + [band.round_off for band in bands]))
-    at = _least_squares(Once(model.fitted), at)
-    return np.array([float(residual @ residual) for residual, _ in model.residuals(at)])
+        weights = np.sqrt([band.size for band in bands] / (squares(start) + [band.round_off for band in bands]))
+    return squares(_least_squares(Once(weighted), start))
 
 
 def backbone_misfit(band: _Band, pair: Complexes, *, enough: float = 0.0) -> float:

@@ -18,10 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import lstsq, svd
 
 from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import normalised_shapes, time_derivatives
+from workbench.identification.signal.searches import check_count
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, mac
 from workbench.threads import one_blas_thread
@@ -42,8 +44,10 @@ def two_delays(record: Record, *, first: int = 0, spacing: int = 1, columns: int
         At most m modes; fewer where eigenvalues come out real. Shapes are of displacement, largest entry 1.
 
     Raises:
-        ValueError: a record too short for its sensors.
+        ValueError: a record too short for its sensors, instants before the record or at one sample.
     """
+    if first < 0 or spacing < 1:
+        raise ValueError(f"the first instant is sample 0 or later, the next 1 or more after it; got {first}, {spacing}")
     m = record.n_outputs
     columns = 6 * m if columns is None else columns
     needed = first + (columns - 1) * spacing + 3
@@ -82,12 +86,11 @@ def stacked_delays(
         At most n_modes modes with 0 < ω < π/Δt (k = 0). Shapes are of displacement, largest entry 1.
 
     Raises:
-        ValueError: too few samples, records that differ in sensors or rate.
+        ValueError: less than one mode, too few samples, records that differ in sensors or rate.
     """
+    check_count("n_modes", n_modes)
     records = of_same_sensors(records)
-    basis = signal_subspace(records, 2 * n_modes, delays=delays)
-    mu, vectors = shift_eigenpairs(basis, records[0].n_outputs)
-    return as_modes(mu, vectors, records[0], branch)
+    return _modes_of(signal_subspace(records, 2 * n_modes, delays=delays), records[0], branch)
 
 
 def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None = None) -> np.ndarray:
@@ -96,18 +99,23 @@ def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None
     Raises:
         ValueError: fewer samples than the order needs.
     """
-    m, shortest = records[0].n_outputs, min(r.n_samples for r in records)
+    m, shortest = records[0].n_outputs, min(records, key=lambda record: record.n_samples)
     if delays is None:
-        delays = min(_default_delays(m, [r.n_samples for r in records], order), shortest - 2)
+        # a third of the shortest record, fewer where the matrix would be too large
+        fitting = LARGEST_MATRIX // (m * sum(r.n_samples for r in records))
+        least = int(np.ceil(2 * order / m)) + 2
+        delays = min(max(min(shortest.n_samples // 3, fitting), least), shortest.n_samples - 2)
     columns = sum(r.n_samples - delays + 1 for r in records)
-    if m * (delays - 1) < order or columns < order or delays < 2:
+    if m * (delays - 1) < order or columns < order or not 2 <= delays <= shortest.n_samples:
         least = int(np.ceil(order / m)) + 1
         raise ValueError(
             f"{order // 2} modes need at least {order} delayed signals and {order} instants: with {m} sensors {least}"
-            f" delays and {order + least - 1} samples; record {records[0].name!r} has {shortest} samples and"
+            f" delays and {order + least - 1} samples; record {shortest.name!r} has {shortest.n_samples} samples and"
             f" {delays} delays were taken. Measure longer or ask for fewer modes"
         )
-    hankel = np.hstack([_hankel(r.outputs, delays) for r in records])
+    # delayed copies stacked, delay by delay
+    windows = [sliding_window_view(r.outputs, r.n_samples - delays + 1, axis=1) for r in records]
+    hankel = np.hstack([each.transpose(1, 0, 2).reshape(m * delays, -1) for each in windows])
     if min(hankel.shape) < 4 * order:
         return np.asarray(svd(hankel, full_matrices=False, lapack_driver="gesdd")[0][:, :order])
     # An orthogonal factorisation first makes the matrix square.
@@ -116,11 +124,11 @@ def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None
     return np.asarray(svd(hankel, full_matrices=False)[0][:, :order])
 
 
-def shift_eigenpairs(basis: np.ndarray, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues (order,) of one step in time, and shapes (n_outputs, order), from a signal subspace."""
-    transition = lstsq(basis[:-n_outputs], basis[n_outputs:])[0]
-    mu, vectors = np.linalg.eig(transition)
-    return mu, basis[:n_outputs] @ vectors
+def _modes_of(basis: np.ndarray, record: Record, branch: int = 0) -> SampledModes:
+    """Modes from a signal subspace: its shift by one sample has their eigenvalues, its first block their shapes."""
+    m = record.n_outputs
+    mu, vectors = np.linalg.eig(lstsq(basis[:-m], basis[m:])[0])
+    return as_modes(mu, basis[:m] @ vectors, record, branch)
 
 
 def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 0) -> SampledModes:
@@ -134,20 +142,6 @@ def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 
     order = np.argsort(np.abs(poles))
     shapes = normalised_shapes(vectors / poles ** time_derivatives(record.output_channels)[:, None])
     return SampledModes.of_poles(poles[order], shapes[:, order], record.positions)
-
-
-def _default_delays(m: int, lengths: Sequence[int], order: int) -> int:
-    """A third of the shortest record, fewer where the matrix would grow beyond `LARGEST_MATRIX` entries."""
-    third = min(lengths) // 3
-    fits = LARGEST_MATRIX // (m * sum(lengths))
-    least = int(np.ceil(2 * order / m)) + 2
-    return max(min(third, fits), least, 2)
-
-
-def _hankel(outputs: np.ndarray, delays: int) -> np.ndarray:
-    """Delayed copies stacked, delay by delay: (n_outputs * delays, n_samples - delays + 1)."""
-    columns = outputs.shape[1] - delays + 1
-    return np.vstack([outputs[:, d : d + columns] for d in range(delays)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,15 +180,12 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
         delays: as in `stacked_delays`.
 
     Raises:
-        ValueError: fewer samples than the highest order needs.
+        ValueError: no order, one below 1, fewer samples than the highest order needs.
     """
+    check_count("the lowest of orders", min(orders, default=0))
     records = of_same_sensors(records)
     basis = signal_subspace(records, 2 * max(orders), delays=delays)
-    by_order = []
-    for n in orders:
-        mu, shapes = shift_eigenpairs(basis[:, : 2 * n], records[0].n_outputs)
-        by_order.append(as_modes(mu, shapes, records[0]))
-    return Stabilisation(tuple(orders), tuple(by_order))
+    return Stabilisation(tuple(orders), tuple(_modes_of(basis[:, : 2 * n], records[0]) for n in orders))
 
 
 def stable_modes(
@@ -221,26 +212,22 @@ def stable_modes(
         keep = (modes.zeta > 0) & (modes.zeta < largest_damping) & (modes.phase_collinearity >= standing)
         taken = set()
         # The most collinear shapes are assigned first: a mode precedes poles that split off it.
-        for r in sorted(np.flatnonzero(keep), key=lambda r: -modes.phase_collinearity[r]):
-            near = _nearest(groups, modes, int(r), frequency, shape)
+        for r in sorted(np.flatnonzero(keep).tolist(), key=lambda r: -modes.phase_collinearity[r]):
+            near = _nearest(groups, modes, r, frequency, shape)
             if near is None:
-                groups.append([(modes, int(r))])
-                taken.add(len(groups) - 1)
-            elif near not in taken:
-                groups[near].append((modes, int(r)))
+                near = len(groups)
+                groups.append([])
+            if near not in taken:
+                groups[near].append((modes, r))
                 taken.add(near)
-    stayed = [g for g in groups if len(g) >= presence * len(diagram.orders)]
-    best = [max(g, key=lambda item: item[0].phase_collinearity[item[1]]) for g in stayed]
-    order = np.argsort([modes.omega[r] for modes, r in best])
-    best, stayed = [best[i] for i in order], [stayed[i] for i in order]
-    positions = diagram.found[0].positions
-    modes = SampledModes(
-        np.array([m.omega[r] for m, r in best]),
-        np.array([m.zeta[r] for m, r in best]),
-        np.array([m.shapes[:, r] for m, r in best]).reshape(len(best), len(positions)).T,
-        positions,
-    )
-    return StableModes(modes, np.array([len(g) for g in stayed]) / len(diagram.orders))
+    stayed = [group for group in groups if len(group) >= presence * len(diagram.orders)]
+    best = [max(group, key=lambda item: item[0].phase_collinearity[item[1]]) for group in stayed]
+    n_outputs, positions = len(diagram.found[0].positions), diagram.found[0].positions
+    omega, zeta = np.array([(modes.omega[r], modes.zeta[r]) for modes, r in best]).reshape(-1, 2).T
+    shapes = np.array([modes.shapes[:, r] for modes, r in best]).reshape(-1, n_outputs).T
+    share = np.array([len(group) for group in stayed]) / len(diagram.orders)
+    order = np.argsort(omega)
+    return StableModes(SampledModes(omega[order], zeta[order], shapes[:, order], positions), share[order])
 
 
 def _nearest(

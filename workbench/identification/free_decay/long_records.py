@@ -23,14 +23,17 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
 from workbench.identification.free_decay.refinement import (
+    amplitude_statistic,
     as_refined,
     identified,
     in_coloured_noise,
     noise_level,
+    over_noise,
     search,
+    thresholds,
 )
 from workbench.identification.signal.modal_estimates import Identified
-from workbench.identification.signal.projection import Projection, forget_transforms, independent
+from workbench.identification.signal.projection import forget_transforms, independent, project
 from workbench.identification.signal.searches import FALSE_ALARM, FIT, FURTHER, SELECTION, Budget, spurious_modes
 from workbench.records.record import Record
 from workbench.threads import cores
@@ -107,12 +110,10 @@ class _Search:
         self.bin_width = 2.0 * np.pi / self.span
         count = 1 + int(np.log(max(0.1 * np.pi * self.longest / LONG.slowest, 1.0)) / np.log(LONG.ratio))
         self.rates = LONG.slowest / self.span * LONG.ratio ** np.arange(count)
-        self.signals = 2 * sum(r.n_outputs for r in records)
-        self.white = chi2.ppf(LONG.quantiles, self.signals)
-        cells = sum(self._size(rate)[1] // 2 for rate in self.rates)
-        self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, self.signals))
-        # A mode has two amplitudes per signal and a pole, chosen among all cells.
-        self.limit = float(chi2.isf(false_alarm / cells, self.signals + 2))
+        n_signals = sum(r.n_outputs for r in records)
+        self.white = chi2.ppf(LONG.quantiles, 2 * n_signals)
+        n_cells = sum(self._size(rate)[1] // 2 for rate in self.rates)
+        self.enter, self.limit = thresholds(false_alarm, n_cells, n_signals)
         # The round-off level of sums over so many samples.
         self.floor = 1e-11 * np.sqrt(np.mean([(r.outputs**2).mean() for r in records]))
         self.origins = np.zeros(0, complex)
@@ -130,7 +131,8 @@ class _Search:
             ended = fruitless >= LONG.most_fruitless or (before > 0 and self.budget.spent(FURTHER))
             peaks = np.zeros(0) if ended else self.peaks()[: max(max_modes - before, 0)]
             if peaks.size:
-                self.add(peaks)
+                self.origins = np.append(self.origins, peaks)
+                self.settle(np.append(self.poles, peaks), LONG.steps)
                 self.remove()
                 fruitless = 0 if self.poles.size > before else fruitless + 1
             else:
@@ -138,22 +140,16 @@ class _Search:
                 if not self.remove(thoroughly=not self.budget.spent("check of each mode")):
                     break
 
-    def add(self, peaks: np.ndarray) -> None:
-        """Add poles (n_peaks,) to the current ones and fit all together."""
-        self.origins = np.append(self.origins, peaks)
-        self.settle(np.append(self.poles, peaks), LONG.steps)
-
     def settle(self, poles: np.ndarray, most_steps: int) -> None:
         """Fit all poles together, outputs weighted by the residual of the fit before."""
-        self.converged, self.steps = True, 0
+        self.poles, self.converged, self.steps = poles, True, 0
         if poles.size:
-            poles, fits, self.converged, self.steps = search(
+            self.poles, self.fits, self.converged, self.steps = search(
                 self.records, poles, self.weights, True, most_steps, hold=True, budget=self.budget
             )
         else:
-            fits = [_nothing(record) for record in self.records]
-        self.poles, self.fits = poles, fits
-        self.noise = np.maximum(noise_level(self.records, fits, self.weights), self.floor)
+            self.fits = [project(record, poles, True) for record in self.records]
+        self.noise = np.maximum(noise_level(self.records, self.fits, self.weights), self.floor)
         self.weights = 1.0 / self.noise
 
     def peaks(self) -> np.ndarray:
@@ -180,11 +176,14 @@ class _Search:
             return False
         statistic = self.statistic()
         limit = self.limit * np.array([self._noise_ratio(pole) for pole in self.poles])
-        out = spurious_modes(self.poles, self._shapes, statistic, self.bin_width) | (statistic < limit)
+        out = spurious_modes(self.poles, over_noise(self.fits, self.weights), statistic, self.bin_width) | (
+            statistic < limit
+        )
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
                 near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
-                if near.size > 1 and self._orthogonal_statistic(r, near) < limit[r]:
+                # χ² in combinations of the outputs that are orthogonal to the shapes of the neighbours
+                if near.size > 1 and self._statistic(r, self._directions(near[near != r])) < limit[r]:
                     statistic[r] = self._gain(r, near)
                     out[r] = statistic[r] < limit[r]
         for r in map(int, np.flatnonzero(out)):
@@ -197,28 +196,17 @@ class _Search:
             self.settle(self.poles[~out], 2)
         return bool(out.any())
 
-    @property
-    def _shapes(self) -> np.ndarray:
-        """Amplitudes over the noise, (n_signals, n_modes), a signal being an output of a record."""
-        return np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(self.fits, self.weights, strict=True)])
-
     def statistic(self) -> np.ndarray:
         """χ² of the amplitudes of each mode at fixed poles, (n_modes,)."""
-        return np.array([self._strength(r, np.zeros((self.weights.shape[1], 0))) for r in range(self.poles.size)])
+        return np.array([self._statistic(r) for r in range(self.poles.size)])
 
-    def _strength(self, r: int, without: np.ndarray) -> float:
-        """χ² of the amplitudes of mode r orthogonal to some directions (n_outputs, n_directions)."""
-        strength, rows = 0.0, [r, self.poles.size + r]
-        for fit, weights in zip(self.fits, self.weights, strict=True):
-            a = fit.coefficients[rows] * weights
-            a = a - (a @ without) @ without.T
-            strength += float((a * np.linalg.solve(fit.spread[np.ix_(rows, rows)], a)).sum())
-        return strength
+    def _statistic(self, r: int, without: np.ndarray | None = None) -> float:
+        return amplitude_statistic(self.fits, self.weights, r, without)
 
-    def _orthogonal_statistic(self, r: int, near: np.ndarray) -> float:
-        """χ² of mode r in combinations of the outputs that are orthogonal to the shapes of its neighbours."""
-        shapes = np.hstack(np.split(self._shapes[:, near[near != r]], len(self.fits)))
-        return self._strength(r, np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0])
+    def _directions(self, which: np.ndarray) -> np.ndarray:
+        """Orthonormal directions (n_outputs, n_directions) of the shapes of some modes in all records."""
+        shapes = np.hstack(np.split(over_noise(self.fits, self.weights)[:, which], len(self.fits)))
+        return np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0]
 
     def report(self, statistic: np.ndarray) -> Identified:
         """The modes with their covariance, and the statistic (n_modes,) of each."""
@@ -226,8 +214,7 @@ class _Search:
         refined = as_refined(*fit, converged=self.converged, steps=self.steps)
         refined = in_coloured_noise(refined, self.records, self.fits)
         statistic = statistic[np.argsort(np.abs(self.poles))]
-        result = identified(refined, statistic, self.limit, self.rejected, self.records[0])
-        return replace(result, remarks=self.budget.remarks)
+        return identified(refined, statistic, self.limit, self.rejected, self.records[0], self.budget.remarks)
 
     def _size(self, rate: float) -> tuple[int, int]:
         """Samples that an exponential of this decay rate lasts, and the length of a transform that resolves it."""
@@ -320,8 +307,7 @@ class _Search:
 
         Computed in the span of the shapes of these modes: other combinations of the outputs do not contain them.
         """
-        shapes = np.hstack(np.split(self._shapes[:, near], len(self.fits)))
-        directions = np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0]
+        directions = self._directions(near)
         projected, channels = [], self.records[0].output_channels[: directions.shape[1]]
         for record, fit, weights in zip(self.records, self.fits, self.weights, strict=True):
             residual = (fit.residual * weights) @ directions
@@ -332,10 +318,3 @@ class _Search:
         _, with_it, *_ = search(projected, self.poles[near], alone, False, SELECTION.few_steps)
         _, without, *_ = search(projected, self.poles[near[near != r]], alone, False, SELECTION.few_steps)
         return float(sum((a.residual**2).sum() - (b.residual**2).sum() for a, b in zip(without, with_it, strict=True)))
-
-
-def _nothing(record: Record) -> Projection:
-    """The projection of a record on constants alone."""
-    level, none = record.outputs.mean(axis=1), np.zeros((0, 0))
-    power = ((record.outputs - level[:, None]) ** 2).sum(axis=1)
-    return Projection(record, np.zeros(0, complex), power, 0.0, level[None], none, none, none, none)

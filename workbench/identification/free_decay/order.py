@@ -11,22 +11,29 @@ it stays. Rejected candidates are reported as noise. The search ends when the st
 stronger than the strongest of so many in noise.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NoReturn
 
 import numpy as np
 from scipy.fft import rfft
-from scipy.stats import chi2
 
 from workbench.arrays import Complexes, Floats
 from workbench.identification.free_decay.assumptions import amplitude_dependence
 from workbench.identification.free_decay.backbone import are_two, band_about
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.preparation import decay_start
-from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
+from workbench.identification.free_decay.refinement import (
+    amplitude_statistic,
+    identified,
+    in_coloured_noise,
+    over_noise,
+    refine,
+    search,
+    thresholds,
+    unshaped,
+)
 from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors, steps
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import Projection, differ, project, variances, whitened
@@ -76,9 +83,6 @@ class OrderSettings:
 ORDER = OrderSettings()
 # Results of the test for one nonlinear mode: the poles of two modes and their neighbours, and whether the two are two.
 Verdicts = list[tuple[Complexes, bool]]
-# Options of `search` for fits that only decide on a mode, and for fits to convergence.
-TO_DECIDE: Mapping[str, Any] = {"most_steps": SELECTION.few_steps, "enough": ORDER.decided}
-TO_CONVERGENCE: Mapping[str, Any] = {}
 
 
 @former_arguments(most_modes="max_modes")
@@ -136,17 +140,36 @@ def identify_within(
     for record in records:
         check_data_quality(record)
     shortest = min(records, key=lambda record: record.n_samples)
-    most_possible = (shortest.n_samples - 4) // 3
-    if most_possible < 1:
+    most = (shortest.n_samples - 4) // 3
+    if most < 1:
         raise ValueError(f"record {shortest.name!r} has {shortest.n_samples} samples; a mode needs 7: measure longer")
-    if sum(r.outputs.size for r in records) > ORDER.long:
-        most = min(max_modes or 10 * ORDER.max_modes, most_possible)
-        result = identify_long(records, max_modes=most, false_alarm=false_alarm, budget=budget)
-        return result if result is not None else _refuse_noise(records)
-    most = min(max_modes or ORDER.max_modes, most_possible)
+    is_long = sum(r.outputs.size for r in records) > ORDER.long
+    most = min(max_modes or (10 if is_long else 1) * ORDER.max_modes, most)
+    select = identify_long if is_long else _identify_stepwise
+    found = select(records, max_modes=most, false_alarm=false_alarm, budget=budget)
+    if found is None:
+        raise ValueError(
+            f"record {records[0].name!r} holds no mode that rises above its noise: is it a free decay? Cut it to the"
+            " decay, measure longer or excite harder"
+        )
+    return found
+
+
+def _identify_stepwise(
+    records: Sequence[Record], *, max_modes: int, false_alarm: float, budget: Budget
+) -> Identified | None:
+    """The modes by stepwise selection, in the records as measured and then whitened; None where none is significant."""
     search_time = budget.share(SELECTION.search_share)
     verdicts: Verdicts = []
-    problem, model = _select(records, most, false_alarm, search_time, records, verdicts)
+
+    def selected(some: Sequence[Record]) -> tuple[_FreeDecay, _Model]:
+        problem = _FreeDecay(some, false_alarm, records, search_time, verdicts)
+        selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, False, search_time, alone=True)
+        model = selection.select(problem.nothing)
+        problem.rejected = selection.rejected
+        return problem, model
+
+    problem, model = selected(records)
     explained = problem.explains(model)
     for _ in range(ORDER.whitenings):
         # After an unfinished search the residual still holds modes.
@@ -155,7 +178,7 @@ def identify_within(
         white = whitened(records, problem.oscillating(model))
         if white is None:
             break
-        other, fewer = _select(white, most, false_alarm, search_time, records, verdicts)
+        other, fewer = selected(white)
         # The residual of a mode that depends on amplitude or time is not noise: whitening by it removes modes.
         if not fewer.poles.size and explained:
             break
@@ -166,30 +189,7 @@ def identify_within(
             fewer = other.fitted(all_modes, fewer.weights)
         problem, model = other, fewer
     problem.budget = budget
-    return problem.report(model, records) if model.poles.size else _refuse_noise(records)
-
-
-def _select(
-    records: Sequence[Record],
-    max_modes: int,
-    false_alarm: float,
-    budget: Budget,
-    measured: Sequence[Record],
-    verdicts: "Verdicts",
-) -> tuple["_FreeDecay", "_Model"]:
-    """The problem and the selected model for records, whitened or as measured; `measured` are those as measured."""
-    problem = _FreeDecay(records, false_alarm, measured, budget, verdicts)
-    selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, False, budget, alone=True)
-    model = selection.select(problem.nothing)
-    problem.rejected = selection.rejected
-    return problem, model
-
-
-def _refuse_noise(records: Sequence[Record]) -> NoReturn:
-    raise ValueError(
-        f"record {records[0].name!r} holds no mode that rises above its noise: is it a free decay? Cut it to the"
-        " decay, measure longer or excite harder"
-    )
+    return problem.report(model) if model.poles.size else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +210,11 @@ class _Model:
     def residuals(self) -> list[Floats]:
         """Residual (n_samples, n_outputs) of each record."""
         return [fit.residual for fit in self.fits]
+
+    @property
+    def statistic(self) -> np.ndarray:
+        """χ² of the amplitudes of each mode at fixed poles, (n_modes,)."""
+        return np.array([amplitude_statistic(self.fits, self.weights, r) for r in range(self.poles.size)])
 
     @cached_property
     def residual_power(self) -> Floats:
@@ -237,7 +242,7 @@ class _FreeDecay:
         false_alarm: float,
         measured: Sequence[Record],
         budget: Budget,
-        verdicts: "Verdicts | None" = None,
+        verdicts: Verdicts,
     ) -> None:
         longest = max(record.n_samples for record in records)
         self.records, self.measured, self.budget = records, measured, budget
@@ -245,14 +250,11 @@ class _FreeDecay:
         # Residuals at round-off level do not show how noise differs between sensors.
         self.round_off = FIT.round_off * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
         self.round_off = np.maximum(self.round_off, [m.n_samples * steps(m) ** 2 / 12.0 for m in measured])
-        cells = self.grids[0].n_cells
-        signals = 2 * sum(r.n_outputs for r in records)
-        self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))
-        # A mode has two amplitudes per signal and a pole, chosen among all cells of the grid.
-        self.limit = float(chi2.isf(false_alarm / cells, signals + 2))
+        n_signals = sum(r.n_outputs for r in records)
+        self.enter, self.limit = thresholds(false_alarm, self.grids[0].n_cells, n_signals)
         # With several records the test for two modes needs no correction for the choice among all cells.
-        self.two_modes_threshold = self.limit if len(records) == 1 else float(chi2.isf(false_alarm, signals + 2))
-        self.verdicts = [] if verdicts is None else verdicts
+        self.two_modes_threshold = self.limit if len(records) == 1 else thresholds(false_alarm, 1, n_signals)[1]
+        self.verdicts = verdicts
         self.split_off: list[tuple[complex, float]] = []
         self.rejected: list[tuple[complex, float]] = []
         self.nothing = self.fitted(np.zeros(0, complex), np.ones((len(records), records[0].n_outputs)))
@@ -268,7 +270,7 @@ class _FreeDecay:
         strengths = np.sum([grid.strengths(residual, weights, model.poles) for grid, residual, weights in each], axis=0)
         grid = self.grids[0]
         for pole, _ in rejected:
-            strengths[:, grid.near(pole, 2.0)] = 0.0
+            strengths[:, np.abs(grid.omega - pole.imag) < 2.0 * max(grid.bin_width, 0.5 * abs(pole.real))] = 0.0
         elsewhere = np.where(self._tried(model, rejected), 0.0, strengths)
         candidate = self._significant(model, elsewhere)
         return self._significant(model, strengths) if candidate is None else candidate
@@ -296,7 +298,7 @@ class _FreeDecay:
         return candidate
 
     def extended(self, model: _Model, candidate: complex) -> _Model:
-        return self.fitted(np.append(model.poles, candidate), model.weights, TO_DECIDE)
+        return self.fitted(np.append(model.poles, candidate), model.weights, decide=True)
 
     def gain(self, smaller: _Model, larger: _Model) -> float:
         """Twice the log-likelihood ratio, noise unknown: Σ_ij N_i log(s²_smaller / s²_larger), records i, sensors j."""
@@ -341,14 +343,14 @@ class _FreeDecay:
         n, trial = model.poles.size, model
         with suppress(np.linalg.LinAlgError):
             spurious = np.zeros(0, bool)
-            trial = self.fitted(np.append(model.poles, candidates), model.weights, TO_DECIDE)
+            trial = self.fitted(np.append(model.poles, candidates), model.weights, decide=True)
             while trial.poles.size > n and (spurious := self._spurious(trial, trial)).any():
-                trial = self.fitted(trial.poles[~spurious], trial.weights, TO_DECIDE)
+                trial = self.fitted(trial.poles[~spurious], trial.weights, decide=True)
         return trial if trial.poles.size > n else model
 
     def suspects(self, model: _Model) -> Iterator[tuple[complex, _Model, bool]]:
         """Modes to leave out on trial: the weakest spurious one, or else those that are weak or close to another."""
-        statistic, spurious = self.statistic(model), self._spurious(model, model)
+        statistic, spurious = model.statistic, self._spurious(model, model)
         if spurious.any():
             r = int(np.argmin(np.where(spurious, statistic, np.inf)))
             yield complex(model.poles[r]), self._without(model, r), True
@@ -360,8 +362,8 @@ class _FreeDecay:
 
     def explains(self, model: _Model) -> bool:
         """Whether the modes explain most of the energy of every record."""
-        left = _squares(model.residuals).sum(axis=1)
-        return bool((left < ORDER.most_residual * _squares([grid.centred for grid in self.grids]).sum(axis=1)).all())
+        energy = [record.n_samples * record.outputs.var(axis=1).sum() for record in self.records]
+        return bool((_squares(model.residuals).sum(axis=1) < ORDER.most_residual * np.array(energy)).all())
 
     def oscillating(self, model: _Model) -> Complexes:
         """The poles that oscillate within a record and do not grow, rad/s; others may be coloured noise."""
@@ -369,19 +371,9 @@ class _FreeDecay:
         span = max(record.n_samples * record.sample_time for record in self.records)
         return poles[(poles.real * span < SELECTION.most_growth) & (np.abs(poles) * span > 2.0 * np.pi)]
 
-    def statistic(self, model: _Model) -> np.ndarray:
-        """χ² of the amplitudes of each mode at fixed poles, (n_modes,)."""
-        n, strength = model.poles.size, np.zeros(model.poles.size)
-        for fit, weights in zip(model.fits, model.weights, strict=True):
-            for r in range(n):
-                both = [r, n + r]
-                a = fit.coefficients[both] * weights
-                strength[r] += float(np.sum(a * np.linalg.solve(fit.spread[np.ix_(both, both)], a)))
-        return strength
-
-    def report(self, model: _Model, records: Sequence[Record]) -> Identified:
+    def report(self, model: _Model) -> Identified:
         """The modes refined in the records as measured: whitening filters lose the first samples, the strongest."""
-        poles = model.poles
+        poles, records = model.poles, self.measured
         if self.budget.unfinished:  # perhaps before all modes were tested
             spurious = self._spurious(model, model)
             poles = poles[~spurious] if not spurious.all() else poles
@@ -390,9 +382,9 @@ class _FreeDecay:
         while (lost := self._lost(poles, refined.modes.poles)).any() and not lost.all():
             poles = poles[~lost]
             refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
-        statistic = self.statistic(replace(model, poles=poles, fits=self._projected(poles)))[np.argsort(np.abs(poles))]
-        result = identified(in_coloured_noise(refined, records), statistic, self.limit, self.rejected, records[0])
-        return replace(result, remarks=self.budget.remarks)
+        statistic = replace(model, poles=poles, fits=self._projected(poles)).statistic[np.argsort(np.abs(poles))]
+        refined = in_coloured_noise(refined, records)
+        return identified(refined, statistic, self.limit, self.rejected, records[0], self.budget.remarks)
 
     def _lost(self, poles: np.ndarray, refined: np.ndarray) -> np.ndarray:
         """Which modes moved away or became overdamped in the refinement, fitted to a part of the record that is no
@@ -405,12 +397,16 @@ class _FreeDecay:
         distance = np.abs(np.subtract.outer(poles, others)).min(axis=1, initial=np.inf)
         return np.asarray(distance > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width))
 
-    def fitted(self, poles: np.ndarray, weights: np.ndarray, how: Mapping[str, Any] = TO_CONVERGENCE) -> _Model:
-        """The model of refined poles, weighted by the noise of each sensor in each record; `how` as of `search`."""
-        if poles.size == 0:
-            fits = self._projected(poles)
+    def fitted(self, poles: np.ndarray, weights: np.ndarray, *, decide: bool = False) -> _Model:
+        """The model of refined poles, weighted by the noise of each sensor in each record.
+
+        With `decide` only as precisely as a decision on a mode needs it.
+        """
+        most_steps, enough = (SELECTION.few_steps, ORDER.decided) if decide else (FIT.most_steps, FIT.negligible)
+        if poles.size:
+            poles, fits, *_ = search(self.records, poles, weights, True, most_steps, enough=enough, budget=self.budget)
         else:
-            poles, fits, *_ = search(self.records, poles, weights, True, budget=self.budget, **how)
+            fits = self._projected(poles)
         n, squares = np.array([r.n_samples for r in self.records]), _squares([fit.residual for fit in fits])
         return _Model(poles, 1.0 / np.sqrt(variances(np.maximum(squares, self.round_off), n)), fits)
 
@@ -418,23 +414,18 @@ class _FreeDecay:
         return [project(record, poles, True) for record in self.records]
 
     def _without(self, model: _Model, r: int) -> _Model:
-        return self.fitted(np.delete(model.poles, r), model.weights, TO_DECIDE)
+        return self.fitted(np.delete(model.poles, r), model.weights, decide=True)
 
     def _spurious(self, tested: _Model, model: _Model) -> np.ndarray:
         """Which modes of a tested model are spurious, (n_modes,), in the noise of another model."""
-        poles = tested.poles
-        each = zip(tested.fits, model.weights, strict=True)
-        shapes = np.vstack([f.complex_amplitudes * w[:, None] for f, w in each])
+        poles, shapes = tested.poles, over_noise(tested.fits, model.weights)
         strength = np.linalg.norm(shapes, axis=0)
         if self.records[0].n_outputs == 1:  # one sensor shows no shape, however many records there are
             shapes = strength[None]
+        width = self.grids[0].bin_width
+        return spurious_modes(poles, shapes, strength, width, lambda r, s: self._distinct(poles, r, s))
 
-        def distinct(r: int, s: int) -> bool:
-            return self._distinct(model, poles, r, s)
-
-        return spurious_modes(poles, shapes, strength, self.grids[0].bin_width, distinct)
-
-    def _distinct(self, model: _Model, poles: np.ndarray, r: int, s: int) -> bool:
+    def _distinct(self, poles: np.ndarray, r: int, s: int) -> bool:
         """Whether a single sensor shows two linear modes r and s, rather than one nonlinear mode.
 
         The records as measured decide: whitening by the residual of one mode removes most of the evidence.
@@ -456,7 +447,7 @@ class _FreeDecay:
         """Noise about a frequency over its mean, 1 or more: by the median of the residual's spectrum there."""
         grid = self.grids[0]
         power = model.residual_power
-        at = round((pole.imag - grid.lowest) / grid.bin_width)
+        at = round((pole.imag - grid.bin_width) / grid.bin_width)
         nearby = power[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
         return max(1.0, float(np.median(nearby)) / float(power.mean())) if nearby.size else 1.0
 
@@ -469,11 +460,10 @@ class _Grid:
 
     def __init__(self, record: Record, n: int) -> None:
         self.record, dt = record, record.sample_time
-        self.centred = (record.outputs - record.outputs.mean(axis=1, keepdims=True)).T
         self.size = 1 << int(np.ceil(np.log2(2 * n)))
         omega = 2.0 * np.pi * np.fft.rfftfreq(self.size, dt)
         span = n * dt
-        self.bin_width = self.lowest = 2.0 * np.pi / span
+        self.bin_width = 2.0 * np.pi / span
         fastest = 0.1 * np.pi / dt
         self.rates = np.r_[
             0.0, np.geomspace(1.0 / span, max(fastest, 2.0 / span), max(int(np.log(fastest * span)) + 1, 2))
@@ -486,24 +476,18 @@ class _Grid:
         # For each rate: the indices of its frequencies in `omega`, and in its own transform.
         self.cells = [np.flatnonzero(columns % stride == 0) for stride in self.strides]
         self.columns = [columns[at] // stride for at, stride in zip(self.cells, self.strides, strict=True)]
-        self._sums: dict[int, list[tuple[Floats, float, Complexes, Complexes, Complexes]]] = {}
 
-    def _of_length(self, n: int) -> list[tuple[Floats, float, Complexes, Complexes, Complexes]]:
+    @cached_property
+    def _tables(self) -> list[tuple[Floats, float, Complexes, Complexes, Complexes]]:
         """For each rate, over n samples: its decay, Σ|w|^2t, and w = e^{λΔt}, Σ w*^2t and w^n at its frequencies."""
-        if n not in self._sums:
-            dt, tables = self.record.sample_time, []
-            step, last = np.exp(1j * dt * self.omega), np.exp(1j * n * dt * self.omega)
-            for rate, cells, stride in zip(self.rates, self.cells, self.strides, strict=True):
-                decay = np.exp(-rate * dt * np.arange(min(n, self.size // stride)))
-                w, ends = np.exp(-rate * dt) * step[cells], np.exp(-rate * dt * n) * last[cells]
-                double = (1.0 - ends.conj() ** 2) / (1.0 - w.conj() ** 2)
-                tables.append((decay, float(decay @ decay), w, double, ends))
-            self._sums[n] = tables
-        return self._sums[n]
-
-    def near(self, pole: complex, bins: float) -> np.ndarray:
-        """Which frequencies lie within so many bins, or half as many decay rates, of a pole."""
-        return np.asarray(np.abs(self.omega - pole.imag) < bins * max(self.bin_width, 0.5 * abs(pole.real)))
+        n, dt, tables = self.record.n_samples, self.record.sample_time, []
+        step, last = np.exp(1j * dt * self.omega), np.exp(1j * n * dt * self.omega)
+        for rate, cells, stride in zip(self.rates, self.cells, self.strides, strict=True):
+            decay = np.exp(-rate * dt * np.arange(min(n, self.size // stride)))
+            w, ends = np.exp(-rate * dt) * step[cells], np.exp(-rate * dt * n) * last[cells]
+            double = (1.0 - ends.conj() ** 2) / (1.0 - w.conj() ** 2)
+            tables.append((decay, float(decay @ decay), w, double, ends))
+        return tables
 
     def strengths(self, residual: np.ndarray, weights: np.ndarray, poles: np.ndarray) -> np.ndarray:
         """χ² of each candidate, (n_rates, n_frequencies); 0 where the modes of the model are indistinguishable from it.
@@ -513,11 +497,10 @@ class _Grid:
             weights: (n_outputs,) 1 / noise.
             poles: of the model, rad/s.
         """
-        dt, n = self.record.sample_time, residual.shape[0]
         weighted = residual * weights
         chi_square = np.zeros((self.rates.size, self.omega.size))
-        modes = _Span(np.exp(poles * dt), n)
-        for k, (decay, energy, w, double, ends) in enumerate(self._of_length(n)):
+        modes = _Span(np.exp(poles * self.record.sample_time), self.record.n_samples)
+        for k, (decay, energy, w, double, ends) in enumerate(self._tables):
             rate, cells = self.rates[k], self.cells[k]
             allowed = rate < SELECTION.most_damped * self.omega[cells]
             decayed = weighted[: decay.size] * decay[:, None]

@@ -1,4 +1,4 @@
-"""Preparation of a record for identification: start of the free decay, repair of spikes, removal of drift.
+"""Preparation of a record for identification: whether and since when it is a free decay, spikes, and drift.
 
 A free decay satisfies a backward linear prediction y(t) = Σ_k c_k y(t + kΔt), with the same c_k for every output, for
 any modes with constants and drifts. The c_k are estimated from the end of the record backwards, by recursive least
@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial.legendre import leggauss, legvander
 from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgeqrf, dtrtrs
@@ -19,6 +20,8 @@ from scipy.signal import upfirdn
 from scipy.signal.windows import blackman
 from scipy.stats import chi2
 
+from workbench.identification.free_decay.ibrahim import stacked_delays
+from workbench.identification.signal.projection import project
 from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
@@ -53,7 +56,22 @@ class StartSettings:
     leaps: float = 6.0  # interpolation error of a spike, in standard deviations
 
 
-START = StartSettings()
+@dataclass(frozen=True)
+class DecayingSettings:
+    """Constants of the test for a free decay."""
+
+    decayed: float = 0.1  # rms of the last tenth over the largest of any tenth, below which a record has decayed
+    falling: int = 6  # tenths of decreasing level: by chance in 1 of 720 stationary records
+    # Share of the energy that decaying modes leave of a short free decay, at most: 0.05 where noise is a tenth of the
+    # motion. Of 28 random vibrations of one to five decay times they leave 0.14 to 0.96, as accelerations; as
+    # displacements, one of one decay time may leave less.
+    left: float = 0.05
+    modes: int = 8  # of that fit
+    instants: int = 600  # of that fit: fewer than the samples alias frequencies, and leave decays as they are
+    signals: int = 8  # of that fit, evenly spaced among the outputs
+
+
+START, DECAYING = StartSettings(), DecayingSettings()
 HIGHEST_DEGREE = 8  # of a drift; polynomials of higher degree oscillate like modes
 PART = 16_384  # most samples of a part of a record in the fit of drifts
 # Least number of samples to estimate the predictor and to test it.
@@ -101,6 +119,45 @@ def decay_start(record: Record) -> float:
     return float(record.start_time + record.sample_time * min(starts.max(initial=0), n - 1))
 
 
+def decays(record: Record) -> bool:
+    """Whether the outputs are a free decay: at rest in the end, falling all the time, or explained by decaying modes.
+
+    The level of a short decay need not fall from tenth to tenth, as these hold few periods.
+    """
+    about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
+    tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
+    falling = tenths[int(np.argmax(tenths)) :]
+    if tenths[-1] < DECAYING.decayed**2 * max(tenths):
+        return True
+    return (len(falling) >= DECAYING.falling and bool(np.all(np.diff(falling) < 0))) or _explained(record)
+
+
+def _explained(record: Record) -> bool:
+    """Whether the record falls from the start of a decay on, and decaying modes leave little of it."""
+    after = record.between(decay_start(record))
+    stride = -(-after.n_samples // DECAYING.instants)
+    sensors = slice(None, None, -(-after.n_outputs // DECAYING.signals))
+    outputs = after.outputs[sensors, ::stride]
+    outputs = outputs - outputs.mean(axis=1, keepdims=True)
+    energy = [float((part**2).sum()) for part in np.array_split(outputs, 2, axis=1)]
+    if not energy[1] < energy[0]:
+        return False
+    part = replace(
+        after,
+        outputs=outputs,
+        inputs=np.zeros((0, 0)),
+        input_channels=(),
+        output_channels=after.output_channels[sensors],
+        sample_time=stride * after.sample_time,
+    )
+    try:
+        poles = stacked_delays(part, n_modes=DECAYING.modes).poles
+    except ValueError:  # too short
+        return False
+    left = project(part, poles[poles.real < 0], True).residual
+    return float((left**2).sum()) < DECAYING.left * float((outputs**2).sum())
+
+
 def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
     """A record without single wrong samples in its free decay, the start of the decay in s, and remarks.
 
@@ -133,7 +190,7 @@ def _repair(row: np.ndarray, at: int) -> bool:
     if at < START.order or at + START.order >= row.size:
         return False
     part, centre = row[max(at - near, 0) : at + near + 1], min(at, near) - k
-    windows = np.lib.stride_tricks.sliding_window_view(part - part.mean(), 2 * k + 1)
+    windows = sliding_window_view(part - part.mean(), 2 * k + 1)
     both = windows[:, :k] + windows[:, :k:-1]
     others = np.abs(np.arange(len(windows)) - centre) > k
     c = np.linalg.lstsq(both[others], windows[others, k], rcond=None)[0]
@@ -361,25 +418,21 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     rate, settling = best_rate
     criterion = settling - penalty * (m + 1)
     of_polynomial = ratio[degree] - penalty * m * degree if likely else 0.0
+    time_constant = None
     if criterion > of_polynomial and settling > chi2.isf(FALSE_ALARM / START.rates, m + 1):
-        settling_part = _Columns.settling(np.array([dt * rate]), n)
-        return _removed(record, fixed, with_constant.beside(settling_part), 1.0 / float(rate))
-    if not likely:
+        columns, time_constant = with_constant.beside(_Columns.settling(np.array([dt * rate]), n)), 1.0 / float(rate)
+    elif likely:
+        columns = modes.beside(_Columns.polynomials(degree, n))
+    else:
         return no_drift
-    return _removed(record, fixed, modes.beside(_Columns.polynomials(degree, n)), None)
-
-
-def _removed(record: Record, fixed: int, columns: _Columns, time_constant: float | None) -> Drift:
-    """A record without the part of its drift: of the columns after the first `fixed`."""
     weights = np.linalg.solve(*columns.factored(record.outputs))
-    weights[:fixed] = 0.0
-    m = record.n_outputs
-    outputs, lowest, highest = record.outputs.copy(), np.full(m, np.inf), np.full(m, -np.inf)
-    for part in _parts(record.n_samples):
+    weights[:fixed] = 0.0  # the modes and a constant stay
+    outputs, extremes = record.outputs.copy(), []
+    for part in _parts(n):
         drift = columns.combined(part, weights)
         outputs[:, part] -= drift
-        lowest, highest = (np.minimum(lowest, drift.min(axis=1)), np.maximum(highest, drift.max(axis=1)))
-    return Drift(replace(record, outputs=outputs), frozen(highest - lowest), time_constant)
+        extremes.append((drift.min(axis=1), drift.max(axis=1)))
+    return Drift(replace(record, outputs=outputs), frozen(np.ptp(extremes, axis=(0, 1))), time_constant)
 
 
 def without_polynomial(outputs: np.ndarray) -> np.ndarray:

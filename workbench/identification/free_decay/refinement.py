@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from workbench.arrays import scaled_inverse, symmetric_root
 from workbench.identification.signal.data_quality import of_same_sensors
@@ -46,7 +47,12 @@ def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
 
 
 def identified(
-    refined: Refined, statistic: np.ndarray, limit: float, rejected: Sequence[tuple[complex, float]], record: Record
+    refined: Refined,
+    statistic: np.ndarray,
+    limit: float,
+    rejected: Sequence[tuple[complex, float]],
+    record: Record,
+    remarks: tuple[str, ...],
 ) -> Identified:
     """The result of an identification: refined modes with their test statistics, and the poles rejected as noise.
 
@@ -56,10 +62,38 @@ def identified(
         limit: threshold of the statistic.
         rejected: pole, rad/s, and statistic of each rejected candidate.
         record: for the positions of its sensors.
+        remarks: of the result.
     """
     noise = sorted(rejected, key=lambda pair: abs(pair[0]))
     modes = unshaped(np.array([pole for pole, _ in noise], complex), record)
-    return Identified(refined, frozen(statistic), limit, modes, frozen([strength for _, strength in noise]))
+    return Identified(refined, frozen(statistic), limit, modes, frozen([strength for _, strength in noise]), remarks)
+
+
+def thresholds(false_alarm: float, n_cells: int, n_signals: int) -> tuple[float, float]:
+    """χ² from which on the strongest of `n_cells` candidates enters, and from which on it stays, in white noise.
+
+    A mode has two amplitudes per signal, an output of a record, and a pole.
+    """
+    enter = chi2.isf(min(20.0 * false_alarm, 0.5) / n_cells, 2 * n_signals)
+    return float(enter), float(chi2.isf(false_alarm / n_cells, 2 * n_signals + 2))
+
+
+def over_noise(fits: Sequence[Projection], weights: np.ndarray) -> np.ndarray:
+    """Amplitudes over the noise, (n_signals, n_modes), a signal being an output of a record."""
+    return np.vstack([fit.complex_amplitudes * weight[:, None] for fit, weight in zip(fits, weights, strict=True)])
+
+
+def amplitude_statistic(
+    fits: Sequence[Projection], weights: np.ndarray, r: int, without: np.ndarray | None = None
+) -> float:
+    """χ² of the amplitudes of mode r at fixed poles, without those along some directions (n_outputs, n_directions)."""
+    strength, rows = 0.0, [r, fits[0].poles.size + r]
+    for fit, weight in zip(fits, weights, strict=True):
+        a = fit.coefficients[rows] * weight
+        if without is not None:
+            a = a - (a @ without) @ without.T
+        strength += float((a * np.linalg.solve(fit.spread[np.ix_(rows, rows)], a)).sum())
+    return strength
 
 
 def in_coloured_noise(
@@ -287,13 +321,19 @@ def cramer_rao_bound(modes: SampledModes, record: Record, *, noise_std: float | 
 
     Returns:
         `Refined` with the true modes and the standard errors of an efficient estimate.
+
+    Raises:
+        ValueError: noise that is not positive, or of another number of outputs.
     """
+    noise = np.asarray(noise_std, float)
+    if noise.shape not in ((), (record.n_outputs,)) or not (np.isfinite(noise) & (noise > 0)).all():
+        raise ValueError(f"noise_std is positive, one for all outputs or one each, ({record.n_outputs},); got {noise}")
     derivative = time_derivatives(record.output_channels)[:, None]
     amplitude = modes.shapes * modes.poles**derivative
     clean = replace(record, outputs=(amplitude @ np.exp(modes.poles[:, None] * record.time)).real)
-    noise = np.broadcast_to(np.asarray(noise_std, float), (1, record.n_outputs))
     fits = [project(clean, modes.poles, False)]
-    return as_refined([clean], modes.poles, fits, noise, converged=True, steps=0)
+    each = np.broadcast_to(noise, (1, record.n_outputs))
+    return as_refined([clean], modes.poles, fits, each, converged=True, steps=0)
 
 
 def modal_amplitudes(record: Record, modes: SampledModes) -> SampledModes:
@@ -341,9 +381,9 @@ def search(
     Returns:
         poles, projections (one per record), whether the search converged, and the number of steps.
     """
-    problem = _Poles(records, weights, offset, hold, enough)
     start = _Fitted(poles, [project(record, poles, offset) for record in records])
-    minimum = minimise(problem, start, most_steps=most_steps, round_off=problem.start_from(start), budget=budget)
+    problem = _Poles(start, records, weights, offset, hold, enough)
+    minimum = minimise(problem, start, most_steps=most_steps, round_off=problem.round_off, budget=budget)
     return minimum.state.poles, minimum.state.fits, minimum.converged, minimum.steps
 
 
@@ -354,18 +394,28 @@ class _Fitted:
 
 
 class _Poles:
-    """The `searches.LeastSquares` of free decays."""
+    """The `searches.LeastSquares` of free decays.
 
-    def __init__(self, records: Sequence[Record], weights: np.ndarray, offset: bool, hold: bool, enough: float) -> None:
+    Attributes:
+        free: degrees of freedom.
+        signal: energy of the records over the noise.
+        round_off: of the cost.
+    """
+
+    def __init__(
+        self,
+        start: _Fitted,
+        records: Sequence[Record],
+        weights: np.ndarray,
+        offset: bool,
+        hold: bool,
+        enough: float,
+    ) -> None:
         self.records, self.weights, self.offset, self.hold, self.enough = records, weights, offset, hold, enough
-
-    def start_from(self, start: _Fitted) -> float:
-        """The round-off error of the cost; also sets the degrees of freedom and the weighted signal energy."""
         coefficients = sum(fit.coefficients.size for fit in start.fits)
-        self.free = sum(r.outputs.size for r in self.records) - 2 * start.poles.size - coefficients
-        self.signal = float((self.weights**2 * _squares(self.records)).sum())
+        self.free = sum(r.outputs.size for r in records) - 2 * start.poles.size - coefficients
+        self.signal = float((weights**2 * _squares(records)).sum())
         self.round_off = max(fit.round_off for fit in start.fits) * self.signal
-        return self.round_off
 
     def cost(self, state: _Fitted) -> float:
         each = zip(state.fits, self.weights, strict=True)

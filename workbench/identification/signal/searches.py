@@ -14,7 +14,7 @@ significant. Both alternate until the modes no longer change.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -272,7 +272,7 @@ class Once:
             self.at, self.value = unknowns.copy(), self.fitted(unknowns)
         return self.value
 
-    def least(self, start: Floats, most_tries: int, **options: float) -> Floats:
+    def least(self, start: Floats, most_tries: int, **options: Any) -> Floats:
         """The least squares unknowns, by at most so many evaluations; options of `scipy.optimize.least_squares`."""
         residual, jacobian = (lambda x: self(x)[0]), (lambda x: self(x)[1])
         return np.asarray(least_squares(residual, start, jacobian, x_scale="jac", max_nfev=most_tries, **options).x)

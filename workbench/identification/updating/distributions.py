@@ -1,4 +1,4 @@
-"""Mass and stiffness along the structure, from modes alone and the mass at a point (Ch. 4).
+"""Mass and stiffness along the structure, from modes alone and the mass at a point, and their check (Ch. 4).
 
 Modes are orthogonal with respect to the mass and to the stiffness, whatever their scale:
 
@@ -15,9 +15,8 @@ with one mode left out at a time. It shows both the noise in second derivatives 
 inconsistent, as those of a structure with masses or springs that the relations do not contain.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,11 +24,16 @@ from numpy.polynomial.legendre import legvander
 from scipy.interpolate import BSpline
 from scipy.linalg import null_space
 
+from workbench.arrays import Floats
+from workbench.identification.shapes.mode_pairing import subspace_mac
 from workbench.identification.signal.modal_estimates import rounded
-from workbench.structure.domain import gauss_between
+from workbench.structure.domain import Domain, gauss_between
+from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.plate import Plate
 from workbench.structure.printed import Printed, counted, warns_of_remarks
 from workbench.structure.profile import Profile, ProfileLike, as_profile
+from workbench.structure.supports import End
 from workbench.threads import one_blas_thread
 
 KNOWN_TOLERANCE = 1e-8
@@ -37,6 +41,7 @@ KNOWN_TOLERANCE = 1e-8
 # (Ewins, Modal Testing)
 RELIABLE = 0.1
 PRINTED = 11  # number of places at which distributions are printed
+COMPARED = 101  # number of places at which shapes are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +52,18 @@ class Basis:
         functions: x (n_points,) -> (n_points, n_terms).
         n_terms: number of functions.
         breaks: places where they are not smooth, m.
+
+    Raises:
+        ValueError: a negative number of functions.
     """
 
     functions: Callable[[np.ndarray], np.ndarray] = field(repr=False)
     n_terms: int
     breaks: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.n_terms < 0:
+            raise ValueError(f"a series has 0 terms or more; got {self.n_terms}")
 
     @classmethod
     def polynomial(cls, n_terms: int) -> "Basis":
@@ -106,7 +118,7 @@ class Distribution:
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Values at x, in the shape of x."""
         x = np.asarray(x, float)
-        series = self.basis.functions(np.atleast_1d(x)) @ self.coefficients
+        series = self.basis.functions(x.ravel()) @ self.coefficients
         return np.asarray(self.prior(x) + series.reshape(x.shape))
 
     @property
@@ -197,13 +209,14 @@ def mass_and_stiffness(
         prior_mass, prior_stiffness: first estimates, kg/m and N (N m²), which the series corrects.
 
     Raises:
-        ValueError: no known mass, more terms than relations, known values that the series cannot take.
+        ValueError: no known mass, one that is not positive or off the structure, more terms than relations, known
+            values that the series cannot take.
         UserWarning: mass or stiffness of a standard error above a tenth or unknown; modes that are not orthogonal.
     """
-    return distributions_of(modes, kind, (mass_basis, stiffness_basis), known_mass, (prior_mass, prior_stiffness))
+    return _distributions(modes, kind, (mass_basis, stiffness_basis), known_mass, (prior_mass, prior_stiffness))
 
 
-def distributions_of(
+def _distributions(
     modes: Modes,
     kind: str,
     bases: tuple[Basis, Basis],
@@ -213,14 +226,25 @@ def distributions_of(
     """`mass_and_stiffness` without its warnings; `bases` and `priors` are of mass and of stiffness."""
     if kind not in ("bar", "beam"):
         raise ValueError(f"mass and stiffness are those of a bar or a beam; got {kind!r}")
-    unit, scale = _unit_mean_square(modes)
-    identified = partial(
-        _identified,
-        order=1 if kind == "bar" else 2,
-        bases=bases,
-        known=known,
-        priors=(as_profile(priors[0]), as_profile(priors[1])),
-    )
+    order = 1 if kind == "bar" else 2
+    m0, k0 = map(as_profile, priors)
+    # Of shapes with mean square 1 all relations have equal weight.
+    x = (np.arange(2000) + 0.5) / 2000 * modes.length
+    scale = 1.0 / np.sqrt((modes.phi(x) ** 2).mean(axis=0))
+    unit = replace(modes, shapes=lambda x, derivative: modes.shapes(x, derivative) * scale)
+
+    def identified(some: Modes) -> tuple[Distribution, Distribution, Floats]:
+        """Mass, stiffness, and ∫ m φ_r φ_s dx (n_modes, n_modes)."""
+        x, weights = _quadrature(some, (*bases[0].breaks, *m0.breaks))
+        places, values = known_masses(some.domain, known)
+        held = bases[0].functions(places), values - m0(places)
+        c, misfit, gram = mass_series(some.phi(x), weights, bases[0].functions(x), m0(x), *held)
+        mass = Distribution(frozen(c), bases[0], m0, misfit)
+        x, weights = _quadrature(some, (*bases[1].breaks, *k0.breaks))
+        strains = [(1.0, some.phi(x, order))]
+        c, misfit = stiffness_series(strains, weights, bases[1].functions(x), k0(x), np.diag(gram), some.omega)
+        return mass, Distribution(frozen(c), bases[1], k0, misfit), gram
+
     mass, stiffness, gram = identified(unit)
     scales = np.sqrt(np.diag(gram))
     orthogonality = float(np.abs(gram / np.outer(scales, scales) - np.eye(scales.size)).max())
@@ -233,43 +257,35 @@ def distributions_of(
     return Distributions(mass, stiffness, frozen(scales / scale), modes.length, orthogonality)
 
 
-def _identified(
-    unit: Modes,
-    *,
-    order: int,
-    bases: tuple[Basis, Basis],
-    known: Sequence[tuple[float, float]],
-    priors: tuple[Profile, Profile],
-) -> tuple[Distribution, Distribution, np.ndarray]:
-    """Mass, stiffness, and ∫ m φ_r φ_s dx (n_modes, n_modes), of modes of mean square 1."""
-    mass = _mass(unit, bases[0], priors[0], known)
-    shapes, weights, x = _sampled(unit, 0, mass.profile.breaks)
-    gram = (shapes.T * (weights * mass(x))) @ shapes
-    a_squared = np.diag(gram)
-    if (a_squared <= 0).any():
-        raise ValueError(
-            "the identified mass is negative over so much of the structure that a mode has no positive scale; use"
-            " fewer terms, more sensors, or a prior estimate"
-        )
-    return mass, _stiffness(unit, order, a_squared, bases[1], priors[1]), gram
+def _quadrature(modes: Modes, breaks: Sequence[float]) -> tuple[Floats, Floats]:
+    """Points and weights of a Gauss rule for products of two shapes, split at the breaks."""
+    n_pieces = 16 * (1 + modes.n_modes // 4)
+    nodes = np.unique(np.r_[np.linspace(0.0, modes.length, n_pieces + 1), [b for b in breaks if 0 < b < modes.length]])
+    return gauss_between(nodes, 12)
 
 
-def _mass(modes: Modes, basis: Basis, prior: Profile, known: Sequence[tuple[float, float]]) -> Distribution:
+def known_masses(domain: Domain, known: Sequence[tuple[Any, float]]) -> tuple[np.ndarray, Floats]:
+    """`known_values` of a mass, at least one.
+
+    Raises:
+        ValueError: none; as `known_values`.
+    """
     if len(known) == 0:
         raise ValueError("orthogonality determines the mass only up to a factor; give the mass at one point or more")
-    shapes, weights, x = _sampled(modes, 0, (*basis.breaks, *prior.breaks))
-    places, values = np.array(known, float).T
-    coefficients, misfit = mass_series(
-        shapes, weights, basis.functions(x), prior(x), basis.functions(places), values - prior(places)
-    )
-    return Distribution(frozen(coefficients), basis, prior, misfit)
+    return known_values(domain, known, "mass")
 
 
-def _stiffness(modes: Modes, order: int, a_squared: np.ndarray, basis: Basis, prior: Profile) -> Distribution:
-    strain, weights, x = _sampled(modes, order, (*basis.breaks, *prior.breaks))
-    strains = [(1.0, strain)]
-    coefficients, misfit = stiffness_series(strains, weights, basis.functions(x), prior(x), a_squared, modes.omega)
-    return Distribution(frozen(coefficients), basis, prior, misfit)
+def known_values(domain: Domain, known: Sequence[tuple[Any, float]], what: str) -> tuple[np.ndarray, Floats]:
+    """Places, as `domain.locate` returns them, and the values (n_known,) of a distribution there.
+
+    Raises:
+        ValueError: a value that is not positive, or a place that the domain does not have.
+    """
+    places, values = domain.locate([place for place, _ in known]), np.array([value for _, value in known], float)
+    for (place, _), value in zip(known, values, strict=True):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"a known {what} must be positive and finite; got {value:g} at {domain.text(place)}")
+    return places, values
 
 
 def mass_series(
@@ -279,22 +295,32 @@ def mass_series(
     prior: np.ndarray,
     rows: np.ndarray,
     known: np.ndarray,
-) -> tuple[np.ndarray, float]:
-    """Coefficients (n_terms,) of the mass from the relations r ≠ s of (4.6), and their misfit.
+) -> tuple[Floats, float, Floats]:
+    """The mass from the relations r ≠ s of (4.6).
 
     Args:
         shapes: (n_points, n_modes) at integration points, of equal scale.
         weights: (n_points,) of integration.
         functions, prior: (n_points, n_terms) and (n_points,) at these points.
         rows, known: (n_known, n_terms) functions where the mass is known, and its value less the prior.
+
+    Returns:
+        coefficients (n_terms,), misfit of the relations, and ∫ m φ_r φ_s dx (n_modes, n_modes).
     """
-    if functions.shape[1] > (n_relations := shapes.shape[1] * (shapes.shape[1] - 1) // 2 + known.size):
-        raise ValueError(_too_many(functions.shape[1], "mass", n_relations, shapes.shape[1]))
-    r, s = np.triu_indices(shapes.shape[1], 1)
+    n_modes = shapes.shape[1]
+    _check_terms("mass", functions.shape[1], n_modes * (n_modes - 1) // 2 + known.size, n_modes)
+    r, s = np.triu_indices(n_modes, 1)
     products = weights[:, None] * shapes[:, r] * shapes[:, s]
     u, u0 = products.T @ functions, products.T @ prior  # U_rsj of (4.8), U_rs0 of (4.23)
-    coefficients = _constrained(u, -u0, rows, known)
-    return coefficients, _misfit(u @ coefficients + u0, u, coefficients, u0)
+    particular, free = held_exactly(rows, known, "masses", max(np.abs(known).max(), 1e-300))
+    coefficients = particular + free @ np.linalg.lstsq(u @ free, -u0 - u @ particular, rcond=None)[0]
+    gram = (shapes.T * (weights * (prior + functions @ coefficients))) @ shapes
+    if (np.diag(gram) <= 0).any():
+        raise ValueError(
+            "the identified mass is negative over so much of the structure that a mode has no positive scale; use"
+            " fewer terms, more sensors, or a prior estimate"
+        )
+    return coefficients, _misfit(u @ coefficients + u0, u, coefficients, u0), gram
 
 
 def stiffness_series(
@@ -304,7 +330,7 @@ def stiffness_series(
     prior: np.ndarray,
     a_squared: np.ndarray,
     omega: np.ndarray,
-) -> tuple[np.ndarray, float]:
+) -> tuple[Floats, float]:
     """Coefficients (n_terms,) of the stiffness from all relations of (4.6), and their misfit.
 
     Args:
@@ -313,39 +339,29 @@ def stiffness_series(
         weights, functions, prior: as `mass_series` takes them.
         a_squared, omega: (n_modes,) scales and frequencies.
     """
-    if functions.shape[1] > (most := omega.size * (omega.size + 1) // 2):
-        raise ValueError(_too_many(functions.shape[1], "stiffness", most, omega.size))
     r, s = np.triu_indices(omega.size)
+    _check_terms("stiffness", functions.shape[1], r.size, omega.size)
     products = sum((weights * factor)[:, None] * strain[:, r] * strain[:, s] for factor, strain in strains)
     v, v0 = np.asarray(products).T @ functions, np.asarray(products).T @ prior
     targets = np.where(r == s, a_squared[r] * omega[r] ** 2, 0.0)
-    # A relation and its error grow with ω_r ω_s; divided by it, all have equal weight.
-    weight = 1.0 / np.maximum(omega[r] * omega[s], 1e-12 * omega.max() ** 2)
+    weight = relation_weights(omega)
     coefficients = np.linalg.lstsq(weight[:, None] * v, weight * (targets - v0), rcond=None)[0]
     residual = weight * (v @ coefficients + v0 - targets)
     return coefficients, _misfit(residual, weight[:, None] * v, coefficients, weight * v0)
 
 
-def _too_many(n_terms: int, what: str, most: int, n_modes: int) -> str:
-    return (
-        f"{n_terms} terms of {what} cannot be found from {most} relations of {n_modes} modes; use more modes or fewer"
-        " terms"
-    )
+def relation_weights(omega: np.ndarray) -> Floats:
+    """Weights of the stiffness relations r ≤ s, which grow with their errors as ω_r ω_s."""
+    r, s = np.triu_indices(omega.size)
+    return np.asarray(1.0 / np.maximum(omega[r] * omega[s], 1e-12 * omega.max() ** 2))
 
 
-def _unit_mean_square(modes: Modes) -> tuple[Modes, np.ndarray]:
-    """The modes with shapes of mean square 1, so that all relations have equal weight, and the factors applied."""
-    x = (np.arange(2000) + 0.5) / 2000 * modes.length
-    scale = 1.0 / np.sqrt((modes.phi(x) ** 2).mean(axis=0))
-    return replace(modes, shapes=lambda x, derivative: modes.shapes(x, derivative) * scale), scale
-
-
-def _sampled(modes: Modes, derivative: int, breaks: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shapes (n_points, n_modes), weights and places of a Gauss rule split at the breaks."""
-    n_pieces = 16 * (1 + modes.n_modes // 4)
-    nodes = np.unique(np.r_[np.linspace(0.0, modes.length, n_pieces + 1), [b for b in breaks if 0 < b < modes.length]])
-    x, weights = gauss_between(nodes, 12)
-    return modes.phi(x, derivative), weights, x
+def _check_terms(what: str, n_terms: int, n_relations: int, n_modes: int) -> None:
+    if n_terms > n_relations:
+        raise ValueError(
+            f"{n_terms} terms of {what} cannot be found from {n_relations} relations of {n_modes} modes; use more modes"
+            " or fewer terms"
+        )
 
 
 def held_exactly(rows: np.ndarray, values: np.ndarray, what: str, size: float) -> tuple[np.ndarray, np.ndarray]:
@@ -368,14 +384,153 @@ def held_exactly(rows: np.ndarray, values: np.ndarray, what: str, size: float) -
     return particular, null_space(rows)
 
 
-def _constrained(matrix: np.ndarray, target: np.ndarray, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Least squares solution of matrix @ c = target subject to rows @ c = values."""
-    particular, free = held_exactly(rows, values, "masses", max(np.abs(values).max(), 1e-300))
-    if free.shape[1] == 0:
-        return np.asarray(particular)
-    return np.asarray(particular + free @ np.linalg.lstsq(matrix @ free, target - matrix @ particular, rcond=None)[0])
-
-
 def _misfit(residual: np.ndarray, matrix: np.ndarray, coefficients: np.ndarray, offset: np.ndarray) -> float:
     terms = np.sqrt(np.mean((np.abs(matrix) @ np.abs(coefficients) + np.abs(offset)) ** 2)) if residual.size else 0.0
     return float(np.sqrt(np.mean(residual**2)) / terms) if terms else 0.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SelfCheck(Printed):
+    """The eigensolution of an identified structure compared with the measurement (4.3).
+
+    Attributes:
+        frequency_errors: (n_modes,) relative, of the identified structure; infinite where it has no such mode.
+        mac: (n_modes,) of each shape.
+        refusal: why the identified distributions are no structure; empty if they are.
+    """
+
+    frequency_errors: np.ndarray
+    mac: np.ndarray
+    refusal: str = ""
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        each = enumerate(zip(self.frequency_errors, self.mac, strict=True))
+        rows = [(str(r + 1), f"{100 * error:.3g}", f"{agreement:.4f}") for r, (error, agreement) in each]
+        if self.refusal:
+            return f"identified structure against measurement: {self.refusal}", (), (), ()
+        line = f"identified structure against measurement: frequencies at most {100 * self.worst:.3g} % off"
+        return line, ("mode", "frequency [%]", "MAC"), rows, ()
+
+    @property
+    def worst(self) -> float:
+        """Largest relative frequency error, by which identifications are compared."""
+        return float(np.abs(self.frequency_errors).max())
+
+
+@one_blas_thread
+def self_check(
+    found: Distributions, measured: Modes, *, kind: str, left: str | End, right: str | End, first_mode: int = 0
+) -> SelfCheck:
+    """The eigensolution of an identified structure compared with the measurement.
+
+    Args:
+        found: mass and stiffness.
+        measured: the modes they were identified from, consecutive.
+        kind: "bar" or "beam".
+        left, right: its ends.
+        first_mode: index of the first measured mode among all modes of the structure; 2 leaves out the rigid-body
+            modes of a free-free beam.
+    """
+    common: dict[str, Any] = {"length": measured.length, "left": left, "right": right}
+
+    def built() -> Bar | Beam:
+        if kind == "bar":
+            return Bar(axial_stiffness=found.stiffness.profile, mass_per_length=found.mass.profile, **common)
+        return Beam(bending_stiffness=found.stiffness.profile, mass_per_length=found.mass.profile, **common)
+
+    return compared(built, measured, first_mode, 1e-6, np.linspace(0.0, measured.length, COMPARED))
+
+
+def compared(
+    build: Callable[[], Bar | Beam | Plate], measured: Modes, first_mode: int, tolerance: float, places: np.ndarray
+) -> SelfCheck:
+    """The `SelfCheck` of a structure that `build` returns, or refuses; shapes are compared at `places`."""
+    n = measured.n_modes
+    try:
+        computed = build().modes(first_mode + n, tolerance=tolerance).select(slice(first_mode, None))
+    except ValueError as error:
+        return SelfCheck(np.full(n, np.inf), np.zeros(n), str(error))
+    agreement = subspace_mac(measured.phi(places), computed.phi(places), computed.omega)
+    return SelfCheck(computed.omega / measured.omega - 1.0, np.diag(agreement))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identified(Printed):
+    """A structure identified with the number of terms of the best self-check.
+
+    Attributes:
+        distributions: mass and stiffness.
+        n_terms: of mass, of stiffness.
+        check: of these.
+        tried: numbers of terms of mass and stiffness, and the largest frequency error, of every pair tried.
+    """
+
+    distributions: Distributions
+    n_terms: tuple[int, int]
+    check: SelfCheck
+    tried: tuple[tuple[int, int, float], ...] = ()
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        line, headings, rows, remarks = self.distributions._printed()
+        return line, headings, rows, [self.check._printed()[0], *remarks]
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """The remarks of the distributions."""
+        return self.distributions.remarks
+
+
+@warns_of_remarks
+def choose_terms(
+    measured: Modes,
+    *,
+    kind: str,
+    left: str | End,
+    right: str | End,
+    known_mass: Sequence[tuple[float, float]],
+    terms: Iterable[int] = range(1, 7),
+    basis: Callable[[int], Basis] = Basis.polynomial,
+    first_mode: int = 0,
+    prior_mass: ProfileLike = 0.0,
+    prior_stiffness: ProfileLike = 0.0,
+) -> Identified:
+    """The identified structure of the numbers of terms whose modes agree best with the measured ones.
+
+    A pair of more terms must halve the largest frequency error to be preferred, and none is once this is below the
+    standard error of the measured frequencies: further terms would over-fit.
+
+    Args:
+        measured: as `mass_and_stiffness`.
+        kind, left, right, first_mode: as `self_check`.
+        known_mass: ((x, kg/m), ...).
+        terms: numbers of terms to try, for mass and stiffness alike.
+        basis: number of terms -> `Basis`.
+        prior_mass, prior_stiffness: as `mass_and_stiffness`.
+
+    Raises:
+        ValueError: no pair of numbers gives a structure; the last reason is given.
+        UserWarning: as `mass_and_stiffness`.
+    """
+    best: Identified | None = None
+    tried, reason, numbers = [], "no number of terms was given", tuple(terms)
+    measurement_error = 1e-9  # of modes that were computed
+    if measured.covariance is not None:
+        std = np.sqrt(np.diag(measured.covariance)[: measured.n_modes])
+        measurement_error = float((std / measured.omega).max())
+    for pair in sorted(((a, b) for a in numbers for b in numbers), key=lambda pair: (sum(pair), pair)):
+        try:
+            bases = basis(pair[0]), basis(pair[1])
+            found = _distributions(measured, kind, bases, known_mass, (prior_mass, prior_stiffness))
+        except ValueError as error:
+            reason = str(error)
+            continue
+        check = self_check(found, measured, kind=kind, left=left, right=right, first_mode=first_mode)
+        reason = check.refusal or reason
+        tried.append((*pair, check.worst))
+        if np.isfinite(check.worst) and (
+            best is None or (measurement_error < best.check.worst and check.worst < 0.5 * best.check.worst)
+        ):
+            best = Identified(found, pair, check)
+    if best is None:
+        raise ValueError(f"no number of terms gives a structure: {reason}")
+    return replace(best, tried=tuple(tried))

@@ -11,21 +11,29 @@ probability of a false alarm. No measurement of the undamaged structure is neede
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.signal.modal_estimates import Refined
+from workbench.identification.signal.searches import Once
 from workbench.identification.updating.distributions import Basis
-from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
-from workbench.identification.updating.structure_fit import MOST_TERMS, choose, with_spare_terms
-from workbench.identification.updating.structure_problem import PROBLEM, Problem
-from workbench.identification.updating.structure_task import LACKING, FittedStructure, Task, unexplained
+from workbench.identification.updating.sensitivity import LocalLoss
+from workbench.identification.updating.structure_fit import (
+    LACKING,
+    STRUCTURE,
+    Candidates,
+    FittedStructure,
+    fitted,
+    free_near,
+    report,
+    unexplained,
+)
+from workbench.identification.updating.structure_problem import PROBLEM, Problem, Task
 from workbench.renamed import Renamed
 from workbench.structure.member import Bar, Beam
 from workbench.structure.printed import Printed, warns_of_remarks
@@ -105,8 +113,9 @@ class LocatedDamage(Printed):
     @property
     def best(self) -> FittedStructure:
         """The fit to use."""
-        without_loss = self.with_mass if self.with_mass is not None and self._is_mass else self.undamaged
-        return self.damaged if self.detected else without_loss
+        if self.detected:
+            return self.damaged
+        return self.with_mass if self._is_mass and self.with_mass is not None else self.undamaged
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         test = f"statistic {self.statistic:.3g}, threshold {self.threshold:.3g}"
@@ -152,8 +161,8 @@ def locate_damage(
     nominal: Bar | Beam,
     *,
     basis: Callable[[int], Basis] | None = None,
-    mass_terms: Iterable[int] = range(1, MOST_TERMS + 1),
-    stiffness_terms: Iterable[int] = range(1, MOST_TERMS + 1),
+    mass_terms: Iterable[int] = range(1, STRUCTURE.most_terms + 1),
+    stiffness_terms: Iterable[int] = range(1, STRUCTURE.most_terms + 1),
     false_alarm: float = FALSE_ALARM,
     **known: Any,
 ) -> LocatedDamage:
@@ -168,190 +177,112 @@ def locate_damage(
         ValueError: as `fit_structure`.
         UserWarning: nothing explains the modes, or a point mass explains them better than a loss.
     """
-    task = Task.of(measured, nominal, **known)
-    basis = basis or partial(Basis.legendre, length=nominal.length)
-    terms = sorted(mass_terms), sorted(stiffness_terms)
-    if not (terms[0] and terms[1]):
-        raise ValueError("no number of terms was given for mass or stiffness; give at least one, 0 to keep the nominal")
-    first = _fit_from_scan(Problem.of(task, *(basis(numbers[: LOSS.first_terms][-1]) for numbers in terms)), None)
-    damaged = choose(task, basis, *terms, _fit_near_last, near=first, exhaust=False)
-    n_fewer = 0
+    candidates = Candidates.of(Task.of(measured, nominal, **known), basis, mass_terms, stiffness_terms)
+    # three parameters of a loss, tested at 1 / typical_width independent places
+    threshold = float(chi2_distribution.isf(false_alarm * LOSS.typical_width, 3))
+    damaged = _damaged(candidates)
+    undamaged = _undamaged(candidates, damaged, threshold)
+    if _statistic(candidates, undamaged, damaged) <= threshold:
+        # too few terms may have led to a false place: search again with the terms of the undamaged fit
+        other = _from_scan(candidates.problem(*undamaged.n_terms), damaged)
+        if other.criterion < damaged.criterion - 1.0:
+            damaged = _best_beside(candidates, other)
+            undamaged = _undamaged(candidates, damaged, threshold)
+    statistic = _statistic(candidates, undamaged, damaged)
+    if not damaged.explains:  # not even a loss explains the modes: their standard errors are too small
+        statistic = statistic * damaged.degrees_of_freedom / damaged.chi2
+    with_mass = None if undamaged.explains else _with_mass(candidates, damaged)
+    return LocatedDamage(undamaged, damaged, statistic, threshold, with_mass)
+
+
+def _statistic(candidates: Candidates, undamaged: FittedStructure, damaged: FittedStructure) -> float:
+    """Decrease of the criterion by a loss, without the penalty of its parameters, which the threshold accounts for."""
+    return undamaged.criterion - damaged.criterion + 3.0 * candidates.task.penalty
+
+
+def _first_terms(candidates: Candidates) -> tuple[int, int]:
+    """Numbers of terms of mass and stiffness in a first search: many terms imitate a loss well."""
+    return candidates.mass_terms[: LOSS.first_terms][-1], candidates.stiffness_terms[: LOSS.first_terms][-1]
+
+
+def _damaged(candidates: Candidates) -> FittedStructure:
+    """The best fit with a loss."""
+
+    def continued(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+        assert near is not None, "a search along the structure comes first"
+        return fitted(problem, near, near.loss)
+
+    first = _from_scan(candidates.problem(*_first_terms(candidates)))
+    damaged, n_fewer = candidates.best(continued, near=first, exhaust=False), 0
     for _ in range(LOSS.most_looks):
         if damaged.explains or n_fewer >= max(damaged.n_terms):
             break
-        fewer_terms = (max(n - n_fewer, numbers[0]) for n, numbers in zip(damaged.n_terms, terms, strict=True))
-        other = _fit_from_scan(Problem.of(task, *(basis(n) for n in fewer_terms)), damaged)
+        n_mass, n_stiffness = (n - n_fewer for n in damaged.n_terms)
+        fewer = max(n_mass, candidates.mass_terms[0]), max(n_stiffness, candidates.stiffness_terms[0])
+        other = _from_scan(candidates.problem(*fewer), damaged)
         if other.criterion < damaged.criterion - 1.0:
-            damaged, n_fewer = choose(task, basis, *terms, partial(_fit_near_either, other), near=other), 0
+            damaged, n_fewer = _best_beside(candidates, other), 0
         else:
-            n_fewer += LOSS.fewer_terms  # many terms imitate a loss so well that few starts converge to it
-    # three parameters of a loss, tested at 1 / typical_width independent places
-    limit = float(chi2_distribution.isf(false_alarm * LOSS.typical_width, 3))
-    undamaged = _undamaged(task, basis, terms, damaged, limit)
-    statistic = _statistic(task, undamaged, damaged)
-    if statistic <= limit:
-        # too few terms may have led to a false place: search again with the terms of the undamaged fit
-        other = _fit_from_scan(Problem.of(task, *(basis(n) for n in undamaged.n_terms)), damaged)
-        if other.criterion < damaged.criterion - 1.0:
-            damaged = choose(task, basis, *terms, partial(_fit_near_either, other), near=other)
-            undamaged = _undamaged(task, basis, terms, damaged, limit)
-            statistic = _statistic(task, undamaged, damaged)
-    # if not even a loss explains the modes, their standard errors are too small: the statistic is reduced
-    return LocatedDamage(
-        undamaged,
-        damaged,
-        statistic if damaged.explains else statistic * damaged.degrees_of_freedom / damaged.chi2,
-        limit,
-        None if undamaged.explains else _fit_with_mass(task, basis, terms, damaged),
-    )
+            n_fewer += LOSS.fewer_terms
+    return damaged
 
 
-def _statistic(task: Task, undamaged: FittedStructure, damaged: FittedStructure) -> float:
-    """Decrease of the criterion by a loss, without the penalty of its parameters, which the threshold accounts for."""
-    return undamaged.criterion - damaged.criterion + _penalty(task)
+def _best_beside(candidates: Candidates, other: FittedStructure) -> FittedStructure:
+    """The best fit with a loss, searched from the best so far and from `other`: more terms may move the loss."""
+
+    def likelier(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+        return _likeliest(problem, [(start, start.loss) for start in (near, other) if start is not None])
+
+    return candidates.best(likelier, near=other)
 
 
-def _penalty(task: Task) -> float:
-    """Penalty of the three parameters of a loss in the criterion."""
-    return 3.0 * float(np.log(task.n_data))
-
-
-def _undamaged(
-    task: Task,
-    basis: Callable[[int], Basis],
-    terms: tuple[list[int], list[int]],
-    damaged: FittedStructure,
-    limit: float,
-) -> FittedStructure:
+def _undamaged(candidates: Candidates, damaged: FittedStructure, threshold: float) -> FittedStructure:
     """The best fit without a loss; a single fit where it suffices to decide the test."""
 
     def fit_of(*n_terms: int) -> FittedStructure | None:
         try:
-            return Problem.of(task, *(basis(n) for n in n_terms)).fit(damaged)
+            return fitted(candidates.problem(*n_terms), damaged)
         except ValueError:
             return None
 
     equal_terms = fit_of(*damaged.n_terms)
-    if equal_terms is not None and equal_terms.chi2 - damaged.chi2 <= limit:
-        return with_spare_terms(equal_terms, task, basis)
-    most_terms = fit_of(terms[0][-1], terms[1][-1])
-    if most_terms is not None and most_terms.chi2 - damaged.criterion + _penalty(task) > limit:
+    if equal_terms is not None and equal_terms.chi2 - damaged.chi2 <= threshold:
+        return candidates.with_spare_terms(equal_terms)
+    most_terms = fit_of(candidates.mass_terms[-1], candidates.stiffness_terms[-1])
+    if most_terms is not None and most_terms.chi2 - damaged.criterion + 3.0 * candidates.task.penalty > threshold:
         return most_terms
-    return choose(task, basis, terms[0], terms[1], lambda problem, near: problem.fit(near))
+    return candidates.best()
 
 
-def _fit_with_mass(
-    task: Task, basis: Callable[[int], Basis], terms: tuple[list[int], list[int]], damaged: FittedStructure
-) -> FittedStructure | None:
+def _with_mass(candidates: Candidates, damaged: FittedStructure) -> FittedStructure | None:
     """The best fit without a loss but with one more point mass; None where no fit converges."""
     best: FittedStructure | None = None
-    for n_terms in {tuple(numbers[: LOSS.first_terms][-1] for numbers in terms): None, damaged.n_terms: None}:
-        problem = Problem.of(task, *(basis(n) for n in n_terms))
-        starts = [(fitted, part) for fitted in _without_loss(problem) for part in _likely_masses(problem, fitted)]
+    for n_terms in {_first_terms(candidates): None, damaged.n_terms: None}:
+        problem = candidates.problem(*n_terms)
+        starts = [(intact, part) for intact in _without_loss(problem) for part in _likely_masses(problem, intact)]
         if best is not None:
             starts.append((best, cast(PointMass, best.structure.attachments[-1])))
         for near, part in starts:
-            try:
+            with suppress(ValueError):
                 fit = _fit_near_mass(problem, near, part)
-            except ValueError:
-                continue
-            if best is None or fit.criterion < best.criterion:
-                best = fit
+                if best is None or fit.criterion < best.criterion:
+                    best = fit
     return best
 
 
-def _with_point_mass(problem: Problem, at: float, mass: float) -> Problem:
-    """The problem with a further point mass (kg) at a place (m)."""
-    nominal, series = problem.task.nominal, problem.series
-    heavier = replace(nominal, attachments=(*nominal.attachments, PointMass(at, mass)))
-    return replace(
-        problem,
-        task=replace(problem.task, nominal=heavier),
-        series=SeriesStructure(heavier, series.mass, series.stiffness, series.positions),
-    )
-
-
-def _whole_mass(problem: Problem) -> float:
-    """Mass of the nominal structure without attachments, kg."""
-    x = np.linspace(0.0, problem.task.nominal.length, 101)
-    return float(problem.task.nominal.length * problem.task.nominal.mass_per_length(x).mean())
-
-
-def _likely_masses(problem: Problem, intact: FittedStructure) -> list[PointMass]:
-    """Point masses at the peaks of the first-order decrease of χ² along the structure."""
-    z, step = problem.free_near(intact), LOSS.first_mass * _whole_mass(problem)
-    residuals, slopes = problem.residuals(z)
-    basis = np.linalg.qr(slopes)[0]
-    places = np.linspace(0.0, problem.task.nominal.length, LOSS.mass_places)
-    effects = np.stack([(_with_point_mass(problem, at, step).residuals(z)[0] - residuals) / step for at in places])
-    effects -= (effects @ basis) @ basis.T
-    squares = np.maximum((effects**2).sum(axis=1), 1e-300)
-    masses = -(effects @ residuals) / squares
-    gain = np.where(masses > 0.0, masses**2 * squares, 0.0)
-    peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))
-    best = sorted(peaks, key=lambda i: -gain[i])[: LOSS.most_starts]
-    return [PointMass(float(places[i]), float(min(masses[i], _whole_mass(problem)))) for i in best]
-
-
-def _fit_near_mass(problem: Problem, near: FittedStructure, part: PointMass) -> FittedStructure:
-    """The maximum likelihood structure with a point mass, searched from `near` and `part`."""
-    scale = np.array([problem.task.nominal.length, _whole_mass(problem)])
-    steps = 1e-5 * np.eye(2)
-
-    def residuals(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _with_point_mass(problem, *(z[-2:] * scale)).residuals(z[:-2])
-
-    def slopes(z: np.ndarray) -> np.ndarray:
-        own = z[-2:]
-        shifts = [(np.clip(own - step, 0.0, [1.0, np.inf]), np.clip(own + step, 0.0, [1.0, np.inf])) for step in steps]
-        columns = [
-            (residuals(np.r_[z[:-2], after])[0] - residuals(np.r_[z[:-2], before])[0]) / (after - before).sum()
-            for before, after in shifts
-        ]
-        return np.column_stack([residuals(z)[1], *columns])
-
-    n_free = problem.n_free
-    start = np.r_[problem.free_near(near), np.clip([part.at, part.pair[0]] / scale, 1e-4, [1.0 - 1e-4, np.inf])]
-    bounds = np.r_[np.full(n_free, -np.inf), 0.0, 0.0], np.r_[np.full(n_free, np.inf), 1.0, np.inf]
-    solution = least_squares(
-        lambda z: residuals(z)[0], start, slopes, bounds=bounds, x_scale="jac", ftol=1e-5, max_nfev=PROBLEM.most_steps
-    )
-    fit = _with_point_mass(problem, *(solution.x[-2:] * scale)).report(solution.x[:-2])
-    return replace(
-        fit,
-        degrees_of_freedom=fit.degrees_of_freedom - 2,
-        criterion=fit.criterion + 2.0 * float(np.log(problem.task.n_data)),
-    )
-
-
-def _fit_near_last(problem: Problem, near: FittedStructure | None) -> FittedStructure:
-    """The maximum likelihood structure with a loss, searched from an earlier one."""
-    assert near is not None, "a search along the structure comes first"
-    return problem.fit(near, near.loss)
-
-
-def _fit_near_either(other: FittedStructure, problem: Problem, near: FittedStructure | None) -> FittedStructure:
-    """The likelier of two searches, from `near` and from `other`.
-
-    A loss fitted with few terms may lie beside that fitted with many.
-    """
-    return _likeliest(problem, [(start, start.loss) for start in (near, other) if start is not None])
-
-
-def _fit_from_scan(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+def _from_scan(problem: Problem, near: FittedStructure | None = None) -> FittedStructure:
     """The maximum likelihood structure with a loss, searched from the likeliest places and from an earlier fit."""
-    starts = [(fit, loss) for fit in _without_loss(problem) for loss in _likely_losses(problem, fit)]
+    starts = [(intact, loss) for intact in _without_loss(problem) for loss in _likely_losses(problem, intact)]
     return _likeliest(problem, starts if near is None else [*starts, (near, near.loss)])
 
 
 def _without_loss(problem: Problem) -> list[FittedStructure]:
     """Structures from which losses are searched: the nominal one, and the fitted one, which may imitate a loss."""
     structures = []
-    for fit in (problem.nominal, problem.fit):
-        try:
-            structures.append(fit())
-        except ValueError:
-            continue
+    with suppress(ValueError):
+        structures.append(report(problem, problem.start()))
+    with suppress(ValueError):
+        structures.append(fitted(problem))
     return structures
 
 
@@ -360,7 +291,7 @@ def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLo
     fits, reason = [], "no structure of so many terms could be fitted, so no loss can be located; use fewer terms"
     for near, loss in starts:
         try:
-            fits.append(problem.fit(near, loss))
+            fits.append(fitted(problem, near, loss))
         except ValueError as error:
             reason = str(error)
     if not fits:
@@ -370,14 +301,16 @@ def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLo
 
 def _likely_losses(problem: Problem, intact: FittedStructure) -> list[LocalLoss]:
     """Losses at the peaks of `scan`, for each width; none where no loss lowers χ²."""
-    length = problem.task.nominal.length
-    places, all_gains = scan(problem, intact)
-    losses = []
-    for width, gain in zip(LOSS.widths, all_gains, strict=True):
-        peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))
-        best = sorted(peaks, key=lambda i: -gain[i])[: LOSS.most_starts]
-        losses += [LocalLoss(0.1, float(places[i]), width * length) for i in best]
-    return losses
+    places, gains = scan(problem, intact)
+    widths = zip(LOSS.widths, gains, strict=True)
+    length = problem.series.nominal.length
+    return [LocalLoss(0.1, float(places[i]), width * length) for width, gain in widths for i in _highest_peaks(gain)]
+
+
+def _highest_peaks(gain: np.ndarray) -> list[int]:
+    """Indices of the highest local maxima of a gain along the structure, at most `LOSS.most_starts`."""
+    peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))
+    return sorted(peaks.tolist(), key=lambda i: -gain[i])[: LOSS.most_starts]
 
 
 def scan(problem: Problem, undamaged: FittedStructure) -> tuple[np.ndarray, np.ndarray]:
@@ -386,32 +319,83 @@ def scan(problem: Problem, undamaged: FittedStructure) -> tuple[np.ndarray, np.n
     Returns:
         places (n_places,), m; decrease (n_widths, n_places).
     """
-    task, series = problem.task, problem.series
-    length = task.nominal.length
+    length, stiffness = problem.series.nominal.length, problem.series.stiffness
     places = (np.arange(LOSS.places) + 0.5) / LOSS.places * length
-    d, e = np.split(undamaged.parameters, [undamaged.n_terms[0]])
+    e = undamaged.parameters[undamaged.n_terms[0] :]
 
     def with_losses(x: np.ndarray) -> np.ndarray:
-        basis = series.stiffness.functions(x)
+        terms = stiffness.functions(x)
         hats = np.maximum(1.0 - np.abs(x[:, None] - places) * LOSS.places / length, 0.0)
-        return np.hstack([basis, -(1.0 + basis @ e)[:, None] * hats])
+        return np.hstack([terms, -(1.0 + terms @ e)[:, None] * hats])
 
     breaks = tuple(np.linspace(0.0, length, 11))
-    with_hats = Basis(with_losses, e.size + LOSS.places, (*series.stiffness.breaks, *breaks))
-    particular, free = problem.stiffness_held
+    with_hats = Basis(with_losses, e.size + LOSS.places, (*stiffness.breaks, *breaks))
+    mass_held, (particular, free) = problem.held
     stiffness_held = np.r_[particular, np.zeros(LOSS.places)], block_diag(free, np.eye(LOSS.places))
-    trial = replace(
-        problem,
-        series=SeriesStructure(task.nominal, series.mass, with_hats, series.positions),
-        stiffness_held=stiffness_held,
-    )
-    residuals, slopes = trial.residuals(np.r_[problem.free_of(d, e), np.zeros(LOSS.places)])
+    trial = replace(problem, series=replace(problem.series, stiffness=with_hats), held=(mass_held, stiffness_held))
+    residuals, slopes = trial.residuals(np.r_[problem.free_of(undamaged.parameters), np.zeros(LOSS.places)])
     # the part of each effect orthogonal to the smooth series
-    basis = np.linalg.qr(slopes[:, : -LOSS.places])[0]
-    effects = slopes[:, -LOSS.places :] - basis @ (basis.T @ slopes[:, -LOSS.places :])
+    smooth = np.linalg.qr(slopes[:, : -LOSS.places])[0]
+    effects = slopes[:, -LOSS.places :] - smooth @ (smooth.T @ slopes[:, -LOSS.places :])
     distance = np.abs(places[:, None] - places) / length
     gains = []
     for width in LOSS.widths:
         losses = effects @ (distance < 0.5 * width)
         gains.append(np.maximum(-losses.T @ residuals, 0.0) ** 2 / np.maximum((losses**2).sum(axis=0), 1e-300))
     return places, np.array(gains)
+
+
+def _with_point_mass(problem: Problem, at: float, mass: float) -> Problem:
+    """The problem with a further point mass (kg) at a place (m)."""
+    nominal = problem.series.nominal
+    heavier = replace(nominal, attachments=(*nominal.attachments, PointMass(at, mass)))
+    return replace(problem, series=replace(problem.series, nominal=heavier))
+
+
+def _whole_mass(problem: Problem) -> float:
+    """Mass of the nominal structure without attachments, kg."""
+    nominal = problem.series.nominal
+    return float(nominal.length * nominal.mass_per_length(np.linspace(0.0, nominal.length, 101)).mean())
+
+
+def _likely_masses(problem: Problem, intact: FittedStructure) -> list[PointMass]:
+    """Point masses at the peaks of the first-order decrease of χ² along the structure."""
+    z, whole = free_near(problem, intact), _whole_mass(problem)
+    step = LOSS.first_mass * whole
+    residuals, slopes = problem.residuals(z)
+    smooth = np.linalg.qr(slopes)[0]
+    places = np.linspace(0.0, problem.series.nominal.length, LOSS.mass_places)
+    effects = np.stack([(_with_point_mass(problem, at, step).residuals(z)[0] - residuals) / step for at in places])
+    effects -= (effects @ smooth) @ smooth.T
+    squares = np.maximum((effects**2).sum(axis=1), 1e-300)
+    masses = -(effects @ residuals) / squares
+    gain = np.where(masses > 0.0, masses**2 * squares, 0.0)
+    return [PointMass(float(places[i]), float(min(masses[i], whole))) for i in _highest_peaks(gain)]
+
+
+def _fit_near_mass(problem: Problem, near: FittedStructure, part: PointMass) -> FittedStructure:
+    """The maximum likelihood structure with a point mass, searched from `near` and `part`."""
+    scale = np.array([problem.series.nominal.length, _whole_mass(problem)])
+    n_free, least, most = problem.n_free, np.zeros(2), np.array([1.0, np.inf])
+
+    def residuals(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _with_point_mass(problem, *(z[-2:] * scale)).residuals(z[:-2])
+
+    def fit(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rows, slopes = residuals(z)
+        columns = []
+        for step in 1e-5 * np.eye(2):
+            before, after = np.clip(z[-2:] - step, least, most), np.clip(z[-2:] + step, least, most)
+            change = residuals(np.r_[z[:-2], after])[0] - residuals(np.r_[z[:-2], before])[0]
+            columns.append(change / (after - before).sum())
+        return rows, np.column_stack([slopes, *columns])
+
+    start = np.r_[free_near(problem, near), np.clip([part.at, part.pair[0]] / scale, 1e-4, [1.0 - 1e-4, np.inf])]
+    bounds = np.r_[np.full(n_free, -np.inf), least], np.r_[np.full(n_free, np.inf), most]
+    z = Once(fit).least(start, PROBLEM.most_steps, bounds=bounds, ftol=1e-5)
+    found = report(_with_point_mass(problem, *(z[-2:] * scale)), z[:-2])
+    return replace(
+        found,
+        degrees_of_freedom=found.degrees_of_freedom - 2,
+        criterion=found.criterion + 2.0 * problem.task.penalty,
+    )

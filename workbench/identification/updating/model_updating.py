@@ -77,13 +77,10 @@ class UpdatedModel(Printed):
     @property
     def remarks(self) -> tuple[str, ...]:
         """Why the parameters are unreliable: no minimum, or frequencies or shapes that the model does not have."""
-        remarks, degrees_of_freedom = [], self.residuals.size - self.parameters.size
-        if not self.converged:
-            remarks.append(f"not converged: {self.reason}")
-        chi2, limit = (
-            float(self.residuals @ self.residuals),
-            float(chi2_distribution.isf(UPDATING.unlikely, degrees_of_freedom)),
-        )
+        remarks = [] if self.converged else [f"not converged: {self.reason}"]
+        degrees_of_freedom = self.residuals.size - self.parameters.size
+        chi2 = float(self.residuals @ self.residuals)
+        limit = float(chi2_distribution.isf(UPDATING.unlikely, degrees_of_freedom))
         if degrees_of_freedom and chi2 > limit:
             remarks.append(
                 f"the frequencies are not explained: χ² is {chi2:.4g}, and noise alone gives at most {limit:.4g}; the"
@@ -173,22 +170,18 @@ def update_model(
 
     refused: list[str] = []  # reasons why trial steps have no such modes; these steps are rejected
 
-    def residuals_at(logarithms: np.ndarray) -> np.ndarray | None:
+    def residuals(logarithms: np.ndarray) -> np.ndarray:
         try:
             return np.asarray((paired(build(first * np.exp(logarithms)))[2] - target) / deviation)
         except ValueError as error:
             refused.append(str(error))
-            return None
-
-    def residuals(logarithms: np.ndarray) -> np.ndarray:
-        values = residuals_at(logarithms)
-        return np.full(target.size, NO_MODEL) if values is None else values
+            return np.full(target.size, NO_MODEL)
 
     def jacobian(logarithms: np.ndarray) -> np.ndarray:
         columns = []
         for step in UPDATING.step * np.eye(first.size):
-            sides = [(side, residuals_at(logarithms + side * step)) for side in (-1.0, 1.0)]
-            valid = [(side, values) for side, values in sides if values is not None]
+            sides = [(side, residuals(logarithms + side * step)) for side in (-1.0, 1.0)]
+            valid = [(side, values) for side, values in sides if (values != NO_MODEL).any()]
             if len(valid) < 2:  # at the edge of the domain where the model has such modes: one-sided
                 valid.append((0.0, residuals(logarithms)))
             (before, low), (after, high) = valid[0], valid[-1]

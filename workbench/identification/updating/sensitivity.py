@@ -12,22 +12,22 @@ is continuous there and the curvature is not, so ∂K_sr = (k⁻ - k⁺) φ_s''�
 to it the derivative of the shape has a kink, which the sum over modes represents to a few per cent; all else is exact.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import cast
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import eigh
 
 from workbench.identification.updating.distributions import Basis
-from workbench.structure.member import Bar, Beam, checked_places
+from workbench.structure.domain import position
+from workbench.structure.member import Bar, Beam, checked_places, segment_ends
 from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile
-from workbench.structure.supports import HELD, PointDamper, PointMass
 
-EXTRA_DEGREES = 4  # margin of the degree of the polynomials
+DEGREES = 1.7, 16  # of the polynomials, for each half wave and beyond
 RIGID = 1e-10  # of the eigenvalue of a half wave, below which a mode is a rigid-body mode
 ROUND_OFF = 1e-15
+APART = 1e-6  # least distance of nodes over the length
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,14 @@ class SeriesStructure:
         nominal: ends, attachments, m_0 and k_0.
         mass, stiffness: M_j and K_j.
         positions: (n_sensors,) of the sensors, m.
+        n_modes: number of the lowest modes that are resolved.
     """
 
     nominal: Bar | Beam
     mass: Basis
     stiffness: Basis
     positions: np.ndarray
-    _meshes: dict[int, "_Mesh"] = field(default_factory=dict, repr=False)
+    n_modes: int
 
     @property
     def order(self) -> int:
@@ -96,29 +97,33 @@ class SeriesStructure:
         return 2 if isinstance(self.nominal, Beam) else 1
 
     @property
-    def nominal_stiffness(self) -> Profile:
-        """k_0."""
-        return self.nominal.bending_stiffness if isinstance(self.nominal, Beam) else self.nominal.axial_stiffness
+    def bases(self) -> tuple[Basis, Basis]:
+        """M_j and K_j."""
+        return self.mass, self.stiffness
 
-    def solve(
-        self, d: np.ndarray, e: np.ndarray, *, n_modes: int, loss: LocalLoss | None = None
-    ) -> "SolvedSeries | None":
-        """The modes with these coefficients, the lowest `n_modes` resolved; None if mass or stiffness is negative."""
-        mesh = self._mesh(n_modes, loss)
+    @property
+    def nominal_profiles(self) -> tuple[Profile, Profile]:
+        """m_0 and k_0."""
+        nominal = self.nominal
+        stiffness = nominal.bending_stiffness if isinstance(nominal, Beam) else nominal.axial_stiffness
+        return nominal.mass_per_length, stiffness
+
+    def solve(self, d: np.ndarray, e: np.ndarray, loss: LocalLoss | None = None) -> "SolvedSeries | None":
+        """The modes with these coefficients; None if mass or stiffness is negative."""
+        length = self.nominal.length
+        mesh = self._intact_mesh if loss is None else _Mesh(self, loss.edges(length))
         mass = mesh.nominal_mass * (1.0 + mesh.mass_terms @ d)
         stiffness = mesh.nominal_stiffness * (1.0 + mesh.stiffness_terms @ e)
-        if (mass <= 0).any() or (stiffness <= 0).any() or (loss is not None and loss.share >= 1):
-            return None
         # a series of many terms may be negative between the integration points
-        if (1.0 + mesh.checked_mass @ d <= 0).any() or (1.0 + mesh.checked_stiffness @ e <= 0).any():
+        positive = mass, stiffness, 1.0 + mesh.checked_mass @ d, 1.0 + mesh.checked_stiffness @ e
+        if any((values <= 0).any() for values in positive) or (loss is not None and loss.share >= 1):
             return None
-        remaining = stiffness if loss is None else stiffness * np.where(mesh.inside(loss), 1.0 - loss.share, 1.0)
         m = mesh.fixed_mass + (mesh.values.T * (mesh.weights * mass)) @ mesh.values
-        k = mesh.fixed_stiffness + (mesh.strains.T * (mesh.weights * remaining)) @ mesh.strains
+        k = mesh.fixed_stiffness + (mesh.strains.T * (mesh.weights * (stiffness * mesh.left_by(loss)))) @ mesh.strains
         free = mesh.free
         m, k = m[np.ix_(free, free)], k[np.ix_(free, free)]
         # As in `member`: the inverse problem keeps the lowest modes exact, the shift separates rigid-body modes.
-        shift = np.mean(stiffness) / np.mean(mass) * (np.pi / self.nominal.length) ** (2 * self.order)
+        shift = np.mean(stiffness) / np.mean(mass) * (np.pi / length) ** (2 * self.order)
         nu, vectors = eigh(m, k + shift * m)
         lowest = np.flatnonzero(nu > ROUND_OFF * nu[-1])[::-1]
         nu, vectors = nu[lowest], vectors[:, lowest]
@@ -128,12 +133,9 @@ class SeriesStructure:
         n_rigid = int((eigenvalues < RIGID * shift).sum())
         return SolvedSeries(self, mesh, np.maximum(eigenvalues, 0.0), coefficients, stiffness, n_rigid, loss)
 
-    def _mesh(self, n_modes: int, loss: LocalLoss | None) -> "_Mesh":
-        if loss is not None:
-            return _Mesh.of(self, n_modes, loss.edges(self.nominal.length))
-        if n_modes not in self._meshes:
-            self._meshes[n_modes] = _Mesh.of(self, n_modes, ())
-        return self._meshes[n_modes]
+    @cached_property
+    def _intact_mesh(self) -> "_Mesh":
+        return _Mesh(self, ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,36 +150,39 @@ class SolvedSeries:
     n_rigid: int
     loss: LocalLoss | None
 
-    @property
+    @cached_property
     def at_sensors(self) -> np.ndarray:
         """All shapes at the sensors, (n_sensors, n_all)."""
         return np.asarray(self.mesh.segments.evaluation(self.series.positions) @ self.coefficients)
 
+    def modes(self, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Frequencies (n_modes,), rad/s, and shapes at the sensors (n_sensors, n_modes) of elastic modes, from 0."""
+        return np.sqrt(self.eigenvalues[self.n_rigid + which]), self.at_sensors[:, self.n_rigid + which]
+
     def sensitivity(self, which: np.ndarray) -> Sensitivity:
         """Elastic modes `which` (from 0), and their derivatives by d, e and share, centre and width of a loss."""
         r = self.n_rigid + which
-        mesh, loss = self.mesh, self.loss
+        mesh, diagonal = self.mesh, (r, np.arange(r.size))
         shapes, strains = mesh.values @ self.coefficients, mesh.strains @ self.coefficients
         mass_weights = (mesh.weights * mesh.nominal_mass)[:, None] * mesh.mass_terms
-        remaining = 1.0 if loss is None else np.where(mesh.inside(loss), 1.0 - loss.share, 1.0)
-        stiffness_weights = (mesh.weights * mesh.nominal_stiffness * remaining)[:, None] * mesh.stiffness_terms
+        intact = mesh.weights * mesh.nominal_stiffness * mesh.left_by(self.loss)
         by_mass = [(shapes.T * w) @ shapes[:, r] for w in mass_weights.T]
-        by_stiffness = [(strains.T * w) @ strains[:, r] for w in stiffness_weights.T]
-        if loss is not None:
-            by_stiffness += self._by_loss(strains, r, loss)
-        changes = [(g, np.zeros_like(g)) for g in by_stiffness]
-        changes = [(-g * self.eigenvalues[r], g) for g in by_mass] + changes
+        by_stiffness = [(strains.T * w) @ strains[:, r] for w in (intact[:, None] * mesh.stiffness_terms).T]
+        if self.loss is not None:
+            by_stiffness += self._by_loss(strains, r, self.loss)
+        # G_sr and ∂M_rr
+        changes = [(-change * self.eigenvalues[r], change[diagonal]) for change in by_mass]
+        changes += [(change, np.zeros(r.size)) for change in by_stiffness]
         gaps = self.eigenvalues[r] - self.eigenvalues[:, None]
-        diagonal = (r, np.arange(r.size))
         gaps[diagonal] = np.inf
-        omega, at_sensors = np.sqrt(self.eigenvalues[r]), self.at_sensors
-        omega_by, shapes_by = [], []
-        for g, mass_change in changes:
+        omega, at_sensors = self.modes(which)
+        omega_by, shapes_by = np.zeros((r.size, len(changes))), np.zeros((*at_sensors.shape, len(changes)))
+        for j, (g, mass_change) in enumerate(changes):
             mixed = g / gaps
-            mixed[diagonal] = -0.5 * mass_change[diagonal]
-            omega_by.append(g[diagonal] / (2.0 * omega))
-            shapes_by.append(at_sensors @ mixed)
-        return Sensitivity(omega, at_sensors[:, r], np.stack(omega_by, -1), np.stack(shapes_by, -1))
+            mixed[diagonal] = -0.5 * mass_change
+            omega_by[:, j] = g[diagonal] / (2.0 * omega)
+            shapes_by[..., j] = self.at_sensors @ mixed
+        return Sensitivity(omega, at_sensors, omega_by, shapes_by)
 
     def _by_loss(self, strains: np.ndarray, r: np.ndarray, loss: LocalLoss) -> list[np.ndarray]:
         """∂K_sr by share, centre and width."""
@@ -195,76 +200,49 @@ class SolvedSeries:
         return [by_share, by_edge[0] + by_edge[1], 0.5 * (by_edge[1] - by_edge[0])]
 
 
-@dataclass(frozen=True, eq=False)
 class _Mesh:
-    """The discretisation: functions and their highest derivatives at Gauss points, and the fixed matrices."""
+    """The discretisation, with nodes at all places where something jumps, and at the edges of a loss.
 
-    segments: Segments
-    x: np.ndarray
-    weights: np.ndarray
-    values: np.ndarray  # (n_points, n_functions)
-    strains: np.ndarray
-    nominal_mass: np.ndarray
-    nominal_stiffness: np.ndarray
-    mass_terms: np.ndarray  # (n_points, n_terms)
-    stiffness_terms: np.ndarray
-    checked_mass: np.ndarray  # (n_places, n_terms) at the places where `member` checks that it is positive
-    checked_stiffness: np.ndarray
-    fixed_mass: np.ndarray
-    fixed_stiffness: np.ndarray
-    free: np.ndarray
+    Attributes:
+        segments: the functions.
+        x, weights: (n_points,) Gauss points and weights.
+        values, strains: (n_points, n_functions) functions and their highest derivatives there.
+        nominal_mass, nominal_stiffness: (n_points,) m_0 and k_0.
+        mass_terms, stiffness_terms: (n_points, n_terms) M_j and K_j.
+        checked_mass, checked_stiffness: the same where `member` checks that mass and stiffness are positive.
+        fixed_mass, fixed_stiffness: matrices of attachments, springs and tension.
+        free: indices of the functions that the ends do not hold.
+    """
+
+    def __init__(self, series: SeriesStructure, edges: tuple[float, ...]) -> None:
+        nominal, order, length = series.nominal, series.order, series.nominal.length
+        m, k = series.nominal_profiles
+        of_mass, of_stiffness = (*m.breaks, *series.mass.breaks), (*k.breaks, *series.stiffness.breaks, *edges)
+        at_parts = (position(part.at) for part in nominal.attachments)
+        nodes = segment_ends((*of_mass, *of_stiffness, *at_parts), length, APART)
+        degree = int(np.ceil(DEGREES[0] * series.n_modes * np.diff(nodes).max() / length)) + DEGREES[1]
+        self.segments = Segments(nodes, (degree,) * (nodes.size - 1), order - 1)
+        self.x, self.weights, (self.values, slopes, self.strains) = self.segments.tables((0, 1, order))
+        self.nominal_mass, self.nominal_stiffness = m(self.x), k(self.x)
+        self.mass_terms, self.stiffness_terms = series.mass.functions(self.x), series.stiffness.functions(self.x)
+        self.checked_mass = series.mass.functions(checked_places(of_mass, length))
+        self.checked_stiffness = series.stiffness.functions(checked_places(of_stiffness, length))
+        n = self.segments.n_functions
+        self.fixed_mass, self.fixed_stiffness = np.zeros((n, n)), np.zeros((n, n))
+        for mass, row in nominal.point_masses(self.segments):
+            self.fixed_mass += mass * row.T @ row
+        held, _, springs = nominal.restraints(self.segments)
+        for spring, row in springs:
+            self.fixed_stiffness += spring * row.T @ row
+        if isinstance(nominal, Beam) and nominal.tension:
+            self.fixed_stiffness += nominal.tension * (slopes.T * self.weights) @ slopes
+        self.free = np.setdiff1d(np.arange(n), held)
 
     def inside(self, loss: LocalLoss) -> np.ndarray:
         """Whether each point lies within the loss, (n_points,)."""
         begin, end = loss.edges(self.segments.nodes[-1])
         return (self.x > begin) & (self.x < end)
 
-    @classmethod
-    def of(cls, series: SeriesStructure, n_modes: int, edges: tuple[float, ...]) -> "_Mesh":
-        nominal, order = series.nominal, series.order
-        m, k = nominal.mass_per_length, series.nominal_stiffness
-        places = [*m.breaks, *k.breaks, *series.mass.breaks, *series.stiffness.breaks]
-        nodes = _nodes([*places, *edges, *(cast(float, part.at) for part in nominal.attachments)], nominal.length)
-        degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / nominal.length)) + 12 + EXTRA_DEGREES
-        segments = Segments(nodes, (degree,) * (nodes.size - 1), order - 1)
-        x, weights, (values, slopes, strains) = segments.tables((0, 1, order))
-        fixed_mass, fixed_stiffness, free = _fixed(nominal, segments, order)
-        if isinstance(nominal, Beam) and nominal.tension:
-            fixed_stiffness += nominal.tension * (slopes.T * weights) @ slopes
-        terms = series.mass.functions(x), series.stiffness.functions(x)
-        mass_places = checked_places((*m.breaks, *series.mass.breaks), nominal.length)
-        stiffness_places = checked_places((*k.breaks, *series.stiffness.breaks, *edges), nominal.length)
-        checked = series.mass.functions(mass_places), series.stiffness.functions(stiffness_places)
-        return cls(
-            segments, x, weights, values, strains, m(x), k(x), *terms, *checked, fixed_mass, fixed_stiffness, free
-        )
-
-
-def _nodes(places: Sequence[float], length: float) -> np.ndarray:
-    """The ends and all places between them, without coincident ones."""
-    nodes = [0.0]
-    for at in sorted(places):
-        if nodes[-1] + 1e-6 * length < at < length * (1 - 1e-6):
-            nodes.append(float(at))
-    return np.array([*nodes, length])
-
-
-def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass and stiffness matrices of springs and attachments, and the indices of the unconstrained functions."""
-    mass, stiffness = np.zeros((2, segments.n_functions, segments.n_functions))
-    fixed = []
-
-    def add(matrix: np.ndarray, at: float, values: Sequence[float]) -> None:
-        for derivative, value in enumerate(values[:order]):
-            if value:
-                row = segments.evaluation(at, derivative)
-                matrix += value * row.T @ row
-
-    for node, at, end in ((0, 0.0, nominal.left), (segments.nodes.size - 1, nominal.length, nominal.right)):
-        springs = (end.translation, end.rotation)
-        fixed += [order * node + derivative for derivative, spring in enumerate(springs[:order]) if spring == HELD]
-        add(stiffness, at, [0.0 if spring == HELD else spring for spring in springs])
-    for part in nominal.attachments:
-        if not isinstance(part, PointDamper):
-            add(mass if isinstance(part, PointMass) else stiffness, cast(float, part.at), part.pair)
-    return mass, stiffness, np.setdiff1d(np.arange(segments.n_functions), fixed)
+    def left_by(self, loss: LocalLoss | None) -> np.ndarray | float:
+        """Share of the stiffness that a loss leaves at each point, (n_points,)."""
+        return 1.0 if loss is None else np.where(self.inside(loss), 1.0 - loss.share, 1.0)

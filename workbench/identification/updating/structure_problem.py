@@ -1,4 +1,4 @@
-"""The maximum likelihood mass and stiffness of a structure as series, given modes with their covariance.
+"""χ² of a candidate structure, whose mass and stiffness are series, given modes with their covariance.
 
 Orthogonality (4.6) needs curvatures, and second derivatives of noisy shapes are inaccurate. Here the eigenfunctions are
 those of the candidate structure itself: the coefficients d, e of
@@ -9,39 +9,165 @@ minimise χ², the sum of squares of the residuals of the candidate's frequencie
 errors, by Gauss-Newton steps with exact sensitivities. The criterion is thus the self-check of section 4.3.
 """
 
-from dataclasses import astuple, dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import OptimizeResult, least_squares
-from scipy.stats import chi2 as chi2_distribution
+from scipy.optimize import linear_sum_assignment
 
-from workbench.arrays import Floats, scaled_inverse, symmetric_root
-from workbench.identification.signal.searches import Once
-from workbench.identification.updating.distributions import Basis, held_exactly
-from workbench.identification.updating.self_check import SelfCheck
+from workbench.arrays import Floats, scaled_inverse
+from workbench.identification.shapes.eigenfunctions import check_along
+from workbench.identification.signal.modal_estimates import Refined, normalised_shapes
+from workbench.identification.updating.distributions import Basis, held_exactly, known_values
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
-from workbench.identification.updating.structure_task import TASK, FittedStructure, Task, UncertainProfile
-from workbench.structure.member import Beam
-from workbench.structure.modes import frozen, mac
-from workbench.structure.profile import Profile
+from workbench.structure.domain import Interval
+from workbench.structure.member import Bar, Beam
+from workbench.structure.modes import mac
 
 
 @dataclass(frozen=True)
 class ProblemSettings:
-    """Constants of the fit of a structure."""
+    """Constants of the data and of the fit of a structure."""
 
+    trusted: float = 1e-8  # relative error of the model, below which no standard error counts
+    same_mode: float = 0.6  # least MAC of a measured mode with the nominal structure's mode paired with it
     narrowest: float = 0.02  # of the length: a narrower loss is a crack
     widest: float = 0.5  # of the length: a wider loss is not local
     most_lost: float = 0.95  # of the stiffness
-    draws: int = 1000  # Monte Carlo samples of the structure, for confidence bands
     most_steps: int = 25  # of least squares
 
 
 PROBLEM = ProblemSettings()
 INDISTINCT = 1e-12  # relative eigenvalue of the normal equations of parameters that the data do not determine
 FROM_EDGES = np.array([[0.5, 0.5], [-1.0, 1.0]])  # centre and width of a loss, from its edges
+NOT_POSITIVE = 1e8  # residuals where mass or stiffness is not positive, so that the step is rejected
+
+
+@dataclass(frozen=True)
+class GaussianPrior:
+    """Gaussian prior of the relative deviation of a distribution from its nominal one.
+
+    Attributes:
+        std: standard deviation of k / k_0 - 1 (or m / m_0 - 1) at any place.
+        correlation: length ℓ of the correlation exp(-Δx² / (2 ℓ²)) between two places, m.
+    """
+
+    std: float
+    correlation: float
+
+    def __post_init__(self) -> None:
+        if not (self.std > 0 and self.correlation > 0):
+            raise ValueError(
+                f"a prior needs a positive standard deviation and correlation length; got {self.std} and"
+                f" {self.correlation}. Keep the nominal distribution, without terms, where it is known exactly"
+            )
+
+    def root(self, basis: Basis, length: float) -> Floats:
+        """R such that |R c|² is the prior's χ² of coefficients c."""
+        x = (np.arange(200) + 0.5) / 200 * length
+        projection = np.linalg.pinv(basis.functions(x))
+        kernel = self.std**2 * np.exp(-0.5 * ((x[:, None] - x) / self.correlation) ** 2)
+        return _whitening_matrix(projection @ kernel @ projection.T, 1e-8)
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """The measured modes, in units of their standard errors, and what is known beforehand of mass and stiffness.
+
+    Attributes:
+        measured, nominal: as `fit_structure` takes them.
+        known: of mass, of stiffness: places and values, (n_known,) each.
+        priors: of mass, of stiffness.
+        which: (n_modes,) elastic mode of the structure, from 0, of each measured one.
+        reference: (n_modes,) the sensor where each shape is 1.
+        shapes: (n_sensors, n_modes) real.
+        unit_omega: (n_modes, n_modes) whitening matrix of the errors of ω.
+        unit_shapes: likewise of the shape of each mode at all sensors but its reference.
+    """
+
+    measured: Refined
+    nominal: Bar | Beam
+    known: tuple[tuple[np.ndarray, Floats], tuple[np.ndarray, Floats]]
+    priors: tuple[GaussianPrior | None, GaussianPrior | None]
+    which: np.ndarray
+    reference: np.ndarray
+    shapes: np.ndarray
+    unit_omega: np.ndarray
+    unit_shapes: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(
+        cls,
+        measured: Refined,
+        nominal: Bar | Beam,
+        known_mass: Sequence[tuple[float, float]] = (),
+        known_stiffness: Sequence[tuple[float, float]] = (),
+        mass_prior: GaussianPrior | None = None,
+        stiffness_prior: GaussianPrior | None = None,
+        numbers: Sequence[int] | None = None,
+    ) -> "Task":
+        """The task of `fit_structure`."""
+        modes = measured.modes
+        check_along(modes)
+        n, m = modes.n_modes, modes.n_outputs
+        if m < 2:
+            raise ValueError("one sensor shows no shape; use two or more")
+        # The entry that a shape is normalised by has no error.
+        reference = np.argmin(measured.shape_std, axis=0)
+        unit_shapes = []
+        for covariance, k in zip(measured.shape_covariance, reference, strict=True):
+            others = np.delete(np.delete(covariance, k, axis=0), k, axis=1)
+            unit_shapes.append(_whitening_matrix(others + PROBLEM.trusted**2 * np.eye(m - 1)))
+        domain = Interval(nominal.length)
+        which = _paired(measured, nominal) if numbers is None else np.asarray(numbers, int) - 1
+        if which.shape != (n,) or (which < 0).any() or np.unique(which).size < n:
+            raise ValueError(f"numbers must name {n} different modes from 1 on; got {numbers}")
+        return cls(
+            measured=measured,
+            nominal=nominal,
+            known=(known_values(domain, known_mass, "mass"), known_values(domain, known_stiffness, "stiffness")),
+            priors=(mass_prior, stiffness_prior),
+            which=which,
+            reference=reference,
+            shapes=(modes.shapes / modes.shapes[reference, np.arange(n)]).real,
+            unit_omega=_whitening_matrix(measured.covariance[:n, :n] + np.diag((PROBLEM.trusted * modes.omega) ** 2)),
+            unit_shapes=tuple(unit_shapes),
+        )
+
+    @property
+    def n_data(self) -> int:
+        """Number of frequencies and of shape entries, less one per shape for its scale."""
+        return self.shapes.size
+
+    @property
+    def penalty(self) -> float:
+        """ln n_data, by which each parameter raises the criterion."""
+        return float(np.log(self.n_data))
+
+
+def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
+    """Index of the nominal structure's elastic mode paired with each measured one by shape, (n_modes,), from 0."""
+    modes, none = measured.modes, Basis.polynomial(0)
+    n = modes.n_modes + 4
+    solved = SeriesStructure(nominal, none, none, modes.positions, n).solve(np.zeros(0), np.zeros(0))
+    assert solved is not None, "a nominal structure has positive mass and stiffness"
+    agreement = mac(normalised_shapes(modes.shapes).real, solved.modes(np.arange(n))[1])
+    pairs = linear_sum_assignment(-agreement)[1]
+    worst = int(np.argmin(agreement[np.arange(modes.n_modes), pairs]))
+    if agreement[worst, pairs[worst]] < PROBLEM.same_mode:
+        raise ValueError(
+            f"measured mode {worst + 1} at {modes.frequencies_hz[worst]:.4g} Hz resembles no mode of the nominal"
+            f" structure (best MAC {agreement[worst].max():.2f}); leave it out, correct the ends, or give numbers"
+        )
+    return np.asarray(pairs)
+
+
+def _whitening_matrix(covariance: np.ndarray, least: float = 1e-12) -> Floats:
+    """Whitening matrix W, W^T W the inverse of a covariance whose eigenvalues are at least a share of the largest."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors / np.sqrt(np.maximum(values, least * values.max()))).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +175,16 @@ class Problem:
     """χ² of a structure of given terms, as a function of its free parameters z.
 
     z are the coefficients that the known values leave free, and share, centre and width of a loss if there is one.
+
+    Attributes:
+        task: the data.
+        series: the structure.
+        held: of mass, of stiffness: c_0 and F of their coefficients c_0 + F z, which have the known values.
     """
 
     task: Task
     series: SeriesStructure
-    mass_held: tuple[np.ndarray, np.ndarray]  # (particular, free): d = particular + free @ z
-    stiffness_held: tuple[np.ndarray, np.ndarray]
+    held: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
     @classmethod
     def of(cls, task: Task, mass: Basis, stiffness: Basis) -> "Problem":
@@ -63,18 +193,26 @@ class Problem:
         Raises:
             ValueError: common factor unknown, more terms than data, known values the series cannot take.
         """
-        if mass.n_terms and stiffness.n_terms and not (len(task.known_mass) or len(task.known_stiffness)):
-            if task.mass_prior is None and task.stiffness_prior is None:
-                raise ValueError(
-                    "modes determine mass and stiffness only up to a common factor; give known_mass at a point,"
-                    " known_stiffness, or a prior"
-                )
-        series = SeriesStructure(task.nominal, mass, stiffness, task.measured.modes.positions)
-        known = (
-            (mass, task.known_mass, task.nominal.mass_per_length, "masses"),
-            (stiffness, task.known_stiffness, series.nominal_stiffness, "stiffnesses"),
+        is_known = any(x.size for x, _ in task.known) or task.priors != (None, None)
+        if mass.n_terms and stiffness.n_terms and not is_known:
+            raise ValueError(
+                "modes determine mass and stiffness only up to a common factor; give known_mass at a point,"
+                " known_stiffness, or a prior"
+            )
+        series = SeriesStructure(
+            task.nominal, mass, stiffness, task.measured.modes.positions, int(task.which.max()) + 1
         )
-        problem = cls(task, series, *(_held(*constraint) for constraint in known))
+        held = []
+        for basis, nominal, (x, values), what in zip(
+            series.bases, series.nominal_profiles, task.known, ("masses", "stiffnesses"), strict=True
+        ):
+            if basis.n_terms and x.size:
+                ratios = values / nominal(x) - 1.0
+                size = max(np.abs(ratios).max(), 1.0)
+                held.append(held_exactly(basis.functions(x), ratios, f"{what} over the nominal", size))
+            else:
+                held.append((np.zeros(basis.n_terms), np.eye(basis.n_terms)))
+        problem = cls(task, series, (held[0], held[1]))
         if problem.n_free > task.n_data:
             raise ValueError(
                 f"{problem.n_free} terms cannot be found from {task.n_data} data of {task.which.size} modes at"
@@ -85,151 +223,90 @@ class Problem:
     @property
     def n_free(self) -> int:
         """Number of free parameters without a loss."""
-        return int(self.mass_held[1].shape[1] + self.stiffness_held[1].shape[1])
+        return sum(free.shape[1] for _, free in self.held)
 
-    def fit(self, near: FittedStructure | None = None, loss: LocalLoss | None = None) -> FittedStructure:
-        """The maximum likelihood structure, searched from an earlier fit, and with a loss from `loss` if given."""
-        length = self.task.nominal.length
-        z = self._start() if near is None else self.free_near(near)[: self.n_free]
-        low, high = np.full(z.size, -np.inf), np.full(z.size, np.inf)
-        if loss is not None:
-            z = np.r_[z, loss.share, loss.centre, loss.width]
-            low = np.r_[low, 0.0, 0.0, PROBLEM.narrowest * length]
-            high = np.r_[high, PROBLEM.most_lost, length, PROBLEM.widest * length]
-            z[-3:] = np.clip(z[-3:], *(0.999 * low[-3:] + 0.001 * high[-3:], 0.001 * low[-3:] + 0.999 * high[-3:]))
-        if z.size == 0:
-            return self.report(z)
-        if near is not None and not self.residuals(z)[1].any():
-            z[: self.n_free] = self._start()  # with other terms the earlier fit may not be positive
-        residuals_at = Once(self.residuals)
+    @cached_property
+    def places(self) -> Floats:
+        """Places (n_places,), m, at which series are compared."""
+        return np.asarray((np.arange(100) + 0.5) / 100 * self.series.nominal.length)
 
-        def search(z: np.ndarray) -> OptimizeResult:
-            tolerances = {"ftol": 1e-5, "xtol": 1e-9, "gtol": 1e-9, "max_nfev": PROBLEM.most_steps}
-            return least_squares(
-                lambda z: residuals_at(z)[0],
-                z,
-                lambda z: residuals_at(z)[1],
-                bounds=(low, high),
-                x_scale="jac",
-                **tolerances,
-            )
-
-        solution = search(z)
-        if loss is not None:
-            # χ² does not depend on an edge beyond an end
-            inside = self._edges_inside(solution.x)
-            if inside is not solution.x:
-                solution = min(solution, search(np.clip(inside, low, high)), key=lambda result: result.cost)
-        return self.report(solution.x)
-
-    def nominal(self) -> FittedStructure:
-        """The nominal structure, scaled to the known values and the measured frequencies."""
-        return self.report(self._start())
+    @cached_property
+    def _prior_roots(self) -> list[tuple[Floats, slice]]:
+        """`GaussianPrior.root` of each prior, and the place of its coefficients among d, e."""
+        n, m = (basis.n_terms for basis in self.series.bases)
+        each = zip(self.task.priors, self.series.bases, (slice(0, n), slice(n, n + m)), strict=True)
+        return [
+            (prior.root(basis, self.series.nominal.length), columns)
+            for prior, basis, columns in each
+            if prior is not None and basis.n_terms
+        ]
 
     def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, LocalLoss | None]:
         """Coefficients d, e and the loss, from the free parameters."""
-        (d0, d_free), (e0, e_free) = self.mass_held, self.stiffness_held
+        (d0, d_free), (e0, e_free) = self.held
         n, m = d_free.shape[1], self.n_free
         loss = LocalLoss(*(float(value) for value in z[m:])) if z.size > m else None
         return d0 + d_free @ z[:n], e0 + e_free @ z[n:m], loss
 
-    def free_of(self, d: np.ndarray, e: np.ndarray) -> np.ndarray:
-        """The free parameters of coefficients that satisfy the known values."""
-        both = zip((d, e), (self.mass_held, self.stiffness_held), strict=True)
-        return np.concatenate([free.T @ (value - particular) for value, (particular, free) in both])
+    def free_of(self, coefficients: np.ndarray) -> Floats:
+        """The free parameters of coefficients (d, e) that have the known values."""
+        (d0, d_free), (e0, e_free) = self.held
+        d, e = np.split(coefficients, [d0.size])
+        return np.concatenate([d_free.T @ (d - d0), e_free.T @ (e - e0)])
 
     def coefficient_jacobian(self, z: np.ndarray) -> np.ndarray:
         """∂(d, e, loss)/∂z."""
-        return np.asarray(block_diag(self.mass_held[1], self.stiffness_held[1], np.eye(z.size - self.n_free)))
+        return np.asarray(block_diag(*(free for _, free in self.held), np.eye(z.size - self.n_free)))
 
-    def residuals(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def residuals(self, z: np.ndarray) -> tuple[Floats, Floats]:
         """Residuals of frequencies, shapes and priors in standard errors, (n_rows,), and their Jacobian by z."""
         task = self.task
         d, e, loss = self.parts(z)
-        solved = self.series.solve(d, e, n_modes=int(task.which.max()) + 1, loss=loss)
-        coefficient_jacobian = self.coefficient_jacobian(z)
-        priors = [
-            (task.mass_prior, self.series.mass, d, slice(0, d.size)),
-            (task.stiffness_prior, self.series.stiffness, e, slice(d.size, d.size + e.size)),
-        ]
-        n_prior = sum(value.size for prior, _, value, _ in priors if prior is not None)
+        solved = self.series.solve(d, e, loss)
         if solved is None:
-            # not positive: large residuals, so that the step is rejected
-            return np.full(task.n_data + n_prior, 1e8), np.zeros((task.n_data + n_prior, z.size))
+            n_rows = task.n_data + sum(len(root) for root, _ in self._prior_roots)
+            return np.full(n_rows, NOT_POSITIVE), np.zeros((n_rows, z.size))
         computed = solved.sensitivity(task.which)
         rows = [task.unit_omega @ (computed.omega - task.measured.modes.omega)]
         slopes = [task.unit_omega @ computed.omega_by]
         for r, (k, unit) in enumerate(zip(task.reference, task.unit_shapes, strict=True)):
-            others = np.arange(task.shapes.shape[0]) != k
             shape, shape_slopes = computed.shapes[:, r], computed.shapes_by[:, r]
             ratio = shape / shape[k]
-            rows.append(unit @ (ratio - task.shapes[:, r])[others])
-            slopes.append(unit @ ((shape_slopes - ratio[:, None] * shape_slopes[k]) / shape[k])[others])
-        for prior, basis, value, columns in priors:
-            if prior is not None and value.size:
-                root = prior.root(basis, task.nominal.length)
-                rows.append(root @ value)
-                slope = np.zeros((value.size, coefficient_jacobian.shape[0]))
-                slope[:, columns] = root
-                slopes.append(slope)
-        return np.concatenate(rows), np.vstack(slopes) @ coefficient_jacobian
+            rows.append(unit @ np.delete(ratio - task.shapes[:, r], k))
+            ratio_slopes = (shape_slopes - ratio[:, None] * shape_slopes[k]) / shape[k]
+            slopes.append(unit @ np.delete(ratio_slopes, k, axis=0))
+        coefficients = np.r_[d, e]
+        for root, columns in self._prior_roots:
+            rows.append(root @ coefficients[columns])
+            slope = np.zeros((len(root), slopes[0].shape[1]))
+            slope[:, columns] = root
+            slopes.append(slope)
+        return np.concatenate(rows), np.vstack(slopes) @ self.coefficient_jacobian(z)
 
-    def report(self, z: np.ndarray) -> FittedStructure:
-        """The structure of free parameters z, with its covariance and confidence bands."""
-        task, series = self.task, self.series
-        if z.size > self.n_free:
-            z = np.r_[z[: self.n_free], astuple(LocalLoss(*z[self.n_free :]).within(task.nominal.length))]
-        rows = self.residuals(z)[0]
-        chi2 = float(rows @ rows)
-        degrees_of_freedom = rows.size - z.size
-        d, e, loss = self.parts(z)
-        parameters = np.r_[d, e, z[self.n_free :]]
-        coefficient_jacobian = self.coefficient_jacobian(z)
-        covariance = coefficient_jacobian @ self._covariance(z) @ coefficient_jacobian.T
-        if degrees_of_freedom > 0 and chi2 > chi2_distribution.isf(TASK.unlikely, degrees_of_freedom):
-            covariance = covariance * chi2 / degrees_of_freedom
-        std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        root = symmetric_root(covariance / np.outer(std, std))
-        standard_normal = np.random.default_rng(0).standard_normal((PROBLEM.draws, parameters.size))
-        draws = parameters + std * (standard_normal @ root.T)
-        n, m = d.size, d.size + e.size
-        length = task.nominal.length
-        mass = _uncertain(task.nominal.mass_per_length, series.mass, d, draws[:, :n], length=length)
-        stiffness = _uncertain(
-            series.nominal_stiffness, series.stiffness, e, draws[:, n:m], loss, draws[:, m:], length=length
-        )
-        name = "bending_stiffness" if isinstance(task.nominal, Beam) else "axial_stiffness"
-        changes: dict[str, Any] = {"mass_per_length": mass.profile, name: stiffness.profile}
-        solved = series.solve(d, e, n_modes=int(task.which.max()) + 1, loss=loss)
+    def start(self) -> Floats:
+        """Free parameters of the nominal structure, scaled to the known values and the measured frequencies."""
+        known = zip(self.task.known, self.series.nominal_profiles, strict=True)
+        mass, stiffness = (float(np.mean(values / nominal(x))) if x.size else 1.0 for (x, values), nominal in known)
+        z = self.nearest(mass, stiffness)
+        solved = self.series.solve(*self.parts(z))
         if solved is None:
-            raise ValueError(
-                "no positive mass and stiffness of this many terms were found; use fewer terms, a prior, or a nominal"
-                " structure nearer to the real one"
-            )
-        computed = solved.sensitivity(task.which)
-        agreement = np.diag(mac(computed.shapes, task.shapes))
-        try:
-            structure = replace(task.nominal, **changes)
-        except ValueError as error:
-            raise ValueError(
-                f"{error}; use fewer terms, a prior, or a nominal structure nearer to the real one"
-            ) from None
-        return FittedStructure(
-            structure=structure,
-            mass=mass,
-            stiffness=stiffness,
-            n_terms=(n, e.size),
-            loss=loss,
-            chi2=chi2,
-            degrees_of_freedom=degrees_of_freedom,
-            criterion=chi2 + z.size * float(np.log(task.n_data)),
-            parameters=frozen(parameters),
-            covariance=frozen(covariance),
-            numbers=task.which + 1,
-            check=SelfCheck(computed.omega / task.measured.modes.omega - 1.0, agreement),
-        )
+            return z
+        ratios = self.task.measured.modes.omega**2 / solved.eigenvalues[solved.n_rigid + self.task.which]
+        ratio = float(np.median(ratios))
+        (_, free), (known_at, _) = self.held[1], self.task.known[1]
+        if free.shape[1] and not known_at.size:  # the stiffness is free to be scaled
+            return self.nearest(mass, stiffness * ratio)
+        return self.nearest(mass / ratio, stiffness)
 
-    def _covariance(self, z: np.ndarray) -> np.ndarray:
+    def nearest(self, mass: np.ndarray | float, stiffness: np.ndarray | float) -> Floats:
+        """Free parameters of the series nearest to given ratios to the nominal mass and stiffness at `places`."""
+        z = []
+        for basis, ratio, (particular, free) in zip(self.series.bases, (mass, stiffness), self.held, strict=True):
+            terms = basis.functions(self.places)
+            z.append(np.linalg.lstsq(terms @ free, ratio - 1.0 - terms @ particular, rcond=None)[0])
+        return np.concatenate(z)
+
+    def covariance(self, z: np.ndarray) -> Floats:
         """Covariance of the free parameters, the Cramér-Rao bound.
 
         χ² does not depend on an edge of a loss beyond an end, and hardly on one just before it: the standard error of
@@ -239,20 +316,22 @@ class Problem:
             slopes = self.residuals(z)[1]
             return scaled_inverse(slopes.T @ slopes, INDISTINCT)
         from_edges = block_diag(np.eye(z.size - 2), FROM_EDGES)
-        return np.asarray(from_edges @ self._edge_covariance(self._edges_inside(z)) @ from_edges.T)
+        return np.asarray(from_edges @ self._edge_covariance(self.edges_inside(z)) @ from_edges.T)
 
-    def _edge_covariance(self, z: np.ndarray) -> np.ndarray:
+    def _edge_covariance(self, z: np.ndarray) -> Floats:
         """The Cramér-Rao bound with the edges of the loss in place of centre and width."""
         slopes = self.residuals(z)[1]
         slopes = np.hstack([slopes[:, :-2], slopes[:, -2:] @ FROM_EDGES])
         return scaled_inverse(slopes.T @ slopes, INDISTINCT)
 
-    def _edges_inside(self, z: np.ndarray) -> np.ndarray:
+    def edges_inside(self, z: np.ndarray) -> np.ndarray:
         """z with each edge of the loss at least one standard error inside the ends; z itself where they are."""
-        return self._edge_inside(self._edge_inside(z, 0, 1.0), 1, -1.0)
+        for edge, inward in enumerate((1.0, -1.0)):
+            z = self._edge_inside(z, edge, inward)
+        return z
 
     def _edge_inside(self, z: np.ndarray, edge: int, inward: float) -> np.ndarray:
-        width, length = z[-1], self.task.nominal.length
+        width, length = z[-1], self.series.nominal.length
         depth = np.linalg.solve(FROM_EDGES, z[-2:])[edge]
         depth = depth if inward > 0 else length - depth
 
@@ -270,81 +349,3 @@ class Problem:
             middle = float(np.sqrt(low * high))
             low, high = (middle, high) if is_within_error(middle) else (low, middle)
         return shifted(high)
-
-    def free_near(self, fit: FittedStructure) -> np.ndarray:
-        """Free parameters, with those of a loss, of the series nearest to a structure fitted with other terms."""
-        nominal, length = self.task.nominal, self.task.nominal.length
-        x = (np.arange(100) + 0.5) / 100 * length
-        mass = fit.mass(x) / nominal.mass_per_length(x)
-        stiffness = fit.stiffness(x) / self.series.nominal_stiffness(x)
-        if fit.loss is None:
-            return self._nearest(x, mass, stiffness)
-        intact = stiffness / fit.loss.of(Profile.constant(1.0), length)(x)
-        return np.asarray(np.r_[self._nearest(x, mass, intact), fit.parameters[-3:]])
-
-    def _start(self) -> np.ndarray:
-        """Free parameters of the nominal structure, scaled to the known values and the measured frequencies."""
-        task, series = self.task, self.series
-        x = (np.arange(100) + 0.5) / 100 * task.nominal.length
-        scale = np.ones(2)
-        for i, (pairs, nominal) in enumerate(
-            ((task.known_mass, task.nominal.mass_per_length), (task.known_stiffness, series.nominal_stiffness))
-        ):
-            if len(pairs):
-                scale[i] = np.mean(pairs[:, 1] / nominal(pairs[:, 0]))
-        z = self._nearest(x, np.full(x.size, scale[0]), np.full(x.size, scale[1]))
-        d, e, _ = self.parts(z)
-        solved = series.solve(d, e, n_modes=int(task.which.max()) + 1)
-        if solved is None:
-            return z
-        ratio = np.median(task.measured.modes.omega**2 / solved.eigenvalues[solved.n_rigid + task.which])
-        if self.stiffness_held[1].shape[1] and not len(task.known_stiffness):
-            return self._nearest(x, np.full(x.size, scale[0]), np.full(x.size, scale[1] * ratio))
-        return self._nearest(x, np.full(x.size, scale[0] / ratio), np.full(x.size, scale[1]))
-
-    def _nearest(self, x: np.ndarray, mass: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
-        """Free parameters of the series nearest to given ratios to the nominal mass and stiffness at x."""
-        z = []
-        for basis, ratio, (particular, free) in (
-            (self.series.mass, mass, self.mass_held),
-            (self.series.stiffness, stiffness, self.stiffness_held),
-        ):
-            terms = basis.functions(x)
-            z.append(np.linalg.lstsq(terms @ free, ratio - 1.0 - terms @ particular, rcond=None)[0])
-        return np.concatenate(z)
-
-
-def _held(basis: Basis, known: np.ndarray, nominal: Profile, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """A particular solution of the known values, and the null space of their rows (n_terms, n_free)."""
-    if basis.n_terms == 0 or len(known) == 0:
-        return np.zeros(basis.n_terms), np.eye(basis.n_terms)
-    rows, values = basis.functions(known[:, 0]), known[:, 1] / nominal(known[:, 0]) - 1.0
-    return held_exactly(rows, values, f"{what} over the nominal", max(np.abs(values).max(), 1.0))
-
-
-def _uncertain(
-    nominal: Profile,
-    basis: Basis,
-    coefficients: np.ndarray,
-    draws: np.ndarray,
-    loss: LocalLoss | None = None,
-    loss_draws: np.ndarray | None = None,
-    *,
-    length: float,
-) -> UncertainProfile:
-    """The distribution nominal (1 + series) (1 - loss), with its Monte Carlo samples."""
-
-    def values(x: Floats, coefficients: Floats, losses: Floats | None) -> Floats:
-        series: Floats = nominal(x) * (1.0 + coefficients @ basis.functions(x).T)
-        if losses is None:
-            return series
-        share, centre, width = losses[:, :, None].transpose(1, 0, 2)
-        inside = np.abs(x - centre) < 0.5 * np.maximum(width, 0.0)
-        return np.where(inside, 1.0 - share, 1.0) * series
-
-    smooth = Profile(
-        lambda x: values(np.ravel(x), coefficients, None).reshape(np.shape(x)),
-        tuple(sorted({*nominal.breaks, *basis.breaks})),
-    )
-    profile = smooth if loss is None else loss.of(smooth, length)
-    return UncertainProfile(profile, lambda x: values(x, draws, None if loss is None else loss_draws), length)

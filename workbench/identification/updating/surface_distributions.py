@@ -20,10 +20,15 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from scipy.linalg import null_space
 
-from workbench.identification.shapes.mode_pairing import subspace_mac
 from workbench.identification.shapes.surface_spline import SurfaceErrors
-from workbench.identification.updating.distributions import mass_series, stiffness_series
-from workbench.identification.updating.self_check import SelfCheck
+from workbench.identification.updating.distributions import (
+    SelfCheck,
+    compared,
+    known_masses,
+    mass_series,
+    relation_weights,
+    stiffness_series,
+)
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.plate import Plate, bending_squares, check_poisson_ratio
@@ -167,28 +172,17 @@ def plate_mass_and_stiffness(
     x, y = at.T
     shapes = modes.phi(at)
     size = np.sqrt((shapes**2).mean(axis=0))
-    shapes = shapes / size
-    if not known_mass:
-        raise ValueError("orthogonality determines the mass only up to a factor; give the mass at one point or more")
-    places = np.vstack([modes.domain.locate(place) for place, _ in known_mass])
-    values = np.array([value for _, value in known_mass], float)
-    if not (np.isfinite(values) & (values > 0)).all():
-        raise ValueError(f"a known mass must be positive and finite, kg/m²; got {values}")
-    coefficients, misfit = mass_series(
-        shapes,
+    places, values = known_masses(modes.domain, known_mass)
+    held = mass_basis.functions(*places.T)
+    coefficients, misfit, gram = mass_series(
+        shapes / size,
         weights,
         mass_basis.functions(x, y),
         prior_mass(x, y),
-        mass_basis.functions(*places.T),
+        held,
         values - prior_mass(*places.T),
     )
-    mass = SurfaceDistribution(frozen(coefficients), mass_basis, prior_mass, misfit)
-    a_squared = (weights * mass(x, y)) @ shapes**2
-    if (a_squared <= 0).any():
-        raise ValueError(
-            "the identified mass is negative over so much of the plate that a mode has no positive scale; use fewer"
-            " terms, more sensors, or a prior estimate"
-        )
+    mass, a_squared = SurfaceDistribution(frozen(coefficients), mass_basis, prior_mass, misfit), np.diag(gram)
     strains = [
         (square.weight(x, y), sum(factor * modes.phi(at, (i, j)) for factor, i, j in square.parts) / size)
         for square in bending_squares(Field.constant(1.0), poisson_ratio)
@@ -199,9 +193,7 @@ def plate_mass_and_stiffness(
     stiffness = SurfaceDistribution(frozen(coefficients), stiffness_basis, prior_stiffness, misfit)
     if errors is not None:
         # none for the mass: near a free edge splines have the same error in all modes, and the mass twice that
-        covariance = _stiffness_covariance(
-            modes, errors, mass, stiffness, poisson_ratio, mass_basis.functions(*places.T)
-        )
+        covariance = _stiffness_covariance(modes, errors, mass, stiffness, poisson_ratio, held)
         stiffness = replace(stiffness, covariance=frozen(covariance))
     return SurfaceDistributions(mass, stiffness, frozen(size * np.sqrt(a_squared)))
 
@@ -240,7 +232,7 @@ def _stiffness_covariance(
     different, every = np.triu_indices(n, 1), np.triu_indices(n)
     diagonal = np.flatnonzero(every[0] == every[1])
     m, d = weights * mass(x, y), weights * stiffness(x, y)
-    weight = 1.0 / np.maximum(omega[every[0]] * omega[every[1]], 1e-12 * omega.max() ** 2)
+    weight = relation_weights(omega)
 
     def change_of_relations(form: np.ndarray, density: np.ndarray, pairs: tuple[np.ndarray, ...]) -> np.ndarray:
         """Change of each relation per error of each mode's shape, (n_modes, n_pairs, n_derivatives n_at)."""
@@ -320,7 +312,7 @@ def check_plate(
     """
     if not isinstance(measured.domain, Rectangle):
         raise ValueError(f"m(x, y) and D(x, y) are those of a plate; these modes are on {measured.domain}")
-    n = measured.n_modes
+    # Edges that no plate has are no fault of what was identified.
     plate = Plate(
         length=measured.domain.length,
         mass_per_area=1.0,
@@ -328,12 +320,12 @@ def check_plate(
         poisson_ratio=poisson_ratio,
         edges=edges,
     )
-    try:
-        plate = replace(plate, mass_per_area=found.mass.field, bending_stiffness=found.stiffness.field)
-        computed = plate.modes(first_mode + n, tolerance=tolerance).select(slice(first_mode, None))
-    except ValueError as error:
-        return SelfCheck(np.full(n, np.inf), np.zeros(n), str(error))
     share = np.linspace(0.0, 1.0, PER_SIDE)
     grid = np.stack(np.meshgrid(*(side * share for side in measured.domain.length), indexing="ij"), axis=-1)
-    agreement = subspace_mac(measured.phi(grid.reshape(-1, 2)), computed.phi(grid.reshape(-1, 2)), computed.omega)
-    return SelfCheck(computed.omega / measured.omega - 1.0, np.diag(agreement))
+    return compared(
+        lambda: replace(plate, mass_per_area=found.mass.field, bending_stiffness=found.stiffness.field),
+        measured,
+        first_mode,
+        tolerance,
+        grid.reshape(-1, 2),
+    )
