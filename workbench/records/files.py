@@ -6,17 +6,15 @@ detects later changes of the file. Files of other programs have no such text: al
 names in the file.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
-from workbench.arrays import Floats
 from workbench.records import csv_file, hdf5_file, mat_file, npz_file, tdms_file, uff_file, wav_file
 from workbench.records.assembly import KEY, checksum, legible, record_of
 from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_file, reading
 from workbench.records.named_arrays import signals_of
-from workbench.records.record import Channel, Record
+from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions, complex_columns, holds_transfer, transfer_of
 from workbench.records.units import SI, Units
 
@@ -137,7 +135,7 @@ def write_record(record: Record, path: str | Path) -> Path:
     if path.suffix.lower() in READ_ONLY:
         written = ", ".join(sorted(set(FORMATS) - set(READ_ONLY)))
         raise RecordFileError(f"{path}: {path.suffix} is read, not written; use one of {written}")
-    signals = {f"{kind}:{legible(path, channel.name)}": row for kind, channel, row in _rows(record)}
+    signals = {f"{kind}:{legible(path, channel.name)}": row for kind, channel, row in record.signals()}
     header = {
         "name": record.name,
         "sample_time": record.sample_time,
@@ -145,7 +143,7 @@ def write_record(record: Record, path: str | Path) -> Path:
         "input_hold": record.input_hold,
         "channels": [
             {"kind": kind, "name": c.name, "quantity": c.quantity, "unit": c.unit, "at": c.at, "noise_std": c.noise_std}
-            for kind, c, _ in _rows(record)
+            for kind, c, _ in record.signals()
         ],
     }
     stored = map(module.as_stored, signals.values()) if module is uff_file else signals.values()
@@ -159,10 +157,3 @@ def _format(path: Path) -> ModuleType:
     if path.suffix.lower() not in FORMATS:
         raise RecordFileError(f"{path}: the ending {path.suffix!r} names no format; use one of {', '.join(FORMATS)}")
     return FORMATS[path.suffix.lower()]
-
-
-def _rows(record: Record) -> Iterator[tuple[str, Channel, Floats]]:
-    for channel, row in zip(record.input_channels, record.inputs, strict=True):
-        yield "input", channel, row
-    for channel, row in zip(record.output_channels, record.outputs, strict=True):
-        yield "output", channel, row

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from workbench.records.assembly import legible, unit_remark
 from workbench.records.confined import load_confined
 from workbench.records.limits import RecordFileError, check_file
-from workbench.records.record import Channel, Record
+from workbench.records.record import Channel, Record, rows_of
 from workbench.records.units import BRACKETED, split_unit, unit_named
 from workbench.renamed import Renamed
 from workbench.structure.modes import freeze
@@ -100,10 +100,7 @@ class TransferFunctions(Printed):
         Raises:
             ValueError: an unknown output.
         """
-        for name in outputs:
-            if name not in self.output_names:
-                raise ValueError(f"{self.name} has no output {name!r}; it has {', '.join(self.output_names)}")
-        rows = [self.output_names.index(name) for name in outputs]
+        rows = rows_of(self.name, self.output_names, outputs)
         channels = tuple(self.output_channels[row] for row in rows)
         return replace(self, values=self.values[rows], output_channels=channels)
 
