@@ -236,29 +236,21 @@ def write(path: Path, time: np.ndarray, signals: dict[str, Any], header: dict[st
         text = json.dumps(described, separators=(",", ":")).replace(" ", r"\u0020")
         if len(text) > 5 * LINE:
             raise RecordFileError(f"{path}: the names of channel {facts['name']!r} are too long for UFF; shorten them")
-        lines = {f"id{j + 1}": text[j * LINE : (j + 1) * LINE].ljust(LINE, " ") or " " for j in range(5)}
         file.write_sets(
-            pyuff.prepare_58(
-                **lines,
-                binary=0,
-                func_type=1,
-                rsp_node=i + 1,
-                rsp_dir=3,
-                ref_node=1,
-                ref_dir=3,
-                ver_num=0,
-                ord_data_type=4,
-                abscissa_spacing=1,
-                num_pts=values.size,
-                abscissa_min=float(time[0]),
-                abscissa_inc=header["sample_time"],
-                abscissa_spec_data_type=17,
-                orddenom_spec_data_type=0,
-                z_axis_spec_data_type=0,
-                ordinate_spec_data_type=TYPES.get(facts["quantity"], 0),
-                x=time,
-                data=np.asarray(values, float),
-                return_full_dict=False,
-            ),
+            {
+                **{f"id{j + 1}": text[j * LINE : (j + 1) * LINE] or " " for j in range(5)},
+                "type": 58,
+                "func_type": 1,
+                "rsp_node": i + 1,
+                "rsp_dir": 3,
+                "ref_node": 1,
+                "ref_dir": 3,
+                "abscissa_spacing": 1,
+                "abscissa_spec_data_type": 17,
+                "ordinate_spec_data_type": TYPES.get(facts["quantity"], 0),
+                "orddenom_spec_data_type": 0,
+                "x": time,
+                "data": np.asarray(values, float),
+            },
             mode="add",
         )
