@@ -188,9 +188,9 @@ def _channel(path: Path, name: str, facts: Mapping[str, Any], unit: Unit | None)
         return Channel(legible(path, name), unit.quantity, unit.si)
     quantity, symbol, at, noise = (facts.get(fact) for fact in ("quantity", "unit", "at", "noise_std"))
     try:
-        if not all(text is None or isinstance(text, str) for text in (quantity, symbol)):
+        if not (isinstance(quantity, str | None) and isinstance(symbol, str | None)):
             raise TypeError(f"quantity and unit are words; got {quantity!r} and {symbol!r}")
-        if not all(number is None or isinstance(number, int | float) for number in (noise,)):
+        if not isinstance(noise, int | float | None):
             raise TypeError(f"noise_std is a number; got {noise!r}")
         return Channel(legible(path, name), quantity or "", symbol or "", at, noise)
     except (TypeError, ValueError) as error:

@@ -1,12 +1,11 @@
 """Limits of the size of a file and of the time to read it, and the error of all readers and writers."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
-
-import numpy as np
 
 COPIES = 4  # of a record, at most, in memory while it is read
 BYTES_PER_NUMBER = 8
@@ -57,7 +56,7 @@ class Limits:
 
     def __post_init__(self) -> None:
         for name in ("memory", "seconds"):
-            if not 0 < getattr(self, name) < np.inf:
+            if not 0 < getattr(self, name) < inf:
                 raise ValueError(f"the limit of {name} must be positive; got {getattr(self, name)}")
 
     @classmethod
@@ -120,16 +119,6 @@ def check_file(path: Path) -> None:
             f"{path} has {size / 2**30:.3g} GiB; at most {MOST_BYTES / 2**30:g} GiB are read: cut the record or take"
             " fewer channels"
         )
-
-
-def check_arrays(path: Path, arrays: Iterable[np.ndarray], limits: Limits = DEFAULT) -> None:
-    """Refuse arrays that are too many or too large.
-
-    Raises:
-        RecordFileError: more than `MOST_CHANNELS` arrays, or more numbers in all than the memory allows.
-    """
-    sizes = [np.size(values) for values in arrays]
-    check_counts(path, len(sizes), sum(sizes), limits)
 
 
 def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = DEFAULT, share: float = 1.0) -> None:
