@@ -9,6 +9,7 @@ from scipy.io import savemat
 
 from workbench.records.files import FORMATS, READ_ONLY, RecordFileError, read_record, write_record
 from workbench.records.record import Channel, Record
+from workbench.structure.domain import Between, Patch
 
 
 def sample() -> Record:
@@ -39,6 +40,15 @@ def test_a_record_comes_back_as_it_went(tmp_path, ending):
     assert back.input_channels == record.input_channels
     for what in ("sample_time", "start_time", "name", "input_hold"):
         assert getattr(back, what) == getattr(record, what)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".uff", ".npz"])
+def test_places_between_two_and_patches_come_back(tmp_path, ending):
+    """They were written as bare numbers, and read as a pair (x, y) or not at all."""
+    places = (Between(0.2, 0.5), Between("tip", "root"), Between((0.1, 0.2), (0.3, 0.4)), Patch(0.3, 0.4, 0.1, 0.2))
+    channels = tuple(Channel(f"u{i}", "force", at=at) for i, at in enumerate((*places, (0.2, 0.5), "tip", None)))
+    record = replace(sample(), inputs=np.ones((len(channels), 50)), input_channels=channels)
+    assert read_record(write_record(record, tmp_path / f"run{ending}")).input_channels == channels
 
 
 def test_the_hold_of_inputs_is_kept_and_can_be_given(tmp_path):

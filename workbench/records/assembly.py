@@ -17,8 +17,10 @@ from workbench.records.instants import UNIFORM, Sampling, even_sampling
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.records.units import SI, Unit, Units, split_unit, unit_named
+from workbench.structure.domain import Between, Patch
 
 KINDS = ("input", "output")
+COMPOUND = {"Between": Between, "Patch": Patch}  # places of several numbers or names
 KEY = "crc32"  # of the checksum that detects changes of a file written here
 
 
@@ -183,6 +185,14 @@ def legible(path: Path, name: str) -> str:
     return name
 
 
+def facts_of(kind: str, channel: Channel) -> dict[str, Any]:
+    """The description of a channel as JSON holds it, a place that is no single one under the name of its type."""
+    facts = {name: getattr(channel, name) for name in ("name", "quantity", "unit", "at", "noise_std")}
+    if isinstance(channel.at, tuple(COMPOUND.values())):
+        facts["at"] = {type(channel.at).__name__: channel.at}
+    return {"kind": kind, **facts}
+
+
 def _channel(path: Path, name: str, facts: Mapping[str, Any], unit: Unit | None) -> Channel:
     if unit is not None:
         return Channel(legible(path, name), unit.quantity, unit.si)
@@ -192,8 +202,11 @@ def _channel(path: Path, name: str, facts: Mapping[str, Any], unit: Unit | None)
             raise TypeError(f"quantity and unit are words; got {quantity!r} and {symbol!r}")
         if not isinstance(noise, int | float | None):
             raise TypeError(f"noise_std is a number; got {noise!r}")
+        if isinstance(at, dict):
+            ((compound, parts),) = at.items()
+            at = COMPOUND[compound](*parts)
         return Channel(legible(path, name), quantity or "", symbol or "", at, noise)
-    except (TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise RecordFileError(f"{path}, channel {name!r}: {error}") from error
 
 

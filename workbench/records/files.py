@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 from workbench.records import csv_file, hdf5_file, mat_file, npz_file, tdms_file, uff_file, wav_file
-from workbench.records.assembly import KEY, checksum, legible, record_of
+from workbench.records.assembly import KEY, checksum, facts_of, legible, record_of
 from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_file, reading
 from workbench.records.named_arrays import signals_of
 from workbench.records.record import Record
@@ -141,10 +141,7 @@ def write_record(record: Record, path: str | Path) -> Path:
         "sample_time": record.sample_time,
         "start_time": record.start_time,
         "input_hold": record.input_hold,
-        "channels": [
-            {"kind": kind, "name": c.name, "quantity": c.quantity, "unit": c.unit, "at": c.at, "noise_std": c.noise_std}
-            for kind, c, _ in record.signals()
-        ],
+        "channels": [facts_of(kind, channel) for kind, channel, _ in record.signals()],
     }
     stored = map(module.as_stored, signals.values()) if module is uff_file else signals.values()
     header[KEY] = checksum(header, stored)
