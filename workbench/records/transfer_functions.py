@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -136,7 +136,7 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
         column = COLUMN.fullmatch(bare)
         if column is None:
             break
-        which = next(i for i in range(2, 6) if column[i])
+        which = column.lastindex or 0
         output, *before = _split_ratio(column[1] or "H")
         scaled = 10.0 ** (values / 20.0) if decibel else values
         if column[5]:
@@ -167,12 +167,19 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
     arrays = {"f" if in_unit else names[0]: lines, **both}
     if not remarks and not any(facts["unit"] for facts in outputs.values()):
         return arrays
-    described = {
-        "outputs": [{"name": name, **outputs[name]} for name in both],
-        "references": ["input 1"],
+    return arrays | description({name: outputs[name] for name in both}, ["input 1"], remarks)
+
+
+def description(
+    outputs: Mapping[str, Mapping[str, str]], references: Sequence[str], remarks: Iterable[str]
+) -> dict[str, np.ndarray]:
+    """Quantity and unit of each output, the names of the inputs, and remarks, as a text beside the arrays."""
+    table = {
+        "outputs": [{"name": name, **facts} for name, facts in outputs.items()],
+        "references": references,
         "remarks": [*filter(None, remarks)],
     }
-    return arrays | {DESCRIPTION: np.array(json.dumps(described))}
+    return {DESCRIPTION: np.array(json.dumps(table))}
 
 
 def _split_ratio(name: str) -> tuple[str, str, str]:

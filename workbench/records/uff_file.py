@@ -13,7 +13,7 @@ from workbench.records.assembly import unit_remark
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError
 from workbench.records.named_arrays import HEADER
-from workbench.records.transfer_functions import DESCRIPTION
+from workbench.records.transfer_functions import description
 from workbench.records.units import BY_QUANTITY, UNITS, unit_named
 
 # ordinate_spec_data_type of the format
@@ -137,12 +137,7 @@ def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | N
         remarks[f"by reciprocity, those from {named}"] = None
         found |= {(output, reference): found[reference, output] for output, reference in mirrored}
     values = np.array([[found[output, reference] for reference in references] for output in outputs])
-    described = {
-        "outputs": [{"name": name, **facts} for name, facts in outputs.items()],
-        "references": references,
-        "remarks": [*filter(None, remarks)],
-    }
-    return {"frequency_hz": lines, "transfer": values, DESCRIPTION: np.array(json.dumps(described))}
+    return {"frequency_hz": lines, "transfer": values, **description(outputs, references, remarks)}
 
 
 def as_stored(values: np.ndarray) -> np.ndarray:
