@@ -39,6 +39,18 @@ def test_decimation_keeps_poles_and_removes_what_is_above():
     assert np.abs(fewer.outputs[0] - np.exp(lam * fewer.time).real).max() < 5e-3
 
 
+def test_decimation_keeps_the_hold_of_inputs_and_refuses_a_factor_below_one():
+    """A band-limited record came back as one of held inputs, and a factor of 0 as a division by zero."""
+    time = 1e-3 * np.arange(600)
+    signal, channel = np.sin(20.0 * time)[None], (Channel("x"),)
+    record = Record(1e-3, signal, channel, signal, channel, input_hold="band-limited", remarks=("rounded times",))
+    fewer = decimate(record, 2)
+    assert (fewer.input_hold, fewer.remarks) == (record.input_hold, record.remarks)
+    for factor in (0, 2.5):
+        with pytest.raises(ValueError, match="the factor of a decimation is a whole number, 1 or more"):
+            decimate(record, factor)
+
+
 def test_read_transfer(tmp_path):
     path = tmp_path / "frf.mat"
     savemat(path, {"yspec": np.ones((9, 2), complex), "freq": 100})
