@@ -95,7 +95,8 @@ class Modes(Printed):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "domain", as_domain(self.domain))
-        omega = frozen(self.omega)
+        freeze(self, "omega")
+        omega = self.omega
         damping = np.asarray(self.damping, float)
         if omega.ndim != 1 or omega.size == 0:
             raise ValueError(f"Modes.omega must have shape (n_modes,) with at least one mode; got {omega.shape}")
@@ -108,12 +109,11 @@ class Modes(Printed):
                 f"Modes.damping must be finite, (n_modes,) ratios or (n_modes, n_modes) c_rs with n_modes ="
                 f" {omega.size}; got shape {damping.shape}"
             )
-        object.__setattr__(self, "omega", omega)
         object.__setattr__(self, "damping", frozen(damping))
         if self.covariance is not None:
-            object.__setattr__(self, "covariance", frozen(self.covariance))
+            freeze(self, "covariance")
         if self.shape_covariance is not None:
-            object.__setattr__(self, "shape_covariance", frozen(self.shape_covariance))
+            freeze(self, "shape_covariance")
             n_points = len(self.domain.names) if isinstance(self.domain, NamedPoints) else 0
             if self.shape_covariance.shape != (omega.size, n_points, n_points):
                 raise ValueError(

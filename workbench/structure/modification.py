@@ -9,7 +9,7 @@ from scipy.linalg import LinAlgError, eigh
 from workbench.renamed import former_arguments
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
-from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring, masses_among
+from workbench.structure.supports import Attachment, PointDamper, PointMass, masses_among
 
 OWN = 4  # dynamic modes per requested mode
 DIVERGES = 0.9  # ratio of flexibilities (see `truncation_error`) from which on the series counts as divergent
@@ -39,17 +39,16 @@ def attach(
     if n_modes is not None:
         return _with_residual(modes, attachments, n_modes, residual_flexibility)
     n = modes.n_modes
-    mass, stiffness, extra_damping = np.eye(n), np.diag(modes.omega**2), []
-    for part in attachments:
-        if isinstance(part, PointDamper):
-            extra_damping.append(part)
-            continue
+    mass, stiffness = np.eye(n), np.diag(modes.omega**2)
+    dampers = tuple(part for part in attachments if isinstance(part, PointDamper))
+    conservative = [part for part in attachments if not isinstance(part, PointDamper)]
+    for part in conservative:
         target = mass if isinstance(part, PointMass) else stiffness
         for derivative, value in enumerate(part.pair):
             if value:
                 shapes = _shapes_at(modes, part, derivative)
                 target += value * shapes.T @ shapes
-    if any(isinstance(part, PointMass | PointSpring) for part in attachments):
+    if conservative:
         omega, vectors = _eigen(stiffness, mass)
         if modes.proportional:
             # a rigid mode has no damping ratio: its coefficient c is kept
@@ -58,7 +57,7 @@ def attach(
             damping = vectors.T @ modes.damping @ vectors
     else:
         omega, vectors, damping = modes.omega, np.eye(n), modes.damping
-    for part in extra_damping:
+    for part in dampers:
         for derivative, value in enumerate(part.pair):
             if value:
                 shape = _shapes_at(modes, part, derivative) @ vectors
