@@ -155,7 +155,7 @@ class _Member(Printed):
                 warnings.warn(
                     "the modes did not converge to the tolerance: is there a jump in a profile given as a function?"
                     " Give its place by Profile(function, breaks=(x,)).",
-                    stacklevel=3,
+                    stacklevel=4,  # the caller of `modes`, beyond the limit of threads
                 )
                 break
 
