@@ -175,11 +175,7 @@ def _kind(key: str, described: Description) -> str:
 
 
 def legible(path: Path, name: str) -> str:
-    """The name of a channel, checked to be printable.
-
-    Raises:
-        RecordFileError: control characters in the name.
-    """
+    """The name of a channel; one with control characters is refused by a `RecordFileError`."""
     if not name.isprintable():
         raise RecordFileError(f"{path}: the name {name!r} holds control characters; rename the channel")
     return name

@@ -15,7 +15,8 @@ from workbench.records.assembly import KEY, checksum, facts_of, legible, record_
 from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_file, reading
 from workbench.records.named_arrays import signals_of
 from workbench.records.record import Record
-from workbench.records.transfer_functions import TransferFunctions, complex_columns, holds_transfer, transfer_of
+from workbench.records.transfer_arrays import complex_columns, holds_transfer, transfer_of
+from workbench.records.transfer_functions import TransferFunctions
 from workbench.records.units import SI, Units
 
 FORMATS = {

@@ -81,13 +81,10 @@ class Deadline:
         self._begun = time.process_time()
 
     def check(self, share: float = 1.0) -> None:
-        """Refuse to continue after the time limit, or where extrapolation predicts that it will be exceeded.
+        """Refuse, by a `RecordFileError`, to continue where the time limit is or, by extrapolation, will be exceeded.
 
         Args:
             share: of the file, read so far.
-
-        Raises:
-            RecordFileError: the time is or will be exceeded.
         """
         spent = time.process_time() - self._begun
         extrapolates = spent > TELLING * self._seconds
@@ -104,11 +101,7 @@ def _allowed(share: float) -> float:
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file that does not exist, is empty, or is too large.
-
-    Raises:
-        RecordFileError: no file, no bytes, or more than `MOST_BYTES`.
-    """
+    """Refuse a file that does not exist, is empty, or has more than `MOST_BYTES`, by a `RecordFileError`."""
     if not path.is_file():
         raise RecordFileError(f"{path}: there is no such file")
     size = path.stat().st_size
@@ -122,7 +115,7 @@ def check_file(path: Path) -> None:
 
 
 def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = DEFAULT, share: float = 1.0) -> None:
-    """Refuse too many channels or numbers, before they are read.
+    """Refuse, by a `RecordFileError`, more channels than `MOST_CHANNELS` or more numbers than the memory allows.
 
     Args:
         path: of the file.
@@ -130,9 +123,6 @@ def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = D
         n_numbers: in a share of the file.
         limits: see `Limits`.
         share: of the file; the rest is extrapolated.
-
-    Raises:
-        RecordFileError: more than `MOST_CHANNELS`, or more numbers than the memory allows.
     """
     if n_channels > MOST_CHANNELS:
         raise RecordFileError(f"{path} holds {n_channels} channels; at most {MOST_CHANNELS} are read")

@@ -179,11 +179,7 @@ def _obstacle(lines: Sequence[tuple[int, str]]) -> str:
 
 
 def check_length(path: Path, number: int, line: str) -> None:
-    """Refuse a line of more than `LONGEST_LINE` characters.
-
-    Raises:
-        RecordFileError: such a line.
-    """
+    """Refuse a line of `LONGEST_LINE` characters or more, by a `RecordFileError`."""
     if len(line) >= LONGEST_LINE:
         raise RecordFileError(f"{path}, row {number} has more than {LONGEST_LINE} characters: is it a table?")
 

@@ -13,7 +13,7 @@ from workbench.records.assembly import unit_remark
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError
 from workbench.records.named_arrays import HEADER
-from workbench.records.transfer_functions import description
+from workbench.records.transfer_arrays import description
 from workbench.records.units import BY_QUANTITY, UNITS, unit_named
 
 # ordinate_spec_data_type of the format
