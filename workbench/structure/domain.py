@@ -442,11 +442,7 @@ Domain = Interval | Rectangle | NamedPoints
 
 @lru_cache(maxsize=1024)  # a search makes a rig for every prediction, mostly with the same ports
 def check_place(domain: Domain, where: Where, derivative: int = 0, direction: str | None = None) -> None:
-    """Refuse a place, a pair of places or a patch, with a direction or an axis, that a domain does not have.
-
-    Raises:
-        PlaceError: no such place or direction.
-    """
+    """Refuse a place, a pair of places or a patch, or a direction, that a domain does not have, by a `PlaceError`."""
     if isinstance(where, Patch):
         if not isinstance(domain, Rectangle):
             raise PlaceError(f"a patch is placed on a plate; these modes are of {domain}")

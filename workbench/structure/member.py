@@ -180,7 +180,7 @@ class _Member(Printed):
         mass = segments.assemble(self.mass_per_length, 0)
         rigidity = segments.assemble(stiffness, order)
         if tension:
-            rigidity += segments.assemble(lambda x: np.full(x.shape, tension), 1)
+            rigidity += segments.assemble(Profile.constant(tension), 1)
         held, essential, springs = self._restraints(segments)
         for part in self.attachments:
             if isinstance(part, PointMass):
@@ -210,7 +210,7 @@ class _Member(Printed):
         # that 1/ν - σ is inaccurate; a sum of squares does not cancel.
         eigenvalues = segments.form(stiffness, order, coefficients)
         if tension:
-            eigenvalues += segments.form(lambda x: np.full(x.shape, tension), 1, coefficients)
+            eigenvalues += segments.form(Profile.constant(tension), 1, coefficients)
         for spring, row in springs:
             eigenvalues += spring * (row @ coefficients)[0] ** 2
         if (eigenvalues < -1e-7 * shift).any():
@@ -429,7 +429,7 @@ class Beam(_Member):
         """
         segments = self._segments(BUCKLED, 0)
         rigidity = segments.assemble(self.bending_stiffness, 2)
-        slopes = segments.assemble(lambda x: np.ones(x.shape), 1)
+        slopes = segments.assemble(Profile.constant(1.0), 1)
         held, _, springs = self._restraints(segments)
         for spring, row in springs:
             rigidity += spring * row.T @ row

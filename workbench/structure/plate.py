@@ -297,11 +297,7 @@ class Plate(_Surface):
 
 
 def check_poisson_ratio(value: float) -> None:
-    """Refuse a Poisson's ratio that no isotropic material has.
-
-    Raises:
-        ValueError: outside -1 to 0.5.
-    """
+    """Refuse, by a `ValueError`, a Poisson's ratio that no isotropic material has, outside -1 to 0.5."""
     if not -1.0 < value < 0.5 + 1e-12:
         raise ValueError(f"Poisson's ratio lies between -1 and 0.5; got {value}")
 

@@ -147,11 +147,7 @@ FieldLike = Field | float | Callable[[np.ndarray, np.ndarray], ArrayLike]
 
 
 def as_field(quantity: FieldLike) -> Field:
-    """A `Field` from a number, a callable of (x, y), or a `Field`.
-
-    Raises:
-        TypeError: anything else.
-    """
+    """A `Field` from a number, a callable of (x, y), or a `Field`."""
     if isinstance(quantity, Field):
         return quantity
     if isinstance(quantity, Real):
