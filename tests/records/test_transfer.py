@@ -101,6 +101,17 @@ def test_arrays_of_transfer_functions_are_read_whichever_way_they_lie(tmp_path, 
     np.testing.assert_array_equal(found.select_outputs(names[1:2]).values, found.values[1:2])
 
 
+def test_complex_arrays_of_matlab_7_3_are_read(tmp_path):
+    """They were passed over; outputs and inputs of complex numbers by h5py changed places."""
+    matlab = np.zeros(SPECTRA.T.shape, [("real", float), ("imag", float)])
+    matlab["real"], matlab["imag"] = SPECTRA.T.real, SPECTRA.T.imag
+    for values in (matlab, SPECTRA.T):
+        with h5py.File(tmp_path / "x.mat", "w") as file:
+            for name, each in {"f": LINES[None], "H": values}.items():
+                file.create_dataset(name, data=each).attrs["MATLAB_class"] = np.bytes_("double")
+        np.testing.assert_array_equal(read_measured(tmp_path / "x.mat").values, SPECTRA)
+
+
 def test_lines_up_to_half_the_sample_rate(tmp_path):
     """As pydvma keeps them: the rate under `freq`, the number of samples beside it; or the rate given."""
     told = save(tmp_path / "told.npz", {"yspec": SPECTRA[0].T, "freq": 200, "npts": 98})
@@ -285,6 +296,17 @@ def test_lines_of_a_universal_file_are_brought_to_hertz(tmp_path, unit, factor):
     np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-5)
     with pytest.raises(RecordFileError, match="its abscissa is in 'orders', which is no unit of frequency"):
         read_measured(save_58(tmp_path / "y.uff", [(1, 1, SPECTRA[0, 0])], unit="orders"))
+
+
+def test_one_output_of_several_inputs(tmp_path):
+    """Universal files of it were refused, and of arrays the inputs taken for outputs."""
+    one = SPECTRA[:1]
+    universal = save_58(tmp_path / "x.uff", [(1, i + 7, one[0, i]) for i in range(2)])
+    np.testing.assert_allclose(read_measured(universal).values, one, rtol=1e-6)
+    for i, lying in enumerate((one, np.moveaxis(one, -1, 0))):
+        found = read_measured(save(tmp_path / f"{i}.npz", {"f": LINES, "H": lying}))
+        np.testing.assert_array_equal(found.values, one)
+        assert found.references == ("input 1", "input 2") and found.output_names == ("H 1",)
 
 
 def test_half_of_a_symmetric_matrix_is_filled_by_reciprocity(tmp_path):

@@ -136,7 +136,7 @@ def transfer_of(
     Raises:
         RecordFileError: the message names the file and the array, and the remedy.
     """
-    found = {name: np.squeeze(v) for name, v in arrays.items() if v.dtype.kind == "c" and v.size > 1}
+    found = {name: _squeezed(v) for name, v in arrays.items() if v.dtype.kind == "c" and v.size > 1}
     lines, assumed = _lines(path, arrays, found, sample_rate_hz)
     spectra = {name: _frequency_last(path, name, values, lines.size) for name, values in found.items()}
     if len(spectra) > 1 and any(values.ndim > 1 for values in spectra.values()):
@@ -151,6 +151,12 @@ def transfer_of(
         return TransferFunctions(values, lines, channels, references, path.stem, (*remarks, *assumed))
     except ValueError as error:
         raise RecordFileError(f"{path}: {error}") from error
+
+
+def _squeezed(values: np.ndarray) -> np.ndarray:
+    """Values without axes of length 1, but three axes where one output or one reference has several of the other."""
+    squeezed = np.squeeze(values)
+    return values if (values.ndim, squeezed.ndim) == (3, 2) else squeezed
 
 
 def _lines(
