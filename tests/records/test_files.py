@@ -42,6 +42,15 @@ def test_a_record_comes_back_as_it_went(tmp_path, ending):
         assert getattr(back, what) == getattr(record, what)
 
 
+@pytest.mark.parametrize("ending", [".csv", ".uff"])
+@pytest.mark.parametrize(("start", "step"), [(123.4567, 1e-3), (-5.0, 0.01), (1.7e9, 1e-6)])
+def test_a_record_that_starts_late_comes_back(tmp_path, ending, start, step):
+    """UFF rounds the start to six digits, and floats the instants of a microsecond since 1970; both were refused."""
+    record = replace(sample(), start_time=start, sample_time=step)
+    back = read_record(write_record(record, tmp_path / f"run{ending}"))
+    assert (back.start_time, back.sample_time) == (start, step)
+
+
 @pytest.mark.parametrize("ending", [".csv", ".uff", ".npz"])
 def test_places_between_two_and_patches_come_back(tmp_path, ending):
     """They were written as bare numbers, and read as a pair (x, y) or not at all."""

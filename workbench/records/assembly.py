@@ -6,7 +6,7 @@ Files of other programs are converted to SI units and to equal time steps, with 
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -252,23 +252,18 @@ def _sampling(path: Path, contents: Signals, described: Description, sample_rate
         return Sampling(0.0, 1.0 / sample_rate_hz)
     if not np.isfinite(time).all():
         raise RecordFileError(f"{path}, time, row {contents.row_of(int(np.argmax(~np.isfinite(time))))}: not a number")
-    sampling = even_sampling(
-        path,
-        time,
-        [*contents.signals.values()],
-        correct=described.sampling is None,
-        stated_hz=sample_rate_hz,
-        row_of=contents.row_of,
-    )
+    if described.sampling is None:
+        sampling = even_sampling(path, time, [*contents.signals.values()], sample_rate_hz, contents.row_of)
+    else:
+        sampling = Sampling(*described.sampling)
+        with np.errstate(over="ignore", invalid="ignore"):
+            off = np.abs(time - (sampling.start + sampling.step * np.arange(time.size)))
+        if not (sampling.step > 0 and (off <= UNIFORM * sampling.step).all()):
+            raise RecordFileError(
+                f"{path}: its description states a start at {sampling.start:g} s and steps of {sampling.step:g} s, its"
+                f" times {time[0]:g} s and {(time[-1] - time[0]) / (time.size - 1):g} s; correct or remove the"
+                " description"
+            )
     if sample_rate_hz is not None and abs(sample_rate_hz * sampling.step - 1.0) > UNIFORM:
         raise RecordFileError(f"{path} is sampled at {1 / sampling.step:g} Hz, not at {sample_rate_hz:g} Hz")
-    if described.sampling is None:
-        return sampling
-    start, stated = described.sampling
-    step = sampling.step
-    if not (abs(stated - step) <= UNIFORM * step and abs(start - time[0]) <= UNIFORM * step):
-        raise RecordFileError(
-            f"{path}: its description states a start at {start:g} s and steps of {stated:g} s, its times {time[0]:g} s"
-            f" and {step:g} s; correct or remove the description"
-        )
-    return replace(sampling, start=start, step=stated)
+    return sampling

@@ -27,6 +27,7 @@ OVER_TIME = (0, 1, 7, 8)  # general or unknown, time response, auto and cross co
 TIME = (0, 1, 17)  # abscissa_spec_data_type of the format: unknown, general, time
 TURNS = ("rpm", "cpm", "1/min")
 ALIKE = 1e-3  # relative tolerance of factors of units, which data sets 164 round
+SIX_DIGITS = 1e-5  # relative: the rounding of start and step in a data set
 MARK = b"    -1"
 BINARY = re.compile(rb"^ +58b ", re.MULTILINE)
 OURS = ('{"kind"', '"kind":', '"name":')
@@ -80,8 +81,20 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         channels += [facts] if facts else []
     if record is None and any("noise_std" in facts for facts in channels):
         raise RecordFileError(f"{path} is damaged: its description of the record is missing")
+    if record is not None:
+        arrays["t [s]"] = _unrounded(arrays["t [s]"], record)
     header = (record or {}) | {"channels": channels}
     return arrays | {HEADER: np.array(json.dumps(header))}
+
+
+def _unrounded(time: np.ndarray, record: dict[str, Any]) -> np.ndarray:
+    """The instants that the description of a record states, where those of the file are these to six digits."""
+    try:
+        start, step = float(record["start_time"]), float(record["sample_time"])
+    except (KeyError, TypeError, ValueError):  # damaged, as the assembly of the record says
+        return time
+    stated = start + step * np.arange(time.size)
+    return stated if np.abs(stated - time).max() <= SIX_DIGITS * (abs(start) + step * time.size) else time
 
 
 def data_sets(path: Path) -> list[dict[str, Any]]:
