@@ -42,6 +42,13 @@ def test_a_record_comes_back_as_it_went(tmp_path, ending):
         assert getattr(back, what) == getattr(record, what)
 
 
+@pytest.mark.parametrize("ending", [".csv", ".uff", ".npz"])
+def test_a_record_of_one_sample_is_not_written(tmp_path, ending):
+    """What was written could not be read; UFF failed within its writer."""
+    with pytest.raises(RecordFileError, match="'x' has one sample"):
+        write_record(Record(1.0, [[1.0]], (Channel("a"),), name="x"), tmp_path / f"run{ending}")
+
+
 @pytest.mark.parametrize("ending", [".csv", ".uff"])
 @pytest.mark.parametrize(("start", "step"), [(123.4567, 1e-3), (-5.0, 0.01), (1.7e9, 1e-6)])
 def test_a_record_that_starts_late_comes_back(tmp_path, ending, start, step):

@@ -129,13 +129,15 @@ def write_record(record: Record, path: str | Path) -> Path:
     UFF 58 stores each channel with its own header; the other formats store all signals together.
 
     Raises:
-        RecordFileError: an unknown suffix, or a channel name that is not printable.
+        RecordFileError: an unknown suffix, a channel name that is not printable, or a single sample.
     """
     path = Path(path)
     module = _format(path)
     if path.suffix.lower() in READ_ONLY:
         written = ", ".join(sorted(set(FORMATS) - set(READ_ONLY)))
         raise RecordFileError(f"{path}: {path.suffix} is read, not written; use one of {written}")
+    if record.n_samples < 2:
+        raise RecordFileError(f"{path}: record {record.name!r} has one sample; a file needs two, which state the rate")
     signals = {f"{kind}:{legible(path, channel.name)}": row for kind, channel, row in record.signals()}
     header = {
         "name": record.name,
