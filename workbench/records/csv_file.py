@@ -50,7 +50,7 @@ def read(path: Path, limits: Limits = DEFAULT) -> Signals:
     """
     with path.open(encoding=encoding_of(path), newline=None) as file:
         layout = layout_of(path, file)
-        blocks = [*_blocks(path, file, layout, limits)] if layout.first is not None else []
+        blocks = [*_blocks(path, file, layout, limits)] if layout.first[1] else []
     n_columns = len(layout.names) + layout.stamped
     columns = [np.concatenate([block[:, i] for block in blocks]) if blocks else np.empty(0) for i in range(n_columns)]
     del blocks
@@ -98,7 +98,6 @@ def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], heade
 
 def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> Iterator[np.ndarray]:
     """The numbers of the table in blocks (n_rows, n_columns), time stamps as seconds since the first."""
-    assert layout.first is not None
     deadline, clock = Deadline(path, limits), Clock(path)
     number, rest = layout.first[0], layout.first[1] + "\n"
     size = path.stat().st_size
@@ -167,7 +166,6 @@ def _row_by_row(path: Path, layout: Layout, number: int, block: str) -> Iterator
 
 def _row_in_file(path: Path, layout: Layout, sample: int) -> int:
     """The number of the line of the file with a sample, which a message names; blank lines and comments count too."""
-    assert layout.first is not None
     with path.open(encoding=encoding_of(path), newline=None) as file:
         lines = islice(enumerate(file, 1), layout.first[0] - 1, None)
         rows = (number for number, line in lines if not line.isspace() and not line.startswith("#"))

@@ -51,7 +51,7 @@ class Layout:
         trailing: whether each row ends with a delimiter.
         comments: whether texts may follow the numbers.
         header: the description written by this program, as a JSON text.
-        first: (number of the row in the file, text) of the first row of numbers; None where there is none.
+        first: (number of the row in the file, text) of the first row of numbers; (0, "") where there is none.
         sampling: (start, step), s, where the header states them.
         decimal_comma: whether the decimal mark is a comma; None until a number has a mark.
         has_complex: whether numbers as 1.2+3.4i are two columns, of real and imaginary parts.
@@ -65,7 +65,7 @@ class Layout:
     trailing: bool = False
     comments: bool = False
     header: str | None = None
-    first: tuple[int, str] | None = None
+    first: tuple[int, str] = (0, "")
     sampling: tuple[float, float] | None = None
     decimal_comma: bool | None = None
     has_complex: bool = False
@@ -208,7 +208,6 @@ def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]
 
 def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, found: Layout) -> Layout:
     """The layout with the names and units of the header lines with as many fields as the first row of numbers."""
-    assert found.first is not None
     first, width = found.first[0], len(found.names)
     rows = []
     # in the header of LabVIEW files lines may have as many fields as the table
@@ -262,7 +261,6 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
 
 def _with_parts(layout: Layout) -> Layout:
     """The layout with a column each for the real and the imaginary part of complex numbers."""
-    assert layout.first is not None
     if not layout.has_complex:
         return layout
     fields = _fields(layout.first[1], layout.delimiter, layout.trailing)[layout.n_front :]
