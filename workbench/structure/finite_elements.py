@@ -266,13 +266,8 @@ def _symmetric(name: str, matrix: Matrix, n: int) -> csc_array:
 
 def _outer_sum(parts: list[tuple[np.ndarray, float]], n: int) -> csc_array:
     """Σ value r rᵀ of sparse rows r."""
-    rows, columns, values = [0], [0], [0.0]
-    for row, value in parts:
-        for i, a in row:
-            for j, b in row:
-                rows.append(int(i))
-                columns.append(int(j))
-                values.append(value * a * b)
+    entries = [(int(i), int(j), value * a * b) for row, value in parts for i, a in row for j, b in row]
+    rows, columns, values = zip((0, 0, 0.0), *entries)
     return csc_array(coo_array((values, (rows, columns)), shape=(n, n)))
 
 
