@@ -14,7 +14,6 @@ from io import TextIOBase
 from pathlib import Path
 
 from workbench.records.assembly import KEY
-from workbench.records.labview import END, WITHOUT_X, labview_header
 from workbench.records.limits import RecordFileError
 from workbench.records.time_stamps import MOMENT, n_stamps
 from workbench.records.units import split_unit, time_factor, unit_named
@@ -36,6 +35,8 @@ ONE_MARK = "write numbers with one decimal mark and without thousands separators
 MARKS = re.compile("[.,]")
 COMMENTS = re.compile(r'[\t;,] *"?comment"?\s*', re.IGNORECASE)  # at the end of a line of names, as in LabVIEW files
 NO_UNIT = ("", "-", "–")
+LABVIEW_END = "***End_of_Header***"
+LABVIEW_WITHOUT_X = re.compile(r"X_Columns\W+No\W*", re.IGNORECASE)  # the line that says that no instants are written
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def layout_of(path: Path, file: TextIOBase) -> Layout:
             if found is not None:
                 found = replace(found, header=header, first=(number, line), comments=comments)
                 return _with_names(path, lines, comment, found)
-            without_x = without_x or WITHOUT_X.fullmatch(line) is not None
+            without_x = without_x or LABVIEW_WITHOUT_X.fullmatch(line) is not None
             comments = comments or COMMENTS.search(line) is not None
             lines.append((number, line))
     else:
@@ -211,7 +212,7 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
     first, width = found.first[0], len(found.names)
     rows = []
     # in the header of LabVIEW files lines may have as many fields as the table
-    below = next((i for i in reversed(range(len(lines))) if lines[i][1].startswith(END)), -1) + 1
+    below = next((i for i in reversed(range(len(lines))) if lines[i][1].startswith(LABVIEW_END)), -1) + 1
     for number, line in lines[below:]:
         fields = _fields(line, found.delimiter, found.trailing)
         if found.comments and fields and fields[-1].strip().lower() == "comment":
@@ -221,7 +222,7 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
     titles = [row for row in rows if not any(_is_number(f, None) or MOMENT.fullmatch(f) for f in row[2])]
     if not titles or (len(titles) == 1 and _are_units(titles[0][2], set())):
         titles = [row for row in rows if row in titles or _are_numbered(row[2])]
-    channel_units, sampling = labview_header(path, [_fields(line, found.delimiter, False) for _, line in lines])
+    channel_units, sampling = _labview_header(path, [_fields(line, found.delimiter, False) for _, line in lines])
     if not titles:  # as numpy's savetxt: behind a comment
         names = _fields(comment, found.delimiter, found.trailing)[found.n_front :]
         if len(names) != width and rows:
@@ -257,6 +258,36 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
                         " known units; write units in brackets behind the names"
                     )
     return _with_parts(layout)
+
+
+def _labview_header(path: Path, lines: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], tuple[float, float] | None]:
+    """Units of the channels and sampling in the header of a LabVIEW file, from the lines above the numbers (in fields).
+
+    Returns:
+        Units, one per channel as written, none for files of other programs; and (start, step), s, where the instants
+        are not written.
+
+    Raises:
+        RecordFileError: spectra, or channels without instants that differ in start or rate.
+    """
+    rows = {fields[0].strip(): [text.strip() for text in fields[1:]] for fields in lines if fields}
+    if LABVIEW_END not in rows:
+        return (), None
+    over = next((text for text in rows.get("X_Dimension", ()) if text), "Time")
+    if over != "Time":
+        raise RecordFileError(f"{path}: its X_Dimension is {over}; a record runs over Time")
+    units = tuple(rows.get("Y_Unit_Label", ()))
+    if rows.get("X_Columns", [""])[0].lower() != "no" or "Delta_X" not in rows:
+        return units, None
+    starts, steps = ({text.replace(",", ".") for text in rows.get(key, ()) if text} for key in ("X0", "Delta_X"))
+    try:
+        found = {float(text) for text in starts} or {0.0}, {float(text) for text in steps}
+    except ValueError as error:
+        raise RecordFileError(f"{path}: its X0 or Delta_X cannot be read: {error}") from None
+    if any(len(values) != 1 for values in found):
+        raise RecordFileError(f"{path}: its channels differ in X0 or Delta_X; export them at one start and rate")
+    (start,), (step,) = found
+    return units, (start, step)
 
 
 def _with_parts(layout: Layout) -> Layout:
