@@ -9,6 +9,7 @@ from scipy.io import savemat
 
 from workbench.records.files import FORMATS, READ_ONLY, RecordFileError, read_record, write_record
 from workbench.records.record import Channel, Record
+from workbench.structure.domain import Between, Patch
 
 
 def sample() -> Record:
@@ -39,6 +40,31 @@ def test_a_record_comes_back_as_it_went(tmp_path, ending):
     assert back.input_channels == record.input_channels
     for what in ("sample_time", "start_time", "name", "input_hold"):
         assert getattr(back, what) == getattr(record, what)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".uff", ".npz"])
+def test_a_record_of_one_sample_is_not_written(tmp_path, ending):
+    """What was written could not be read; UFF failed within its writer."""
+    with pytest.raises(RecordFileError, match="'x' has one sample"):
+        write_record(Record(1.0, [[1.0]], (Channel("a"),), name="x"), tmp_path / f"run{ending}")
+
+
+@pytest.mark.parametrize("ending", [".csv", ".uff"])
+@pytest.mark.parametrize(("start", "step"), [(123.4567, 1e-3), (-5.0, 0.01), (1.7e9, 1e-6)])
+def test_a_record_that_starts_late_comes_back(tmp_path, ending, start, step):
+    """UFF rounds the start to six digits, and floats the instants of a microsecond since 1970; both were refused."""
+    record = replace(sample(), start_time=start, sample_time=step)
+    back = read_record(write_record(record, tmp_path / f"run{ending}"))
+    assert (back.start_time, back.sample_time) == (start, step)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".uff", ".npz"])
+def test_places_between_two_and_patches_come_back(tmp_path, ending):
+    """They were written as bare numbers, and read as a pair (x, y) or not at all."""
+    places = (Between(0.2, 0.5), Between("tip", "root"), Between((0.1, 0.2), (0.3, 0.4)), Patch(0.3, 0.4, 0.1, 0.2))
+    channels = tuple(Channel(f"u{i}", "force", at=at) for i, at in enumerate((*places, (0.2, 0.5), "tip", None)))
+    record = replace(sample(), inputs=np.ones((len(channels), 50)), input_channels=channels)
+    assert read_record(write_record(record, tmp_path / f"run{ending}")).input_channels == channels
 
 
 def test_the_hold_of_inputs_is_kept_and_can_be_given(tmp_path):

@@ -54,6 +54,18 @@ def write_2414(path):
     return path
 
 
+@pytest.mark.parametrize("n_points", [2, 3])
+def test_arrays_of_matlab_7_3_have_their_axes_in_order(tmp_path, n_points):
+    """Shapes were read transposed: refused, and where points are as many as modes, taken so."""
+    shapes = np.random.default_rng(0).standard_normal((n_points, 2))
+    arrays = {"shapes": shapes, "frequencies_hz": FREQUENCIES[:, None], "positions": np.eye(n_points, 3)}
+    with h5py.File(tmp_path / "modes.mat", "w") as file:
+        for name, values in arrays.items():
+            file.create_dataset(name, data=values.T).attrs["MATLAB_class"] = np.bytes_("double")
+    modes = read_modes(tmp_path / "modes.mat")
+    np.testing.assert_array_equal(modes.phi(modes.domain.names), shapes)
+
+
 @pytest.mark.parametrize("write", [write_55, write_2414])
 def test_universal_files_of_modes_are_read_and_scaled(tmp_path, write):
     modes = read_modes(write(tmp_path / "modes.unv"))

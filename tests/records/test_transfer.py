@@ -39,6 +39,18 @@ def test_decimation_keeps_poles_and_removes_what_is_above():
     assert np.abs(fewer.outputs[0] - np.exp(lam * fewer.time).real).max() < 5e-3
 
 
+def test_decimation_keeps_the_hold_of_inputs_and_refuses_a_factor_below_one():
+    """A band-limited record came back as one of held inputs, and a factor of 0 as a division by zero."""
+    time = 1e-3 * np.arange(600)
+    signal, channel = np.sin(20.0 * time)[None], (Channel("x"),)
+    record = Record(1e-3, signal, channel, signal, channel, input_hold="band-limited", remarks=("rounded times",))
+    fewer = decimate(record, 2)
+    assert (fewer.input_hold, fewer.remarks) == (record.input_hold, record.remarks)
+    for factor in (0, 2.5):
+        with pytest.raises(ValueError, match="the factor of a decimation is a whole number, 1 or more"):
+            decimate(record, factor)
+
+
 def test_read_transfer(tmp_path):
     path = tmp_path / "frf.mat"
     savemat(path, {"yspec": np.ones((9, 2), complex), "freq": 100})
@@ -87,6 +99,17 @@ def test_arrays_of_transfer_functions_are_read_whichever_way_they_lie(tmp_path, 
     np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-14)
     assert found.output_names == names
     np.testing.assert_array_equal(found.select_outputs(names[1:2]).values, found.values[1:2])
+
+
+def test_complex_arrays_of_matlab_7_3_are_read(tmp_path):
+    """They were passed over; outputs and inputs of complex numbers by h5py changed places."""
+    matlab = np.zeros(SPECTRA.T.shape, [("real", float), ("imag", float)])
+    matlab["real"], matlab["imag"] = SPECTRA.T.real, SPECTRA.T.imag
+    for values in (matlab, SPECTRA.T):
+        with h5py.File(tmp_path / "x.mat", "w") as file:
+            for name, each in {"f": LINES[None], "H": values}.items():
+                file.create_dataset(name, data=each).attrs["MATLAB_class"] = np.bytes_("double")
+        np.testing.assert_array_equal(read_measured(tmp_path / "x.mat").values, SPECTRA)
 
 
 def test_lines_up_to_half_the_sample_rate(tmp_path):
@@ -273,6 +296,17 @@ def test_lines_of_a_universal_file_are_brought_to_hertz(tmp_path, unit, factor):
     np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-5)
     with pytest.raises(RecordFileError, match="its abscissa is in 'orders', which is no unit of frequency"):
         read_measured(save_58(tmp_path / "y.uff", [(1, 1, SPECTRA[0, 0])], unit="orders"))
+
+
+def test_one_output_of_several_inputs(tmp_path):
+    """Universal files of it were refused, and of arrays the inputs taken for outputs."""
+    one = SPECTRA[:1]
+    universal = save_58(tmp_path / "x.uff", [(1, i + 7, one[0, i]) for i in range(2)])
+    np.testing.assert_allclose(read_measured(universal).values, one, rtol=1e-6)
+    for i, lying in enumerate((one, np.moveaxis(one, -1, 0))):
+        found = read_measured(save(tmp_path / f"{i}.npz", {"f": LINES, "H": lying}))
+        np.testing.assert_array_equal(found.values, one)
+        assert found.references == ("input 1", "input 2") and found.output_names == ("H 1",)
 
 
 def test_half_of_a_symmetric_matrix_is_filled_by_reciprocity(tmp_path):

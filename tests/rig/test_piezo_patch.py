@@ -104,6 +104,8 @@ def test_a_misplaced_patch_keeps_its_size_and_stays_on_the_structure(on_plate):
             lambda: of("P", (1.15, 0.3)),
             r"0.2 m by 0.12 m at \(x, y\) = \(1.15, 0.3\) does not lie on .* 0 to 1.2 by 0 to 0.8",
         ),
+        # named the first patch, which is on the plate
+        (lambda: plate().modes(2).edge_slopes([(*MIDDLE, *SIDES), (np.nan, 0.3, *SIDES)]), r"\(x, y\) = \(nan, 0.3\)"),
         (lambda: of("P", MIDDLE, direction="z"), "axis 'x' or 'y', or both"),
         (lambda: points().edge_slopes([(*MIDDLE, *SIDES)]), "a patch is placed on a plate"),
         (lambda: plate().modes(2).phi_at(Patch(*MIDDLE, *SIDES)), "not by a force or displacement"),

@@ -11,7 +11,7 @@ from workbench.rig.simulate import simulate
 from workbench.rig.statespace import input_matrix, output_matrix
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
 from workbench.structure.member import Beam
-from workbench.structure.modes import Modes
+from workbench.structure.modes import Modes, PointShapes, SampledModes
 from workbench.structure.modification import attach
 from workbench.structure.supports import PointMass, PointSpring
 
@@ -164,3 +164,12 @@ def test_the_former_name_of_the_domain_is_still_understood():
     assert modes.domain == Interval(2.0) and modes.length == 2.0
     with pytest.raises(AttributeError, match="interval"):
         _ = plate().length
+
+
+def test_modes_are_selected_by_a_mask():
+    """It was taken for the indices 0 and 1."""
+    kept = np.array([False, False, True])
+    modes = Modes([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], PointShapes(np.eye(3)), NamedPoints(("a", "b", "c")))
+    sampled = SampledModes([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], np.eye(3), np.arange(3.0))
+    for some in (modes.select(kept), sampled.select(kept), sampled.select([False, False, True])):
+        assert (some.omega.tolist(), some.zeta.tolist()) == ([3.0], pytest.approx([0.3]))

@@ -261,6 +261,28 @@ def test_more_segments_than_can_be_solved_are_refused():
         uniform("hinged", "free", attachments=tuple(PointMass(x, 1e-3) for x in np.linspace(0, 10, 700))).modes(2)
 
 
+def test_a_jump_in_a_function_warns_the_caller():
+    """The warning named a line of the workbench, so that Python showed it once for all structures."""
+    jump = Bar(
+        length=1.0,
+        mass_per_length=lambda x: np.where(x < 0.3, 1.0, 9.0),
+        axial_stiffness=1.0,
+        left="fixed",
+        right="free",
+    )
+    with pytest.warns(UserWarning, match="did not converge") as said:
+        jump.modes(2)
+    assert said[0].filename == __file__
+
+
+@pytest.mark.parametrize(("between", "doubled"), [((0.5, None), [False, True]), ((None, 0.5), [True, False])])
+def test_a_profile_is_scaled_to_the_end_where_one_bound_is_given(between, doubled):
+    """A bound alone was ignored."""
+    scaled = Profile.points([0.0, 1.0], [1.0, 1.0]).scaled(2.0, *between)
+    assert scaled([0.25, 0.75]).tolist() == [2.0 if each else 1.0 for each in doubled]
+    assert scaled.breaks == (0.0, 0.5, 1.0)
+
+
 def test_positions_outside_are_refused():
     with pytest.raises(ValueError, match="outside"):
         uniform("hinged", "hinged").modes(2).phi(10.5)

@@ -48,6 +48,14 @@ def test_the_static_answer_of_modes_left_out_makes_the_few_that_are_kept_exact(p
     np.testing.assert_allclose(np.diag(with_rest.damping), np.diag(exact.damping), rtol=2e-3)
 
 
+def test_springs_and_inertias_of_rotation_act_on_the_few_modes_kept():
+    """They were left out there."""
+    many, parts = beam().modes(60), (PointSpring(1.3, 0.0, 300.0), PointMass(0.7, 0.5, 0.02))
+    few = attach(many, parts, n_modes=5)
+    np.testing.assert_allclose(few.omega, attach(many, parts).omega[:5], rtol=1e-6)
+    assert abs(few.omega[0] / attach(many, (PointMass(0.7, 0.5),)).omega[0] - 1.0) > 0.1
+
+
 @pytest.mark.slow
 def test_the_cost_of_leaving_out_modes_of_a_plate_is_as_stated():
     plate = Plate(

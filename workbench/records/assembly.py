@@ -6,7 +6,7 @@ Files of other programs are converted to SI units and to equal time steps, with 
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -17,8 +17,10 @@ from workbench.records.instants import UNIFORM, Sampling, even_sampling
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.records.units import SI, Unit, Units, split_unit, unit_named
+from workbench.structure.domain import Between, Patch
 
 KINDS = ("input", "output")
+COMPOUND = {"Between": Between, "Patch": Patch}  # places of several numbers or names
 KEY = "crc32"  # of the checksum that detects changes of a file written here
 
 
@@ -173,14 +175,18 @@ def _kind(key: str, described: Description) -> str:
 
 
 def legible(path: Path, name: str) -> str:
-    """The name of a channel, checked to be printable.
-
-    Raises:
-        RecordFileError: control characters in the name.
-    """
+    """The name of a channel; one with control characters is refused by a `RecordFileError`."""
     if not name.isprintable():
         raise RecordFileError(f"{path}: the name {name!r} holds control characters; rename the channel")
     return name
+
+
+def facts_of(kind: str, channel: Channel) -> dict[str, Any]:
+    """The description of a channel as JSON holds it, a place that is no single one under the name of its type."""
+    facts = {name: getattr(channel, name) for name in ("name", "quantity", "unit", "at", "noise_std")}
+    if isinstance(channel.at, tuple(COMPOUND.values())):
+        facts["at"] = {type(channel.at).__name__: channel.at}
+    return {"kind": kind, **facts}
 
 
 def _channel(path: Path, name: str, facts: Mapping[str, Any], unit: Unit | None) -> Channel:
@@ -188,12 +194,15 @@ def _channel(path: Path, name: str, facts: Mapping[str, Any], unit: Unit | None)
         return Channel(legible(path, name), unit.quantity, unit.si)
     quantity, symbol, at, noise = (facts.get(fact) for fact in ("quantity", "unit", "at", "noise_std"))
     try:
-        if not all(text is None or isinstance(text, str) for text in (quantity, symbol)):
+        if not (isinstance(quantity, str | None) and isinstance(symbol, str | None)):
             raise TypeError(f"quantity and unit are words; got {quantity!r} and {symbol!r}")
-        if not all(number is None or isinstance(number, int | float) for number in (noise,)):
+        if not isinstance(noise, int | float | None):
             raise TypeError(f"noise_std is a number; got {noise!r}")
+        if isinstance(at, dict):
+            ((compound, parts),) = at.items()
+            at = COMPOUND[compound](*parts)
         return Channel(legible(path, name), quantity or "", symbol or "", at, noise)
-    except (TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise RecordFileError(f"{path}, channel {name!r}: {error}") from error
 
 
@@ -243,23 +252,18 @@ def _sampling(path: Path, contents: Signals, described: Description, sample_rate
         return Sampling(0.0, 1.0 / sample_rate_hz)
     if not np.isfinite(time).all():
         raise RecordFileError(f"{path}, time, row {contents.row_of(int(np.argmax(~np.isfinite(time))))}: not a number")
-    sampling = even_sampling(
-        path,
-        time,
-        [*contents.signals.values()],
-        correct=described.sampling is None,
-        stated_hz=sample_rate_hz,
-        row_of=contents.row_of,
-    )
+    if described.sampling is None:
+        sampling = even_sampling(path, time, [*contents.signals.values()], sample_rate_hz, contents.row_of)
+    else:
+        sampling = Sampling(*described.sampling)
+        with np.errstate(over="ignore", invalid="ignore"):
+            off = np.abs(time - (sampling.start + sampling.step * np.arange(time.size)))
+        if not (sampling.step > 0 and (off <= UNIFORM * sampling.step).all()):
+            raise RecordFileError(
+                f"{path}: its description states a start at {sampling.start:g} s and steps of {sampling.step:g} s, its"
+                f" times {time[0]:g} s and {(time[-1] - time[0]) / (time.size - 1):g} s; correct or remove the"
+                " description"
+            )
     if sample_rate_hz is not None and abs(sample_rate_hz * sampling.step - 1.0) > UNIFORM:
         raise RecordFileError(f"{path} is sampled at {1 / sampling.step:g} Hz, not at {sample_rate_hz:g} Hz")
-    if described.sampling is None:
-        return sampling
-    start, stated = described.sampling
-    step = sampling.step
-    if not (abs(stated - step) <= UNIFORM * step and abs(start - time[0]) <= UNIFORM * step):
-        raise RecordFileError(
-            f"{path}: its description states a start at {start:g} s and steps of {stated:g} s, its times {time[0]:g} s"
-            f" and {step:g} s; correct or remove the description"
-        )
-    return replace(sampling, start=start, step=stated)
+    return sampling

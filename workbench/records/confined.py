@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_arrays, unreadable
+from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_counts, unreadable
 
 NAMES = "names"
 REFUSED, NO_MEMORY = 3, 4
@@ -86,7 +86,7 @@ def serve(module: str, name: str, memory: str, seconds: str) -> None:
     try:
         arrays = {key: np.asarray(values) for key, values in import_module(module).load(path, limits).items()}
         arrays = {key: values for key, values in arrays.items() if values.dtype.kind in "fiubcU"}
-        check_arrays(path, arrays.values(), limits)
+        check_counts(path, len(arrays), sum(values.size for values in arrays.values()), limits)
         sent: dict[str, Any] = {f"array_{i}": values for i, values in enumerate(arrays.values())}
         np.savez(out, **(sent | {NAMES: np.array(json.dumps([*arrays]))}))
         code = 0

@@ -9,7 +9,6 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping
-from datetime import datetime
 from functools import partial
 from io import TextIOWrapper
 from itertools import islice, zip_longest
@@ -32,6 +31,7 @@ from workbench.records.table_layout import (
     encoding_of,
     layout_of,
 )
+from workbench.records.time_stamps import Clock
 from workbench.records.units import split_unit, time_base, time_factor
 
 BLOCK = 2**21  # characters
@@ -40,12 +40,6 @@ BLANK_LINES = re.compile(r"\n[ \t\n]+(?<=\n)")
 COMMENT_LINES = re.compile(r"^(?:#.*+\n?+)++", re.MULTILINE)
 SAME = 1e-9  # of the record's length: tolerance of two equal columns of instants
 COUNTERS = ("sample", "samples", "index", "n", "no", "no.", "nr", "nr.", "#", "scan", "point", "row")  # before the time
-PARTS = re.compile(
-    r"(?:(?P<date>[^\sT]+)[T\s]+)?(?P<hour>\d{1,2})(?P<rest>:\d\d:\d\d(?:[.,]\d+)?)(?: ?(?P<half>[AaPp])[Mm])?"
-    r"(?P<zone>Z|[-+]\d\d:?\d\d)?"
-)
-DAY_OR_MONTH = re.compile(r"\d{1,2}/\d{1,2}/\d{4}")
-DATES = ("%d.%m.%Y", "%Y/%m/%d")  # beside ISO's, which numpy reads
 
 
 def read(path: Path, limits: Limits = DEFAULT) -> Signals:
@@ -56,7 +50,7 @@ def read(path: Path, limits: Limits = DEFAULT) -> Signals:
     """
     with path.open(encoding=encoding_of(path), newline=None) as file:
         layout = layout_of(path, file)
-        blocks = [*_blocks(path, file, layout, limits)] if layout.first is not None else []
+        blocks = [*_blocks(path, file, layout, limits)] if layout.first[1] else []
     n_columns = len(layout.names) + layout.stamped
     columns = [np.concatenate([block[:, i] for block in blocks]) if blocks else np.empty(0) for i in range(n_columns)]
     del blocks
@@ -104,8 +98,7 @@ def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], heade
 
 def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> Iterator[np.ndarray]:
     """The numbers of the table in blocks (n_rows, n_columns), time stamps as seconds since the first."""
-    assert layout.first is not None
-    deadline, clock = Deadline(path, limits), _Clock(path)
+    deadline, clock = Deadline(path, limits), Clock(path)
     number, rest = layout.first[0], layout.first[1] + "\n"
     size = path.stat().st_size
     n_numbers, n_columns = 0, len(layout.names) + layout.stamped
@@ -139,7 +132,7 @@ def _lines(path: Path, block: str) -> list[str]:
     return [line for line in block.split("\n") if line and not line.isspace()]
 
 
-def _numbers(path: Path, layout: Layout, number: int, block: str, lines: list[str], clock: "_Clock") -> np.ndarray:
+def _numbers(path: Path, layout: Layout, number: int, block: str, lines: list[str], clock: "Clock") -> np.ndarray:
     delimiter = None if layout.delimiter == " " else layout.delimiter
     tails = lines = [*map(layout.parted, lines)] if layout.has_complex else lines
     if layout.n_front:
@@ -173,71 +166,7 @@ def _row_by_row(path: Path, layout: Layout, number: int, block: str) -> Iterator
 
 def _row_in_file(path: Path, layout: Layout, sample: int) -> int:
     """The number of the line of the file with a sample, which a message names; blank lines and comments count too."""
-    assert layout.first is not None
     with path.open(encoding=encoding_of(path), newline=None) as file:
         lines = islice(enumerate(file, 1), layout.first[0] - 1, None)
         rows = (number for number, line in lines if not line.isspace() and not line.startswith("#"))
         return next(islice(rows, sample, None))
-
-
-class _Clock:
-    """Seconds since the first time stamp of a file."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._start: np.datetime64 | None = None
-        self._last: np.datetime64 | None = None
-        self._date, self._days = "", 0  # of the last stamp, and midnights up to it
-
-    def seconds(self, stamps: list[str]) -> np.ndarray:
-        """Seconds (n_stamps,) of dates with times of day, or of times of day alone, which may pass midnight.
-
-        Raises:
-            RecordFileError: a text that is no time stamp.
-        """
-        try:
-            dates, clocks, zones = zip(*map(_parts, stamps))
-            # in 03/05/2024 the month is unknown, and of no account where the date changes at midnight alone
-            unsure = any(DAY_OR_MONTH.fullmatch(date) for date in dates)
-            known = ["1970-01-01" if unsure or not date else _iso(date) for date in dates]
-            times = np.array([f"{date}T{clock}" for date, clock in zip(known, clocks)], "datetime64[ns]")
-        except ValueError as error:
-            raise RecordFileError(f"{self._path}: a time stamp cannot be read: {error}") from error
-        times -= np.array(zones, "timedelta64[m]")
-        last = times[0] if self._last is None else self._last
-        passed = np.diff(times, prepend=last) < np.timedelta64(0, "ns")
-        if unsure and (passed != [x != y for x, y in zip(dates, (self._date or dates[0], *dates))]).any():
-            raise RecordFileError(
-                f"{self._path}: dates such as {dates[0]} do not say which number is the month, and they change not only"
-                " at midnight; write them as 2024-05-03"
-            )
-        self._date, self._last = dates[-1], times[-1]
-        if unsure or not dates[0]:
-            days = self._days + np.cumsum(passed)
-            self._days = days[-1]
-            times = times + days * np.timedelta64(1, "D")
-        self._start = times[0] if self._start is None else self._start
-        return np.asarray((times - self._start) / np.timedelta64(1, "ns") * 1e-9)
-
-
-def _parts(stamp: str) -> tuple[str, str, int]:
-    """Date (or none), time of day in 24 hours, and minutes east of Greenwich (0 where unstated) of a time stamp.
-
-    Raises:
-        ValueError: no time stamp.
-    """
-    found = PARTS.fullmatch(stamp.replace('"', "").strip())
-    if found is None:
-        raise ValueError(f"{stamp[:40]!r}")
-    hour = int(found["hour"]) if not found["half"] else int(found["hour"]) % 12 + 12 * (found["half"] in "pP")
-    zone = found["zone"] or "Z"
-    minutes = 0 if zone == "Z" else int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
-    return found["date"] or "", f"{hour:02d}{found['rest'].replace(',', '.')}", minutes
-
-
-def _iso(date: str) -> str:
-    """A date in ISO 8601."""
-    for form in DATES:
-        if ("." in date and form[2] == ".") or ("/" in date and "/" in form):
-            return datetime.strptime(date, form).date().isoformat()
-    return date

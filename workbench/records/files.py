@@ -6,18 +6,17 @@ detects later changes of the file. Files of other programs have no such text: al
 names in the file.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
-from workbench.arrays import Floats
 from workbench.records import csv_file, hdf5_file, mat_file, npz_file, tdms_file, uff_file, wav_file
-from workbench.records.assembly import KEY, checksum, legible, record_of
+from workbench.records.assembly import KEY, checksum, facts_of, legible, record_of
 from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_file, reading
 from workbench.records.named_arrays import signals_of
-from workbench.records.record import Channel, Record
-from workbench.records.transfer_functions import TransferFunctions, complex_columns, holds_transfer, transfer_of
+from workbench.records.record import Record
+from workbench.records.transfer_arrays import complex_columns, holds_transfer, transfer_of
+from workbench.records.transfer_functions import TransferFunctions
 from workbench.records.units import SI, Units
 
 FORMATS = {
@@ -130,23 +129,22 @@ def write_record(record: Record, path: str | Path) -> Path:
     UFF 58 stores each channel with its own header; the other formats store all signals together.
 
     Raises:
-        RecordFileError: an unknown suffix, or a channel name that is not printable.
+        RecordFileError: an unknown suffix, a channel name that is not printable, or a single sample.
     """
     path = Path(path)
     module = _format(path)
     if path.suffix.lower() in READ_ONLY:
         written = ", ".join(sorted(set(FORMATS) - set(READ_ONLY)))
         raise RecordFileError(f"{path}: {path.suffix} is read, not written; use one of {written}")
-    signals = {f"{kind}:{legible(path, channel.name)}": row for kind, channel, row in _rows(record)}
+    if record.n_samples < 2:
+        raise RecordFileError(f"{path}: record {record.name!r} has one sample; a file needs two, which state the rate")
+    signals = {f"{kind}:{legible(path, channel.name)}": row for kind, channel, row in record.signals()}
     header = {
         "name": record.name,
         "sample_time": record.sample_time,
         "start_time": record.start_time,
         "input_hold": record.input_hold,
-        "channels": [
-            {"kind": kind, "name": c.name, "quantity": c.quantity, "unit": c.unit, "at": c.at, "noise_std": c.noise_std}
-            for kind, c, _ in _rows(record)
-        ],
+        "channels": [facts_of(kind, channel) for kind, channel, _ in record.signals()],
     }
     stored = map(module.as_stored, signals.values()) if module is uff_file else signals.values()
     header[KEY] = checksum(header, stored)
@@ -159,10 +157,3 @@ def _format(path: Path) -> ModuleType:
     if path.suffix.lower() not in FORMATS:
         raise RecordFileError(f"{path}: the ending {path.suffix!r} names no format; use one of {', '.join(FORMATS)}")
     return FORMATS[path.suffix.lower()]
-
-
-def _rows(record: Record) -> Iterator[tuple[str, Channel, Floats]]:
-    for channel, row in zip(record.input_channels, record.inputs, strict=True):
-        yield "input", channel, row
-    for channel, row in zip(record.output_channels, record.outputs, strict=True):
-        yield "output", channel, row

@@ -13,10 +13,11 @@ import numpy as np
 from workbench.records.confined import load_confined
 from workbench.records.limits import BYTES_PER_NUMBER, Limits, RecordFileError, check_counts
 from workbench.records.named_arrays import HEADER, check_struct, numbered
-from workbench.records.transfer_functions import PLACES
+from workbench.records.transfer_arrays import PLACES
 from workbench.records.units import time_factor, time_unit, unit_named
 
 UNIT = ("unit", "units")  # attributes
+MATLAB_COMPLEX = ("real", "imag")  # fields of MATLAB's complex numbers; those of h5py are numpy's
 
 arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
@@ -52,6 +53,10 @@ def _in_units(name: str, dataset: Any) -> tuple[str, np.ndarray]:
     if _is_text(dataset):
         return name, np.array(dataset.asstr(errors="replace")[()], str)
     values = np.asarray(dataset[()])
+    if values.dtype.names == MATLAB_COMPLEX:
+        values = values["real"] + 1j * values["imag"]
+    if "MATLAB_class" in dataset.attrs:  # stored column by column, the last axis first
+        values = values.T
     text = next((dataset.attrs[key] for key in dataset.attrs if key.lower() in UNIT), "")
     text = text.decode(errors="replace") if isinstance(text, bytes) else text
     text = text.partition(" since ")[0].strip() if isinstance(text, str) else ""  # of dates, as netCDF has them
@@ -74,8 +79,12 @@ def _held(group: Any) -> dict[str, Any]:
     return {name: group[name] for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)}
 
 
+def _is_numeric(dataset: Any) -> bool:
+    return dataset.dtype.base.kind in "fiubc" or dataset.dtype.names == MATLAB_COMPLEX
+
+
 def _is_signal(dataset: Any) -> bool:
-    return dataset.dtype.base.kind in "fiubc" and (dataset.size or 0) > 1
+    return _is_numeric(dataset) and (dataset.size or 0) > 1
 
 
 def _is_text(dataset: Any) -> bool:
@@ -84,8 +93,8 @@ def _is_text(dataset: Any) -> bool:
 
 def _is_read(dataset: Any) -> bool:
     """Whether a dataset is text, or numbers that are not MATLAB text or cells."""
-    numeric = dataset.dtype.base.kind in "fiubc"
-    return _is_text(dataset) or (numeric and dataset.attrs.get("MATLAB_class") not in (b"char", b"cell"))
+    is_matlab_text = dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
+    return _is_text(dataset) or (_is_numeric(dataset) and not is_matlab_text)
 
 
 def _numbers(dataset: Any) -> int:

@@ -63,19 +63,15 @@ def even_sampling(
     path: Path,
     time: np.ndarray,
     signals: Sequence[np.ndarray],
-    *,
-    correct: bool,
     stated_hz: float | None,
     row_of: Callable[[int], int],
 ) -> Sampling:
-    """Start and step of sample instants.
+    """Start and step of sample instants, which may be rounded, or jitter, or be uneven.
 
     Args:
         path: of the file, for messages.
         time: (n_samples,) instants, s.
         signals: (n_samples,) each, at these instants.
-        correct: whether rounded instants are recognised, jitter of the instants too, and signals at uneven ones
-            resampled.
         stated_hz: the rate where the user states it, which rounded instants may leave open.
         row_of: the number of a sample's row in the file.
 
@@ -93,7 +89,7 @@ def even_sampling(
     if 0 < median < np.inf and even.all():
         return Sampling(start, mean)
     shortest, longest = float(steps.min()), float(steps.max())
-    if correct and 0 < mean < np.inf:
+    if 0 < mean < np.inf:
         rounded = _rounded(path, time, steps, stated_hz)
         if rounded is not None:
             return rounded

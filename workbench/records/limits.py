@@ -1,12 +1,11 @@
 """Limits of the size of a file and of the time to read it, and the error of all readers and writers."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
-
-import numpy as np
 
 COPIES = 4  # of a record, at most, in memory while it is read
 BYTES_PER_NUMBER = 8
@@ -57,7 +56,7 @@ class Limits:
 
     def __post_init__(self) -> None:
         for name in ("memory", "seconds"):
-            if not 0 < getattr(self, name) < np.inf:
+            if not 0 < getattr(self, name) < inf:
                 raise ValueError(f"the limit of {name} must be positive; got {getattr(self, name)}")
 
     @classmethod
@@ -82,13 +81,10 @@ class Deadline:
         self._begun = time.process_time()
 
     def check(self, share: float = 1.0) -> None:
-        """Refuse to continue after the time limit, or where extrapolation predicts that it will be exceeded.
+        """Refuse, by a `RecordFileError`, to continue where the time limit is or, by extrapolation, will be exceeded.
 
         Args:
             share: of the file, read so far.
-
-        Raises:
-            RecordFileError: the time is or will be exceeded.
         """
         spent = time.process_time() - self._begun
         extrapolates = spent > TELLING * self._seconds
@@ -105,11 +101,7 @@ def _allowed(share: float) -> float:
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file that does not exist, is empty, or is too large.
-
-    Raises:
-        RecordFileError: no file, no bytes, or more than `MOST_BYTES`.
-    """
+    """Refuse a file that does not exist, is empty, or has more than `MOST_BYTES`, by a `RecordFileError`."""
     if not path.is_file():
         raise RecordFileError(f"{path}: there is no such file")
     size = path.stat().st_size
@@ -122,18 +114,8 @@ def check_file(path: Path) -> None:
         )
 
 
-def check_arrays(path: Path, arrays: Iterable[np.ndarray], limits: Limits = DEFAULT) -> None:
-    """Refuse arrays that are too many or too large.
-
-    Raises:
-        RecordFileError: more than `MOST_CHANNELS` arrays, or more numbers in all than the memory allows.
-    """
-    sizes = [np.size(values) for values in arrays]
-    check_counts(path, len(sizes), sum(sizes), limits)
-
-
 def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = DEFAULT, share: float = 1.0) -> None:
-    """Refuse too many channels or numbers, before they are read.
+    """Refuse, by a `RecordFileError`, more channels than `MOST_CHANNELS` or more numbers than the memory allows.
 
     Args:
         path: of the file.
@@ -141,9 +123,6 @@ def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = D
         n_numbers: in a share of the file.
         limits: see `Limits`.
         share: of the file; the rest is extrapolated.
-
-    Raises:
-        RecordFileError: more than `MOST_CHANNELS`, or more numbers than the memory allows.
     """
     if n_channels > MOST_CHANNELS:
         raise RecordFileError(f"{path} holds {n_channels} channels; at most {MOST_CHANNELS} are read")

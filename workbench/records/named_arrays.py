@@ -9,7 +9,7 @@ import numpy as np
 from workbench.records.assembly import Signals
 from workbench.records.instants import in_seconds
 from workbench.records.limits import RecordFileError, check_counts
-from workbench.records.transfer_functions import SURE_RATES
+from workbench.records.transfer_arrays import SURE_RATES
 from workbench.records.units import time_factor
 
 HEADER = "record_header"
@@ -22,15 +22,12 @@ def numbered(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def check_struct(path: Path, structs: Mapping[str, Collection[str]], read: Collection[str]) -> None:
-    """Refuse MATLAB structs in place of signals, except a single one whose fields are signals.
+    """Refuse, by a `RecordFileError`, MATLAB structs except a single one whose fields are signals.
 
     Args:
         path: of the file.
         structs: fields, by struct.
         read: fields of the single struct that are signals.
-
-    Raises:
-        RecordFileError: several structs, or one without signals.
     """
     if len(structs) == 1 and read:
         return

@@ -3,6 +3,7 @@
 import json
 import zipfile
 from collections.abc import Mapping
+from math import prod
 from pathlib import Path
 from typing import IO, Any
 
@@ -32,7 +33,7 @@ def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
         n_numbers = 0
         for member in members:
             with archive.open(member) as file:
-                n_numbers += _numbers(path, member, *_declared(file))
+                n_numbers += _declared(path, member, file)
             check_counts(path, len(members), n_numbers, limits)
             deadline.check()
         found = {}
@@ -58,21 +59,15 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
                 npy.write_array(file, values, allow_pickle=False)
 
 
-def _declared(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type declared by an array's header."""
-    version = npy.read_magic(file)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+def _declared(path: Path, member: zipfile.ZipInfo, file: IO[bytes]) -> int:
+    """Size that an array's header declares, in numbers of eight bytes; 0 for a text."""
+    read = npy.read_array_header_1_0 if npy.read_magic(file) == (1, 0) else npy.read_array_header_2_0
     shape, _, dtype = read(file)
-    return shape, dtype
-
-
-def _numbers(path: Path, member: zipfile.ZipInfo, shape: tuple[int, ...], dtype: np.dtype) -> int:
-    """Size of an array in numbers of eight bytes."""
-    size = 1
-    for extent in shape:
-        size *= int(extent)
+    size = prod(shape)
     if size < 0 or size * dtype.itemsize > member.file_size:
         raise RecordFileError(f"{path} is damaged: {member.filename} holds fewer numbers than it declares")
-    if dtype.kind in "US" and size * dtype.itemsize > 4 * LONGEST_TEXT:
+    if dtype.kind not in "US":
+        return size * max(1, -(-dtype.itemsize // 8))
+    if size * dtype.itemsize > 4 * LONGEST_TEXT:
         raise RecordFileError(f"{path}: {member.filename} is a text of more than {LONGEST_TEXT} characters")
-    return size * max(1, -(-dtype.itemsize // 8)) if dtype.kind not in "US" else 0
+    return 0

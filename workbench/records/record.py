@@ -1,6 +1,6 @@
 """A record: uniformly sampled input and output signals with names and places."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -132,17 +132,20 @@ class Record(Printed):
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         rows = [
             (c.name, kind, c.quantity, c.unit, place_text(c.at), f"{row.std():.3g}", f"{np.abs(row).max():.3g}")
-            for kind, values, channels in (
-                ("input", self.inputs, self.input_channels),
-                ("output", self.outputs, self.output_channels),
-            )
-            for c, row in zip(channels, values, strict=True)
+            for kind, c, row in self.signals()
         ]
         line = (
             f"record {self.name!r}, {counted(self.n_inputs, 'input')} and {counted(self.n_outputs, 'output')},"
             f" {self.n_samples} samples at {self.sample_rate_hz:.6g} Hz, {self.n_samples * self.sample_time:.4g} s"
         )
         return line, ("channel", "", "quantity", "unit", "at", "std", "peak"), rows, self.remarks
+
+    def signals(self) -> Iterator[tuple[str, Channel, np.ndarray]]:
+        """Kind ("input" or "output"), channel and samples (n_samples,) of each input, then of each output."""
+        sides = ("input", self.input_channels, self.inputs), ("output", self.output_channels, self.outputs)
+        for kind, channels, rows in sides:
+            for channel, row in zip(channels, rows, strict=True):
+                yield kind, channel, row
 
     @property
     def n_samples(self) -> int:
@@ -180,31 +183,20 @@ class Record(Printed):
 
     def between(self, start: float | None = None, stop: float | None = None) -> "Record":
         """The samples with start <= time <= stop (s); the time axis is kept."""
-        slack, ends = 1e-9 * self.sample_time, (self._instant(0), self._instant(self.n_samples - 1))
-        first, last = 0, self.n_samples - 1
-        # The quotient may be rounded to either side of a sample.
-        if start is not None and not start - slack <= ends[0]:
-            first = int(max(min(self.n_samples, (start - self.start_time) / self.sample_time), 1)) - 1
-            while first < self.n_samples and not self._instant(first) >= start - slack:
-                first += 1
-        if stop is not None and not stop + slack >= ends[1]:
-            last = int(max(-1.0, (stop - self.start_time) / self.sample_time)) + 1
-            while last >= 0 and not self._instant(last) <= stop + slack:
-                last -= 1
-        if first > last:
-            wanted = [f"{word} {time:g} s" for word, time in (("from", start), ("to", stop)) if time is not None]
+        time, slack = self.time, 1e-9 * self.sample_time
+        low, high = -np.inf if start is None else start - slack, np.inf if stop is None else stop + slack
+        inside = np.flatnonzero((time >= low) & (time <= high))
+        if inside.size == 0:
+            wanted = [f"{word} {at:g} s" for word, at in (("from", start), ("to", stop)) if at is not None]
             raise ValueError(
-                f"record {self.name!r} runs from {ends[0]:g} to {ends[1]:g} s: it has no sample {' '.join(wanted)}"
+                f"record {self.name!r} runs from {time[0]:g} to {time[-1]:g} s: it has no sample {' '.join(wanted)}"
             )
-        if last - first == self.n_samples - 1:
+        if inside.size == self.n_samples:
             return self
-        kept = slice(first, last + 1)
+        kept = slice(inside[0], inside[-1] + 1)
         return replace(
-            self, outputs=self.outputs[:, kept], inputs=self.inputs[:, kept], start_time=self._instant(first)
+            self, outputs=self.outputs[:, kept], inputs=self.inputs[:, kept], start_time=float(time[inside[0]])
         )
-
-    def _instant(self, sample: int) -> float:
-        return float(self.start_time + self.sample_time * sample)
 
     only = Renamed("select_outputs")
 
@@ -212,13 +204,7 @@ class Record(Printed):
         """The record with only the named outputs, in that order."""
         if tuple(outputs) == self.output_names:
             return self
-        row_of = {name: row for row, name in enumerate(self.output_names)}
-        missing = [name for name in outputs if name not in row_of]
-        if missing:
-            raise ValueError(
-                f"record {self.name!r} has no output {missing[0]!r}; it has {', '.join(self.output_names)}"
-            )
-        rows = [row_of[name] for name in outputs]
+        rows = rows_of(f"record {self.name!r}", self.output_names, outputs)
         return replace(self, outputs=self.outputs[rows], output_channels=tuple(self.output_channels[r] for r in rows))
 
     def to_control(self) -> "control.TimeResponseData":
@@ -246,15 +232,13 @@ class Record(Printed):
         if steps.size == 0 or np.ptp(steps) > 1e-6 * abs(steps.mean()):
             raise ValueError(f"response {name!r} is not uniformly sampled; resample it first")
         outputs = np.asarray(response.y)
-        inputs = None if response.u is None else np.asarray(response.u)
+        inputs = np.zeros((0, *outputs.shape[1:])) if response.u is None else np.asarray(response.u)
         if outputs.ndim == 3:
             if outputs.shape[1] != 1:
                 raise ValueError(f"response {name!r} holds {outputs.shape[1]} traces; take one of them")
-            outputs = outputs[:, 0]
-            inputs = None if inputs is None else inputs[:, 0]
-        labels = response.output_labels or [f"y[{i}]" for i in range(outputs.shape[0])]
-        inputs = np.zeros((0, outputs.shape[1])) if inputs is None else inputs
-        input_labels = response.input_labels or [f"u[{i}]" for i in range(inputs.shape[0])]
+            outputs, inputs = outputs[:, 0], inputs[:, 0]
+        labels = response.output_labels or [f"y[{i}]" for i in range(len(outputs))]
+        input_labels = response.input_labels or [f"u[{i}]" for i in range(len(inputs))]
         return cls(
             sample_time=float(steps.mean()),
             outputs=outputs,
@@ -264,6 +248,19 @@ class Record(Printed):
             start_time=float(response.time[0]),
             name=name,
         )
+
+
+def rows_of(owner: str, outputs: Sequence[str], names: Sequence[str]) -> list[int]:
+    """The rows of named outputs, in the order of the names; `owner` has the outputs, in words.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    row_of = {name: row for row, name in enumerate(outputs)}
+    for name in names:
+        if name not in row_of:
+            raise ValueError(f"{owner} has no output {name!r}; it has {', '.join(outputs)}")
+    return [row_of[name] for name in names]
 
 
 def as_records(records: Record | Iterable[Record]) -> list[Record]:

@@ -1,8 +1,11 @@
 """Decimation of records, after a low-pass filter."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.signal import firwin, oaconvolve
 
+from workbench.arguments import whole
 from workbench.records.record import Record
 
 HALF_WIDTH = 10
@@ -19,12 +22,12 @@ def decimate(record: Record, factor: int) -> Record:
         factor: 1 or more.
 
     Raises:
-        ValueError: a record shorter than the filter.
+        ValueError: a record shorter than the filter, or a factor that is no whole number of 1 or more.
     """
-    if factor == 1:
+    if whole(factor, "the factor of a decimation", least=1) == 1:
         return record
     taps = firwin(2 * HALF_WIDTH * factor + 1, 0.8 / factor)
-    if factor < 1 or record.n_samples < 2 * taps.size:
+    if record.n_samples < 2 * taps.size:
         raise ValueError(
             f"record {record.name!r} has {record.n_samples} samples; decimation by {factor} needs {2 * taps.size}:"
             " take a smaller factor"
@@ -34,13 +37,11 @@ def decimate(record: Record, factor: int) -> Record:
         filtered: np.ndarray = oaconvolve(signals, taps[None], axes=1)
         return filtered[:, taps.size : record.n_samples : factor]
 
-    return Record(
+    return replace(
+        record,
         sample_time=factor * record.sample_time,
         outputs=reduced(record.outputs),
-        output_channels=record.output_channels,
         inputs=reduced(record.inputs) if record.n_inputs else np.zeros((0, 0)),
-        input_channels=record.input_channels,
         # the filter delays by half its length
         start_time=record.start_time + (taps.size - (taps.size - 1) / 2) * record.sample_time,
-        name=record.name,
     )

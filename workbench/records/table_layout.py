@@ -14,8 +14,8 @@ from io import TextIOBase
 from pathlib import Path
 
 from workbench.records.assembly import KEY
-from workbench.records.labview import END, WITHOUT_X, labview_header
 from workbench.records.limits import RecordFileError
+from workbench.records.time_stamps import MOMENT, n_stamps
 from workbench.records.units import split_unit, time_factor, unit_named
 
 MARK = "# record "
@@ -25,10 +25,6 @@ SNIFFED = 2**20  # bytes, for the encoding
 DELIMITERS = "\t", ";", ",", " "
 # parts of a description written by this program: a line with one of them is not a header of another program
 OURS = (f'"{KEY}":', '"channels":', '"kind":', '"noise_std":')
-DATE = re.compile(r"\d{4}-\d\d-\d\d|\d{4}/\d\d/\d\d|\d{1,2}\.\d{1,2}\.\d{4}|\d{1,2}/\d{1,2}/\d{4}")
-CLOCK = re.compile(r"\d{1,2}:\d\d:\d\d(?:[.,]\d+)?(?: ?[AaPp][Mm])?")
-STAMP = re.compile(rf"(?:{DATE.pattern})[T ]+(?:{CLOCK.pattern})(?:Z|[-+]\d\d:?\d\d)?")
-MOMENT = re.compile(rf"{STAMP.pattern}|{DATE.pattern}|{CLOCK.pattern}")
 SMALL = re.compile(r" *[-+]?[1-9]\d{0,2} *")  # a whole number that needs no thousands separator
 FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[-+\d])")  # the exponent of a double, as in 1.5D+00
 REAL = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -39,6 +35,8 @@ ONE_MARK = "write numbers with one decimal mark and without thousands separators
 MARKS = re.compile("[.,]")
 COMMENTS = re.compile(r'[\t;,] *"?comment"?\s*', re.IGNORECASE)  # at the end of a line of names, as in LabVIEW files
 NO_UNIT = ("", "-", "–")
+LABVIEW_END = "***End_of_Header***"
+LABVIEW_WITHOUT_X = re.compile(r"X_Columns\W+No\W*", re.IGNORECASE)  # the line that says that no instants are written
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class Layout:
         trailing: whether each row ends with a delimiter.
         comments: whether texts may follow the numbers.
         header: the description written by this program, as a JSON text.
-        first: (number of the row in the file, text) of the first row of numbers; None where there is none.
+        first: (number of the row in the file, text) of the first row of numbers; (0, "") where there is none.
         sampling: (start, step), s, where the header states them.
         decimal_comma: whether the decimal mark is a comma; None until a number has a mark.
         has_complex: whether numbers as 1.2+3.4i are two columns, of real and imaginary parts.
@@ -68,7 +66,7 @@ class Layout:
     trailing: bool = False
     comments: bool = False
     header: str | None = None
-    first: tuple[int, str] | None = None
+    first: tuple[int, str] = (0, "")
     sampling: tuple[float, float] | None = None
     decimal_comma: bool | None = None
     has_complex: bool = False
@@ -81,14 +79,6 @@ class Layout:
         """The fields of a row that should be numbers."""
         fields = _fields(self.parted(line), self.delimiter, self.trailing)[self.n_front :]
         return fields[: len(self.names)] if self.comments else fields
-
-    def number(self, text: str) -> float:
-        """The number in a field.
-
-        Raises:
-            ValueError: no number.
-        """
-        return _number(text, self.decimal_comma)
 
 
 def decided(path: Path, layout: Layout, block: str, lines: Sequence[str]) -> Layout:
@@ -157,11 +147,11 @@ def layout_of(path: Path, file: TextIOBase) -> Layout:
         elif line.strip():
             found = _row_of_numbers(path, number, line, without_x)
             if found is None and comments:
-                found = _row_of_numbers(path, number, _without_last(line), without_x)
+                found = _row_of_numbers(path, number, line.rpartition(_delimiter(line))[0], without_x)
             if found is not None:
                 found = replace(found, header=header, first=(number, line), comments=comments)
                 return _with_names(path, lines, comment, found)
-            without_x = without_x or WITHOUT_X.fullmatch(line) is not None
+            without_x = without_x or LABVIEW_WITHOUT_X.fullmatch(line) is not None
             comments = comments or COMMENTS.search(line) is not None
             lines.append((number, line))
     else:
@@ -169,7 +159,7 @@ def layout_of(path: Path, file: TextIOBase) -> Layout:
     if not lines:
         raise RecordFileError(f"{path} holds no rows")
     number, line = lines[0]
-    delimiter = next((d for d in DELIMITERS if d in line), ",")
+    delimiter = _delimiter(line)
     layout = Layout(_names(path, _fields(line, delimiter, False)), (), delimiter, header=header)
     for number, line in lines[1:]:
         check_row(path, layout, number, line)
@@ -190,11 +180,7 @@ def _obstacle(lines: Sequence[tuple[int, str]]) -> str:
 
 
 def check_length(path: Path, number: int, line: str) -> None:
-    """Refuse a line of more than `LONGEST_LINE` characters.
-
-    Raises:
-        RecordFileError: such a line.
-    """
+    """Refuse a line of `LONGEST_LINE` characters or more, by a `RecordFileError`."""
     if len(line) >= LONGEST_LINE:
         raise RecordFileError(f"{path}, row {number} has more than {LONGEST_LINE} characters: is it a table?")
 
@@ -211,7 +197,7 @@ def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]
     numbers = []
     for name, field in zip(layout.names, fields):
         try:
-            numbers.append(layout.number(field))
+            numbers.append(_number(field, layout.decimal_comma))
         except ValueError:
             text = field if len(field) < 40 else f"{field[:40]}..."
             joined = BETWEEN.sub("", field)
@@ -223,11 +209,10 @@ def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]
 
 def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, found: Layout) -> Layout:
     """The layout with the names and units of the header lines with as many fields as the first row of numbers."""
-    assert found.first is not None
     first, width = found.first[0], len(found.names)
     rows = []
     # in the header of LabVIEW files lines may have as many fields as the table
-    below = next((i for i in reversed(range(len(lines))) if lines[i][1].startswith(END)), -1) + 1
+    below = next((i for i in reversed(range(len(lines))) if lines[i][1].startswith(LABVIEW_END)), -1) + 1
     for number, line in lines[below:]:
         fields = _fields(line, found.delimiter, found.trailing)
         if found.comments and fields and fields[-1].strip().lower() == "comment":
@@ -237,7 +222,7 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
     titles = [row for row in rows if not any(_is_number(f, None) or MOMENT.fullmatch(f) for f in row[2])]
     if not titles or (len(titles) == 1 and _are_units(titles[0][2], set())):
         titles = [row for row in rows if row in titles or _are_numbered(row[2])]
-    labview = labview_header(path, [_fields(line, found.delimiter, False) for _, line in lines])
+    channel_units, sampling = _labview_header(path, [_fields(line, found.delimiter, False) for _, line in lines])
     if not titles:  # as numpy's savetxt: behind a comment
         names = _fields(comment, found.delimiter, found.trailing)[found.n_front :]
         if len(names) != width and rows:
@@ -255,12 +240,12 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
         return _with_parts(replace(found, names=_names(path, names)))
     at, units = _names_and_units([fields for _, _, fields in titles])
     names = _distinct_names([fields for i, (_, _, fields) in enumerate(titles[: at + 1]) if i != units])
-    layout = replace(
-        found,
-        names=_names(path, names),
-        units=tuple(map(_bare, titles[units][2])) if units is not None else labview.of_columns(names),
-        sampling=labview.sampling,
-    )
+    if units is not None:
+        column_units = tuple(map(_bare, titles[units][2]))
+    else:
+        by_name = dict(zip((name for name in names if time_factor(name) is None), channel_units))
+        column_units = tuple(by_name.get(name, "") for name in names) if channel_units else ()
+    layout = replace(found, names=_names(path, names), units=column_units, sampling=sampling)
     for row in rows:
         if row[0] > titles[at][0] and row not in titles:
             check_row(path, layout, *row[:2])
@@ -275,9 +260,38 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
     return _with_parts(layout)
 
 
+def _labview_header(path: Path, lines: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], tuple[float, float] | None]:
+    """Units of the channels and sampling in the header of a LabVIEW file, from the lines above the numbers (in fields).
+
+    Returns:
+        Units, one per channel as written, none for files of other programs; and (start, step), s, where the instants
+        are not written.
+
+    Raises:
+        RecordFileError: spectra, or channels without instants that differ in start or rate.
+    """
+    rows = {fields[0].strip(): [text.strip() for text in fields[1:]] for fields in lines if fields}
+    if LABVIEW_END not in rows:
+        return (), None
+    over = next((text for text in rows.get("X_Dimension", ()) if text), "Time")
+    if over != "Time":
+        raise RecordFileError(f"{path}: its X_Dimension is {over}; a record runs over Time")
+    units = tuple(rows.get("Y_Unit_Label", ()))
+    if rows.get("X_Columns", [""])[0].lower() != "no" or "Delta_X" not in rows:
+        return units, None
+    starts, steps = ({text.replace(",", ".") for text in rows.get(key, ()) if text} for key in ("X0", "Delta_X"))
+    try:
+        found = {float(text) for text in starts} or {0.0}, {float(text) for text in steps}
+    except ValueError as error:
+        raise RecordFileError(f"{path}: its X0 or Delta_X cannot be read: {error}") from None
+    if any(len(values) != 1 for values in found):
+        raise RecordFileError(f"{path}: its channels differ in X0 or Delta_X; export them at one start and rate")
+    (start,), (step,) = found
+    return units, (start, step)
+
+
 def _with_parts(layout: Layout) -> Layout:
     """The layout with a column each for the real and the imaginary part of complex numbers."""
-    assert layout.first is not None
     if not layout.has_complex:
         return layout
     fields = _fields(layout.first[1], layout.delimiter, layout.trailing)[layout.n_front :]
@@ -353,29 +367,21 @@ def _row_of_numbers(path: Path, number: int, line: str, without_x: bool) -> Layo
             continue
         if trailing and len(fields) == 1:
             continue
-        n_stamps = _n_stamps(fields)
-        n_front = int(not fields[0].strip()) if without_x else n_stamps
+        stamps = n_stamps(fields)
+        n_front = int(not fields[0].strip()) if without_x else stamps
         numbers = fields[n_front:]
         if numbers and any(all(_is_number(field, comma) for field in numbers) for comma in (False, True)):
-            return Layout(("",) * len(numbers), (), delimiter, n_front, n_stamps > 0, trailing)
+            return Layout(("",) * len(numbers), (), delimiter, n_front, stamps > 0, trailing)
         if numbers and all(COMPLEX.fullmatch(field) or _is_number(field, False) for field in numbers):
-            return Layout(("",) * len(numbers), (), delimiter, n_front, n_stamps > 0, trailing, has_complex=True)
+            return Layout(("",) * len(numbers), (), delimiter, n_front, stamps > 0, trailing, has_complex=True)
         if len(numbers) > 1 and all(_is_number(f, None) or THOUSANDS.fullmatch(f.strip()) for f in numbers):
             shown = ", ".join(repr(field) for field in numbers[:10])
             raise RecordFileError(f"{path}, row {number} has points and commas in its numbers, {shown}; {ONE_MARK}")
     return None
 
 
-def _without_last(line: str) -> str:
-    """A row without its last field."""
-    return line.rpartition(next((d for d in DELIMITERS if d in line), ","))[0]
-
-
-def _n_stamps(fields: Sequence[str]) -> int:
-    first, second = (fields[i].strip() if i < len(fields) else "" for i in (0, 1))
-    if STAMP.fullmatch(first) or CLOCK.fullmatch(first):
-        return 1
-    return 2 if DATE.fullmatch(first) and CLOCK.fullmatch(second) else 0
+def _delimiter(line: str) -> str:
+    return next((d for d in DELIMITERS if d in line), ",")
 
 
 def _fields(line: str, delimiter: str, trailing: bool) -> list[str]:

@@ -13,7 +13,7 @@ from workbench.records.assembly import unit_remark
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError
 from workbench.records.named_arrays import HEADER
-from workbench.records.transfer_functions import DESCRIPTION
+from workbench.records.transfer_arrays import description
 from workbench.records.units import BY_QUANTITY, UNITS, unit_named
 
 # ordinate_spec_data_type of the format
@@ -27,6 +27,7 @@ OVER_TIME = (0, 1, 7, 8)  # general or unknown, time response, auto and cross co
 TIME = (0, 1, 17)  # abscissa_spec_data_type of the format: unknown, general, time
 TURNS = ("rpm", "cpm", "1/min")
 ALIKE = 1e-3  # relative tolerance of factors of units, which data sets 164 round
+SIX_DIGITS = 1e-5  # relative: the rounding of start and step in a data set
 MARK = b"    -1"
 BINARY = re.compile(rb"^ +58b ", re.MULTILINE)
 OURS = ('{"kind"', '"kind":', '"name":')
@@ -80,8 +81,20 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         channels += [facts] if facts else []
     if record is None and any("noise_std" in facts for facts in channels):
         raise RecordFileError(f"{path} is damaged: its description of the record is missing")
+    if record is not None:
+        arrays["t [s]"] = _unrounded(arrays["t [s]"], record)
     header = (record or {}) | {"channels": channels}
     return arrays | {HEADER: np.array(json.dumps(header))}
+
+
+def _unrounded(time: np.ndarray, record: dict[str, Any]) -> np.ndarray:
+    """The instants that the description of a record states, where those of the file are these to six digits."""
+    try:
+        start, step = float(record["start_time"]), float(record["sample_time"])
+    except (KeyError, TypeError, ValueError):  # damaged, as the assembly of the record says
+        return time
+    stated = start + step * np.arange(time.size)
+    return stated if np.abs(stated - time).max() <= SIX_DIGITS * (abs(start) + step * time.size) else time
 
 
 def data_sets(path: Path) -> list[dict[str, Any]]:
@@ -137,12 +150,7 @@ def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | N
         remarks[f"by reciprocity, those from {named}"] = None
         found |= {(output, reference): found[reference, output] for output, reference in mirrored}
     values = np.array([[found[output, reference] for reference in references] for output in outputs])
-    described = {
-        "outputs": [{"name": name, **facts} for name, facts in outputs.items()],
-        "references": references,
-        "remarks": [*filter(None, remarks)],
-    }
-    return {"frequency_hz": lines, "transfer": values, DESCRIPTION: np.array(json.dumps(described))}
+    return {"frequency_hz": lines, "transfer": values, **description(outputs, references, remarks)}
 
 
 def as_stored(values: np.ndarray) -> np.ndarray:
@@ -236,29 +244,21 @@ def write(path: Path, time: np.ndarray, signals: dict[str, Any], header: dict[st
         text = json.dumps(described, separators=(",", ":")).replace(" ", r"\u0020")
         if len(text) > 5 * LINE:
             raise RecordFileError(f"{path}: the names of channel {facts['name']!r} are too long for UFF; shorten them")
-        lines = {f"id{j + 1}": text[j * LINE : (j + 1) * LINE].ljust(LINE, " ") or " " for j in range(5)}
         file.write_sets(
-            pyuff.prepare_58(
-                **lines,
-                binary=0,
-                func_type=1,
-                rsp_node=i + 1,
-                rsp_dir=3,
-                ref_node=1,
-                ref_dir=3,
-                ver_num=0,
-                ord_data_type=4,
-                abscissa_spacing=1,
-                num_pts=values.size,
-                abscissa_min=float(time[0]),
-                abscissa_inc=header["sample_time"],
-                abscissa_spec_data_type=17,
-                orddenom_spec_data_type=0,
-                z_axis_spec_data_type=0,
-                ordinate_spec_data_type=TYPES.get(facts["quantity"], 0),
-                x=time,
-                data=np.asarray(values, float),
-                return_full_dict=False,
-            ),
+            {
+                **{f"id{j + 1}": text[j * LINE : (j + 1) * LINE] or " " for j in range(5)},
+                "type": 58,
+                "func_type": 1,
+                "rsp_node": i + 1,
+                "rsp_dir": 3,
+                "ref_node": 1,
+                "ref_dir": 3,
+                "abscissa_spacing": 1,
+                "abscissa_spec_data_type": 17,
+                "ordinate_spec_data_type": TYPES.get(facts["quantity"], 0),
+                "orddenom_spec_data_type": 0,
+                "x": time,
+                "data": np.asarray(values, float),
+            },
             mode="add",
         )

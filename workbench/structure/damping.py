@@ -19,8 +19,8 @@ class ModalDamping:
         zeta = np.atleast_1d(np.asarray(self.zeta, float))
         if not np.isfinite(zeta).all() or (zeta < 0).any():
             raise ValueError(f"damping ratios must be finite and not negative; got {self.zeta}")
-        padded = np.r_[zeta, np.full(max(omega.size - zeta.size, 0), zeta[-1])][: omega.size]
-        return np.diag(2.0 * padded * omega)
+        of_mode = zeta[np.minimum(np.arange(omega.size), zeta.size - 1)]
+        return np.diag(2.0 * of_mode * omega)
 
 
 @dataclass(frozen=True)

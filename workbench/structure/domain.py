@@ -216,8 +216,9 @@ class Rectangle:
         outside = (
             (half <= 0) | (middle - half < -SLACK * self.size) | (middle + half > np.array(self.length) * (1 + SLACK))
         )
-        if (outside.any(axis=1) | ~np.isfinite(found).all(axis=1)).any():
-            x, y, width, height = found[np.argmax(outside.any(axis=1))]
+        wrong = outside.any(axis=1) | ~np.isfinite(found).all(axis=1)
+        if wrong.any():
+            x, y, width, height = found[np.argmax(wrong)]
             raise PlaceError(
                 f"a patch of {width:g} m by {height:g} m at (x, y) = ({x:g}, {y:g}) does not lie on the structure, 0 to"
                 f" {self.length[0]:g} by 0 to {self.length[1]:g}; move its middle, or make it smaller"
@@ -441,11 +442,7 @@ Domain = Interval | Rectangle | NamedPoints
 
 @lru_cache(maxsize=1024)  # a search makes a rig for every prediction, mostly with the same ports
 def check_place(domain: Domain, where: Where, derivative: int = 0, direction: str | None = None) -> None:
-    """Refuse a place, a pair of places or a patch, with a direction or an axis, that a domain does not have.
-
-    Raises:
-        PlaceError: no such place or direction.
-    """
+    """Refuse a place, a pair of places or a patch, or a direction, that a domain does not have, by a `PlaceError`."""
     if isinstance(where, Patch):
         if not isinstance(domain, Rectangle):
             raise PlaceError(f"a patch is placed on a plate; these modes are of {domain}")

@@ -97,21 +97,7 @@ class FiniteElements(Printed):
             raise ValueError(f"{n} degrees of freedom have 1 to {n} modes; got {n_modes}")
         if _negative_pivots(self.mass):
             raise ValueError("the mass matrix is not positive semidefinite: a motion has negative kinetic energy")
-        shift, factor = self._shifted_factor()
-        if n_modes < n:
-            inverse = LinearOperator((n, n), matvec=factor.solve, dtype=float)
-            start = np.random.default_rng(0).standard_normal(n)
-            try:
-                _, shapes = eigsh(self.stiffness, k=n_modes, M=self.mass, sigma=shift, OPinv=inverse, v0=start)
-            except ArpackError:  # hardly more degrees of freedom with mass than modes
-                shapes = self._massive_shapes(n_modes, shift)
-        else:
-            try:
-                shapes = eigh(self.stiffness.toarray(), self.mass.toarray())[1]
-            except LinAlgError as error:
-                raise ValueError(
-                    "some degrees of freedom have no mass, so there are fewer modes; ask for fewer"
-                ) from error
+        shapes = self._lowest_shapes(n_modes)
         sizes = np.sum(shapes * (self.mass @ shapes), axis=0)
         if (sizes <= 0).any():
             raise ValueError("the mass matrix is not positive semidefinite: a mode has no kinetic energy")
@@ -134,6 +120,24 @@ class FiniteElements(Printed):
         else:
             damping = self.damping.matrix(omega)  # type: ignore[union-attr]
         return Modes(omega=omega, damping=damping, shapes=lambda index, _: shapes[index], domain=self.nodes)
+
+    def _lowest_shapes(self, n_modes: int) -> Floats:
+        """The lowest shapes (n, n_modes), in any order and scale."""
+        n = len(self.nodes.names)
+        shift, factor = self._shifted_factor()
+        if n_modes == n:
+            try:
+                return np.asarray(eigh(self.stiffness.toarray(), self.mass.toarray())[1])
+            except LinAlgError as error:
+                raise ValueError(
+                    "some degrees of freedom have no mass, so there are fewer modes; ask for fewer"
+                ) from error
+        inverse = LinearOperator((n, n), matvec=factor.solve, dtype=float)
+        start = np.random.default_rng(0).standard_normal(n)
+        try:
+            return np.asarray(eigsh(self.stiffness, k=n_modes, M=self.mass, sigma=shift, OPinv=inverse, v0=start)[1])
+        except ArpackError:  # hardly more degrees of freedom with mass than modes
+            return self._massive_shapes(n_modes, shift)
 
     def _massive_shapes(self, n_modes: int, shift: float) -> Floats:
         """The lowest shapes (n, n_modes) by LAPACK, M φ = ν (K - σ M) φ, with ν = 0 for massless motions."""
@@ -262,13 +266,8 @@ def _symmetric(name: str, matrix: Matrix, n: int) -> csc_array:
 
 def _outer_sum(parts: list[tuple[np.ndarray, float]], n: int) -> csc_array:
     """Σ value r rᵀ of sparse rows r."""
-    rows, columns, values = [0], [0], [0.0]
-    for row, value in parts:
-        for i, a in row:
-            for j, b in row:
-                rows.append(int(i))
-                columns.append(int(j))
-                values.append(value * a * b)
+    entries = [(int(i), int(j), value * a * b) for row, value in parts for i, a in row for j, b in row]
+    rows, columns, values = zip((0, 0, 0.0), *entries)
     return csc_array(coo_array((values, (rows, columns)), shape=(n, n)))
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy.linalg import LinAlgError, eigh
@@ -54,6 +54,13 @@ class _Member(Printed):
     damping: Damping = field(default_factory=ModalDamping)
     frequency_errors: tuple[float, ...] = ()
 
+    _continuity: ClassVar[int]  # of the shapes: 0 of displacements alone, 1 of slopes too
+    _stiffness_name: ClassVar[str]
+
+    @property
+    def _stiffness(self) -> Profile:
+        return getattr(self, self._stiffness_name)  # type: ignore[no-any-return]
+
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         at = self.length * np.array([0.0, 0.5, 1.0])
         profiles = {name: value for name, value in vars(self).items() if isinstance(value, Profile)}
@@ -62,13 +69,12 @@ class _Member(Printed):
         line = f"{type(self).__name__.lower()}, {self.length:g} m, {ends}"
         return line, ("", *(f"x = {x:.4g} m" for x in at)), rows, tuple(map(str, self.attachments))
 
-    def _prepare(self, allowed_ends: tuple[str, ...], stiffness: str) -> None:
-        if not (np.isfinite(self.length) and self.length > 0):
-            raise ValueError(f"the length of a structure must be positive; got {self.length}")
+    def _prepare(self, allowed_ends: tuple[str, ...]) -> None:
+        Interval(self.length)  # refuses a length that is not positive
         object.__setattr__(self, "left", as_end(self.left, allowed=allowed_ends))
         object.__setattr__(self, "right", as_end(self.right, allowed=allowed_ends))
         object.__setattr__(self, "attachments", tuple(self.attachments))
-        for name in ("mass_per_length", stiffness):
+        for name in ("mass_per_length", self._stiffness_name):
             profile = as_profile(getattr(self, name))
             object.__setattr__(self, name, profile)
             _check_positive(name, profile, self.length)
@@ -80,65 +86,68 @@ class _Member(Printed):
             if isinstance(part, PointMass) and (part.mass < 0 or part.rotary_inertia < 0):
                 raise ValueError(f"{part}: a mass cannot be negative; leave it out or lower mass_per_length")
 
-    def _segments(self, n_modes: int, stiffness: Profile, continuity: int, extra: int) -> Segments:
+    def _segments(self, n_modes: int, extra: int) -> Segments:
         """Segments that represent n_modes half waves, with `extra` degrees more than estimated."""
-        nodes = segment_ends((*self.mass_per_length.breaks, *stiffness.breaks), self.length)
+        nodes = segment_ends((*self.mass_per_length.breaks, *self._stiffness.breaks), self.length)
         for part in self.attachments:
             # a node at an attachment, where a derivative of the shapes jumps
-            if np.abs(nodes - part.at).min() >= self._thinnest(continuity):
-                nodes = np.sort(np.r_[nodes, part.at, self._graded(position(part.at), stiffness)])
+            if np.abs(nodes - part.at).min() >= self._thinnest:
+                nodes = np.sort(np.r_[nodes, part.at, self._graded(position(part.at))])
         if nodes.size > MOST_SEGMENTS:
             raise ValueError(
                 f"the profiles and attachments of the structure make {nodes.size - 1} segments; at most"
                 f" {MOST_SEGMENTS} are solved: give fewer points, or a smooth function"
             )
-        half_waves = n_modes * self._shares_of_waves(nodes, stiffness, continuity)
+        half_waves = n_modes * self._shares_of_waves(nodes)
         pieces = np.array([-(-(_degree_for(each) + extra) // HIGHEST_DEGREE) for each in half_waves])
         degrees = [_degree_for(each / n) + extra // n for each, n in zip(half_waves, pieces, strict=True)]
         ends = (np.linspace(a, b, n + 1)[1:] for (a, b), n in zip(pairwise(nodes), pieces, strict=True))
-        return Segments(np.concatenate([nodes[:1], *ends]), tuple(np.repeat(degrees, pieces).tolist()), continuity)
+        return Segments(
+            np.concatenate([nodes[:1], *ends]), tuple(np.repeat(degrees, pieces).tolist()), self._continuity
+        )
 
-    def _shares_of_waves(self, nodes: np.ndarray, stiffness: Profile, continuity: int) -> np.ndarray:
+    def _shares_of_waves(self, nodes: np.ndarray) -> np.ndarray:
         """Share (n_segments,) of a high mode's half waves in each segment, by the local wavenumber (WKB)."""
         points = nodes[:-1, None] + np.diff(nodes)[:, None] * INSIDE
-        ratio = self.mass_per_length(points.ravel()) / stiffness(points.ravel())
-        density = ratio.reshape(points.shape) ** (0.5 / (continuity + 1))
+        ratio = self.mass_per_length(points.ravel()) / self._stiffness(points.ravel())
+        density = ratio.reshape(points.shape) ** (0.5 / (self._continuity + 1))
         waves: Floats = np.diff(nodes) * density.mean(axis=1)
         return waves / float(waves.sum())
 
-    def _graded(self, at: float, stiffness: Profile) -> list[float]:
+    def _graded(self, at: float) -> list[float]:
         """Nodes graded from a tip beyond an attachment near it, where the motion is nearly singular."""
         graded = []
         for tip, inward in ((0.0, 1.0), (self.length, -1.0)):
             away = abs(at - tip)
-            while self._is_tip(tip, stiffness) and away < COARSEST * self.length / CROWDING:
+            while self._is_tip(tip) and away < COARSEST * self.length / CROWDING:
                 away *= CROWDING
                 graded.append(tip + inward * away)
         return graded
 
-    def _is_tip(self, end: float, stiffness: Profile) -> bool:
+    def _is_tip(self, end: float) -> bool:
         """Whether the stiffness vanishes at an end."""
-        return bool(stiffness(np.array([end]))[0] <= TIP * stiffness(np.array([0.5 * self.length]))[0])
+        return bool(self._stiffness(end) <= TIP * self._stiffness(0.5 * self.length))
 
-    def _thinnest(self, continuity: int) -> float:
-        return THINNEST[continuity] * self.length
+    @property
+    def _thinnest(self) -> float:
+        return THINNEST[self._continuity] * self.length
 
     def _motion_at(self, segments: Segments, at: float, derivative: int) -> np.ndarray:
         """The row that maps coefficients to the motion of an attachment; one very near a node is rigidly tied to it."""
         node = segments.nodes[np.argmin(np.abs(segments.nodes - at))]
-        if segments.continuity == 0 or abs(at - node) >= self._thinnest(segments.continuity):
+        if self._continuity == 0 or abs(at - node) >= self._thinnest:
             return segments.evaluation(at, derivative)
         lever = (at - node) * segments.evaluation(node, 1) if derivative == 0 else 0.0
         return segments.evaluation(node, derivative) + lever
 
     @one_blas_thread
-    def _solve(self, n_modes: int, stiffness: Profile, continuity: int, tension: float, tolerance: float) -> Modes:
+    def _solve(self, n_modes: int, tolerance: float, tension: float = 0.0) -> Modes:
         if n_modes < 1:
             raise ValueError(f"the number of modes must be at least 1; got {n_modes}")
         extra = 0
         while True:
-            segments = self._segments(n_modes, stiffness, continuity, extra)
-            omega, coefficients, essential = self._eigenpairs(segments, n_modes, stiffness, tension)
+            segments = self._segments(n_modes, extra)
+            omega, coefficients, essential = self._eigenpairs(segments, n_modes, tension)
             if segments.unresolved(coefficients) < tolerance:
                 break
             extra = 10 + 2 * extra
@@ -146,7 +155,7 @@ class _Member(Printed):
                 warnings.warn(
                     "the modes did not converge to the tolerance: is there a jump in a profile given as a function?"
                     " Give its place by Profile(function, breaks=(x,)).",
-                    stacklevel=3,
+                    stacklevel=4,  # the caller of `modes`, beyond the limit of threads
                 )
                 break
 
@@ -165,13 +174,13 @@ class _Member(Printed):
         )
 
     def _eigenpairs(
-        self, segments: Segments, n_modes: int, stiffness: Profile, tension: float
+        self, segments: Segments, n_modes: int, tension: float
     ) -> tuple[Floats, Floats, tuple[tuple[float, int], ...]]:
-        order = segments.continuity + 1
+        order, stiffness = self._continuity + 1, self._stiffness
         mass = segments.assemble(self.mass_per_length, 0)
         rigidity = segments.assemble(stiffness, order)
         if tension:
-            rigidity += segments.assemble(lambda x: np.full(x.shape, tension), 1)
+            rigidity += segments.assemble(Profile.constant(tension), 1)
         held, essential, springs = self.restraints(segments)
         for value, row in self.point_masses(segments):
             mass += value * row.T @ row
@@ -198,7 +207,7 @@ class _Member(Printed):
         # that 1/ν - σ is inaccurate; a sum of squares does not cancel.
         eigenvalues = segments.form(stiffness, order, coefficients)
         if tension:
-            eigenvalues += segments.form(lambda x: np.full(x.shape, tension), 1, coefficients)
+            eigenvalues += segments.form(Profile.constant(tension), 1, coefficients)
         for spring, row in springs:
             eigenvalues += spring * (row @ coefficients)[0] ** 2
         if (eigenvalues < -1e-7 * shift).any():
@@ -226,7 +235,7 @@ class _Member(Printed):
         self, segments: Segments
     ) -> tuple[list[int], list[tuple[float, int]], list[tuple[float, np.ndarray]]]:
         """Functions held by the ends, their (x, derivative), and springs with the rows of their elongations."""
-        order = segments.continuity + 1
+        order = self._continuity + 1
         held, essential = [], []
         springs: list[tuple[float, np.ndarray]] = []
         last = segments.nodes.size - 1
@@ -248,7 +257,7 @@ class _Member(Printed):
         middle = 0.5 * self.length
         size = 1.0 / np.sqrt(float(self.mass_per_length(middle)) * self.length)
         signs = np.zeros(coefficients.shape[1])
-        for derivative in range(segments.continuity + 2):
+        for derivative in range(self._continuity + 2):
             start = (segments.evaluation(0.0, derivative) @ coefficients)[0] * self.length**derivative / size
             signs = np.where((signs == 0) & (np.abs(start) > 1e-6), np.sign(start), signs)
             if signs.all():
@@ -336,6 +345,8 @@ class Bar(_Member):
     """
 
     axial_stiffness: Profile
+    _continuity = 0
+    _stiffness_name = "axial_stiffness"
 
     if TYPE_CHECKING:  # the arguments may have short forms, which become `Profile` and `End`
 
@@ -353,12 +364,12 @@ class Bar(_Member):
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        self._prepare(("fixed", "free"), "axial_stiffness")
+        self._prepare(("fixed", "free"))
         for part in self.attachments:
             at = position(part.at)
             end = 0.0 if at < 0.5 * self.length else self.length
             on_end = abs(at - end) < NO_SLIVER * self.length and isinstance(part, PointSpring | PointMass)
-            if on_end and self._is_tip(end, self.axial_stiffness):
+            if on_end and self._is_tip(end):
                 raise ValueError(
                     f"{part} stands on a tip: axial_stiffness vanishes at x = {end:g}, where a point force has an"
                     " infinite displacement; attach it further in, or give the tip some stiffness"
@@ -366,7 +377,7 @@ class Bar(_Member):
 
     def modes(self, n_modes: int, *, tolerance: float = 1e-10) -> Modes:
         """The lowest `n_modes` modes, mass-normalised, resolved to `tolerance` in their highest derivative."""
-        return self._solve(n_modes, self.axial_stiffness, 0, 0.0, tolerance)
+        return self._solve(n_modes, tolerance)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -389,6 +400,8 @@ class Beam(_Member):
 
     bending_stiffness: Profile
     tension: float = 0.0
+    _continuity = 1
+    _stiffness_name = "bending_stiffness"
 
     if TYPE_CHECKING:  # the arguments may have short forms, which become `Profile` and `End`
 
@@ -407,11 +420,11 @@ class Beam(_Member):
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        self._prepare(("hinged", "clamped", "free", "sliding"), "bending_stiffness")
+        self._prepare(("hinged", "clamped", "free", "sliding"))
 
     def modes(self, n_modes: int, *, tolerance: float = 1e-10) -> Modes:
         """The lowest `n_modes` modes, mass-normalised, resolved to `tolerance` in their highest derivative."""
-        return self._solve(n_modes, self.bending_stiffness, 1, self.tension, tolerance)
+        return self._solve(n_modes, tolerance, self.tension)
 
     @one_blas_thread
     def buckling_load(self) -> float:
@@ -422,9 +435,9 @@ class Beam(_Member):
         Raises:
             ValueError: negative springs that make the beam unstable without compression.
         """
-        segments = self._segments(BUCKLED, self.bending_stiffness, 1, 0)
+        segments = self._segments(BUCKLED, 0)
         rigidity = segments.assemble(self.bending_stiffness, 2)
-        slopes = segments.assemble(lambda x: np.ones(x.shape), 1)
+        slopes = segments.assemble(Profile.constant(1.0), 1)
         held, _, springs = self.restraints(segments)
         for spring, row in springs:
             rigidity += spring * row.T @ row

@@ -95,7 +95,8 @@ class Modes(Printed):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "domain", as_domain(self.domain))
-        omega = frozen(self.omega)
+        freeze(self, "omega")
+        omega = self.omega
         damping = np.asarray(self.damping, float)
         if omega.ndim != 1 or omega.size == 0:
             raise ValueError(f"Modes.omega must have shape (n_modes,) with at least one mode; got {omega.shape}")
@@ -108,12 +109,11 @@ class Modes(Printed):
                 f"Modes.damping must be finite, (n_modes,) ratios or (n_modes, n_modes) c_rs with n_modes ="
                 f" {omega.size}; got shape {damping.shape}"
             )
-        object.__setattr__(self, "omega", omega)
         object.__setattr__(self, "damping", frozen(damping))
         if self.covariance is not None:
-            object.__setattr__(self, "covariance", frozen(self.covariance))
+            freeze(self, "covariance")
         if self.shape_covariance is not None:
-            object.__setattr__(self, "shape_covariance", frozen(self.shape_covariance))
+            freeze(self, "shape_covariance")
             n_points = len(self.domain.names) if isinstance(self.domain, NamedPoints) else 0
             if self.shape_covariance.shape != (omega.size, n_points, n_points):
                 raise ValueError(
@@ -246,8 +246,8 @@ class Modes(Printed):
         return float(np.abs(self.phi(self.domain.grid(12))).max())
 
     def select(self, modes: Sequence[int] | slice) -> "Modes":
-        """The modes of some zero-based indices."""
-        index = np.arange(self.n_modes)[modes] if isinstance(modes, slice) else np.asarray(modes, int)
+        """The modes of some zero-based indices, of a slice, or of a mask (n_modes,)."""
+        index = _indices(modes, self.n_modes)
         if index.size == 0 or index.min() < 0 or index.max() >= self.n_modes:
             raise ValueError(f"modes {index.tolist()} are not all among the {self.n_modes} modes at hand (from 0)")
         shapes = self.shapes
@@ -359,8 +359,8 @@ class SampledModes(Printed):
         return -self.zeta * self.omega + 1j * self.omega * np.sqrt(np.maximum(1.0 - self.zeta**2, 0.0))
 
     def select(self, modes: Sequence[int] | slice) -> "SampledModes":
-        """The modes of some zero-based indices."""
-        index = np.arange(self.n_modes)[modes] if isinstance(modes, slice) else np.asarray(modes, int)
+        """The modes of some zero-based indices, of a slice, or of a mask (n_modes,)."""
+        index = _indices(modes, self.n_modes)
         return SampledModes(self.omega[index], self.zeta[index], self.shapes[:, index], self.positions)
 
     @property
@@ -393,6 +393,13 @@ def mac(first: ArrayLike, second: ArrayLike) -> Floats:
         raise ValueError(f"MAC compares shapes at the same places; got {a.shape[0]} and {b.shape[0]} of them")
     norms = np.outer((np.abs(a) ** 2).sum(0), (np.abs(b) ** 2).sum(0))
     return np.asarray(np.abs(a.conj().T @ b) ** 2 / np.maximum(norms, 1e-300))
+
+
+def _indices(modes: Sequence[int] | slice, n_modes: int) -> Integers:
+    """Zero-based indices of modes that are given by them, by a slice, or by a mask."""
+    if isinstance(modes, slice) or np.asarray(modes).dtype == bool:
+        return np.arange(n_modes)[modes]
+    return np.asarray(modes, int)
 
 
 def _range_hz(frequencies: np.ndarray) -> str:

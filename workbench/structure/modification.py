@@ -1,5 +1,6 @@
 """Structural modification: modes of a structure with attachments, computed from its modes alone."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +10,7 @@ from scipy.linalg import LinAlgError, eigh
 from workbench.renamed import former_arguments
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
-from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring, masses_among
+from workbench.structure.supports import Attachment, PointDamper, PointMass, masses_among
 
 OWN = 4  # dynamic modes per requested mode
 DIVERGES = 0.9  # ratio of flexibilities (see `truncation_error`) from which on the series counts as divergent
@@ -39,17 +40,13 @@ def attach(
     if n_modes is not None:
         return _with_residual(modes, attachments, n_modes, residual_flexibility)
     n = modes.n_modes
-    mass, stiffness, extra_damping = np.eye(n), np.diag(modes.omega**2), []
-    for part in attachments:
-        if isinstance(part, PointDamper):
-            extra_damping.append(part)
-            continue
+    mass, stiffness = np.eye(n), np.diag(modes.omega**2)
+    conservative = [part for part in attachments if not isinstance(part, PointDamper)]
+    for part, derivative, value in _coefficients(conservative):
+        shapes = _shapes_at(modes, part, derivative)
         target = mass if isinstance(part, PointMass) else stiffness
-        for derivative, value in enumerate(part.pair):
-            if value:
-                shapes = _shapes_at(modes, part, derivative)
-                target += value * shapes.T @ shapes
-    if any(isinstance(part, PointMass | PointSpring) for part in attachments):
+        target += value * shapes.T @ shapes
+    if conservative:
         omega, vectors = _eigen(stiffness, mass)
         if modes.proportional:
             # a rigid mode has no damping ratio: its coefficient c is kept
@@ -58,11 +55,9 @@ def attach(
             damping = vectors.T @ modes.damping @ vectors
     else:
         omega, vectors, damping = modes.omega, np.eye(n), modes.damping
-    for part in extra_damping:
-        for derivative, value in enumerate(part.pair):
-            if value:
-                shape = _shapes_at(modes, part, derivative) @ vectors
-                damping = damping + value * shape.T @ shape
+    for part, derivative, value in _coefficients(part for part in attachments if isinstance(part, PointDamper)):
+        shape = _shapes_at(modes, part, derivative) @ vectors
+        damping = damping + value * shape.T @ shape
     return _combined(modes, vectors, omega, damping, attachments)
 
 
@@ -102,12 +97,13 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
     frequency.
     """
     own = min(OWN * kept, modes.n_modes)
-    conservative = [part for part in attachments if not isinstance(part, PointDamper)]
-    rows = np.vstack([np.zeros((0, modes.n_modes)), *(_shapes_at(modes, part, 0) for part in conservative)])
+    conservative = _coefficients(part for part in attachments if not isinstance(part, PointDamper))
+    each = [_shapes_at(modes, part, derivative) for part, derivative, _ in conservative]
+    rows = np.vstack([np.zeros((0, modes.n_modes)), *each])
     # rows of `rest`: static responses of the higher modes to the forces, of unit energy and orthogonal
     _, sizes, directions = np.linalg.svd(rows[:, own:] / modes.omega[own:], full_matrices=False)
     rest = directions[sizes > 1e-6 * sizes.max(initial=0.0)] / modes.omega[own:]
-    places = list(dict.fromkeys(part.at for part in conservative)) if residual else []
+    places = list(dict.fromkeys(part.at for part, derivative, _ in conservative if derivative == 0 and residual))
     first = own + len(rest)  # of the coordinates of residual flexibility
     basis = np.zeros((modes.n_modes, first + len(places)))
     basis[:own, :own] = np.eye(own)
@@ -116,16 +112,21 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
     mass, stiffness = basis.T @ basis, basis.T @ (modes.omega[:, None] ** 2 * basis)
     stiffness[first:, first:] = np.eye(len(places))  # of unit energy
     mass[first:, first:] = np.eye(len(places)) / modes.omega[-1] ** 2
-    for part in conservative:
-        shapes = _shapes_at(reduced, part, 0)
-        if places:
+    for part, derivative, value in conservative:
+        shapes = _shapes_at(reduced, part, derivative)
+        if places and derivative == 0:
             shapes = shapes.copy()
             shapes[:, first + places.index(part.at)] = np.sqrt(residual)
         target = mass if isinstance(part, PointMass) else stiffness
-        target += part.pair[0] * shapes.T @ shapes
+        target += value * shapes.T @ shapes
     omega, vectors = _eigen(stiffness, mass, subset_by_index=[0, kept - 1])
     changed = _combined(modes, basis @ vectors, omega, modes.zeta[:kept], attachments)
     return attach(changed, tuple(part for part in attachments if isinstance(part, PointDamper)))
+
+
+def _coefficients(parts: Iterable[Attachment]) -> list[tuple[Attachment, int, float]]:
+    """The coefficients that are not zero: the part, 0 of a displacement or 1 of a rotation, and the value."""
+    return [(part, derivative, value) for part in parts for derivative, value in enumerate(part.pair) if value]
 
 
 def _shapes_at(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:

@@ -1,8 +1,7 @@
 """Rectangular plates and membranes, and their modes."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +22,7 @@ from workbench.structure.supports import (
     masses_among,
 )
 from workbench.structure.surface_basis import EdgeSpring, PointTerm, Square, SurfaceProblem
-from workbench.structure.surface_ritz import SurfaceModes, solve
+from workbench.structure.surface_ritz import solve
 
 SAMPLES = 41  # per side, at which a field is checked to be positive
 SAME_POINT = 1e-6  # of a side: attachments nearer to one another are at one point
@@ -41,12 +40,12 @@ class _Surface:
         """The rectangle of the surface."""
         return Rectangle(self.length)
 
-    def _prepare(self, allowed_edges: tuple[str, ...], fields: tuple[str, ...]) -> None:
+    def _prepare(self, allowed_edges: tuple[str, ...], names: tuple[str, ...]) -> None:
         object.__setattr__(self, "length", Rectangle(self.length).length)
         object.__setattr__(self, "edges", as_edges(self.edges, allowed=allowed_edges))
         share = (np.arange(SAMPLES) + 0.5) / SAMPLES
         x, y = share[:, None] * self.length[0], share[None, :] * self.length[1]
-        for name in fields:
+        for name in names:
             value = as_field(getattr(self, name))
             object.__setattr__(self, name, value)
             values = value(x, y)
@@ -69,19 +68,13 @@ class _Surface:
         share = np.linspace(0.05, 0.95, 19)
         return float(quantity(share[:, None] * self.length[0], share[None, :] * self.length[1]).mean())
 
-    def _damping_matrix(self, omega: np.ndarray, products: Callable[[Field], np.ndarray]) -> np.ndarray:
-        """(n_modes, n_modes) c_rs; `products` gives ∫ c φ_r φ_s dA of a coefficient per area."""
-        if not isinstance(self.damping, ViscousDamping):
-            return self.damping.matrix(omega)
-        return products(as_field(self.damping.coefficient_per_length))  # type: ignore[arg-type]
-
-    def _solved(self, found: SurfaceModes) -> Modes:
-        return Modes(
-            omega=found.omega,
-            damping=self._damping_matrix(found.omega, found.products),
-            shapes=found.shapes,
-            domain=self.domain,
-        )
+    def _solved(self, problem: SurfaceProblem, n_modes: int, tolerance: float, beyond: int = 0) -> Modes:
+        found = solve(problem, n_modes, tolerance=tolerance, beyond=beyond)
+        if isinstance(self.damping, ViscousDamping):
+            damping = found.products(as_field(self.damping.coefficient_per_length))  # type: ignore[arg-type]
+        else:
+            damping = self.damping.matrix(found.omega)
+        return Modes(omega=found.omega, damping=damping, shapes=found.shapes, domain=self.domain)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -139,10 +132,10 @@ class Plate(_Surface):
         object.__setattr__(self, "attachments", tuple(self.attachments))
         for part in self.attachments:
             self.domain.locate([part.at])
-            if getattr(part, ROTATIONAL[type(part)]):
+            if part.pair[1]:
                 raise ValueError(
                     f"{part}: the rotation of a thin plate under a point moment is infinite, so"
-                    f" {ROTATIONAL[type(part)]} has no meaning there; distribute it over two points or more"
+                    f" {fields(part)[-1].name} has no meaning there; distribute it over two points or more"
                 )
             if isinstance(part, PointMass) and part.mass < 0:
                 raise ValueError(f"{part}: a mass cannot be negative; leave it out or lower mass_per_area")
@@ -194,8 +187,7 @@ class Plate(_Surface):
         loaded = any(isinstance(part, PointMass | PointSpring) for part in self.attachments)
         if self.is_navier and not loaded and not isinstance(self.damping, ViscousDamping):
             return self._with_dampers(self._closed_form(n_modes + beyond))
-        solution = solve(self.ritz_problem(), n_modes, tolerance=tolerance, beyond=beyond)
-        return self._with_dampers(self._solved(solution))
+        return self._with_dampers(self._solved(self.ritz_problem(), n_modes, tolerance, beyond))
 
     @property
     def is_navier(self) -> bool:
@@ -210,7 +202,7 @@ class Plate(_Surface):
         principal, directions = np.linalg.eigh([[nx, nxy], [nxy, ny]])
         for value, (c, s) in zip(principal, directions.T):
             if value:
-                squares.append(Square(partial(_everywhere, value), ((c, 1, 0), (s, 0, 1))))
+                squares.append(Square(Field.constant(value), ((c, 1, 0), (s, 0, 1))))
         a, b = self.length
         return SurfaceProblem(
             length=self.length,
@@ -305,11 +297,7 @@ class Plate(_Surface):
 
 
 def check_poisson_ratio(value: float) -> None:
-    """Refuse a Poisson's ratio that no isotropic material has.
-
-    Raises:
-        ValueError: outside -1 to 0.5.
-    """
+    """Refuse, by a `ValueError`, a Poisson's ratio that no isotropic material has, outside -1 to 0.5."""
     if not -1.0 < value < 0.5 + 1e-12:
         raise ValueError(f"Poisson's ratio lies between -1 and 0.5; got {value}")
 
@@ -322,9 +310,6 @@ def bending_squares(rigidity: Field, poisson_ratio: float) -> tuple[Square, ...]
         Square(lambda x, y: 0.5 * (1.0 - nu) * rigidity(x, y), ((1.0, 2, 0), (-1.0, 0, 2))),
         Square(lambda x, y: 2.0 * (1.0 - nu) * rigidity(x, y), ((1.0, 1, 1),)),
     )
-
-
-ROTATIONAL = {PointMass: "rotary_inertia", PointSpring: "rotational_stiffness", PointDamper: "rotational_coefficient"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -382,13 +367,9 @@ class Membrane(_Surface):
             corners=((), ()),
             scale=self._mean(self.tension) / self._mean(self.mass_per_area) * np.pi**2 / (a * b),
         )
-        return self._solved(solve(problem, n_modes, tolerance=tolerance))
+        return self._solved(problem, n_modes, tolerance)
 
 
 def _breaks(*fields: Field) -> tuple[tuple[float, ...], tuple[float, ...]]:
     along_x = sorted({x for each in fields for x in each.x_breaks})
     return tuple(along_x), tuple(sorted({y for each in fields for y in each.y_breaks}))
-
-
-def _everywhere(value: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.full(np.broadcast(x, y).shape, value)

@@ -101,10 +101,6 @@ class Segments:
         inner = np.arange(self._inner[segment], self._inner[segment + 1])
         return np.concatenate([np.arange(nodal * segment, nodal * (segment + 2)), inner])
 
-    def scales(self, segment: int) -> np.ndarray:
-        """Factors (degree + 1,) that turn a local slope into a slope per metre."""
-        return _scales(self.degrees[segment], self.continuity, self.nodes[segment + 1] - self.nodes[segment])
-
     def evaluation(self, x: ArrayLike, derivative: int = 0) -> np.ndarray:
         """The matrix (n_points, n_functions) that maps coefficients to values (or derivatives) at x, read-only."""
         x = np.atleast_1d(np.asarray(x, float))
@@ -163,6 +159,7 @@ class Segments:
 
 
 def _scales(degree: int, continuity: int, width: float) -> Floats:
+    """Factors (degree + 1,) that turn slopes in the local coordinate into slopes per metre."""
     factors = np.ones(degree + 1)
     if continuity == 1:
         factors[[1, 3]] = 0.5 * width
@@ -196,7 +193,7 @@ def _evaluation(nodes: bytes, degrees: tuple[int, ...], continuity: int, places:
         local = 2.0 * (x[here] - segments.nodes[s]) / h - 1.0
         coefficients = _derived(degrees[s], continuity, derivative)
         values = eval_legendre(np.arange(coefficients.shape[0]), local[:, None]) @ coefficients
-        values = values * segments.scales(s) * (2.0 / h) ** derivative
+        values = values * _scales(degrees[s], continuity, h) * (2.0 / h) ** derivative
         matrix[np.ix_(np.flatnonzero(here), segments.indices(s))] = values
     matrix.flags.writeable = False
     return matrix

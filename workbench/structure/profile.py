@@ -70,15 +70,17 @@ class Profile:
         return values if values.shape == x.shape else np.broadcast_to(values, np.atleast_1d(x).shape).reshape(x.shape)
 
     def scaled(self, factor: float, start: float | None = None, stop: float | None = None) -> "Profile":
-        """The same quantity times `factor`, everywhere or between `start` and `stop` (m)."""
-        if start is None or stop is None:
+        """The same quantity times `factor`, from `start` to `stop` (m), or to the end where one is not given."""
+        ends = [float(end) for end in (start, stop) if end is not None]
+        if not ends:
             return Profile(lambda x: factor * self.function(x), self.breaks)
+        low, high = -np.inf if start is None else start, np.inf if stop is None else stop
 
         def changed(x: Floats) -> Floats:
-            factors: Floats = np.where((x > start) & (x < stop), factor, 1.0)
+            factors: Floats = np.where((x > low) & (x < high), factor, 1.0)
             return factors * self(x)
 
-        return Profile(changed, tuple(sorted({*self.breaks, float(start), float(stop)})))
+        return Profile(changed, tuple(sorted({*self.breaks, *ends})))
 
 
 ProfileLike = Profile | float | Callable[[np.ndarray], np.ndarray] | tuple[ArrayLike, ArrayLike]
@@ -145,11 +147,7 @@ FieldLike = Field | float | Callable[[np.ndarray, np.ndarray], ArrayLike]
 
 
 def as_field(quantity: FieldLike) -> Field:
-    """A `Field` from a number, a callable of (x, y), or a `Field`.
-
-    Raises:
-        TypeError: anything else.
-    """
+    """A `Field` from a number, a callable of (x, y), or a `Field`."""
     if isinstance(quantity, Field):
         return quantity
     if isinstance(quantity, Real):

@@ -99,11 +99,7 @@ class AtPlace:
 
 
 class _Attached(AtPlace):
-    """An attachment of a structure, with finite coefficients.
-
-    Raises:
-        ValueError: a coefficient that is not finite.
-    """
+    """An attachment of a structure; a coefficient that is not finite is refused by a `ValueError`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -68,7 +68,7 @@ class SurfaceProblem:
         continuity: 0 (values shared between segments; membrane) or 1 (slopes too; plate).
         mass: per area, a function of (x, y), kg/m².
         squares: of the strain energy.
-        edges: springs along edges, held ones mutual them.
+        edges: springs along edges, held ones among them.
         points: masses and springs at points.
         breaks: coordinates of jumps, along x and along y, m.
         corners: coordinates of edges that end in a singular corner, along x and along y, m.
@@ -84,6 +84,11 @@ class SurfaceProblem:
     breaks: tuple[tuple[float, ...], tuple[float, ...]]
     corners: tuple[tuple[float, ...], tuple[float, ...]]
     scale: float
+
+    @property
+    def springs(self) -> tuple[EdgeSpring, ...]:
+        """The edges that are not held."""
+        return tuple(edge for edge in self.edges if edge.stiffness != HELD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +158,9 @@ class Functions:
             for coefficient, dx, dy in square.parts:
                 strain = strain + coefficient * self.on_grid(self.x_axis, self.y_axis, (dx, dy))
             total += np.einsum("qpr,qp->r", strain**2, weights_on(square.weight, self.x_axis, self.y_axis))
-        for edge in problem.edges:
-            if edge.stiffness != HELD:
-                along = _own_and_other(edge, self.x_axis, self.y_axis)[1]
-                total += edge.stiffness * (along.weights @ self.on_edge(edge, along.points) ** 2)
+        for edge in problem.springs:
+            along = _own_and_other(edge, self.x_axis, self.y_axis)[1]
+            total += edge.stiffness * (along.weights @ self.on_edge(edge, along.points) ** 2)
         return total
 
     def on_edge(self, edge: EdgeSpring, points: np.ndarray) -> np.ndarray:
@@ -190,16 +194,15 @@ def assemble(squares: tuple[Square, ...], x_axis: Axis, y_axis: Axis) -> np.ndar
     return total.reshape(nx, nx, ny, ny).transpose(0, 2, 1, 3).reshape(nx * ny, nx * ny)
 
 
-def edge_matrix(edges: tuple[EdgeSpring, ...], x_axis: Axis, y_axis: Axis) -> np.ndarray:
+def edge_matrix(springs: tuple[EdgeSpring, ...], x_axis: Axis, y_axis: Axis) -> np.ndarray:
     """Stiffness (n, n) of the springs along edges."""
     total = np.zeros((x_axis.n * y_axis.n,) * 2)
-    for edge in edges:
-        if edge.stiffness != HELD:
-            own, other = _own_and_other(edge, x_axis, y_axis)
-            across = own.values(edge.at, edge.derivative)[0]
-            along = other.tables[0].T @ (other.weights[:, None] * other.tables[0])
-            pair = (np.outer(across, across), along)
-            total += edge.stiffness * np.kron(*(pair if edge.axis == 0 else pair[::-1]))
+    for edge in springs:
+        own, other = _own_and_other(edge, x_axis, y_axis)
+        across = own.values(edge.at, edge.derivative)[0]
+        along = other.tables[0].T @ (other.weights[:, None] * other.tables[0])
+        pair = (np.outer(across, across), along)
+        total += edge.stiffness * np.kron(*(pair if edge.axis == 0 else pair[::-1]))
     return total
 
 
@@ -217,7 +220,7 @@ def common_grid(*grids: tuple[Axis, Axis]) -> tuple[Axis, Axis]:
 
 
 def products(
-    edges: tuple[EdgeSpring, ...],
+    springs: tuple[EdgeSpring, ...],
     squares: tuple[Square, ...],
     axes: tuple[Axis, Axis],
     others: tuple[Functions, ...],
@@ -226,7 +229,7 @@ def products(
     """Energy products of other functions with those of the axes (n, n_others) and with each other (n_others, n_others).
 
     Args:
-        edges, squares: of the energy.
+        springs, squares: of the energy.
         axes: of the polynomial functions.
         others: functions on other axes, a single one each.
         grid: of the quadrature, see `common_grid`.
@@ -241,15 +244,14 @@ def products(
             for c, dx, dy in square.parts:
                 tables = axes[0].values(grid[0].points, dx), axes[1].values(grid[1].points, dy)
                 cross[:, :, p] += c * (tables[0].T @ load @ tables[1])
-    for edge in edges:
-        if edge.stiffness != HELD:
-            own, along = _own_and_other(edge, *axes), _own_and_other(edge, *grid)[1]
-            on_edge = [other.on_edge(edge, along.points)[:, 0] for other in others]
-            loads = [edge.stiffness * along.weights * values for values in on_edge]
-            mutual += np.array([[one @ other for other in on_edge] for one in loads])
-            for p, load in enumerate(loads):
-                outer = np.outer(own[0].values(edge.at, edge.derivative)[0], own[1].values(along.points).T @ load)
-                cross[:, :, p] += outer if edge.axis == 0 else outer.T
+    for edge in springs:
+        own, along = _own_and_other(edge, *axes), _own_and_other(edge, *grid)[1]
+        on_edge = [other.on_edge(edge, along.points)[:, 0] for other in others]
+        loads = [edge.stiffness * along.weights * values for values in on_edge]
+        mutual += np.array([[one @ other for other in on_edge] for one in loads])
+        for p, load in enumerate(loads):
+            outer = np.outer(own[0].values(edge.at, edge.derivative)[0], own[1].values(along.points).T @ load)
+            cross[:, :, p] += outer if edge.axis == 0 else outer.T
     return cross.reshape(-1, len(others)), mutual
 
 
@@ -269,8 +271,8 @@ def axes_of(
         level: of refinement.
         near: a point towards which segments shrink, instead of the singular corners.
     """
-    first, second = (_axis(problem, axis, n_modes, level, None if near is None else near[axis]) for axis in (0, 1))
-    return first, second
+    along_x, along_y = near or (None, None)
+    return _axis(problem, 0, n_modes, level, along_x), _axis(problem, 1, n_modes, level, along_y)
 
 
 def _axis(problem: SurfaceProblem, axis: int, n_modes: int, level: int, near: float | None) -> Axis:

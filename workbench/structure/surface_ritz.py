@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh
 
+from workbench.structure.profile import Field
 from workbench.structure.surface_basis import (
     Axis,
     Functions,
@@ -43,12 +44,10 @@ class SurfaceModes:
     Attributes:
         omega: (n_modes,) rad/s, not decreasing.
         parts: (functions, coefficients): k functions and their coefficients (k, n_modes) in the modes.
-        error: relative, of the frequencies, estimated from the last refinements.
     """
 
     omega: np.ndarray
     parts: tuple[tuple[Functions, np.ndarray], ...]
-    error: float
 
     def shapes(self, places: np.ndarray, derivatives: tuple[int, int] = (0, 0)) -> np.ndarray:
         """(n_places, n_modes) ∂_x^i ∂_y^j φ at places (n_places, 2), with (i, j) = derivatives."""
@@ -85,19 +84,18 @@ def solve(problem: SurfaceProblem, n_modes: int, *, tolerance: float, beyond: in
         axes = axes_of(problem, n_modes, level)
         if axes[0].n * axes[1].n > MOST_FUNCTIONS:
             break
-        statics = [_static_response(problem, point.at, level) for point in problem.points]
-        if None in statics:
+        near = [axes_of(problem, 2, level, near=point.at) for point in problem.points]
+        if any(x.n * y.n > MOST_STATIC for x, y in near):
             break
-        modes = _ritz(problem, axes, tuple(s for s in statics if s is not None), n_modes)
+        statics = tuple(_static_response(problem, point.at, *each) for point, each in zip(problem.points, near))
+        modes = _ritz(problem, axes, statics, n_modes)
         if before.size:
             elastic = (modes.omega > 0) & (before > 0)
             last, change = change, float(np.abs(modes.omega[elastic] / before[elastic] - 1.0).max(initial=0.0))
             error = _remaining(change, last)
             if error <= tolerance:
                 further = min(beyond, axes[0].n * axes[1].n // WORTH - n_modes)
-                if further > 0:
-                    modes = _ritz(problem, axes, tuple(s for s in statics if s is not None), n_modes + further)
-                return replace(modes, error=error)
+                return modes if further <= 0 else _ritz(problem, axes, statics, n_modes + further)
         before = modes.omega
     if not np.isfinite(error):
         raise ValueError(
@@ -119,13 +117,10 @@ def _remaining(change: float, last: float) -> float:
     return change if not np.isfinite(last) or ratio > 0.5 else change * ratio / (1.0 - ratio)
 
 
-def _static_response(problem: SurfaceProblem, at: tuple[float, float], level: int) -> Functions | None:
-    """The response (K + σ M)⁻¹ to a force at a point, of unit energy; None where that needs too many functions."""
-    x_axis, y_axis = axes_of(problem, 2, level, near=at)
-    if x_axis.n * y_axis.n > MOST_STATIC:
-        return None
+def _static_response(problem: SurfaceProblem, at: tuple[float, float], x_axis: Axis, y_axis: Axis) -> Functions:
+    """The response (K + σ M)⁻¹ to a force at a point, of unit energy."""
     matrix = assemble((*problem.squares, mass_square(problem, problem.scale)), x_axis, y_axis)
-    matrix += edge_matrix(problem.edges, x_axis, y_axis)
+    matrix += edge_matrix(problem.springs, x_axis, y_axis)
     try:
         factor = cho_factor(matrix, overwrite_a=True, check_finite=False)
     except LinAlgError as error:
@@ -141,7 +136,7 @@ def _ritz(
 ) -> SurfaceModes:
     """Modes in the space of polynomial products and static responses to forces at the points."""
     mass = assemble((mass_square(problem),), *axes)
-    stiffness = assemble(problem.squares, *axes) + edge_matrix(problem.edges, *axes) + problem.scale * mass
+    stiffness = assemble(problem.squares, *axes) + edge_matrix(problem.springs, *axes) + problem.scale * mass
     n = mass.shape[0]
     if n_modes > n:
         raise ValueError(f"{n_modes} modes requested of {n} functions")
@@ -164,7 +159,7 @@ def _ritz(
         raise ValueError(UNSTABLE)
     values = np.where(values < RIGID * problem.scale, 0.0, values)
     order = np.argsort(values, kind="stable")
-    modes = _rotated(SurfaceModes(np.sqrt(values), tuple(parts), np.inf), np.eye(n_modes)[:, order])
+    modes = _rotated(SurfaceModes(np.sqrt(values), tuple(parts)), np.eye(n_modes)[:, order])
     modes = replace(modes, omega=np.sqrt(values[order]))
     modes = _rotated(modes, _uncoupling(modes, problem))
     return _rotated(modes, np.diag(_signs(modes, problem)))
@@ -180,7 +175,7 @@ def _with_points(
     """M and K + σ M with the static responses as further functions, and with the masses and springs at the points."""
     grid = common_grid(axes, *((s.x_axis, s.y_axis) for s in statics))
     shifted = (*problem.squares, mass_square(problem, problem.scale))
-    cross, mutual = products(problem.edges, shifted, axes, statics, grid)
+    cross, mutual = products(problem.springs, shifted, axes, statics, grid)
     mass_cross, mass_mutual = products((), (mass_square(problem),), axes, statics, grid)
     stiffness = np.block([[stiffness, cross], [cross.T, mutual]])
     mass = np.block([[mass, mass_cross], [mass_cross.T, mass_mutual]])
@@ -209,8 +204,7 @@ def _uncoupling(modes: SurfaceModes, problem: SurfaceProblem) -> np.ndarray:
     if not repeated.size:
         return rotation
     a, b = problem.length
-    slopes = modes.products(lambda x, y: a**2 + 0 * x * y, (1, 0))
-    slopes = slopes + modes.products(lambda x, y: 0.5 * b**2 + 0 * x * y, (0, 1))
+    slopes = modes.products(Field.constant(a**2), (1, 0)) + modes.products(Field.constant(0.5 * b**2), (0, 1))
     for cluster in np.split(repeated, np.flatnonzero(np.diff(repeated) > 1) + 1):
         index = slice(cluster[0], cluster[-1] + 2)
         rotation[index, index] = eigh(slopes[index, index])[1]
