@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.special import ndtr
 
 from workbench.arrays import Floats
@@ -156,14 +157,13 @@ class SolvedPlant:
             finest: radians of the highest mode in one step.
         """
         plant = self.plant
-        system, drive, edges, steps = self.system(sample_time, finest)
+        system, drive, pieces = self.system(sample_time, finest)
         held = self.random_forces(commands.shape[1], sample_time, rng)
         acting = np.array([not a.direct for a in plant.actuators], float)
-        sent = np.ascontiguousarray(commands, float).copy()
-        pieces = motion.integrate(
-            system, drive, sent, feedback * acting[:, None] * self.at_actuators, held, float(sample_time), edges, steps
-        )
-        return ModalMotion(pieces[0, 0], pieces[1, 0], pieces[2, 0], np.r_[0.0, edges[:-1]], pieces), sent
+        sent = np.array(commands, float, order="C")
+        feedbacks = feedback * acting[:, None] * self.at_actuators
+        moved = motion.integrate(system, drive, pieces, sent, feedbacks, held)
+        return ModalMotion(moved[0, 0], moved[1, 0], moved[2, 0], np.r_[0.0, pieces.edges[:-1]], moved), sent
 
     def random_forces(self, n_samples: int, sample_time: float, rng: np.random.Generator | None) -> np.ndarray:
         """Unmeasured random modal forces (n_samples, n_modes), constant over each sample; zero without `rng`."""
@@ -173,36 +173,47 @@ class SolvedPlant:
                 held += np.outer(rms * coloured_noise(rng, n_samples, sample_time, corner), shape)
         return held
 
-    def system(self, sample_time: float, finest: float = FINEST) -> tuple[Any, Any, np.ndarray, np.ndarray]:
-        """The arguments system, drive, edges and steps of `motion.integrate`."""
+    def system(self, sample_time: float, finest: float = FINEST) -> tuple[motion.System, motion.Drive, motion.Pieces]:
+        """The plant as `motion` integrates it."""
         plant, modes = self.plant, self.modes
-        zeta = _damping_ratios(plant)
         m = len(plant.actuators)
-        drives = np.array([[a.gain, a.dead_zone, a.limit, a.delay] for a in plant.actuators])
-        hysteresis = np.array([[a.hysteresis_share, a.hysteresis_width] for a in plant.actuators])
-        curvature = np.zeros(m) if plant.curvature is None else plant.curvature
-        mix = np.eye(m) if plant.mix is None else plant.mix
         late = [a.delay / sample_time for a in plant.actuators] + [-s.delay / sample_time for s in plant.sensors]
         ends = np.unique(np.round([*(delay % 1.0 for delay in late), 1.0], 12))
         edges = ends[ends > 0]
         turns = max(modes.omega[-1] * sample_time / finest, 8.0)
         steps = np.ceil(turns * np.diff(np.r_[0.0, edges])).astype(np.int64)
-        laws = np.array([[code, *p, *[1.0] * (3 - len(p))] for code, _, p in plant.laws]).reshape(-1, 4)
-        tones = np.array([[a, 2.0 * np.pi * f, p] for _, a, f, p in plant.tones]).reshape(-1, 3)
-        damping = 2.0 * zeta * modes.omega
-        system = (
-            (modes.omega**2, damping, modes.gram, float(plant.stretching), float(plant.stiffness_rate)),
-            (
-                np.array([a.time_constant for a in plant.actuators]),
-                np.ascontiguousarray(self.at_actuators),
-                np.array([a.rate_limit for a in plant.actuators]),
-                np.array([a.bias for a in plant.actuators]),
-            ),
-            (tones, np.ascontiguousarray(self.at_tones)),
-            (laws, np.ascontiguousarray(self.at_laws)),
-            (float(plant.drag), np.ascontiguousarray(self.field)),
+
+        def each(name: str) -> Floats:
+            return np.array([getattr(a, name) for a in plant.actuators], float)
+
+        system = motion.System(
+            omega2=modes.omega**2,
+            damping=2.0 * _damping_ratios(plant) * modes.omega,
+            gram=modes.gram,
+            stretching=float(plant.stretching),
+            stiffness_rate=float(plant.stiffness_rate),
+            lags=each("time_constant"),
+            rate_limits=each("rate_limit"),
+            biases=each("bias"),
+            at_actuators=np.ascontiguousarray(self.at_actuators),
+            tones=np.array([[a, 2.0 * np.pi * f, p] for _, a, f, p in plant.tones]).reshape(-1, 3),
+            at_tones=np.ascontiguousarray(self.at_tones),
+            laws=np.array([[code, *p, *[1.0] * (3 - len(p))] for code, _, p in plant.laws]).reshape(-1, 4),
+            at_laws=np.ascontiguousarray(self.at_laws),
+            drag=float(plant.drag),
+            field=np.ascontiguousarray(self.field),
         )
-        return system, (mix, np.ascontiguousarray(np.c_[drives, curvature, hysteresis])), edges, steps
+        drive = motion.Drive(
+            mix=np.eye(m) if plant.mix is None else plant.mix,
+            curvature=np.zeros(m) if plant.curvature is None else plant.curvature,
+            share=each("hysteresis_share"),
+            width=each("hysteresis_width"),
+            gain=each("gain"),
+            dead_zone=each("dead_zone"),
+            limit=each("limit"),
+            delays=each("delay"),
+        )
+        return system, drive, motion.Pieces(float(sample_time), edges, steps)
 
     def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
         """The readings (n_outputs, n_samples) of perfect sensors, each with its delay."""
@@ -232,11 +243,8 @@ class SolvedPlant:
             y = law(y, sample_time)
         rows = []
         for sensor, row in zip(self.plant.sensors, y, strict=True):
-            row = _lag(row, sensor.time_constant, sample_time)
-            row = sensor.gain * row + sensor.bias + sensor.drift * np.arange(row.size) / (row.size - 1)
-            if rng is not None:
-                row = row + sensor.noise_std * sensor_noise(rng, row.size, self.plant.noise_memory)
-            row = np.clip(row, -sensor.limit, sensor.limit)
+            noise = 0.0 if rng is None else sensor.noise_std * sensor_noise(rng, row.size, self.plant.noise_memory)
+            row = measured(sensor, _lag(row, sensor.time_constant, sample_time), np.arange(row.size), row.size, noise)
             if sensor.step > 0:
                 mean = rng is None and sensor.noise_std > 0
                 rounded = sensor.step * np.round(row / sensor.step)
@@ -264,26 +272,35 @@ def _damping_ratios(plant: Plant) -> Floats:
 
 
 def sensor_noise(rng: np.random.Generator, n_samples: int, memory: float) -> np.ndarray:
-    """Gaussian noise of unit standard deviation, e_k = memory e_{k-1} + sqrt(1 - memory²) white."""
+    """Gaussian noise of unit standard deviation, e_k = memory e_{k-1} + sqrt(1 - memory²) white, e_0 white."""
     white = rng.standard_normal(n_samples)
     if memory == 0:
         return white
-    noise = white.copy()
-    for k in range(1, n_samples):
-        noise[k] = memory * noise[k - 1] + np.sqrt(1.0 - memory**2) * white[k]
-    return noise
+    later, _ = lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], white[1:], zi=[memory * white[0]])
+    return np.r_[white[0], later]
+
+
+def lagged(out: float, before: float, now: float, time_constant: float, sample_time: float) -> float:
+    """The output of a first-order lag a sample after `out`, as its input goes evenly from `before` to `now`."""
+    slope = (now - before) / sample_time
+    behind = out - before + slope * time_constant
+    return now - slope * time_constant + behind * np.exp(-sample_time / time_constant)
 
 
 def _lag(y: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
     """First-order lag of a signal that is linear between samples, initially settled at its first value."""
     if time_constant == 0:
         return y
-    fade, out = np.exp(-sample_time / time_constant), y.copy()
+    out = y.copy()
     for k in range(1, y.size):
-        slope = (y[k] - y[k - 1]) / sample_time
-        behind = out[k - 1] - y[k - 1] + slope * time_constant
-        out[k] = y[k] - slope * time_constant + behind * fade
+        out[k] = lagged(out[k - 1], y[k - 1], y[k], time_constant, sample_time)
     return out
+
+
+def measured(sensor: Sensor, y: Any, k: Any, n_samples: int, noise: Any) -> Any:
+    """The unrounded readings of a sensor at the samples k of a record, from its lagged input y there, and its noise."""
+    drifted = sensor.gain * y + sensor.bias + sensor.drift * k / (n_samples - 1)
+    return np.clip(drifted + noise, -sensor.limit, sensor.limit)
 
 
 def _mean_rounded(y: Floats, step: float, noise_std: float) -> Floats:
