@@ -19,8 +19,8 @@ from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Bar
 from workbench.structure.modes import Modes, PointShapes
 from workbench.trials.hidden import stands
-from workbench.trials.hold import hold_trials
-from workbench.trials.make import KINDS, OUTSIDE_KINDS, draw_kinds, make_trial, write_trials
+from workbench.trials.hold import draw_kinds, hold_trials, write_trials
+from workbench.trials.make import KINDS, OUTSIDE_KINDS, make_trial
 from workbench.trials.scoring import score, tally
 
 QUICK = (

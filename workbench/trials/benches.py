@@ -1,9 +1,11 @@
 """Benches of blind trials: nominal rigs and their experiments."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.cases.case import Case
 from workbench.rig.rig import Rig
 from workbench.structure.member import Structure
@@ -102,40 +104,41 @@ def multisine(bench: Bench, rng: np.random.Generator) -> np.ndarray:
     lines = np.arange(1, SAMPLES // 2)
     frequency = lines / (SAMPLES * bench.sample_time)
     lines = lines[(frequency >= 0.04 * bench.band_hz) & (frequency <= bench.band_hz)]
-    commands = np.zeros((len(bench.rig.actuators), SAMPLES))
-    for j, actuator in enumerate(bench.rig.actuators):
-        if not actuator.direct:
-            phases = rng.uniform(0.0, 2.0 * np.pi, lines.size)
-            wave = np.sin(2.0 * np.pi * np.outer(lines, np.arange(SAMPLES)) / SAMPLES + phases[:, None]).sum(axis=0)
-            commands[j] = wave / np.sqrt(np.mean(wave**2))
-    return commands
+
+    def wave() -> Floats:
+        phases = rng.uniform(0.0, 2.0 * np.pi, lines.size)
+        values: Floats = np.sin(2.0 * np.pi * np.outer(lines, np.arange(SAMPLES)) / SAMPLES + phases[:, None]).sum(
+            axis=0
+        )
+        return values / float(np.sqrt(np.mean(values**2)))
+
+    return _commands(bench, wave)
 
 
-def _random(bench: Bench, rng: np.random.Generator) -> np.ndarray:
-    commands = np.zeros((len(bench.rig.actuators), SAMPLES))
-    for j, actuator in enumerate(bench.rig.actuators):
-        if not actuator.direct:
-            commands[j] = coloured_noise(rng, SAMPLES, bench.sample_time, 0.9 * bench.band_hz)
-    return commands
+def _commands(bench: Bench, wave: Callable[[], Floats]) -> np.ndarray:
+    """Commands (n_inputs, n_samples) with a wave (n_samples,) for each actuator, and hammers at rest."""
+    return np.array([np.zeros(SAMPLES) if actuator.direct else wave() for actuator in bench.rig.actuators])
 
 
 def _strike(bench: Bench, commands: np.ndarray, sample: int, share: float = 1.0) -> np.ndarray:
     commands = commands.copy()
-    for j, actuator in enumerate(bench.rig.actuators):
-        if actuator.direct:
-            commands[j, sample : sample + 2] = share * STRIKE * bench.level
+    commands[[actuator.direct for actuator in bench.rig.actuators], sample : sample + 2] = share * STRIKE * bench.level
     return commands
 
 
 def experiments(bench: Bench, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """The commands (n_inputs, n_samples) of every record by name; those of `closed_loop` are added to the feedback."""
+
+    def noise() -> Floats:
+        return coloured_noise(rng, SAMPLES, bench.sample_time, 0.9 * bench.band_hz)
+
     tests = {name: share * bench.level * multisine(bench, rng) for name, share in LEVELS.items()}
     still = np.zeros_like(tests["low"])
     if any(a.direct for a in bench.rig.actuators):
         tests["hammer"] = _strike(bench, still, 20)
-    tests["validate"] = _strike(bench, 0.75 * bench.level * _random(bench, rng), SAMPLES * 5 // 8)
+    tests["validate"] = _strike(bench, 0.75 * bench.level * _commands(bench, noise), SAMPLES * 5 // 8)
     if bench.feedback is not None:
-        tests["closed_loop"] = _strike(bench, 0.5 * bench.level * _random(bench, rng), SAMPLES // 3, 0.5)
+        tests["closed_loop"] = _strike(bench, 0.5 * bench.level * _commands(bench, noise), SAMPLES // 3, 0.5)
     return tests
 
 

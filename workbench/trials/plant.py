@@ -253,7 +253,7 @@ class SolvedPlant:
         return np.array(rows)
 
 
-def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float, corner_hz: float) -> np.ndarray:
+def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float, corner_hz: float) -> Floats:
     """Gaussian noise (n_samples,) of unit rms, white up to a corner frequency, with a steep roll-off above it."""
     spectrum = np.fft.rfft(rng.standard_normal(2 * n_samples))
     frequency = np.fft.rfftfreq(2 * n_samples, sample_time)
@@ -277,10 +277,10 @@ def sensor_noise(rng: np.random.Generator, n_samples: int, memory: float) -> np.
     if memory == 0:
         return white
     later, _ = lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], white[1:], zi=[memory * white[0]])
-    return np.r_[white[0], later]
+    return np.asarray(np.r_[white[0], later])
 
 
-def lagged(out: float, before: float, now: float, time_constant: float, sample_time: float) -> float:
+def lagged(out: float, before: float, now: float, time_constant: float, sample_time: float) -> Any:
     """The output of a first-order lag a sample after `out`, as its input goes evenly from `before` to `now`."""
     slope = (now - before) / sample_time
     behind = out - before + slope * time_constant
@@ -310,13 +310,3 @@ def _mean_rounded(y: Floats, step: float, noise_std: float) -> Floats:
     above: Floats = ndtr((y - (nearest + reach) * step) / noise_std).sum(axis=0)
     below: Floats = ndtr(((nearest - reach) * step - y) / noise_std).sum(axis=0)
     return step * (nearest + above - below)
-
-
-def with_ports(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
-    """The plant with one actuator or sensor changed, or all of them (except hammers) for the name "all"."""
-
-    def meant(port: Actuator | Sensor) -> bool:
-        return port.name == name or (name == "all" and not getattr(port, "direct", False))
-
-    ports: Any = tuple(replace(port, **changes) if meant(port) else port for port in getattr(plant, side))
-    return replace(plant, **{side: ports})

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from workbench.structure.domain import Domain, NamedPoints, Rectangle, Where
+from workbench.rig.rig import Rig
+from workbench.structure.domain import NamedPoints, Rectangle, Where
 from workbench.trials.benches import Bench
-from workbench.trials.plant import ModalMotion, Plant, SolvedPlant
+from workbench.trials.plant import ModalMotion, Plant
 
 DISTINCT = 0.1  # least sine of the angle between the modal force vectors at two named points
 COARSE = 0.2  # radians of the highest mode in one step: accurate enough to draw a strength
@@ -17,9 +18,10 @@ class Unsuitable(ValueError):
     """A kind that is impossible on a bench, or a draw without a detectable gap."""
 
 
-def extent(domain: Domain) -> float:
-    """The length that errors of place are divided by, m; 1 for points without positions."""
-    return 1.0 if isinstance(domain, NamedPoints) and domain.positions is None else domain.size
+def relative_gap(difference: np.ndarray, measured: np.ndarray) -> float:
+    """The rms of a difference (n_outputs, n_samples or 1) over the standard deviation of each measured output."""
+    scale = measured.std(axis=1, keepdims=True)
+    return float(np.sqrt(np.mean((difference / np.where(scale > 0, scale, 1.0)) ** 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +35,6 @@ class Scene:
     """
 
     bench: Bench
-    nominal: SolvedPlant
     commands: np.ndarray
     moved: ModalMotion
     outputs: np.ndarray
@@ -42,15 +43,21 @@ class Scene:
     def of(cls, bench: Bench, commands: np.ndarray) -> "Scene":
         nominal = bench.plant().solved()
         moved, _ = nominal.move(commands, bench.sample_time, finest=COARSE)
-        return cls(bench, nominal, commands, moved, nominal.readings(moved, bench.sample_time))
+        return cls(bench, commands, moved, nominal.readings(moved, bench.sample_time))
+
+    @property
+    def rig(self) -> Rig:
+        """The nominal rig."""
+        return self.bench.rig
 
     @property
     def acting(self) -> list[str]:
-        return [a.name for a in self.bench.rig.actuators if not a.direct]
+        """Names of the actuators that follow commands."""
+        return [a.name for a in self.rig.actuators if not a.direct]
 
     def motion_at(self, where: Where) -> tuple[np.ndarray, np.ndarray]:
         """Nominal displacement and velocity at a place, or between two, (n_samples,) each."""
-        shape = self.bench.rig.modes.phi_at(where)
+        shape = self.rig.modes.phi_at(where)
         return self.moved[0] @ shape, self.moved[1] @ shape
 
     def place(self, rng: np.random.Generator, *, between: bool = False) -> Where:
@@ -59,14 +66,14 @@ class Scene:
         Args:
             between: whether half of the draws at named points are a pair `Between` two points.
         """
-        domain = self.bench.rig.modes.domain
+        domain = self.rig.modes.domain
         if isinstance(domain, NamedPoints):
             if domain.positions is not None:
                 return self._distinct(rng, between and rng.random() < 0.5)
             grid: Any = np.array(domain.names)
         else:
             grid = domain.grid(24) if isinstance(domain, Rectangle) else np.linspace(0.05, 1.0, 96) * domain.size
-        rms = np.sqrt(np.mean((self.bench.rig.modes.phi(grid) @ self.moved[0].T) ** 2, axis=1))
+        rms = np.sqrt(np.mean((self.rig.modes.phi(grid) @ self.moved[0].T) ** 2, axis=1))
         at = rng.choice(np.asarray(grid)[rms > rms.max() / 3])
         if isinstance(domain, NamedPoints):
             return str(at)
@@ -82,7 +89,7 @@ class Scene:
         A force at a place with a parallel vector (weighted by the modal velocities) and another strength explains the
         records equally well, so that the place of an effect would not be identifiable.
         """
-        modes = self.bench.rig.modes
+        modes = self.rig.modes
         points = modes.domain
         assert isinstance(points, NamedPoints)
         alone, pairs = list(points.grid()), list(points.pairs())
@@ -103,17 +110,19 @@ class Scene:
         raise Unsuitable("no two places are distinguishable by their mode shapes")
 
     def gap(self, plant: Plant, rng: np.random.Generator, reference: Plant | None = None) -> float:
-        """Noise-free gap between a plant and the nominal one (or the reference) at the middle level."""
-        outputs = [self.outputs]
-        for one in (plant, reference):
-            if one is not None:
-                solved = one.solved()
-                own = np.random.default_rng(rng.integers(2**31))
-                moved, _ = solved.move(self.commands, self.bench.sample_time, rng=own, finest=COARSE)
-                outputs.append(solved.readings(moved, self.bench.sample_time))
-        measured, predicted = outputs[1], outputs[2] if reference is not None else outputs[0]
-        scale = measured.std(axis=1, keepdims=True)
-        gap = float(np.sqrt(np.mean(((measured - predicted) / np.where(scale > 0, scale, 1.0)) ** 2)))
+        """Noise-free gap between a plant and the nominal one (or the reference) at the middle level.
+
+        Raises:
+            Unsuitable: the response diverges.
+        """
+        measured = self._readings(plant, rng)
+        predicted = self.outputs if reference is None else self._readings(reference, rng)
+        gap = relative_gap(measured - predicted, measured)
         if not np.isfinite(gap):
             raise Unsuitable("the response diverges")
         return gap
+
+    def _readings(self, plant: Plant, rng: np.random.Generator) -> np.ndarray:
+        solved, own = plant.solved(), np.random.default_rng(rng.integers(2**31))
+        moved, _ = solved.move(self.commands, self.bench.sample_time, rng=own, finest=COARSE)
+        return solved.readings(moved, self.bench.sample_time)
