@@ -23,7 +23,17 @@ from workbench.structure.modes import SampledModes, mac
 from workbench.structure.printed import command_headings
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
-from workbench.study.pages.page import FORMAT, PageContent, Table, block, page_content_of, tables_of, to_its_error
+from workbench.study.pages.page import (
+    FORMAT,
+    PageContent,
+    Table,
+    block,
+    checks_of,
+    page_content_of,
+    short,
+    tables_of,
+    to_its_error,
+)
 from workbench.study.pages.verdict_page import STANDING_OF, case_inputs, moving_modes, verdict_tables
 from workbench.study.runs.cases import StudyError
 
@@ -195,8 +205,8 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     rows = [
         [
             law["law"],
-            *(_short(law[key]) for key in ("cost", "effort", "peak_force")),
-            _short(works[law["law"]].sum()),
+            *(short(law[key]) for key in ("cost", "effort", "peak_force")),
+            short(works[law["law"]].sum()),
             stability(poles[law["law"]]),
         ]
         for law in laws
@@ -205,7 +215,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     sensed = [
         [
             one["design"],
-            _short(one["margin"]),
+            short(one["margin"]),
             "stable" if one["stable"] else "unstable",
             *_words([one.get("limited_by", ""), one.get("path", "")]),
             "" if one.get("robustness") is None else one["robustness"],
@@ -264,7 +274,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     places = [np.array(one["positions"], float) for one in placements]
     works = {n: np.array(one["by_mode"], float) for n, one in zip(names, placements, strict=True)}
     rows = [
-        [name, *(_short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), _between(at)]
+        [name, *(short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), _between(at)]
         for name, one, at in zip(names, placements, places, strict=True)
     ]
     first, bound = placements[0]["residual_work"], content.get("lower_bound")
@@ -291,26 +301,14 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _short(number: float) -> float:
-    """The number to four significant digits, enough for a comparison."""
-    return float(f"{float(number):.4g}")
-
-
 def _between(places: np.ndarray) -> str:
     return ", ".join(f"{x:.4g}" for x in places)
 
 
 def _studied(content: dict[str, Any]) -> dict[str, Any]:
     """The results of a study."""
-    checks = [
-        [c["name"], c["value"], ("≥ " if c.get("at_least") else "≤ ") + f"{c['limit']:.6g}", bool(c["holds"])]
-        for c in content["checks"]
-    ]
     tables = tables_of({name: value for name, value in content.items() if name != "checks"})
-    return {
-        "lines": _words(content.get("found", [])),
-        "tables": [*tables, *([("Checks", ("what", "value", "limit", ""), checks)] if checks else [])],
-    }
+    return {"lines": _words(content.get("found", [])), "tables": [*tables, *checks_of(content["checks"])]}
 
 
 def _anything(content: dict[str, Any]) -> dict[str, Any]:

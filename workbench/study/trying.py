@@ -162,20 +162,17 @@ def _domain(rig: Rig) -> Domain:
 
 
 def _share(rig: Rig, share: float) -> Place:
-    """The place at this fraction of the length (of both sides of a plate); for named points that of largest motion."""
+    """The place at this fraction of the length (of both sides of a plate).
+
+    For named points, the one with the largest shape of the first elastic mode.
+    """
     domain = rig.modes.domain
     if isinstance(domain, NamedPoints):
-        return _largest_motion(rig)
+        first, names = int(np.argmax(rig.modes.omega > 0)), domain.grid(1)
+        return str(names[int(np.argmax(np.abs(rig.modes.phi(names)[:, first])))])
     if isinstance(domain, Interval):
         return share * domain.length
     return (share * domain.length[0], share * domain.length[1])
-
-
-def _largest_motion(rig: Rig) -> str:
-    """The named point with the largest shape of the first elastic mode."""
-    first = int(np.argmax(rig.modes.omega > 0))
-    names = rig.modes.domain.grid(1)
-    return str(names[int(np.argmax(np.abs(rig.modes.phi(names)[:, first])))])
 
 
 def try_out(rig: Rig, design: Design) -> Tried:
@@ -294,14 +291,11 @@ def _common(rig: Rig, patch: list[float]) -> dict[str, Any]:
 
 def _plain(values: ArrayLike) -> Any:
     """The values as JSON numbers of six digits; None where not finite."""
-    values = np.asarray(values, float).tolist()
-    return _short(values) if isinstance(values, list) else _short([values])[0]
+    return _rounded(np.asarray(values, float).tolist())
 
 
-def _short(values: list[Any]) -> list[Any]:
-    if values and isinstance(values[0], list):
-        return [_short(row) for row in values]
-    return [rounded(value) for value in values]
+def _rounded(values: Any) -> Any:
+    return [_rounded(value) for value in values] if isinstance(values, list) else rounded(values)
 
 
 def read_structure(path: Path | None) -> tuple[Rig, str]:

@@ -120,10 +120,6 @@ def in_script(content: object) -> Markup:
 
 def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | None = None, made_by: str = "") -> Path:
     """Write the page of a study: results, figures, checks, and tables of its runs."""
-    checks = [
-        (c["name"], _cell(c["value"]), ("≥ " if c["at_least"] else "≤ ") + str(_cell(c["limit"])), c["holds"])
-        for c in outcome.checks
-    ]
     runs = [(name, *_table_of(found.rows())) for name, found in outcome.runs.items()]
     page_content = PageContent(
         title=outcome.title or outcome.name,
@@ -131,13 +127,22 @@ def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | No
         blocks=[block(shown, caption) for shown, caption in outcome.shown],
         tables=[
             *tables_of(outcome.tables),
-            *([("Checks", ("what", "value", "limit", ""), checks)] if checks else ()),
+            *checks_of(outcome.checks),
             *runs,
         ],
         inputs=inputs or {},
         made_by=made_by or f"workbench study {outcome.name}",
     )
     return write_page(folder / f"{outcome.name}.html", page_content)
+
+
+def checks_of(checks: Sequence[Mapping[str, Any]]) -> list[Table]:
+    """The table of a study's checks; none without any."""
+    rows = [
+        [c["name"], c["value"], f"{'≥' if c.get('at_least') else '≤'} {_cell(c['limit'])}", bool(c["holds"])]
+        for c in checks
+    ]
+    return [("Checks", ("what", "value", "limit", ""), rows)] if rows else []
 
 
 def tables_of(content: Mapping[str, Any]) -> list[Table]:
@@ -152,7 +157,7 @@ def tables_of(content: Mapping[str, Any]) -> list[Table]:
 def _table_of(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], list[list[str | bool]]]:
     heads = tuple(dict.fromkeys(head for row in rows for head in row if head != "versions"))
     shown = [[row.get(head) for head in heads] for row in rows]
-    return heads, [["" if v is None else v if isinstance(v, bool) else _cell(v) for v in row] for row in shown]
+    return heads, [["" if v is None else _cell(v) for v in row] for row in shown]
 
 
 def to_its_error(value: object, error: object) -> tuple[str | bool, str | bool]:
@@ -163,6 +168,11 @@ def to_its_error(value: object, error: object) -> tuple[str | bool, str | bool]:
     if 0 <= digits <= 6 and abs(value) < 1e6:
         return f"{value:.{digits}f}", f"{error:.{digits}f}"
     return f"{value:.{max(1, 2 + math.floor(math.log10(max(abs(value), error) / error)))}g}", f"{error:.2g}"
+
+
+def short(number: float) -> float:
+    """The number to four significant digits, enough for a comparison."""
+    return float(f"{float(number):.4g}")
 
 
 def _cell(value: object) -> str | bool:

@@ -21,12 +21,13 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
-from workbench.study.pages.page import PageContent, Table, block, to_its_error, write_page
+from workbench.study.pages.page import PageContent, Table, block, short, to_its_error, write_page
 
 MOVING = (
     "The modes of the nominal model, and of the corrected one where it differs; circles are sensors, triangles inputs."
 )
 
+GAPS = ("before", "after", "floor")
 STANDING_OF = {"none": "good", "explained": "good", "part": "part", "unknown": "bad"}  # by outcome
 
 
@@ -122,7 +123,10 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     gap, closed = content["gap"], content.get("shrinkage", {})
     length = content.get("units", {}).get("length", "m")
     gaps = [
-        [record, *(_short(gap[name].get(record)) for name in ("before", "after", "floor")), _short(closed.get(record))]
+        [
+            record,
+            *("" if v is None else short(v) for v in (*(gap[name].get(record) for name in GAPS), closed.get(record))),
+        ]
         for record in gap["before"]
     ]
     rivals = [
@@ -132,15 +136,10 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
         rivals.insert(0, ["the set named", content["probability"]])
     tables = [
         (title, ("effect", "parameter", "value", "standard error", f"place [{length}]", "input or output"), effects),
-        ("Gap (rms error / rms signal)", ("record", "before", "after", "floor", "share closed"), gaps),
+        ("Gap (rms error / rms signal)", ("record", *GAPS, "share closed"), gaps),
         ("Alternatives that the records do not exclude", ("set of effects", "probability"), rivals),
     ]
     return [table for table in tables if table[2]]
-
-
-def _short(number: float | None) -> float | str:
-    """The number to four significant digits; "" for None."""
-    return "" if number is None else float(f"{number:.4g}")
 
 
 def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
