@@ -42,6 +42,7 @@ MOST_BYTES = 200_000_000
 MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram
 EXTRA_ORDERS = 8  # highest model order of the diagram, above the number of modes
 SAMPLES_PER_ORDER = 8  # at least
+ROBUSTNESS = "share of perturbed models stable"
 STABLE = "Stabilisation diagram: the poles of models of each order, blue if the shape is real; bands mark stable poles."
 
 
@@ -175,20 +176,15 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
         blocks.append(
             block(plot_mac(mac(modes.shapes, modes.shapes)), "Modal assurance criterion of each pair of modes.")
         )
+    rows = [
+        [r + 1, *to_its_error(f, f_std), *to_its_error(zeta, zeta_std)]
+        for r, (f, f_std, zeta, zeta_std) in enumerate(zip(*columns, strict=True))
+    ]
     return {
         "lead": _words([content.get("heading", "")])[0],
         "lines": _words(content.get("lines", [])),
         "blocks": blocks,
-        "tables": [
-            (
-                "Modes",
-                heads,
-                [
-                    [r + 1, *to_its_error(f, f_std), *to_its_error(zeta, zeta_std)]
-                    for r, (f, f_std, zeta, zeta_std) in enumerate(zip(*columns, strict=True))
-                ],
-            )
-        ],
+        "tables": [("Modes", heads, rows)],
     }
 
 
@@ -222,34 +218,29 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         ]
         for one in through
     ]
-    heads: tuple[str, ...] = ("controller", "margin [1/s]", "loop", "residual mode that limits it", "path")
-    heads += ("share of perturbed models stable",)
+    heads = ("controller", "margin [1/s]", "loop", "residual mode that limits it", "path", ROBUSTNESS)
     filled = [i for i in range(len(heads)) if i < 3 or any(row[i] != "" for row in sensed)]
-    heads, sensed = tuple(heads[i] for i in filled), [[row[i] for i in filled] for row in sensed]
+    sensed = [[row[i] for i in filled] for row in sensed]
     seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}
     unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if row[2] == "unstable"]
     loops = [row[0] for row in (*rows, *sensed)]
+    blocks = [
+        block(plot_two_works(works, first=len(controlled)), "Spillover work of each law in each residual mode."),
+        block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
+    ]
+    if seen:
+        caption = "Closed-loop poles with sensors, including those of the estimators."
+        blocks.append(block(plot_poles(seen), caption))
+    headings = command_headings(str(content.get("command_unit", "N")))
+    tables: list[Table] = [("Laws", ("law", "cost", *headings, "W_R [J]", "loop"), rows)]
+    if sensed:
+        tables.append(("With sensors", tuple(heads[i] for i in filled), sensed))
     return {
         "title": "Control design",
         "lead": "" if not sensed else _stability(loops, unstable),
         "standing": "" if not sensed else "bad" if len(unstable) == len(loops) else "part" if unstable else "good",
-        "blocks": [
-            block(plot_two_works(works, first=len(controlled)), "Spillover work of each law in each residual mode."),
-            block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
-            *(
-                [block(plot_poles(seen), "Closed-loop poles with sensors, including those of the estimators.")]
-                if seen
-                else []
-            ),
-        ],
-        "tables": [
-            (
-                "Laws",
-                ("law", "cost", *command_headings(str(content.get("command_unit", "N"))), "W_R [J]", "loop"),
-                rows,
-            ),
-            *([("With sensors", heads, sensed)] if sensed else []),
-        ],
+        "blocks": blocks,
+        "tables": tables,
     }
 
 
@@ -291,13 +282,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
             ),
             block(plot_two_works(works, first=n), "Spillover work of each placement in each residual mode."),
         ],
-        "tables": [
-            (
-                "Placements",
-                ("placement", "W_R [J]", *headings, "condition number of B", "places [m]"),
-                rows,
-            )
-        ],
+        "tables": [("Placements", ("placement", "W_R [J]", *headings, "condition number of B", "places [m]"), rows)],
     }
 
 

@@ -118,20 +118,16 @@ def in_script(content: object) -> Markup:
     return Markup(text)
 
 
-def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | None = None, made_by: str = "") -> Path:
+def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str], made_by: str) -> Path:
     """Write the page of a study: results, figures, checks, and tables of its runs."""
     runs = [(name, *_table_of(found.rows())) for name, found in outcome.runs.items()]
     page_content = PageContent(
         title=outcome.title or outcome.name,
         lines=tuple(outcome.lines),
         blocks=[block(shown, caption) for shown, caption in outcome.shown],
-        tables=[
-            *tables_of(outcome.tables),
-            *checks_of(outcome.checks),
-            *runs,
-        ],
-        inputs=inputs or {},
-        made_by=made_by or f"workbench study {outcome.name}",
+        tables=[*tables_of(outcome.tables), *checks_of(outcome.checks), *runs],
+        inputs=inputs,
+        made_by=made_by,
     )
     return write_page(folder / f"{outcome.name}.html", page_content)
 
