@@ -16,9 +16,9 @@ from workbench.rig.sensors import Sensor
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle, Where, middle
 from workbench.structure.member import Beam, Structure
 from workbench.structure.supports import HELD
+from workbench.trials.benches import Scene, Unsuitable
 from workbench.trials.hidden import hide
 from workbench.trials.laws import POINT_LAWS, PointSizes, Strengths
-from workbench.trials.scene import Scene, Unsuitable
 
 Numbers = dict[str, Any]
 OfStrength = Callable[[float], Numbers]

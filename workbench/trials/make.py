@@ -9,14 +9,22 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.cases.case import Case
 from workbench.structure.domain import NamedPoints
-from workbench.trials.benches import Bench, bench_of, draw_bench, experiments, tested
+from workbench.trials.benches import (
+    Bench,
+    Scene,
+    Unsuitable,
+    bench_of,
+    draw_bench,
+    experiments,
+    relative_gap,
+    tested,
+)
 from workbench.trials.draws import draw_effect
 from workbench.trials.hidden import HIDE, NONE, OUTSIDE, UNKNOWN, hide
 from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, with_imperfections
 from workbench.trials.laws import POINT_LAWS
 from workbench.trials.plant import Plant, SolvedPlant
 from workbench.trials.rigs import MEMBERS
-from workbench.trials.scene import Scene, Unsuitable, relative_gap
 
 KINDS = tuple(HIDE)
 OUTSIDE_KINDS = tuple(OUTSIDE)
