@@ -239,25 +239,36 @@ def results_of(rig: Rig, design: Design) -> dict[str, Any]:
 
 def setting(rig: Rig) -> dict[str, Any]:
     """Data that the page of the bench loads once: the structure, its modes and its shapes."""
-    domain, patch = _domain(rig), patch_of(rig)
-    if isinstance(domain, NamedPoints):
-        return {**_points(rig, domain), **_common(rig, [])}
+    domain = _domain(rig)
+    return {
+        **(_frame(rig, domain) if isinstance(domain, NamedPoints) else _field(rig, domain)),
+        "omega": _plain(rig.modes.omega),
+        "zeta": _plain(rig.modes.zeta),
+        "most": MOST_PORTS,
+        "laws": LAWS,
+        "design": {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(start(rig)).items()},
+    }
+
+
+def _field(rig: Rig, domain: Interval | Rectangle) -> dict[str, Any]:
+    """Drawing data of a member or a plate: where its shapes are shown, the shapes there, and the size of a patch."""
     if isinstance(domain, Interval):
         shown_at, across = np.linspace(0.0, domain.length, N_PLACES), [N_PLACES]
     else:  # centres of cells, each drawn in one colour
         across = [max(round(N_CELLS * side / max(domain.length)), 8) for side in domain.length]
         x, y = ((np.arange(n) + 0.5) / n * side for n, side in zip(across, domain.length, strict=True))
         shown_at = np.column_stack([np.repeat(x, y.size), np.tile(y, x.size)])
+    patch = patch_of(rig)
     return {
         "length": domain.length,
         "cells": across,
         "x": _plain(shown_at),
         "shapes": _plain(rig.modes.phi(shown_at)),
-        **_common(rig, [] if patch is None else _plain(2.0 * reach(domain, patch.at)[0])),
+        "patch": [] if patch is None else _plain(2.0 * reach(domain, patch.at)[0]),
     }
 
 
-def _points(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
+def _frame(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
     """Drawing data of a frame: nodes, lines between them, mode shapes, and the drawn position of each point."""
     net = frame_net(domain)
     corner, size = net.rest.min(axis=0), float(np.ptp(net.rest, axis=0).max())
@@ -275,17 +286,7 @@ def _points(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
             "lines": net.lines,
         },
         "shapes": _plain(moves.reshape(-1, rig.modes.n_modes)),
-    }
-
-
-def _common(rig: Rig, patch: list[float]) -> dict[str, Any]:
-    return {
-        "patch": patch,
-        "omega": _plain(rig.modes.omega),
-        "zeta": _plain(rig.modes.zeta),
-        "most": MOST_PORTS,
-        "laws": LAWS,
-        "design": {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(start(rig)).items()},
+        "patch": [],
     }
 
 

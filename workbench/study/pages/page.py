@@ -88,15 +88,12 @@ def write_page(path: Path, page_content: PageContent) -> Path:
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((ASSETS / "page.html").read_text(encoding="utf-8"))
     moving = [{key: one[key] for key in ("figure", "motion") if key in one} for one in page_content.blocks]
+    tables = [
+        {"title": title, "heads": heads, "rows": [[_cell(cell) for cell in row] for row in rows[:MOST_ROWS]]}
+        for title, heads, rows in page_content.tables
+    ]
     html = template.render(
-        **{
-            name: getattr(page_content, name)
-            for name in ("title", "lead", "lines", "blocks", "inputs", "made_by", "standing", "versions")
-        },
-        tables=[
-            {"title": title, "heads": heads, "rows": [[_cell(cell) for cell in row] for row in rows[:MOST_ROWS]]}
-            for title, heads, rows in page_content.tables
-        ],
+        {**vars(page_content), "tables": tables},
         css=asset("page.css"),
         scripts=Markup("\n").join(map(asset, SCRIPTS)),
         data=in_script(moving),
