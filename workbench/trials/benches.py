@@ -48,7 +48,7 @@ class Bench:
 
 
 def draw_bench(rng: np.random.Generator, structure: str = MEMBERS) -> Bench:
-    """A random structure with actuators, a hammer, sensors, levels and noise.
+    """A random structure with actuators, a hammer, sensors, levels and noise; a member may have a closed-loop record.
 
     Args:
         structure: "members" for a beam or a rod, "plates", or "frames", whose rig has only modes at named points.
@@ -56,7 +56,23 @@ def draw_bench(rng: np.random.Generator, structure: str = MEMBERS) -> Bench:
     Raises:
         ValueError: an unknown structure.
     """
-    return _suited(*draw_rig(rng, structure), rng)
+    rig, frame = draw_rig(rng, structure)
+    top = min(int(rng.integers(3, 6)), rig.modes.n_modes) - 1
+    band = 1.1 * float(rig.modes.omega[top]) / (2.0 * np.pi)
+    snr_db = float(rng.choice([30.0, 40.0, 50.0]))
+    bench = Bench(rig, float(f"{0.095 / band:.2g}"), band, 1.0, snr_db, None, frame)
+    plant = bench.plant().solved()
+    commands = multisine(bench, rng)
+    moved, _ = plant.move(commands, bench.sample_time)
+    widest = np.sqrt(np.mean((plant.at_actuators @ moved[0].T) ** 2, axis=1)).max()
+    level = float(f"{rig.modes.domain.size * np.exp(rng.uniform(np.log(0.001), np.log(0.02))) / widest:.2g}")
+    fastest = np.sqrt(np.mean((plant.at_actuators @ moved[1].T) ** 2, axis=1)).max()
+    low = plant.readings(moved, bench.sample_time).std(axis=1) * level * LEVELS["low"]
+    noise = [float(f"{10 ** (-snr_db / 20) * value:.6g}") for value in low]
+    sensors = tuple(replace(s, noise_std=n) for s, n in zip(rig.sensors, noise, strict=True))
+    closed = isinstance(rig.structure, Structure) and rng.random() < 0.6
+    feedback = float(rng.uniform(0.2, 0.6)) / fastest if closed else None
+    return replace(bench, rig=replace(rig, sensors=sensors), level=level, feedback=feedback)
 
 
 def bench_of(case: Case) -> Bench:
@@ -79,26 +95,6 @@ def bench_of(case: Case) -> Bench:
     frequency = np.fft.rfftfreq(loudest.n_samples, loudest.sample_time)
     band = float(frequency[np.searchsorted(power, 0.95 * power[-1])])
     return Bench(case.rig, loudest.sample_time, band, float(level[loudest]), None, None)
-
-
-def _suited(rig: Rig, frame: Frame | None, rng: np.random.Generator) -> Bench:
-    """A bench with random sample time, band, level and noise for a rig; a member may have a closed-loop record."""
-    top = min(int(rng.integers(3, 6)), rig.modes.n_modes) - 1
-    band = 1.1 * float(rig.modes.omega[top]) / (2.0 * np.pi)
-    snr_db = float(rng.choice([30.0, 40.0, 50.0]))
-    bench = Bench(rig, float(f"{0.095 / band:.2g}"), band, 1.0, snr_db, None, frame)
-    plant = bench.plant().solved()
-    commands = multisine(bench, rng)
-    moved, _ = plant.move(commands, bench.sample_time)
-    widest = np.sqrt(np.mean((plant.at_actuators @ moved[0].T) ** 2, axis=1)).max()
-    level = float(f"{rig.modes.domain.size * np.exp(rng.uniform(np.log(0.001), np.log(0.02))) / widest:.2g}")
-    fastest = np.sqrt(np.mean((plant.at_actuators @ moved[1].T) ** 2, axis=1)).max()
-    low = plant.readings(moved, bench.sample_time).std(axis=1) * level * LEVELS["low"]
-    noise = [float(f"{10 ** (-snr_db / 20) * value:.6g}") for value in low]
-    sensors = tuple(replace(s, noise_std=n) for s, n in zip(rig.sensors, noise, strict=True))
-    closed = isinstance(rig.structure, Structure) and rng.random() < 0.6
-    feedback = float(rng.uniform(0.2, 0.6)) / fastest if closed else None
-    return replace(bench, rig=replace(rig, sensors=sensors), level=level, feedback=feedback)
 
 
 def multisine(bench: Bench, rng: np.random.Generator) -> np.ndarray:
