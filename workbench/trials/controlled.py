@@ -82,7 +82,7 @@ def control_plant(
     """
     plant, dt = real.plant, controller.sample_time
     m, n = real.at_actuators.shape
-    system, drive, pieces = real.system(dt)
+    system, pieces = real.system, real.pieces(dt)
     inputs = [a.name for a in plant.actuators]
     commanded = [inputs.index(name) for name in controller.actuators]
     reading = _Reading(real, controller, n_samples, pieces.edges, rng)
@@ -104,7 +104,7 @@ def control_plant(
         outputs[:, k] = reading.at(k, state.y, moved)
         commands = np.zeros(m)
         commands[commanded], followed, z = controller.step(z, followed, outputs[:, k])
-        motion.interval(k, state, system, drive, pieces, commands, held[k], moved[k], sums)
+        motion.interval(k, state, system, real.drive, pieces, commands, held[k], moved[k], sums)
     return Controlled(energy, sums.work, float(sums.squares.sum()), float(sums.peaks.max()), bounded, dt, outputs)
 
 

@@ -90,12 +90,41 @@ class Plant:
             [noise[0] for noise in self.noises],
             field_places,
         ]
-        places = [x for group in groups for x in group]
-        modes = self._modes(places)
-        shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
-        inputs, sensors, laws, tones, noises, field = shapes
-        drag = np.c_[field, weights]
-        return SolvedPlant(self, modes, inputs, sensors, laws, tones, noises, drag)
+        modes = self._modes([x for group in groups for x in group])
+        shapes = np.split(modes.shapes, np.cumsum([len(group) for group in groups])[:-1])
+        at_actuators, at_sensors, at_laws, at_tones, at_noises, field = map(np.ascontiguousarray, shapes)
+
+        def each(name: str) -> Floats:
+            return np.array([getattr(a, name) for a in self.actuators], float)
+
+        system = motion.System(
+            omega2=modes.omega**2,
+            damping=2.0 * self._damping_ratios() * modes.omega,
+            gram=modes.gram,
+            stretching=float(self.stretching),
+            stiffness_rate=float(self.stiffness_rate),
+            lags=each("time_constant"),
+            rate_limits=each("rate_limit"),
+            biases=each("bias"),
+            at_actuators=at_actuators,
+            tones=np.array([[a, 2.0 * np.pi * f, p] for _, a, f, p in self.tones]).reshape(-1, 3),
+            at_tones=at_tones,
+            laws=np.array([[code, *p, *[1.0] * (3 - len(p))] for code, _, p in self.laws]).reshape(-1, 4),
+            at_laws=at_laws,
+            drag=float(self.drag),
+            field=np.ascontiguousarray(np.c_[field, weights]),
+        )
+        drive = motion.Drive(
+            mix=np.eye(len(self.actuators)) if self.mix is None else self.mix,
+            curvature=np.zeros(len(self.actuators)) if self.curvature is None else self.curvature,
+            share=each("hysteresis_share"),
+            width=each("hysteresis_width"),
+            gain=each("gain"),
+            dead_zone=each("dead_zone"),
+            limit=each("limit"),
+            delays=each("delay"),
+        )
+        return SolvedPlant(self, modes, system, drive, at_actuators, at_sensors, at_noises)
 
     def _modes(self, places: list[Any]) -> ElementModes:
         structure = self.nominal.structure
@@ -108,6 +137,14 @@ class Plant:
             altered = replace(self.altered, stiffness_waves=(), mass_waves=())
             return matrix_modes(frame, places, self.n_modes, altered=altered)
         return modal_modes(self.nominal.modes, places, altered=self.altered)
+
+    def _damping_ratios(self) -> Floats:
+        """The damping ratio of each mode; modes above the nominal ones have the last nominal ratio."""
+        zeta, factors = self.nominal.modes.zeta, np.ones(self.n_modes)
+        padded: Floats = np.r_[zeta, np.full(max(self.n_modes - zeta.size, 0), zeta[-1])][: self.n_modes]
+        known = self.damping_factors[: self.n_modes]
+        factors[: len(known)] = known
+        return self.damping_factor * factors * padded
 
 
 class ModalMotion(NamedTuple):
@@ -127,16 +164,15 @@ class ModalMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SolvedPlant:
-    """A plant with its modes; shapes are (n_places, n_modes), `field` carries the weights of a quadrature too."""
+    """A plant with its modes, as `motion` integrates it; shapes are (n_places, n_modes)."""
 
     plant: Plant
     modes: ElementModes
+    system: motion.System
+    drive: motion.Drive
     at_actuators: np.ndarray
     at_sensors: np.ndarray
-    at_laws: np.ndarray
-    at_tones: np.ndarray
     at_noises: np.ndarray
-    field: np.ndarray
 
     def move(
         self,
@@ -156,13 +192,12 @@ class SolvedPlant:
             rng: generator of the random forces; None for no random forces.
             finest: radians of the highest mode in one step.
         """
-        plant = self.plant
-        system, drive, pieces = self.system(sample_time, finest)
+        pieces = self.pieces(sample_time, finest)
         held = self.random_forces(commands.shape[1], sample_time, rng)
-        acting = np.array([not a.direct for a in plant.actuators], float)
+        acting = np.array([not a.direct for a in self.plant.actuators], float)
         sent = np.array(commands, float, order="C")
         feedbacks = feedback * acting[:, None] * self.at_actuators
-        moved = motion.integrate(system, drive, pieces, sent, feedbacks, held)
+        moved = motion.integrate(self.system, self.drive, pieces, sent, feedbacks, held)
         return ModalMotion(moved[0, 0], moved[1, 0], moved[2, 0], np.r_[0.0, pieces.edges[:-1]], moved), sent
 
     def random_forces(self, n_samples: int, sample_time: float, rng: np.random.Generator | None) -> np.ndarray:
@@ -173,47 +208,15 @@ class SolvedPlant:
                 held += np.outer(rms * coloured_noise(rng, n_samples, sample_time, corner), shape)
         return held
 
-    def system(self, sample_time: float, finest: float = FINEST) -> tuple[motion.System, motion.Drive, motion.Pieces]:
-        """The plant as `motion` integrates it."""
-        plant, modes = self.plant, self.modes
-        m = len(plant.actuators)
+    def pieces(self, sample_time: float, finest: float = FINEST) -> motion.Pieces:
+        """The pieces of a sample interval, which end where a command arrives or a late sensor reads."""
+        plant = self.plant
         late = [a.delay / sample_time for a in plant.actuators] + [-s.delay / sample_time for s in plant.sensors]
         ends = np.unique(np.round([*(delay % 1.0 for delay in late), 1.0], 12))
         edges = ends[ends > 0]
-        turns = max(modes.omega[-1] * sample_time / finest, 8.0)
+        turns = max(self.modes.omega[-1] * sample_time / finest, 8.0)
         steps = np.ceil(turns * np.diff(np.r_[0.0, edges])).astype(np.int64)
-
-        def each(name: str) -> Floats:
-            return np.array([getattr(a, name) for a in plant.actuators], float)
-
-        system = motion.System(
-            omega2=modes.omega**2,
-            damping=2.0 * _damping_ratios(plant) * modes.omega,
-            gram=modes.gram,
-            stretching=float(plant.stretching),
-            stiffness_rate=float(plant.stiffness_rate),
-            lags=each("time_constant"),
-            rate_limits=each("rate_limit"),
-            biases=each("bias"),
-            at_actuators=np.ascontiguousarray(self.at_actuators),
-            tones=np.array([[a, 2.0 * np.pi * f, p] for _, a, f, p in plant.tones]).reshape(-1, 3),
-            at_tones=np.ascontiguousarray(self.at_tones),
-            laws=np.array([[code, *p, *[1.0] * (3 - len(p))] for code, _, p in plant.laws]).reshape(-1, 4),
-            at_laws=np.ascontiguousarray(self.at_laws),
-            drag=float(plant.drag),
-            field=np.ascontiguousarray(self.field),
-        )
-        drive = motion.Drive(
-            mix=np.eye(m) if plant.mix is None else plant.mix,
-            curvature=np.zeros(m) if plant.curvature is None else plant.curvature,
-            share=each("hysteresis_share"),
-            width=each("hysteresis_width"),
-            gain=each("gain"),
-            dead_zone=each("dead_zone"),
-            limit=each("limit"),
-            delays=each("delay"),
-        )
-        return system, drive, motion.Pieces(float(sample_time), edges, steps)
+        return motion.Pieces(float(sample_time), edges, steps)
 
     def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
         """The readings (n_outputs, n_samples) of perfect sensors, each with its delay."""
@@ -259,16 +262,6 @@ def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float,
     frequency = np.fft.rfftfreq(2 * n_samples, sample_time)
     noise: Floats = np.fft.irfft(spectrum / np.sqrt(1.0 + (frequency / corner_hz) ** 8), 2 * n_samples)[:n_samples]
     return noise / float(np.sqrt(np.mean(noise**2)))
-
-
-def _damping_ratios(plant: Plant) -> Floats:
-    """The damping ratio of each mode of the plant; modes above the nominal ones have the last nominal ratio."""
-    zeta = plant.nominal.modes.zeta
-    padded: Floats = np.r_[zeta, np.full(max(plant.n_modes - zeta.size, 0), zeta[-1])][: plant.n_modes]
-    factors = np.ones(plant.n_modes)
-    known = plant.damping_factors[: plant.n_modes]
-    factors[: len(known)] = known
-    return plant.damping_factor * factors * padded
 
 
 def sensor_noise(rng: np.random.Generator, n_samples: int, memory: float) -> np.ndarray:
