@@ -139,7 +139,7 @@ class _Cubics:
         row = np.zeros(self.size)
         dofs = (self.values[i], self.slopes_at[i], self.values[i + 1], self.slopes_at[i + 1])
         for dof, cubic, size in zip(dofs, CUBICS, (1.0, h, 1.0, h)):
-            row[dof] = size * (cubic.deriv(derivative) if derivative else cubic)(t) / h**derivative
+            row[dof] = size * cubic.deriv(derivative)(t) / h**derivative
         return row
 
     def integral(self, start: float, stop: float) -> Floats:
@@ -158,7 +158,7 @@ def _row(x: _Cubics, y: _Cubics, at: Any) -> Floats:
         bottom, top = at.y - 0.5 * at.height, at.y + 0.5 * at.height
         across_x = np.kron(x.at(right, 1) - x.at(left, 1), y.integral(bottom, top))
         return np.asarray(across_x + np.kron(x.integral(left, right), y.at(top, 1) - y.at(bottom, 1)))
-    return np.asarray(np.kron(x.at(at[0]), y.at(at[1])).astype(float))
+    return np.asarray(np.kron(x.at(at[0]), y.at(at[1])))
 
 
 def _square(row: Floats) -> csc_array:
