@@ -17,6 +17,7 @@ from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
 from workbench.structure.member import Beam, Structure
 from workbench.structure.supports import HELD
 from workbench.trials.benches import Scene, Unsuitable
+from workbench.trials.finite_elements import Buckled
 from workbench.trials.hidden import hide
 from workbench.trials.laws import POINT_LAWS, PointSizes, Strengths
 
@@ -364,9 +365,5 @@ def draw_effect(kind: str, scene: Scene, rng: np.random.Generator) -> dict[str, 
 def _gap(effect: dict[str, Any], scene: Scene, rng: np.random.Generator) -> float:
     try:
         return scene.gap(hide(scene.bench.plant(), [effect]), rng)
-    except Unsuitable:
+    except (Unsuitable, Buckled):
         return 1e3
-    except ValueError as error:
-        if "buckles" in str(error):
-            return 1e3
-        raise

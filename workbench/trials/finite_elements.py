@@ -25,6 +25,10 @@ from workbench.structure.supports import HELD
 ELEMENTS = 240
 
 
+class Buckled(ValueError):
+    """An altered structure that buckles."""
+
+
 @dataclass(frozen=True)
 class Alterations:
     """Differences of a real structure from the nominal one.
@@ -80,6 +84,9 @@ def element_modes(
 
     Args:
         places: (n_places,) of the shapes returned, m.
+
+    Raises:
+        Buckled: the member buckles.
     """
     beam = isinstance(member, Beam)
     special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
@@ -111,7 +118,7 @@ def element_modes(
     values = np.array(energy) + np.einsum("ir,ir->r", full, beside @ full)
     omega2 = np.where(np.abs(values) < 1e-6 * abs(shift), 0.0, values)
     if (omega2 < 0).any():
-        raise ValueError("the altered member is unstable: it buckles; draw a weaker compression")
+        raise Buckled("the altered member is unstable: it buckles; draw a weaker compression")
     at_places = full[displacement[[_node(nodes, x) for x in places]]] if len(places) else np.zeros((0, n_modes))
     return ElementModes(np.sqrt(omega2), at_places, full.T @ (slopes @ full))
 
