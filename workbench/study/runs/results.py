@@ -140,9 +140,9 @@ def _plain(value: object) -> object:
         return _plain(value.tolist())
     if isinstance(value, list):
         return [_plain(item) for item in value]
-    if isinstance(value, complex):
-        return str(value)
-    return str(value) if isinstance(value, Path) else value
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return str(value) if isinstance(value, complex | Path) else value
 
 
 def _finite(value: Any) -> Any:
