@@ -163,9 +163,9 @@ def to_its_error(value: object, error: object) -> tuple[str | bool, str | bool]:
     return f"{value:.{max(1, 2 + math.floor(math.log10(max(abs(value), error) / error)))}g}", f"{error:.2g}"
 
 
-def short(number: float) -> float:
-    """The number to four significant digits, enough for a comparison."""
-    return float(f"{float(number):.4g}")
+def short(number: float | None) -> float | str:
+    """The number to four significant digits, enough for a comparison; "" for None."""
+    return "" if number is None else float(f"{float(number):.4g}")
 
 
 def _cell(value: object) -> str | bool:

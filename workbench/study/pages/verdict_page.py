@@ -114,10 +114,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     gap, closed = content["gap"], content.get("shrinkage", {})
     length = content.get("units", {}).get("length", "m")
     gaps = [
-        [
-            record,
-            *("" if v is None else short(v) for v in (*(gap[name].get(record) for name in GAPS), closed.get(record))),
-        ]
+        [record, *(short(gap[name].get(record)) for name in GAPS), short(closed.get(record))]
         for record in gap["before"]
     ]
     rivals = [
@@ -140,7 +137,7 @@ def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
         with suppress(ValueError):  # not periodic
             found.append(distortion_of(record))
     found.sort(key=lambda each: each.input_rms)
-    return [*found[:1], *found[1:][-1:]]
+    return found if len(found) < 2 else [found[0], found[-1]]
 
 
 def moving_modes(rig: Rig, modes: Mapping[str, Modes], *, length: str = "m") -> list[dict[str, Any]]:

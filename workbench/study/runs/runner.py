@@ -65,14 +65,14 @@ def run(
         if key not in records
     }
 
-    def tell(text: str) -> None:
+    def progress(text: str) -> None:
         if report is not None:
             report(text, len(records) / len(files))
 
     def awaiting(n: int) -> None:
-        tell(f"waiting for {n} cases of another run")
+        progress(f"waiting for {n} cases of another run")
 
-    tell(f"{len(records)} of {len(files)} cases")
+    progress(f"{len(records)} of {len(files)} cases")
     unkept: list[str] = []
     for key, record in _computed(function, list(jobs.values()), workers, scheduler, awaiting):
         records[key] = record
@@ -80,7 +80,7 @@ def run(
         if scheduler and file is not None:
             record["unkept"] = keep(file, record)
         unkept += filter(None, [record.get("unkept")])
-        tell(f"{len(records)} of {len(files)} cases")
+        progress(f"{len(records)} of {len(files)} cases")
     if unkept:
         warnings.warn(
             f"{len(unkept)} of {len(files)} results could not be written to {folder} and would be computed again:"
