@@ -7,8 +7,8 @@ what hides in a frame at a point acts between two points.
 from pathlib import Path
 
 from workbench.draw.trials import plot_confusion
-from workbench.trials.hold import hold_one, processor_times
-from workbench.trials.make import OUTSIDE_KINDS, draw_kinds
+from workbench.trials.hold import draw_kinds, hold_one, processor_times
+from workbench.trials.make import OUTSIDE_KINDS
 from workbench.trials.scoring import tally
 
 SINGLES, PAIRS, QUIET, SEED = 13, 4, 4, 985311  # of each structure

@@ -100,7 +100,7 @@ def _soonest(real, controller, impulse_input, test, free):
 
 def _least_energy(real, controller, impulse_input, test, free, n_samples):
     """The least energy of the controlled modes that any forces leave after some samples, over that of the impulse."""
-    (omega2, damping, *_), *_ = real.system(test.sample_time)[0]
+    omega2, damping = real.system.omega2, real.system.damping
     omega, n = np.sqrt(omega2), omega2.size
     actuators = [a.name for a in real.plant.actuators]
     driven = [actuators.index(name) for name in controller.actuators]
@@ -139,7 +139,7 @@ def _with_effect(real, name, size):
     """The plant whose driven actuators have the effect."""
     own = real.plant.actuators
     changed = tuple(a if a.direct else replace(a, **{EFFECTS[name][2]: size}) for a in own)
-    return replace(real, plant=replace(real.plant, actuators=changed))
+    return replace(real.plant, actuators=changed).solved()
 
 
 def _figures(run):

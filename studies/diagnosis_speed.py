@@ -16,7 +16,8 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
-from workbench.trials.make import KINDS, draw_kinds, make_trial
+from workbench.trials.hold import draw_kinds
+from workbench.trials.make import KINDS, make_trial
 
 SEED = 70000
 FAMILIES = {"single": (1, 18, 10.0), "pair": (2, 9, 30.0)}  # effects that hide, cases, limit in s

@@ -6,9 +6,8 @@ import numpy as np
 
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.structure.printed import counted
-from workbench.trials.hold import hold_one, processor_times
+from workbench.trials.hold import draw_imperfect_kinds, hold_one, processor_times
 from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, SIZES, TRIPLE
-from workbench.trials.make import draw_imperfect_kinds
 from workbench.trials.scoring import NONE, reliability, tally_imperfect
 
 CASES, SEED = 300, 20360101

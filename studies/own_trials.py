@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from workbench.draw.trials import plot_confusion
-from workbench.trials.hold import hold_one, processor_times
-from workbench.trials.make import draw_kinds
+from workbench.trials.hold import draw_kinds, hold_one, processor_times
 from workbench.trials.scoring import tally
 
 CASES, SEED = 200, 845211

@@ -567,7 +567,7 @@ def test_a_limit_is_made_up_for_where_residual_modes_fill_the_readings(hidden_pl
     free = run(real, designed().present)
     limit = 0.5 * free.peak_force
     actuators = tuple(a if a.direct else replace(a, limit=limit) for a in real.plant.actuators)
-    held = replace(real, plant=replace(real.plant, actuators=actuators))
+    held = replace(real.plant, actuators=actuators).solved()
     found = designed(effect("actuator_saturation", "all", limit=limit))
     before, after = (run(held, one) for one in (found.present, found.redesigned))
     lost, left = (r.modal_energy[:2].sum() / free.modal_energy[:2].sum() - 1.0 for r in (before, after))

@@ -73,7 +73,9 @@ def test_numbers_are_stable_to_ten_digits():
 
 
 def test_a_page_is_one_file_and_escapes_what_it_is_told(tmp_path):
-    text = study_page(sample(tmp_path), tmp_path).read_text(encoding="utf-8")
+    text = study_page(sample(tmp_path), tmp_path, inputs={}, made_by="workbench study sample").read_text(
+        encoding="utf-8"
+    )
     tags = Tags()
     tags.feed(text)
     assert "<script>alert(1)</script>" not in text and "&lt;script&gt;alert(1)" in text

@@ -217,6 +217,16 @@ def test_the_table_as_json_is_json(tmp_path):
     assert row["y"] is None and row["z"] == [None, 1.0]
 
 
+@pytest.mark.parametrize("ending", ["csv", "json"])
+def test_rows_inside_a_table_hold_arrays_and_complex_numbers(ending, tmp_path):
+    """Only those outside dicts were written; inside, the whole table was lost after its run."""
+    found = study.run([{}], lambda: {"modes": [{"pole": -1 + 2j, "shape": np.arange(2)}]}, cache=None, **HERE)
+    text = found.write(tmp_path / f"t.{ending}").read_text()
+    [row] = json.loads(text) if ending == "json" else csv.DictReader(text.splitlines())
+    modes = row["modes"] if ending == "json" else json.loads(row["modes"])
+    assert modes == [{"pole": "(-1+2j)", "shape": [0, 1]}]
+
+
 def test_a_table_says_what_it_cannot_do(tmp_path):
     with pytest.raises(StudyError, match=r"written as .csv, .parquet, .json; got .xls"):
         table().write(tmp_path / "t.xls")

@@ -14,8 +14,9 @@ from workbench.structure.member import Beam
 from workbench.structure.profile import Profile
 from workbench.trials.benches import draw_bench
 from workbench.trials.finite_elements import Alterations, element_modes
-from workbench.trials.imperfections import IMPERFECTIONS, MIMICS, SIZES, Imperfections, draw_imperfections
-from workbench.trials.make import TWINS, draw_imperfect_kinds, make_trial
+from workbench.trials.hold import ALIKE, draw_imperfect_kinds
+from workbench.trials.imperfections import IMPERFECTIONS, MIMICS, SIZES, with_imperfections
+from workbench.trials.make import make_trial
 from workbench.trials.plant import Plant
 from workbench.trials.scoring import reliability, score_imperfect, tally_imperfect
 
@@ -127,9 +128,10 @@ def test_late_sensors_read_what_was_a_fraction_of_a_sample_before(bench):
     """The late reading is that of a plant sampled ten times as often, three of its samples before."""
     dt, n = bench.sample_time, 60
     commands = np.random.default_rng(0).standard_normal((len(bench.rig.actuators), n))
-    late = Imperfections(delays=(0.3,) * len(bench.rig.sensors)).on(Plant.of(bench.rig), dt).solved()
+    plain = Plant.of(bench.rig)
+    late = replace(plain, sensors=tuple(replace(s, delay=0.3 * dt) for s in plain.sensors)).solved()
     readings = late.readings(late.move(commands, dt)[0], dt)
-    fine = Plant.of(bench.rig).solved()
+    fine = plain.solved()
     moved, _ = fine.move(np.repeat(commands, 10, axis=1), dt / 10)
     expected = fine.readings(moved, dt / 10)
     shifted = np.c_[np.zeros((len(expected), 3)), expected][:, ::10][:, :n]
@@ -153,25 +155,23 @@ def test_waves_of_stiffness_and_mass_shift_the_mode_of_half_their_length():
 def test_shape_errors_are_those_of_a_member_with_that_mass_stiffness_and_damping(bench):
     """A beam or rod that has the drawn profiles and ratios from the first moves as the imperfect plant does."""
     structure = bench.rig.structure
-    imperfections = draw_imperfections("shape", 1.0, bench, np.random.default_rng(4))
+    plant = with_imperfections(Plant.of(bench.rig), "shape", 1.0, bench, np.random.default_rng(4))
+    altered = plant.altered
     grid = np.linspace(0.0, structure.length, 400)
-    spread = [
-        np.std(_wave(waves, grid / structure.length))
-        for waves in (imperfections.stiffness_waves, imperfections.mass_waves)
-    ]
+    spread = [np.std(_wave(waves, grid / structure.length)) for waves in (altered.stiffness_waves, altered.mass_waves)]
     np.testing.assert_allclose(spread, 0.02, rtol=0.05)
-    assert np.abs(np.log(imperfections.damping_factors)).max() <= 0.3
+    assert np.abs(np.log(plant.damping_factors)).max() <= 0.3
     name = "bending_stiffness" if isinstance(structure, Beam) else "axial_stiffness"
     changed = replace(
         structure,
-        mass_per_length=_varied(structure.mass_per_length, imperfections.mass_waves, structure.length),
-        damping=ModalDamping(bench.rig.modes.zeta * imperfections.damping_factors),
-        **{name: _varied(getattr(structure, name), imperfections.stiffness_waves, structure.length)},
+        mass_per_length=_varied(structure.mass_per_length, altered.mass_waves, structure.length),
+        damping=ModalDamping(bench.rig.modes.zeta * plant.damping_factors),
+        **{name: _varied(getattr(structure, name), altered.stiffness_waves, structure.length)},
     )
     rig = replace(bench.rig, structure=changed, modes=changed.modes(bench.rig.modes.n_modes, tolerance=1e-9))
     commands = np.random.default_rng(0).standard_normal((len(rig.actuators), 200))
-    plant = imperfections.on(Plant.of(bench.rig), bench.sample_time).solved()
-    readings = plant.readings(plant.move(commands, bench.sample_time)[0], bench.sample_time)
+    solved = plant.solved()
+    readings = solved.readings(solved.move(commands, bench.sample_time)[0], bench.sample_time)
     expected = simulate(rig, commands, sample_time=bench.sample_time).outputs
     np.testing.assert_allclose(readings, expected, atol=2e-3 * np.abs(expected).max())
 
@@ -192,7 +192,7 @@ def test_a_strong_effect_hides_in_every_class_and_nothing_in_every_third():
         hidden = {len(draw.kinds) for draw in of_class}
         assert hidden == ({3} if name == "triple" else {0, 1})
         assert not any(set(draw.kinds) & MIMICS[name] for draw in of_class)
-        assert not any(twins <= set(draw.kinds) for draw in of_class for twins in TWINS)
+        assert not any(len(alike & set(draw.kinds)) > 1 for draw in of_class for alike in ALIKE)
     assert sum(not draw.kinds for draw in drawn) == 30
 
 
@@ -200,7 +200,7 @@ def test_an_unknown_class_and_a_negative_size_are_refused(bench):
     with pytest.raises(ValueError, match="sand"):
         make_trial(1, imperfections="sand")
     with pytest.raises(ValueError, match="size"):
-        draw_imperfections("noise", -1.0, bench, np.random.default_rng(0))
+        with_imperfections(Plant.of(bench.rig), "noise", -1.0, bench, np.random.default_rng(0))
 
 
 # --- scores

@@ -19,8 +19,8 @@ from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Bar
 from workbench.structure.modes import Modes, PointShapes
 from workbench.trials.hidden import stands
-from workbench.trials.hold import hold_trials
-from workbench.trials.make import KINDS, OUTSIDE_KINDS, draw_kinds, make_trial, write_trials
+from workbench.trials.hold import draw_kinds, hold_trials, write_trials
+from workbench.trials.make import KINDS, OUTSIDE_KINDS, make_trial
 from workbench.trials.scoring import score, tally
 
 QUICK = (
@@ -217,7 +217,7 @@ def test_scores_count_kinds_channels_and_places():
     assert found["position_errors"] == [pytest.approx(0.015)] and found["shrinkage"] == {"validate": 0.99}
     assert not score(verdict, label, domain=10.0, outputs=("d2", "d1"))["channels"]
     assert not score(verdict, label, domain=5.0, outputs=("d1", "d2"))["positions"]
-    wrong = score({"effects": verdict["effects"][:1]}, label, domain=10.0)
+    wrong = score({"effects": verdict["effects"][:1]}, label, domain=10.0, outputs=("d1", "d2"))
     assert not wrong["kinds"] and wrong["channels"] is None and wrong["positions"] is None
 
 
@@ -225,6 +225,13 @@ def test_two_of_a_kind_are_matched_by_their_places():
     label = {"effects": [{"kind": "point_mass", "at": 2.0}, {"kind": "point_mass", "at": 8.0}]}
     verdict = {"effects": [{"kind": "point_mass", "at": 8.1}, {"kind": "point_mass", "at": 2.0}]}
     assert sorted(score(verdict, label, domain=10.0)["position_errors"]) == [0.0, pytest.approx(0.01)]
+
+
+def test_two_of_a_kind_are_matched_by_their_channels():
+    """They were paired in the order of the verdict, so that another order counted as wrong channels."""
+    label = {"effects": [{"kind": "sensor_gain", "output": name} for name in ("d1", "d2")]}
+    verdict = {"effects": [{"kind": "sensor_gain", "output": name, "parameters": {}} for name in ("d2", "d1")]}
+    assert score(verdict, label, domain=10.0)["channels"] is True
 
 
 def test_silence_is_right_only_where_nothing_hides():

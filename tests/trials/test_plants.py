@@ -179,7 +179,7 @@ QUICK = ("clearance", "coulomb_friction", "bouc_wen")
 @pytest.mark.parametrize("kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in LAWS])
 def test_laws_at_a_point_agree_with_an_adaptive_integrator(rig, commands, kind):
     solved = hide(Plant.of(rig), [{"kind": kind, "at": 0.8, **EFFECTS[kind]}]).solved()
-    shape, law = solved.at_laws[0], LAWS[kind]
+    shape, law = solved.system.at_laws[0], LAWS[kind]
 
     def extra(t, q, v, z):
         w, speed = shape @ q, shape @ v

@@ -17,14 +17,13 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle
 from workbench.structure.member import Beam
 from workbench.structure.plate import Plate
-from workbench.trials.benches import draw_bench, experiments
+from workbench.trials.benches import Scene, draw_bench, experiments
 from workbench.trials.finite_elements import Alterations, element_modes, matrix_modes
 from workbench.trials.hidden import stands
-from workbench.trials.hold import hold_trials
-from workbench.trials.make import KINDS, NOT_ON, draw_kinds, make_trial
+from workbench.trials.hold import NOT_ON, draw_kinds, hold_trials
+from workbench.trials.make import KINDS, make_trial
 from workbench.trials.plane_frame import Section, plane_frame
 from workbench.trials.plate_elements import plate_modes
-from workbench.trials.scene import Scene
 from workbench.trials.scoring import score
 
 CHANNELS = ("kind", "input", "output", "with", "from", "at", "between")

@@ -13,20 +13,14 @@ from typing import Any
 from jinja2 import Environment
 
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Interval, NamedPoints, Rectangle
+from workbench.structure.domain import NamedPoints
 from workbench.study.pages.page import asset, in_script
 from workbench.study.runs.cases import StudyError
 from workbench.study.saved_design import save
 from workbench.study.trying import design_from, results_of, setting
 
 HERE = "127.0.0.1"
-DRAG = "Drag a triangle (actuator), a circle (sensor) or the hammer; the arrow keys move them too."
-SEEN = {
-    Interval: DRAG,
-    Rectangle: DRAG,
-    NamedPoints: "Drag a triangle (actuator), a circle (sensor) or the hammer from point to point; the arrow keys move"
-    " them too.",
-}
+DRAG = "Drag a triangle (actuator), a circle (sensor) or the hammer{}; the arrow keys move them too."
 MOST_BYTES = 65536
 CLIENT_SECONDS = 10.0  # time limit of a whole request, after which the connection is closed
 MOST_WAITING = 128  # connections not yet accepted
@@ -55,7 +49,7 @@ def bench_server(rig: Rig, structure: str, *, port: int = 0, folder: Path = Path
         figures=asset("figure.js"),
         script=asset("bench.js"),
         setting=in_script(content),
-        seen=SEEN[type(rig.modes.domain)],
+        seen=DRAG.format(" from point to point" if isinstance(rig.modes.domain, NamedPoints) else ""),
     )
     handler = partial(_Handler, rig, structure, folder, page.encode())
     try:

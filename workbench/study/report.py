@@ -23,7 +23,17 @@ from workbench.structure.modes import SampledModes, mac
 from workbench.structure.printed import command_headings
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
-from workbench.study.pages.page import FORMAT, PageContent, Table, block, page_content_of, tables_of, to_its_error
+from workbench.study.pages.page import (
+    FORMAT,
+    PageContent,
+    Table,
+    block,
+    checks_of,
+    page_content_of,
+    short,
+    tables_of,
+    to_its_error,
+)
 from workbench.study.pages.verdict_page import STANDING_OF, case_inputs, moving_modes, verdict_tables
 from workbench.study.runs.cases import StudyError
 
@@ -32,6 +42,7 @@ MOST_BYTES = 200_000_000
 MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram
 EXTRA_ORDERS = 8  # highest model order of the diagram, above the number of modes
 SAMPLES_PER_ORDER = 8  # at least
+ROBUSTNESS = "share of perturbed models stable"
 STABLE = "Stabilisation diagram: the poles of models of each order, blue if the shape is real; bands mark stable poles."
 
 
@@ -165,20 +176,15 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
         blocks.append(
             block(plot_mac(mac(modes.shapes, modes.shapes)), "Modal assurance criterion of each pair of modes.")
         )
+    rows = [
+        [r + 1, *to_its_error(f, f_std), *to_its_error(zeta, zeta_std)]
+        for r, (f, f_std, zeta, zeta_std) in enumerate(zip(*columns, strict=True))
+    ]
     return {
         "lead": _words([content.get("heading", "")])[0],
         "lines": _words(content.get("lines", [])),
         "blocks": blocks,
-        "tables": [
-            (
-                "Modes",
-                heads,
-                [
-                    [r + 1, *to_its_error(f, f_std), *to_its_error(zeta, zeta_std)]
-                    for r, (f, f_std, zeta, zeta_std) in enumerate(zip(*columns, strict=True))
-                ],
-            )
-        ],
+        "tables": [("Modes", heads, rows)],
     }
 
 
@@ -195,8 +201,8 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     rows = [
         [
             law["law"],
-            *(_short(law[key]) for key in ("cost", "effort", "peak_force")),
-            _short(works[law["law"]].sum()),
+            *(short(law[key]) for key in ("cost", "effort", "peak_force")),
+            short(works[law["law"]].sum()),
             stability(poles[law["law"]]),
         ]
         for law in laws
@@ -205,41 +211,36 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     sensed = [
         [
             one["design"],
-            _short(one["margin"]),
+            short(one["margin"]),
             "stable" if one["stable"] else "unstable",
             *_words([one.get("limited_by", ""), one.get("path", "")]),
             "" if one.get("robustness") is None else one["robustness"],
         ]
         for one in through
     ]
-    heads: tuple[str, ...] = ("controller", "margin [1/s]", "loop", "residual mode that limits it", "path")
-    heads += ("share of perturbed models stable",)
+    heads = ("controller", "margin [1/s]", "loop", "residual mode that limits it", "path", ROBUSTNESS)
     filled = [i for i in range(len(heads)) if i < 3 or any(row[i] != "" for row in sensed)]
-    heads, sensed = tuple(heads[i] for i in filled), [[row[i] for i in filled] for row in sensed]
+    sensed = [[row[i] for i in filled] for row in sensed]
     seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}
     unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if row[2] == "unstable"]
     loops = [row[0] for row in (*rows, *sensed)]
+    blocks = [
+        block(plot_two_works(works, first=len(controlled)), "Spillover work of each law in each residual mode."),
+        block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
+    ]
+    if seen:
+        caption = "Closed-loop poles with sensors, including those of the estimators."
+        blocks.append(block(plot_poles(seen), caption))
+    headings = command_headings(str(content.get("command_unit", "N")))
+    tables: list[Table] = [("Laws", ("law", "cost", *headings, "W_R [J]", "loop"), rows)]
+    if sensed:
+        tables.append(("With sensors", tuple(heads[i] for i in filled), sensed))
     return {
         "title": "Control design",
         "lead": "" if not sensed else _stability(loops, unstable),
         "standing": "" if not sensed else "bad" if len(unstable) == len(loops) else "part" if unstable else "good",
-        "blocks": [
-            block(plot_two_works(works, first=len(controlled)), "Spillover work of each law in each residual mode."),
-            block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
-            *(
-                [block(plot_poles(seen), "Closed-loop poles with sensors, including those of the estimators.")]
-                if seen
-                else []
-            ),
-        ],
-        "tables": [
-            (
-                "Laws",
-                ("law", "cost", *command_headings(str(content.get("command_unit", "N"))), "W_R [J]", "loop"),
-                rows,
-            ),
-            *([("With sensors", heads, sensed)] if sensed else []),
-        ],
+        "blocks": blocks,
+        "tables": tables,
     }
 
 
@@ -264,7 +265,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     places = [np.array(one["positions"], float) for one in placements]
     works = {n: np.array(one["by_mode"], float) for n, one in zip(names, placements, strict=True)}
     rows = [
-        [name, *(_short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), _between(at)]
+        [name, *(short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), _between(at)]
         for name, one, at in zip(names, placements, places, strict=True)
     ]
     first, bound = placements[0]["residual_work"], content.get("lower_bound")
@@ -281,19 +282,8 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
             ),
             block(plot_two_works(works, first=n), "Spillover work of each placement in each residual mode."),
         ],
-        "tables": [
-            (
-                "Placements",
-                ("placement", "W_R [J]", *headings, "condition number of B", "places [m]"),
-                rows,
-            )
-        ],
+        "tables": [("Placements", ("placement", "W_R [J]", *headings, "condition number of B", "places [m]"), rows)],
     }
-
-
-def _short(number: float) -> float:
-    """The number to four significant digits, enough for a comparison."""
-    return float(f"{float(number):.4g}")
 
 
 def _between(places: np.ndarray) -> str:
@@ -302,15 +292,8 @@ def _between(places: np.ndarray) -> str:
 
 def _studied(content: dict[str, Any]) -> dict[str, Any]:
     """The results of a study."""
-    checks = [
-        [c["name"], c["value"], ("≥ " if c.get("at_least") else "≤ ") + f"{c['limit']:.6g}", bool(c["holds"])]
-        for c in content["checks"]
-    ]
     tables = tables_of({name: value for name, value in content.items() if name != "checks"})
-    return {
-        "lines": _words(content.get("found", [])),
-        "tables": [*tables, *([("Checks", ("what", "value", "limit", ""), checks)] if checks else [])],
-    }
+    return {"lines": _words(content.get("found", [])), "tables": [*tables, *checks_of(content["checks"])]}
 
 
 def _anything(content: dict[str, Any]) -> dict[str, Any]:

@@ -162,20 +162,17 @@ def _domain(rig: Rig) -> Domain:
 
 
 def _share(rig: Rig, share: float) -> Place:
-    """The place at this fraction of the length (of both sides of a plate); for named points that of largest motion."""
+    """The place at this fraction of the length (of both sides of a plate).
+
+    For named points, the one with the largest shape of the first elastic mode.
+    """
     domain = rig.modes.domain
     if isinstance(domain, NamedPoints):
-        return _largest_motion(rig)
+        first, names = int(np.argmax(rig.modes.omega > 0)), domain.grid(1)
+        return str(names[int(np.argmax(np.abs(rig.modes.phi(names)[:, first])))])
     if isinstance(domain, Interval):
         return share * domain.length
     return (share * domain.length[0], share * domain.length[1])
-
-
-def _largest_motion(rig: Rig) -> str:
-    """The named point with the largest shape of the first elastic mode."""
-    first = int(np.argmax(rig.modes.omega > 0))
-    names = rig.modes.domain.grid(1)
-    return str(names[int(np.argmax(np.abs(rig.modes.phi(names)[:, first])))])
 
 
 def try_out(rig: Rig, design: Design) -> Tried:
@@ -242,25 +239,36 @@ def results_of(rig: Rig, design: Design) -> dict[str, Any]:
 
 def setting(rig: Rig) -> dict[str, Any]:
     """Data that the page of the bench loads once: the structure, its modes and its shapes."""
-    domain, patch = _domain(rig), patch_of(rig)
-    if isinstance(domain, NamedPoints):
-        return {**_points(rig, domain), **_common(rig, [])}
+    domain = _domain(rig)
+    return {
+        **(_frame(rig, domain) if isinstance(domain, NamedPoints) else _field(rig, domain)),
+        "omega": _plain(rig.modes.omega),
+        "zeta": _plain(rig.modes.zeta),
+        "most": MOST_PORTS,
+        "laws": LAWS,
+        "design": {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(start(rig)).items()},
+    }
+
+
+def _field(rig: Rig, domain: Interval | Rectangle) -> dict[str, Any]:
+    """Drawing data of a member or a plate: where its shapes are shown, the shapes there, and the size of a patch."""
     if isinstance(domain, Interval):
         shown_at, across = np.linspace(0.0, domain.length, N_PLACES), [N_PLACES]
     else:  # centres of cells, each drawn in one colour
         across = [max(round(N_CELLS * side / max(domain.length)), 8) for side in domain.length]
         x, y = ((np.arange(n) + 0.5) / n * side for n, side in zip(across, domain.length, strict=True))
         shown_at = np.column_stack([np.repeat(x, y.size), np.tile(y, x.size)])
+    patch = patch_of(rig)
     return {
         "length": domain.length,
         "cells": across,
         "x": _plain(shown_at),
         "shapes": _plain(rig.modes.phi(shown_at)),
-        **_common(rig, [] if patch is None else _plain(2.0 * reach(domain, patch.at)[0])),
+        "patch": [] if patch is None else _plain(2.0 * reach(domain, patch.at)[0]),
     }
 
 
-def _points(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
+def _frame(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
     """Drawing data of a frame: nodes, lines between them, mode shapes, and the drawn position of each point."""
     net = frame_net(domain)
     corner, size = net.rest.min(axis=0), float(np.ptp(net.rest, axis=0).max())
@@ -278,30 +286,17 @@ def _points(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
             "lines": net.lines,
         },
         "shapes": _plain(moves.reshape(-1, rig.modes.n_modes)),
-    }
-
-
-def _common(rig: Rig, patch: list[float]) -> dict[str, Any]:
-    return {
-        "patch": patch,
-        "omega": _plain(rig.modes.omega),
-        "zeta": _plain(rig.modes.zeta),
-        "most": MOST_PORTS,
-        "laws": LAWS,
-        "design": {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(start(rig)).items()},
+        "patch": [],
     }
 
 
 def _plain(values: ArrayLike) -> Any:
     """The values as JSON numbers of six digits; None where not finite."""
-    values = np.asarray(values, float).tolist()
-    return _short(values) if isinstance(values, list) else _short([values])[0]
+    return _rounded(np.asarray(values, float).tolist())
 
 
-def _short(values: list[Any]) -> list[Any]:
-    if values and isinstance(values[0], list):
-        return [_short(row) for row in values]
-    return [rounded(value) for value in values]
+def _rounded(values: Any) -> Any:
+    return [_rounded(value) for value in values] if isinstance(values, list) else rounded(values)
 
 
 def read_structure(path: Path | None) -> tuple[Rig, str]:

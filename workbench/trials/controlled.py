@@ -8,7 +8,7 @@ from workbench.design.estimation.digital import DigitalController
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.robust.verification import settling
 from workbench.trials import motion
-from workbench.trials.plant import FINEST, SolvedPlant, sensor_noise
+from workbench.trials.plant import SolvedPlant, lagged, measured, sensor_noise
 
 RUN_AWAY = 1e6  # times the energy that the impulse gives
 
@@ -69,7 +69,6 @@ def control_plant(
     impulse_input: str,
     impulse: float = 1.0,
     rng: np.random.Generator | None = None,
-    finest: float = FINEST,
 ) -> Controlled:
     """The response of the plant to an impulse at one of its inputs, under control.
 
@@ -80,41 +79,33 @@ def control_plant(
         impulse_input: name of the input at which the impulse acts.
         impulse: N s.
         rng: generator of the sensors' noise and of random forces; None for neither.
-        finest: radians of the highest mode in one step.
     """
-    plant, n, dt = real.plant, real.plant.n_modes, controller.sample_time
-    system, drive, edges, steps = real.system(dt, finest)
-    m = len(plant.actuators)
+    plant, dt = real.plant, controller.sample_time
+    m, n = real.at_actuators.shape
+    system, pieces = real.system, real.pieces(dt)
     inputs = [a.name for a in plant.actuators]
     commanded = [inputs.index(name) for name in controller.actuators]
-    reading = _Reading(real, controller, n_samples, edges, rng)
+    reading = _Reading(real, controller, n_samples, pieces.edges, rng)
     held = real.random_forces(n_samples, dt, rng)
-    size = 2 * n + m + system[3][0].shape[0]
-    y, work = np.zeros(size), np.zeros((5, size))
-    y[n : 2 * n] = impulse * real.at_actuators[inputs.index(impulse_input)]
-    omega2 = system[0][0]
-    given = 0.5 * float(y[n : 2 * n] @ y[n : 2 * n])
-    pieces = np.zeros((n_samples, 3, edges.size, n))
-    aims, now = np.zeros((m, n_samples)), np.zeros(m)
-    earlier, hysteresis = np.zeros(m), np.zeros(m)
-    headed_for = (np.zeros(m), np.zeros(m), np.zeros(1))
-    sums = (np.zeros(m), np.zeros(m), np.zeros(n), np.zeros(m))
+    state = motion.at_rest(system, n_samples)
+    displacement, velocity = state.y[:n], state.y[n : 2 * n]
+    velocity[:] = impulse * real.at_actuators[inputs.index(impulse_input)]
+    given = 0.5 * float(velocity @ velocity)
+    moved = np.zeros((n_samples, 3, pieces.edges.size, n))
+    sums = motion.Sums(squares=np.zeros(m), work=np.zeros(n), peaks=np.zeros(m))
     z, followed = np.zeros(controller.a.shape[0]), np.zeros(len(commanded))
-    energy, outputs = np.zeros((n, n_samples)), np.zeros((len(controller.sensors), n_samples))
-    most = np.ascontiguousarray(drive[1][:, 3])
+    energy, outputs, bounded = np.zeros((n, n_samples)), np.zeros((len(controller.sensors), n_samples)), True
     for k in range(n_samples):
-        energy[:, k] = 0.5 * (y[n : 2 * n] ** 2 + omega2 * y[:n] ** 2)
-        if not energy[:, k].sum() < RUN_AWAY * given:
-            effort, most_force = float(sums[1].sum()), float(sums[3].max())
-            return Controlled(energy[:, : k + 1], sums[2], effort, most_force, False, dt, outputs[:, :k])
-        outputs[:, k] = reading.at(k, y, pieces)
-        command, followed, z = controller.step(z, followed, outputs[:, k])
+        energy[:, k] = 0.5 * (velocity**2 + system.omega2 * displacement**2)
+        bounded = bool(energy[:, k].sum() < RUN_AWAY * given)
+        if not bounded:
+            energy, outputs = energy[:, : k + 1], outputs[:, :k]
+            break
+        outputs[:, k] = reading.at(k, state.y, moved)
         commands = np.zeros(m)
-        commands[commanded] = command
-        motion.aim(commands, drive, earlier, hysteresis, now)
-        aims[:, k] = now
-        motion.interval(k, y, system, most, aims, headed_for, held[k], dt, edges, steps, work, pieces[k], sums)
-    return Controlled(energy, sums[2], float(sums[1].sum()), float(sums[3].max()), True, dt, outputs)
+        commands[commanded], followed, z = controller.step(z, followed, outputs[:, k])
+        motion.interval(k, state, system, real.drive, pieces, commands, held[k], moved[k], sums)
+    return Controlled(energy, sums.work, float(sums.squares.sum()), float(sums.peaks.max()), bounded, dt, outputs)
 
 
 class _Reading:
@@ -133,15 +124,14 @@ class _Reading:
         self.read = [names.index(name) for name in controller.sensors]
         self.sensors, self.shapes, self.laws = plant.sensors, real.at_sensors, plant.reading_laws
         self.dt, self.n_samples, self.starts = controller.sample_time, n_samples, np.r_[0.0, edges[:-1]]
-        self.truth = np.zeros((len(names), n_samples))
-        self.lagged = np.zeros(len(names))
-        self.before = np.zeros(len(names))
-        self.noise = np.zeros((len(names), n_samples))
+        self.truth, self.noise = np.zeros((2, len(names), n_samples))
+        self.lagged, self.before = np.zeros((2, len(names)))
         if rng is not None:
             for row, sensor in zip(self.noise, plant.sensors, strict=True):
                 row[:] = sensor.noise_std * sensor_noise(rng, n_samples, plant.noise_memory)
 
-    def at(self, k: int, y: np.ndarray, pieces: np.ndarray) -> np.ndarray:
+    def at(self, k: int, y: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """The readings at sample k, from the state y there and the motion before it."""
         n = self.shapes.shape[1]
         for j, sensor in enumerate(self.sensors):
             order = MEASURED[sensor.quantity][1]
@@ -154,25 +144,16 @@ class _Reading:
             whole = int(np.ceil(late))
             if k >= whole:
                 piece = int(np.argmin(np.abs(self.starts - (whole - late))))
-                self.truth[j, k] = self.shapes[j] @ pieces[k - whole, order, piece]
+                self.truth[j, k] = self.shapes[j] @ moved[k - whole, order, piece]
         truth = self.truth[:, : k + 1]
         for law in self.laws:
             truth = law(truth, self.dt)
-        out = np.empty(len(self.sensors))
-        for j, sensor in enumerate(self.sensors):
-            out[j] = self._one(j, sensor, float(truth[j, -1]), k)
-        return out[self.read]
+        readings = [self._reading(j, sensor, float(truth[j, -1]), k) for j, sensor in enumerate(self.sensors)]
+        return np.array(readings)[self.read]
 
-    def _one(self, j: int, sensor: Sensor, true: float, k: int) -> float:
-        y = true
+    def _reading(self, j: int, sensor: Sensor, y: float, k: int) -> float:
         if sensor.time_constant > 0:
-            if k == 0:
-                self.lagged[j] = y
-            else:
-                slope = (y - self.before[j]) / self.dt
-                behind = self.lagged[j] - self.before[j] + slope * sensor.time_constant
-                self.lagged[j] = y - slope * sensor.time_constant + behind * np.exp(-self.dt / sensor.time_constant)
-            self.before[j], y = y, self.lagged[j]
-        y = sensor.gain * y + sensor.bias + sensor.drift * k / (self.n_samples - 1) + self.noise[j, k]
-        y = float(np.clip(y, -sensor.limit, sensor.limit))
+            before, self.before[j] = self.before[j], y
+            self.lagged[j] = y = lagged(self.lagged[j], before, y, sensor.time_constant, self.dt) if k else y
+        y = float(measured(sensor, y, k, self.n_samples, self.noise[j, k]))
         return float(sensor.step * np.round(y / sensor.step)) if sensor.step > 0 else y

@@ -16,18 +16,22 @@ from workbench.rig.sensors import Sensor
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle, Where, middle
 from workbench.structure.member import Beam, Structure
 from workbench.structure.supports import HELD
+from workbench.trials.benches import Scene, Unsuitable
+from workbench.trials.finite_elements import Buckled
 from workbench.trials.hidden import hide
 from workbench.trials.laws import POINT_LAWS, PointSizes, Strengths
-from workbench.trials.scene import Scene, Unsuitable
 
 Numbers = dict[str, Any]
 OfStrength = Callable[[float], Numbers]
 Draw = Callable[[Scene, np.random.Generator], Numbers | OfStrength]
-Number = Callable[[float], float]  # of a strength near 1
 
 
 def _sign(rng: np.random.Generator) -> float:
     return float(rng.choice([-1.0, 1.0]))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _factor(name: str, size: float) -> Draw:
@@ -40,7 +44,7 @@ def _factor(name: str, size: float) -> Draw:
 
 def _typical_stiffness(scene: Scene) -> float:
     """A typical stiffness at a point, N/m: that of the first elastic mode."""
-    modes = scene.bench.rig.modes
+    modes = scene.rig.modes
     first = int(np.argmax(modes.omega > 0))
     domain = modes.domain
     places = np.linspace(0.0, 1.0, 41) * domain.size if isinstance(domain, Interval) else domain.grid(24)
@@ -68,7 +72,7 @@ def _at_point(make: Callable[[PointSizes, np.random.Generator], Strengths]) -> D
 
 
 def _member(scene: Scene) -> Structure:
-    member = scene.bench.rig.structure
+    member = scene.rig.structure
     if not isinstance(member, Structure):
         raise Unsuitable("only a beam or a rod shows this")
     return member
@@ -76,19 +80,15 @@ def _member(scene: Scene) -> Structure:
 
 def _beam(scene: Scene) -> tuple[Beam, float]:
     """The beam, and its bending stiffness at midspan, N m²."""
-    member = scene.bench.rig.structure
+    member = scene.rig.structure
     if not isinstance(member, Beam):
         raise Unsuitable("only a beam shows this")
     return member, float(member.bending_stiffness(np.array([0.5 * member.length]))[0])
 
 
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def _modal_damping(scene: Scene) -> float:
     """2 ζ ω of the first elastic mode, 1/s."""
-    modes = scene.bench.rig.modes
+    modes = scene.rig.modes
     return float(2.0 * modes.zeta[0] * modes.omega[modes.omega > 0][0])
 
 
@@ -116,7 +116,7 @@ def _axial(scene: Scene, rng: np.random.Generator) -> OfStrength:
 
 
 def _stretching(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    modes, (member, stiffness) = scene.bench.rig.modes, _beam(scene)
+    modes, (member, stiffness) = scene.rig.modes, _beam(scene)
     if not (member.left.translation == HELD and member.right.translation == HELD):
         raise Unsuitable("the midplane stretches only between ends held in translation")
     grid = np.linspace(0.0, 1.0, 101) * modes.length
@@ -126,7 +126,7 @@ def _stretching(scene: Scene, rng: np.random.Generator) -> OfStrength:
 
 
 def _drag(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    modes, member = scene.bench.rig.modes, _member(scene)
+    modes, member = scene.rig.modes, _member(scene)
     grid = np.linspace(0.0, 1.0, 101) * modes.length
     speed, damping = _rms(modes.phi(grid) @ scene.moved[1].T), _modal_damping(scene)
     mass = float(np.mean(member.mass_per_length(grid[1:-1])))
@@ -135,56 +135,47 @@ def _drag(scene: Scene, rng: np.random.Generator) -> OfStrength:
 
 def _damper(scene: Scene, rng: np.random.Generator) -> OfStrength:
     where, damping = scene.place(rng, between=True), _modal_damping(scene)
-    shape = float(np.abs(scene.bench.rig.modes.phi_at(where)).max())
+    shape = float(np.abs(scene.rig.modes.phi_at(where)).max())
     return lambda s: {**_place(where), "coefficient": s * damping / shape**2}
 
 
 def _mass(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at = scene.place(rng)
-    shape = float(np.abs(scene.bench.rig.modes.phi(at)[0]).max())
+    shape = float(np.abs(scene.rig.modes.phi(at)[0]).max())
     return lambda s: {**_place(at), "mass": 0.01 * s / shape**2}
 
 
-def _drive(name: str, make: Callable[[Scene, np.random.Generator], Number], every: float = 0.6) -> Draw:
-    """The draw of an effect on all actuators, or with probability 1 - every on one of them."""
+def _one_or_all(names: Sequence[str], rng: np.random.Generator, every: float = 0.6) -> str:
+    """The name of one channel, or "all" with probability `every`."""
+    return "all" if rng.random() < every else str(rng.choice(names))
+
+
+def _drive(name: str, number: Callable[[Scene, float], float], *, every: float = 0.6, signed: bool = False) -> Draw:
+    """The draw of an effect on all actuators or one, with a number that depends on a strength, of either sign."""
 
     def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
-        which = "all" if rng.random() < every else str(rng.choice(scene.acting))
-        number = make(scene, rng)
-        return lambda s: {"input": which, name: number(s)}
+        which = _one_or_all(scene.acting, rng, every)
+        sign = _sign(rng) if signed else 1.0
+        return lambda s: {"input": which, name: float(number(scene, sign * s))}
 
     return draw
 
 
-def _gain(scene: Scene, rng: np.random.Generator) -> Number:
-    sign = _sign(rng)
-    return lambda s: float(np.exp(sign * 0.2 * s))
+def _rate_limit(scene: Scene, strength: float) -> float:
+    """A rate limit at most twice the 0.9 quantile of the command's rate: above, readings show a delay and no more."""
+    rates = np.abs(np.diff(scene.commands[0])) / scene.bench.sample_time
+    return float(np.quantile(rates, 0.9)) / max(strength, 0.5)
 
 
-def _limit(scene: Scene, rng: np.random.Generator) -> Number:
-    peak = float(np.abs(scene.commands).max())
-    return lambda s: peak * float(np.exp(-0.5 * s))
-
-
-def _dead_zone(scene: Scene, rng: np.random.Generator) -> Number:
-    return lambda s: 0.1 * s * _rms(scene.commands[0])
+def _late(scene: Scene, strength: float) -> float:
+    """A delay, s, of about half a sample and at least a twentieth: an accelerometer shows any delay as a jump."""
+    return max(0.5 * strength, 0.05) * scene.bench.sample_time
 
 
 def _hysteresis(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    which = "all" if rng.random() < 0.6 else str(rng.choice(scene.acting))
+    which = _one_or_all(scene.acting, rng)
     width = float(rng.uniform(0.3, 1.0)) * _rms(scene.commands[0])
     return lambda s: {"input": which, "share": float(-np.expm1(-0.3 * s)), "width": width}
-
-
-def _bias_force(scene: Scene, rng: np.random.Generator) -> Number:
-    sign = _sign(rng)
-    return lambda s: sign * 0.1 * s * scene.bench.level
-
-
-def _rate_limit(scene: Scene, rng: np.random.Generator) -> Number:
-    """A rate limit at most twice the 0.9 quantile of the command's rate: above, readings show a delay and no more."""
-    steps = np.abs(np.diff(scene.commands[0])) / scene.bench.sample_time
-    return lambda s: float(np.quantile(steps, 0.9)) / max(s, 0.5)
 
 
 def _swapped_inputs(scene: Scene, rng: np.random.Generator) -> Numbers:
@@ -193,7 +184,7 @@ def _swapped_inputs(scene: Scene, rng: np.random.Generator) -> Numbers:
 
 
 def _swapped_outputs(scene: Scene, rng: np.random.Generator) -> Numbers:
-    sensors = scene.bench.rig.sensors
+    sensors = scene.rig.sensors
     alike = [(a.name, b.name) for a, b in combinations(sensors, 2) if a.quantity == b.quantity]
     if not alike:
         raise Unsuitable("no two sensors measure the same quantity")
@@ -202,22 +193,17 @@ def _swapped_outputs(scene: Scene, rng: np.random.Generator) -> Numbers:
 
 
 def _sensor_crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    row, source = rng.choice(len(scene.bench.rig.sensors), 2, replace=False)
-    names, sign = [s.name for s in scene.bench.rig.sensors], _sign(rng)
+    row, source = rng.choice(len(scene.rig.sensors), 2, replace=False)
+    names, sign = [s.name for s in scene.rig.sensors], _sign(rng)
     ratio = float(scene.outputs[row].std() / scene.outputs[source].std())
     return lambda s: {"output": names[row], "from": names[source], "share": sign * 0.2 * s * ratio}
 
 
-def _late(scene: Scene, strength: float) -> float:
-    """A delay, s, of about half a sample and at least a twentieth: an accelerometer shows any delay as a jump."""
-    return max(0.5 * strength, 0.05) * scene.bench.sample_time
-
-
 def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
     """The draw of a misplaced actuator (side "input") or sensor ("output")."""
-    rig = scene.bench.rig
+    rig, domain = scene.rig, scene.rig.modes.domain
     ports: Sequence[Actuator | Sensor] = rig.sensors if side == "output" else [a for a in rig.actuators if not a.direct]
-    port, domain = ports[int(rng.integers(len(ports)))], scene.bench.rig.modes.domain
+    port = ports[int(rng.integers(len(ports)))]
     if isinstance(domain, NamedPoints):
         if domain.positions is None:
             return {side: port.name, "at": str(rng.choice([name for name in domain.names if name != port.at]))}
@@ -225,56 +211,47 @@ def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
         if at == port.at:
             raise Unsuitable("the actuator or sensor would stay at its place")
         return {side: port.name, "at": at}
-    lengths, stands = np.atleast_1d(domain.length), np.atleast_1d(np.asarray(middle(port.at), float))
+    lengths, stated = np.atleast_1d(domain.length), np.atleast_1d(np.asarray(middle(port.at), float))
     if isinstance(domain, Rectangle):
         angle = float(rng.uniform(0.0, 2.0 * np.pi))
-        step = np.array([np.cos(angle), np.sin(angle)])
+        direction = np.array([np.cos(angle), np.sin(angle)])
     else:
-        step = np.array([_sign(rng)])
-    step = step * float(rng.uniform(0.03, 0.25)) * domain.size
-
-    def inside(place: np.ndarray) -> bool:
-        return bool(((0.02 * lengths < place) & (place < lengths)).all())
-
-    moved = stands + step if inside(stands + step) else stands - step
-    if not inside(moved):
-        raise Unsuitable("the actuator or sensor would leave the structure")
-    place = np.round(moved, 4).tolist()
-    return {side: port.name, "at": place if isinstance(domain, Rectangle) else place[0]}
+        direction = np.array([_sign(rng)])
+    step = direction * float(rng.uniform(0.03, 0.25)) * domain.size
+    for moved in (stated + step, stated - step):
+        if ((0.02 * lengths < moved) & (moved < lengths)).all():
+            place = np.round(moved, 4).tolist()
+            return {side: port.name, "at": place if isinstance(domain, Rectangle) else place[0]}
+    raise Unsuitable("the actuator or sensor would leave the structure")
 
 
-def _reading(name: str, make: Callable[[Scene, int, np.random.Generator], Number]) -> Draw:
+def _sensor(scene: Scene, rng: np.random.Generator) -> tuple[Sensor, np.ndarray]:
+    """A random sensor, and its nominal readings."""
+    row = int(rng.integers(len(scene.rig.sensors)))
+    return scene.rig.sensors[row], scene.outputs[row]
+
+
+def _reading(name: str, number: Callable[[Scene, np.ndarray, float], float], *, signed: bool = False) -> Draw:
+    """The draw of an effect on a sensor, with a number that depends on its readings and a strength, of either sign."""
+
     def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
-        row = int(rng.integers(len(scene.bench.rig.sensors)))
-        number = make(scene, row, rng)
-        return lambda s: {"output": scene.bench.rig.sensors[row].name, name: number(s)}
+        sensor, y = _sensor(scene, rng)
+        sign = _sign(rng) if signed else 1.0
+        return lambda s: {"output": sensor.name, name: float(number(scene, y, sign * s))}
 
     return draw
 
 
-def _in_rms(size: float) -> Callable[[Scene, int, np.random.Generator], Number]:
-    def make(scene: Scene, row: int, rng: np.random.Generator) -> Number:
-        rms, sign = float(scene.outputs[row].std()), _sign(rng)
-        return lambda s: sign * size * s * rms
-
-    return make
-
-
-def _clip(scene: Scene, row: int, rng: np.random.Generator) -> Number:
-    return lambda s: float(np.abs(scene.outputs[row]).max()) * float(np.exp(-0.4 * s))
-
-
 def _quantisation(scene: Scene, rng: np.random.Generator) -> Numbers:
-    row = int(rng.integers(len(scene.bench.rig.sensors)))
-    sensor = scene.bench.rig.sensors[row]
-    step = float(f"{min(rng.uniform(4.0, 12.0) * sensor.noise_std, 0.3 * scene.outputs[row].std()):.3g}")
+    sensor, y = _sensor(scene, rng)
+    step = float(f"{min(rng.uniform(4.0, 12.0) * sensor.noise_std, 0.3 * y.std()):.3g}")
     if step < 2.0 * sensor.noise_std:
         raise Unsuitable("the noise exceeds the quantisation step")
     return {"output": sensor.name, "step": step}
 
 
 def _sensor_lag(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    which = "all" if rng.random() < 0.6 else str(rng.choice([s.name for s in scene.bench.rig.sensors]))
+    which = _one_or_all([s.name for s in scene.rig.sensors], rng)
     return lambda s: {"output": which, "time_constant": _late(scene, s)}
 
 
@@ -300,25 +277,14 @@ def _actuator_crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
     return lambda s: {"input": str(first), "from": str(second), "share": sign * 0.2 * s}
 
 
-def _bent_command(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    return lambda s: {"curvature": 0.2 * s / _rms(scene.commands[0])}
-
-
-def _bent_reading(scene: Scene, row: int, rng: np.random.Generator) -> Number:
-    rms, sign = float(scene.outputs[row].std()), _sign(rng)
-    return lambda s: sign * 0.2 * s / rms
-
-
 def _hum(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    row, frequency = int(rng.integers(len(scene.bench.rig.sensors))), float(rng.uniform(0.2, 2.0)) * scene.bench.band_hz
-    rms = float(scene.outputs[row].std())
-    return lambda s: {"output": scene.bench.rig.sensors[row].name, "frequency": frequency, "amplitude": 0.3 * s * rms}
+    (sensor, y), frequency = _sensor(scene, rng), float(rng.uniform(0.2, 2.0)) * scene.bench.band_hz
+    return lambda s: {"output": sensor.name, "frequency": frequency, "amplitude": 0.3 * s * float(y.std())}
 
 
 def _spikes(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    row, every = int(rng.integers(len(scene.bench.rig.sensors))), int(rng.integers(60, 300))
-    rms = float(scene.outputs[row].std())
-    return lambda s: {"output": scene.bench.rig.sensors[row].name, "every": every, "amplitude": 2.0 * s * rms}
+    (sensor, y), every = _sensor(scene, rng), int(rng.integers(60, 300))
+    return lambda s: {"output": sensor.name, "every": every, "amplitude": 2.0 * s * float(y.std())}
 
 
 DRAWS: dict[str, Draw] = {
@@ -333,38 +299,37 @@ DRAWS: dict[str, Draw] = {
     "point_damper": _damper,
     "air_drag": _drag,
     "midplane_stretching": _stretching,
-    "actuator_gain": _drive("gain", _gain, every=0.0),
-    "actuator_lag": _drive("time_constant", lambda c, r: lambda s: _late(c, s)),
-    "actuator_delay": _drive("delay", lambda c, r: lambda s: _late(c, s)),
-    "actuator_saturation": _drive("limit", _limit),
-    "actuator_dead_zone": _drive("width", _dead_zone),
+    "actuator_gain": _drive("gain", lambda c, x: np.exp(0.2 * x), every=0.0, signed=True),
+    "actuator_lag": _drive("time_constant", _late),
+    "actuator_delay": _drive("delay", _late),
+    "actuator_saturation": _drive("limit", lambda c, x: np.abs(c.commands).max() * np.exp(-0.5 * x)),
+    "actuator_dead_zone": _drive("width", lambda c, x: 0.1 * x * _rms(c.commands[0])),
     "actuator_misplacement": partial(_moved, "input"),
     "actuator_hysteresis": _hysteresis,
-    "actuator_bias": _drive("force", _bias_force, every=0.0),
+    "actuator_bias": _drive("force", lambda c, x: 0.1 * x * c.bench.level, every=0.0, signed=True),
     "actuator_rate_limit": _drive("rate", _rate_limit),
     "swapped_inputs": _swapped_inputs,
-    "sensor_gain": _reading("gain", lambda c, row, r: (lambda sign: lambda s: float(np.exp(sign * 0.3 * s)))(_sign(r))),
-    "sensor_bias": _reading("bias", _in_rms(0.3)),
-    "sensor_drift": _reading("drift_over_record", _in_rms(0.5)),
+    "sensor_gain": _reading("gain", lambda c, y, x: np.exp(0.3 * x), signed=True),
+    "sensor_bias": _reading("bias", lambda c, y, x: 0.3 * x * y.std(), signed=True),
+    "sensor_drift": _reading("drift_over_record", lambda c, y, x: 0.5 * x * y.std(), signed=True),
     "sensor_lag": _sensor_lag,
     "sensor_misplacement": partial(_moved, "output"),
-    "sensor_delay": _reading("delay", lambda c, row, r: lambda s: _late(c, s)),
+    "sensor_delay": _reading("delay", lambda c, y, x: _late(c, x)),
     "sensor_crosstalk": _sensor_crosstalk,
     "swapped_outputs": _swapped_outputs,
-    "sensor_clipping": _reading("limit", _clip),
+    "sensor_clipping": _reading("limit", lambda c, y, x: np.abs(y).max() * np.exp(-0.4 * x)),
     "sensor_quantisation": _quantisation,
     "periodic_disturbance": _periodic_force,
     "random_disturbance": _random_force,
     "stiffness_drift": _drift,
     "cross_talk": _actuator_crosstalk,
-    "bent_command": _bent_command,
-    "bent_reading": _reading("curvature", _bent_reading),
+    "bent_command": lambda c, rng: lambda s: {"curvature": 0.2 * s / _rms(c.commands[0])},
+    "bent_reading": _reading("curvature", lambda c, y, x: 0.2 * x / y.std(), signed=True),
     "hum": _hum,
     "spikes": _spikes,
 }
 
-
-SMALLEST, LARGEST = 0.02, 1.5
+SMALLEST, LARGEST = 0.02, 1.5  # gap
 TRIES = 9
 
 
@@ -400,9 +365,5 @@ def draw_effect(kind: str, scene: Scene, rng: np.random.Generator) -> dict[str, 
 def _gap(effect: dict[str, Any], scene: Scene, rng: np.random.Generator) -> float:
     try:
         return scene.gap(hide(scene.bench.plant(), [effect]), rng)
-    except Unsuitable:
+    except (Unsuitable, Buckled):
         return 1e3
-    except ValueError as error:
-        if "buckles" in str(error):
-            return 1e3
-        raise

@@ -15,7 +15,7 @@ from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, Functi
 from skfem.helpers import d, dd
 
 from workbench.arrays import Floats
-from workbench.structure.domain import Between, NamedPoints, Where, position
+from workbench.structure.domain import Between, Domain, NamedPoints, Where, position
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, freeze
@@ -23,6 +23,10 @@ from workbench.structure.profile import Profile
 from workbench.structure.supports import HELD
 
 ELEMENTS = 240
+
+
+class Buckled(ValueError):
+    """An altered structure that buckles."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,9 @@ def element_modes(
 
     Args:
         places: (n_places,) of the shapes returned, m.
+
+    Raises:
+        Buckled: the member buckles.
     """
     beam = isinstance(member, Beam)
     special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
@@ -111,7 +118,7 @@ def element_modes(
     values = np.array(energy) + np.einsum("ir,ir->r", full, beside @ full)
     omega2 = np.where(np.abs(values) < 1e-6 * abs(shift), 0.0, values)
     if (omega2 < 0).any():
-        raise ValueError("the altered member is unstable: it buckles; draw a weaker compression")
+        raise Buckled("the altered member is unstable: it buckles; draw a weaker compression")
     at_places = full[displacement[[_node(nodes, x) for x in places]]] if len(places) else np.zeros((0, n_modes))
     return ElementModes(np.sqrt(omega2), at_places, full.T @ (slopes @ full))
 
@@ -127,20 +134,14 @@ def matrix_modes(
     Raises:
         ValueError: alterations that only a member can have.
     """
-    _check_no_member(altered)
     points = frame.nodes
-    mass, stiffness = frame.mass.toarray(), altered.stiffness_factor * frame.stiffness.toarray()
     rows = np.eye(len(points.names))
 
     def row(where: Where) -> Floats:
         first, *second = points.locate(list(where) if isinstance(where, Between) else where)
         return np.asarray(rows[first] - rows[second].sum(axis=0))
 
-    _add(stiffness, [(row(at), value) for at, value in altered.springs])
-    _add(mass, [(row(name), value) for at, value in altered.masses for name in points.translations(at)])
-    values, vectors = eigh(stiffness, mass, subset_by_index=(0, n_modes - 1))
-    shapes = np.array([row(at) for at in places]).reshape(-1, len(rows)) @ vectors
-    return ElementModes(np.sqrt(np.maximum(values, 0.0)), shapes, np.zeros((n_modes, n_modes)))
+    return _dense_modes(frame.stiffness.toarray(), frame.mass.toarray(), points, row, places, n_modes, altered)
 
 
 def modal_modes(nominal: Modes, places: Sequence[Where], *, altered: Alterations = AS_NOMINAL) -> ElementModes:
@@ -151,28 +152,33 @@ def modal_modes(nominal: Modes, places: Sequence[Where], *, altered: Alterations
     Raises:
         ValueError: alterations that only a member can have.
     """
-    _check_no_member(altered)
-    points = nominal.domain
-    every = points.translations if isinstance(points, NamedPoints) else lambda at: (at,)
-    moving = [(name, value) for at, value in altered.masses for name in every(at)]
-    stiffness, mass = np.diag(altered.stiffness_factor * nominal.omega**2), np.eye(nominal.n_modes)
-    _add(stiffness, [(nominal.phi_at(at), value) for at, value in altered.springs])
-    _add(mass, [(nominal.phi_at(at), value) for at, value in moving])
-    values, vectors = eigh(stiffness, mass)
-    shapes = np.array([nominal.phi_at(at) for at in places]).reshape(-1, nominal.n_modes) @ vectors
-    return ElementModes(np.sqrt(np.maximum(values, 0.0)), shapes, np.zeros_like(mass))
+    stiffness, mass = np.diag(nominal.omega**2), np.eye(nominal.n_modes)
+    return _dense_modes(stiffness, mass, nominal.domain, nominal.phi_at, places, nominal.n_modes, altered)
 
 
-def _check_no_member(altered: Alterations) -> None:
+def _dense_modes(
+    stiffness: Floats,
+    mass: Floats,
+    domain: Domain,
+    row: Callable[[Where], Floats],
+    places: Sequence[Where],
+    n_modes: int,
+    altered: Alterations,
+) -> ElementModes:
+    """The lowest modes of altered matrices; `row` has the coefficients of a displacement in all degrees of freedom."""
     of_a_member = (altered.losses, altered.tension, altered.stiffness_waves, altered.mass_waves)
     if any(of_a_member) or altered.rotational_stiffness != (None, None):
         raise ValueError("named points have no local stiffness, tension or rotation; describe a beam or a rod")
-
-
-def _add(matrix: Floats, parts: list[tuple[Floats, float]]) -> None:
-    """Add Σ value r rᵀ to a matrix, in place."""
-    for row, value in parts:
-        matrix += value * np.outer(row, row)
+    stiffness = altered.stiffness_factor * stiffness
+    for at, value in altered.springs:
+        stiffness += value * np.outer(row(at), row(at))
+    for at, value in altered.masses:
+        for name in domain.translations(at) if isinstance(domain, NamedPoints) else (at,):
+            mass += value * np.outer(row(name), row(name))
+    lowest = (0, n_modes - 1) if n_modes < len(mass) else None
+    values, vectors = eigh(stiffness, mass, subset_by_index=lowest)
+    shapes = np.array([row(at) for at in places]).reshape(-1, len(mass)) @ vectors
+    return ElementModes(np.sqrt(np.maximum(values, 0.0)), shapes, np.zeros((n_modes, n_modes)))
 
 
 def _nodes(special: np.ndarray, length: float) -> np.ndarray:

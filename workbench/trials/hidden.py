@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
 from workbench.structure.domain import Between, centred_at
 from workbench.trials.laws import POINT_LAWS, PointLaw
-from workbench.trials.plant import Plant, with_ports
+from workbench.trials.plant import Plant
 
 NONE, UNKNOWN = "none", "unknown"  # kinds of a label: no hidden effect, or one outside every catalogue
 Hide = Callable[[Plant, dict[str, Any]], Plant]
@@ -31,12 +34,22 @@ def _law(law: PointLaw, plant: Plant, e: dict[str, Any]) -> Plant:
     return replace(plant, laws=(*plant.laws, (law.code, stands(e), tuple(e[name] for name in law.parameters))))
 
 
-def _actuator(**fields: str) -> Hide:
-    return lambda plant, e: with_ports(plant, "actuators", e["input"], **{f: e[name] for f, name in fields.items()})
+def _with_ports(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
+    """The plant with one actuator or sensor changed, or all of them (except hammers) for the name "all"."""
+
+    def meant(port: Actuator | Sensor) -> bool:
+        return port.name == name or (name == "all" and not getattr(port, "direct", False))
+
+    ports: Any = tuple(replace(port, **changes) if meant(port) else port for port in getattr(plant, side))
+    return replace(plant, **{side: ports})
 
 
-def _sensor(**fields: str) -> Hide:
-    return lambda plant, e: with_ports(plant, "sensors", e["output"], **{f: e[name] for f, name in fields.items()})
+def _port(side: str, key: str, **fields: str) -> Hide:
+    """A change of fields of an actuator or sensor, each to the parameter of this name."""
+    return lambda plant, e: _with_ports(plant, side, e[key], **{f: e[name] for f, name in fields.items()})
+
+
+_actuator, _sensor = partial(_port, "actuators", "input"), partial(_port, "sensors", "output")
 
 
 def _support(plant: Plant, e: dict[str, Any]) -> Plant:
@@ -48,7 +61,7 @@ def _support(plant: Plant, e: dict[str, Any]) -> Plant:
 def _moved(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
     """The plant with one actuator or sensor moved; a patch keeps its size."""
     (stood,) = (port.at for port in getattr(plant, side) if port.name == e[key])
-    return with_ports(plant, side, e[key], at=centred_at(stood, stands(e)))
+    return _with_ports(plant, side, e[key], at=centred_at(stood, stands(e)))
 
 
 def _swapped(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
@@ -63,18 +76,6 @@ def _swapped(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
     return replace(plant, **{side: ports})
 
 
-def _sensor_crosstalk(plant: Plant, e: dict[str, Any]) -> Plant:
-    names = [sensor.name for sensor in plant.sensors]
-    row, source = names.index(e["output"]), names.index(e["from"])
-
-    def read(y: np.ndarray, sample_time: float) -> np.ndarray:
-        y = y.copy()
-        y[row] += e["share"] * y[source]
-        return y
-
-    return replace(plant, reading_laws=(*plant.reading_laws, read))
-
-
 def _actuator_crosstalk(plant: Plant, e: dict[str, Any]) -> Plant:
     names = [a.name for a in plant.actuators]
     mix = np.eye(len(names))
@@ -87,27 +88,31 @@ def _bent_command(plant: Plant, e: dict[str, Any]) -> Plant:
     return replace(plant, curvature=e["curvature"] * acting)
 
 
-def _reading(law: Callable[[np.ndarray, float, dict[str, Any], int], None], plant: Plant, e: dict[str, Any]) -> Plant:
-    row = [s.name for s in plant.sensors].index(e["output"])
+def _reading(law: Callable[[dict[str, Floats], float, dict[str, Any]], Floats]) -> Hide:
+    """An addition to the readings of a sensor: (readings by sensor, sample time, effect) -> (n_samples,)."""
 
-    def read(y: np.ndarray, sample_time: float) -> np.ndarray:
-        y = y.copy()
-        law(y, sample_time, e, row)
-        return y
+    def hide(plant: Plant, e: dict[str, Any]) -> Plant:
+        names = [sensor.name for sensor in plant.sensors]
 
-    return replace(plant, reading_laws=(*plant.reading_laws, read))
+        def read(y: np.ndarray, sample_time: float) -> np.ndarray:
+            y = y.copy()
+            y[names.index(e["output"])] += law(dict(zip(names, y, strict=True)), sample_time, e)
+            return y
 
+        return replace(plant, reading_laws=(*plant.reading_laws, read))
 
-def _bent_reading(y: np.ndarray, sample_time: float, e: dict[str, Any], row: int) -> None:
-    y[row] += e["curvature"] * y[row] ** 2
-
-
-def _hum(y: np.ndarray, sample_time: float, e: dict[str, Any], row: int) -> None:
-    y[row] += e["amplitude"] * np.sin(2.0 * np.pi * e["frequency"] * sample_time * np.arange(y.shape[1]))
+    return hide
 
 
-def _spikes(y: np.ndarray, sample_time: float, e: dict[str, Any], row: int) -> None:
-    y[row, e["every"] // 2 :: e["every"]] += e["amplitude"]
+def _hum(y: dict[str, Floats], sample_time: float, e: dict[str, Any]) -> Floats:
+    wave: Floats = np.sin(2.0 * np.pi * e["frequency"] * sample_time * np.arange(y[e["output"]].size))
+    return float(e["amplitude"]) * wave
+
+
+def _spikes(y: dict[str, Floats], sample_time: float, e: dict[str, Any]) -> Floats:
+    spikes = np.zeros_like(y[e["output"]])
+    spikes[e["every"] // 2 :: e["every"]] = e["amplitude"]
+    return spikes
 
 
 HIDE: dict[str, Hide] = {
@@ -138,7 +143,7 @@ HIDE: dict[str, Hide] = {
     "sensor_lag": _sensor(time_constant="time_constant"),
     "sensor_misplacement": partial(_moved, "sensors", "output"),
     "sensor_delay": _sensor(delay="delay"),
-    "sensor_crosstalk": _sensor_crosstalk,
+    "sensor_crosstalk": _reading(lambda y, sample_time, e: e["share"] * y[e["from"]]),
     "swapped_outputs": partial(_swapped, "sensors", "output"),
     "sensor_clipping": _sensor(limit="limit"),
     "sensor_quantisation": _sensor(step="step"),
@@ -154,9 +159,9 @@ OUTSIDE: dict[str, Hide] = {
     **{name: partial(_law, law) for name, law in POINT_LAWS.items() if law.outside},
     "cross_talk": _actuator_crosstalk,
     "bent_command": _bent_command,
-    "bent_reading": partial(_reading, _bent_reading),
-    "hum": partial(_reading, _hum),
-    "spikes": partial(_reading, _spikes),
+    "bent_reading": _reading(lambda y, sample_time, e: e["curvature"] * y[e["output"]] ** 2),
+    "hum": _reading(_hum),
+    "spikes": _reading(_spikes),
 }
 
 

@@ -1,4 +1,4 @@
-"""Holding blind trials: make cases with sealed labels, diagnose them, score them."""
+"""Holding blind trials: draw what is hidden, write the cases with sealed labels, diagnose them, score them."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -6,14 +6,146 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from workbench.cases.case import read_case
+from workbench.cases.case import Case, read_case
+from workbench.cases.writing import write_case
 from workbench.gap.diagnose import diagnose_case
-from workbench.trials.make import write_trials
+from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, MIMICS, SIZES, TRIPLE
+from workbench.trials.make import KINDS, OUTSIDE_KINDS, find_trial_with_plant
+from workbench.trials.rigs import FRAMES, MEMBERS, PLATES
 from workbench.trials.scoring import Tally, score, score_imperfect, tally
+
+MOST_SEEDS = 100
+
+# Kinds that are impossible on a structure.
+OF_MEMBERS = frozenset({"local_stiffness_loss", "support_rotation", "axial_load", "air_drag", "midplane_stretching"})
+NOT_ON = {MEMBERS: frozenset(), PLATES: OF_MEMBERS, FRAMES: OF_MEMBERS | {"truncated_modes"}}
+
+# Kinds that the records of a case cannot distinguish.
+ALIKE = (
+    {"actuator_lag", "actuator_delay", "sensor_lag", "sensor_delay"},
+    {"modulus_error", "stiffness_drift"},
+)
+
+
+class ImperfectDraw(NamedTuple):
+    """The draw of a trial with imperfections: their class and size, and the kinds of the hidden effects."""
+
+    imperfections: str
+    size: float
+    kinds: tuple[str, ...]
+
+
+def draw_kinds(n: int, seed: int, *, like: Case | None = None, structure: str = MEMBERS) -> list[tuple[str, ...]]:
+    """Random kinds for n trials: of every 60, 40 of one effect, 10 pairs, 5 without and 5 outside the vocabulary."""
+    rng = np.random.default_rng(seed)
+    missing = NOT_ON[structure] if like is None else {"truncated_modes"}
+    pool = [kind for kind in KINDS if kind not in missing]
+    singles = [(str(kind),) for _ in range(n // len(pool) + 1) for kind in rng.permutation(pool)]
+    drawn: list[tuple[str, ...]] = []
+    for i in range(n):
+        turn = (i * 7 + 3) % 60  # spreads the families over the list for any n
+        if turn < 5:
+            drawn.append(())
+        elif turn < 10:
+            drawn.append((str(rng.choice(OUTSIDE_KINDS)),))
+        elif turn < 20:
+            drawn.append(_draw_several(2, pool, rng))
+        else:
+            drawn.append(singles.pop(0))
+    return drawn
+
+
+def draw_imperfect_kinds(
+    n: int, seed: int, *, imperfections: str = "all", size: float | None = None
+) -> list[ImperfectDraw]:
+    """Random imperfections and kinds for n trials; every third trial has no hidden effect.
+
+    Args:
+        imperfections: a class, or "all" for each in turn.
+        size: of the imperfections; None for each of `SIZES` in turn.
+    """
+    rng = np.random.default_rng(seed)
+    drawn: list[ImperfectDraw] = []
+    for i in range(n):
+        name = IMPERFECTIONS[i % len(IMPERFECTIONS)] if imperfections == "all" else imperfections
+        turn = i // len(IMPERFECTIONS) if imperfections == "all" else i
+        how_large = SIZES[turn % len(SIZES)] if size is None else size
+        pool = [k for k in KINDS if k not in MIMICS[name]]
+        if name == TRIPLE:
+            kinds = tuple(sorted(_draw_several(3, pool, rng)))
+        elif (turn // len(SIZES) + turn) % 3 == 2:
+            kinds = ()
+        else:
+            kinds = (str(rng.choice(pool)),)
+        drawn.append(ImperfectDraw(name, how_large, kinds))
+    return drawn
+
+
+def _draw_several(n: int, pool: list[str], rng: np.random.Generator) -> tuple[str, ...]:
+    """n random kinds that records can distinguish."""
+    while True:
+        kinds = tuple(str(kind) for kind in rng.choice(pool, n, replace=False))
+        if "truncated_modes" not in kinds and not any(len(alike & set(kinds)) > 1 for alike in ALIKE):
+            return kinds
+
+
+def write_trials(
+    folder: str | Path,
+    labels: str | Path,
+    n: int,
+    seed: int,
+    *,
+    like: Case | None = None,
+    structure: str = MEMBERS,
+    kinds: Sequence[Sequence[str]] | None = None,
+    imperfections: str | None = None,
+    size: float | None = None,
+    report: Callable[[str, float], None] = lambda text, share: None,
+) -> None:
+    """Write n cases as folders, and their labels as one JSON file elsewhere.
+
+    Args:
+        like: a case whose rig and kinds of record all cases have; None draws a bench for each case. Kinds that are
+            impossible on a bench are replaced by others.
+        structure: of drawn benches: "members" (beams and rods), "plates" or "frames".
+        kinds: of the hidden effects of each case; None draws them, see `draw_kinds` and `draw_imperfect_kinds`.
+        imperfections: class of small additional errors, of `IMPERFECTIONS`, or "all" in turn; None for none.
+        size: of these errors; None for each of `SIZES` in turn.
+        report: called with (name, share done).
+
+    Raises:
+        ValueError: the labels would be in the folder that the diagnosis reads.
+    """
+    folder, labels = Path(folder), Path(labels)
+    if labels.resolve().is_relative_to(folder.resolve()):
+        raise ValueError(f"labels {labels} would be in the folder of the cases, {folder}; give another folder")
+    if imperfections is None:
+        draws = [ImperfectDraw(CLEAN, 1.0, k) for k in draw_kinds(n, seed, like=like, structure=structure)]
+    else:
+        draws = draw_imperfect_kinds(n, seed, imperfections=imperfections, size=size)
+    if kinds is not None:
+        draws = [draw._replace(kinds=tuple(hidden)) for draw, hidden in zip(draws, kinds, strict=True)]
+    labelled = {}
+    for i, draw in enumerate(draws):
+        name = f"case-{i + 1:03d}"
+        pool = [k for k in KINDS if k not in MIMICS[draw.imperfections] | NOT_ON[structure] | {"truncated_modes"}]
+        case, labelled[name], _ = find_trial_with_plant(
+            np.random.default_rng([seed, i]),
+            others=pool,
+            tries=MOST_SEEDS,
+            like=like,
+            structure=structure,
+            name=name,
+            **draw._asdict(),
+        )
+        write_case(case, folder / name)
+        report(name, (i + 1) / n)
+    labels.parent.mkdir(parents=True, exist_ok=True)
+    labels.write_text(json.dumps(labelled, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 @dataclass(frozen=True, eq=False)

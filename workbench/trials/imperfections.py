@@ -1,10 +1,14 @@
 """Imperfections: small errors of a real test that are not effects of the catalogue, in classes and sizes."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from workbench.structure.domain import NamedPoints, Where, centred_at, middle, reach
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.structure.domain import Interval, NamedPoints, Rectangle, Where, centred_at, middle, reach
 from workbench.trials.benches import Bench
 from workbench.trials.plant import Plant
 
@@ -41,79 +45,11 @@ MIMICS: dict[str, frozenset[str]] = {
 MIMICS["mixed"] = frozenset().union(*(MIMICS[name] for name in MIXED))
 
 
-@dataclass(frozen=True)
-class Imperfections:
-    """Small errors of a test.
-
-    Attributes:
-        stiffness_waves, mass_waves: coefficients of the smooth variation along the structure, see `Alterations`.
-        stiffness_factor, damping_factor: of all stiffness, of all damping.
-        damping_factors: of each mode's damping ratio.
-        noise_ratio: the true standard deviation of the sensors' noise over the stated one.
-        noise_memory: correlation of that noise over one sample.
-        logging_noise: of each logged input, as a share of its rms.
-        delays: of each sensor, in samples.
-        interpolated: whether the delays are made by linear interpolation, as when a logger resamples to one clock.
-        gains: of each actuator, then of each sensor, relative to the stated ones.
-        moved: of each actuator, then of each sensor, (n_coordinates,) m from the stated place.
-    """
-
-    stiffness_waves: tuple[float, ...] = ()
-    mass_waves: tuple[float, ...] = ()
-    stiffness_factor: float = 1.0
-    damping_factor: float = 1.0
-    damping_factors: tuple[float, ...] = ()
-    noise_ratio: float = 1.0
-    noise_memory: float = 0.0
-    logging_noise: float = 0.0
-    delays: tuple[float, ...] = ()
-    interpolated: bool = False
-    gains: tuple[float, ...] = ()
-    moved: tuple[tuple[float, ...], ...] = ()
-
-    def on(self, plant: Plant, sample_time: float) -> Plant:
-        """The plant with these imperfections, before any effect is hidden in it."""
-        n = len(plant.actuators)
-        delays = self.delays or (0.0,) * len(plant.sensors)
-        gains = self.gains or (1.0,) * (n + len(plant.sensors))
-        moved = self.moved or ((),) * (n + len(plant.sensors))
-        actuators = tuple(
-            replace(a, gain=a.gain * gain, at=_moved(a.at, by))
-            for a, gain, by in zip(plant.actuators, gains[:n], moved[:n], strict=True)
-        )
-        sensors = tuple(
-            replace(
-                s,
-                noise_std=s.noise_std * self.noise_ratio,
-                delay=s.delay + delay * sample_time,
-                interpolated=self.interpolated,
-                gain=s.gain * gain,
-                at=middle(_moved(s.at, by)),
-            )
-            for s, delay, gain, by in zip(plant.sensors, delays, gains[n:], moved[n:], strict=True)
-        )
-        altered = replace(
-            plant.altered,
-            stiffness_factor=plant.altered.stiffness_factor * self.stiffness_factor,
-            stiffness_waves=self.stiffness_waves,
-            mass_waves=self.mass_waves,
-        )
-        return replace(
-            plant,
-            actuators=actuators,
-            sensors=sensors,
-            altered=altered,
-            damping_factor=plant.damping_factor * self.damping_factor,
-            damping_factors=self.damping_factors,
-            noise_memory=self.noise_memory,
-            logging_noise=self.logging_noise,
-        )
-
-
-def draw_imperfections(name: str, size: float, bench: Bench, rng: np.random.Generator) -> Imperfections:
-    """Random imperfections of a class.
+def with_imperfections(plant: Plant, name: str, size: float, bench: Bench, rng: np.random.Generator) -> Plant:
+    """The real structure of a bench with random imperfections of a class, before any effect is hidden in it.
 
     Args:
+        plant: the structure equal to the nominal one; it is returned as it is if the class has no imperfections.
         name: one of `IMPERFECTIONS`.
         size: 1 for those of a careful laboratory; 0 for none.
 
@@ -124,61 +60,68 @@ def draw_imperfections(name: str, size: float, bench: Bench, rng: np.random.Gene
         raise ValueError(f"imperfections must be one of {', '.join(IMPERFECTIONS)}; got {name!r}")
     if not size >= 0:
         raise ValueError(f"the size of imperfections must be 0 or more; got {size}")
-    imperfections = Imperfections()
     for part in MIXED if name == "mixed" else (name,):
-        imperfections = _with_part(imperfections, part, 0.5 * size if name == "mixed" else size, bench, rng)
-    return imperfections
+        plant = _with_part(plant, part, 0.5 * size if name == "mixed" else size, bench, rng)
+    return plant
 
 
-def _with_part(
-    imperfections: Imperfections, name: str, size: float, bench: Bench, rng: np.random.Generator
-) -> Imperfections:
+def _with_part(plant: Plant, name: str, size: float, bench: Bench, rng: np.random.Generator) -> Plant:
+    actuators, sensors, domain = plant.actuators, plant.sensors, bench.rig.modes.domain
+    ports: tuple[Actuator | Sensor, ...] = (*actuators, *sensors)
+    n = len(actuators)
     if name == "shape":
         spread = rng.uniform(-1.0, 1.0, bench.rig.modes.n_modes) * DAMPING_SPREAD * size
-        waves = [_waves(VARIATION * size, rng) for _ in range(2)]
-        factors = tuple(map(float, np.exp(spread)))
-        return replace(imperfections, stiffness_waves=waves[0], mass_waves=waves[1], damping_factors=factors)
+        stiffness_waves, mass_waves = (_waves(VARIATION * size, rng) for _ in range(2))
+        altered = replace(plant.altered, stiffness_waves=stiffness_waves, mass_waves=mass_waves)
+        return replace(plant, altered=altered, damping_factors=tuple(np.exp(spread).tolist()))
     if name == "offset":
         stiffness, damping = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.5, 1.0, 2) * size
-        factors = np.exp(np.array([STIFFNESS_OFFSET * stiffness, DAMPING_OFFSET * damping]))
-        return replace(imperfections, stiffness_factor=float(factors[0]), damping_factor=float(factors[1]))
+        altered = replace(plant.altered, stiffness_factor=float(np.exp(STIFFNESS_OFFSET * stiffness)))
+        return replace(plant, altered=altered, damping_factor=float(np.exp(DAMPING_OFFSET * damping)))
     if name == "noise":
-        return replace(imperfections, noise_ratio=NOISE_RATIO**size)
+        return replace(plant, sensors=_each(sensors, noise_std=[s.noise_std * NOISE_RATIO**size for s in sensors]))
     if name == "coloured":
-        return replace(imperfections, noise_memory=NOISE_MEMORY ** (1.0 / size) if size > 0 else 0.0)
+        return replace(plant, noise_memory=NOISE_MEMORY ** (1.0 / size) if size > 0 else 0.0)
     if name == "input":
-        return replace(imperfections, logging_noise=LOGGING_NOISE * size)
+        return replace(plant, logging_noise=LOGGING_NOISE * size)
     if name == "late":
-        delays = tuple(map(float, rng.uniform(0.0, LATE * size, len(bench.rig.sensors))))
-        return replace(imperfections, delays=delays, interpolated=bool(rng.random() < 0.5))
+        late = rng.uniform(0.0, LATE * size, len(sensors)).tolist()
+        delays = [s.delay + share * bench.sample_time for s, share in zip(sensors, late, strict=True)]
+        interpolated = bool(rng.random() < 0.5)
+        return replace(plant, sensors=_each(sensors, delay=delays, interpolated=[interpolated] * len(sensors)))
     if name == "gain":
-        ports = len(bench.rig.actuators) + len(bench.rig.sensors)
-        return replace(imperfections, gains=tuple(map(float, np.exp(CALIBRATION * size * rng.standard_normal(ports)))))
-    if name == "place":
-        return replace(imperfections, moved=_off_places(bench, PLACED * size, rng))
-    return imperfections
+        errors = np.exp(CALIBRATION * size * rng.standard_normal(len(ports)))
+        gains = [port.gain * float(error) for port, error in zip(ports, errors, strict=True)]
+        return replace(plant, actuators=_each(actuators, gain=gains[:n]), sensors=_each(sensors, gain=gains[n:]))
+    if name == "place" and not isinstance(domain, NamedPoints):
+        places = _off_places(domain, [port.at for port in ports], PLACED * size, rng)
+        return replace(
+            plant,
+            actuators=_each(actuators, at=places[:n]),
+            sensors=_each(sensors, at=[middle(at) for at in places[n:]]),
+        )
+    return plant
 
 
-def _moved(where: Where, by: tuple[float, ...]) -> Where:
-    """The place, patch or pair of points moved by (n_coordinates,) m; unchanged if empty."""
-    if not by:
-        return where
-    at = np.atleast_1d(np.asarray(middle(where), float)) + by
-    return centred_at(where, (float(at[0]), float(at[1])) if len(by) > 1 else float(at[0]))
+def _each(ports: Any, **values: list[Any]) -> Any:
+    """The actuators or sensors with a value of each field for each of them."""
+    return tuple(replace(port, **{name: each[i] for name, each in values.items()}) for i, port in enumerate(ports))
 
 
-def _off_places(bench: Bench, size: float, rng: np.random.Generator) -> tuple[tuple[float, ...], ...]:
-    """Random errors of place of each actuator and sensor, m, limited to stay on the structure."""
-    domain, rig = bench.rig.modes.domain, bench.rig
-    stated: list[Where] = [*(a.at for a in rig.actuators), *(s.at for s in rig.sensors)]
-    if isinstance(domain, NamedPoints):
-        return ()
+def _off_places(
+    domain: Interval | Rectangle, stated: Sequence[Where], size: float, rng: np.random.Generator
+) -> list[Where]:
+    """Places with random errors, m, limited to stay on the structure."""
     drawn = size * domain.size * rng.standard_normal((len(stated), len(domain.coordinates)))
-    room = [np.array(reach(domain, where)) - np.asarray(middle(where), float) for where in stated]
-    return tuple(tuple(np.clip(by, *ends).tolist()) for by, ends in zip(drawn, room, strict=True))
+    places: list[Where] = []
+    for where, by in zip(stated, drawn, strict=True):
+        centre = np.asarray(middle(where), float)
+        at = np.atleast_1d(centre) + np.clip(by, *(np.array(reach(domain, where)) - centre))
+        places.append(centred_at(where, (float(at[0]), float(at[1])) if at.size > 1 else float(at[0])))
+    return places
 
 
 def _waves(size: float, rng: np.random.Generator) -> tuple[float, ...]:
     """Coefficients of cosines with a standard deviation of `size` along the structure."""
     waves = rng.standard_normal(WAVES) / np.arange(1, WAVES + 1)
-    return tuple(map(float, waves * size * np.sqrt(2.0) / np.linalg.norm(waves)))
+    return tuple((waves * size * np.sqrt(2.0) / np.linalg.norm(waves)).tolist())

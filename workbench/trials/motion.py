@@ -1,8 +1,9 @@
 """Motion of a real structure by the classical Runge-Kutta method in many small steps, independent of `simulate`.
 
-Steps end where a delayed command changes, so that forces are smooth within each. The state consists of modal
-coordinates and velocities, actuator lags, and hysteretic variables of laws at points.
+Steps end where a delayed command changes, so that forces are smooth within each.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -12,18 +13,82 @@ from workbench.trials.laws import BOUC_WEN, law_force
 
 HYSTERESIS_STEPS = 200  # of a command's change over one sample
 
-# As `integrate` describes it: structure, actuators, tones, laws, air drag.
-System = tuple[
-    tuple[Floats, Floats, Floats, float, float],
-    tuple[Floats, Floats, Floats, Floats],
-    tuple[Floats, Floats],
-    tuple[Floats, Floats],
-    tuple[float, Floats],
-]
+
+class System(NamedTuple):
+    """A structure of n modes with its m actuators and all that acts on it; SI units."""
+
+    omega2: Floats  # (n,)
+    damping: Floats  # (n,) 2 ζ ω
+    gram: Floats  # (n, n) ∫ φ_r' φ_s' dx
+    stretching: float
+    stiffness_rate: float
+    lags: Floats  # (m,) and so are the next two
+    rate_limits: Floats
+    biases: Floats
+    at_actuators: Floats  # (m, n) shapes
+    tones: Floats  # (n_tones, 3) amplitude, rad/s, phase
+    at_tones: Floats  # (n_tones, n) shapes
+    laws: Floats  # (n_laws, 4) code and parameters of `law_force`
+    at_laws: Floats  # (n_laws, n) shapes
+    drag: float
+    field: Floats  # (n_points, n + 1) shapes and weights of a quadrature over the structure
+
+
+class Drive(NamedTuple):
+    """From commands to what the m actuators aim at, in this order; (m,) each but `mix`."""
+
+    mix: Floats  # (m, m) share of every command in that of each actuator
+    curvature: Floats  # of u + curvature u |u|
+    share: Floats  # of hysteresis
+    width: Floats
+    gain: Floats
+    dead_zone: Floats
+    limit: Floats
+    delays: Floats  # s
+
+
+class Pieces(NamedTuple):
+    """The pieces of each sample interval, within which the targets of the actuators are constant."""
+
+    sample_time: float
+    edges: Floats  # (n_pieces,) fractions of the interval at which they end, the last one 1
+    steps: Floats  # (n_pieces,) number of steps in each
+
+
+class State(NamedTuple):
+    """The state of a system under way, changed in place."""
+
+    y: Floats  # modal coordinates (n,) and velocities (n,), actuator lags (m,), hysteretic variables of laws (n_laws,)
+    aims: Floats  # (m, n_samples)
+    targets: Floats  # (m,)
+    before: Floats  # (m,) forces of the actuators when the targets last changed
+    begun: Floats  # (1,) the time of that, s
+    earlier: Floats  # (m,) commands, and the next the hysteretic variables that follow them
+    z: Floats
+    work: Floats  # (5, size of y) work space
+
+
+class Sums(NamedTuple):
+    """Integrals over the motion: of squared forces (m,), of work by mode (n,); and the largest forces (m,)."""
+
+    squares: Floats
+    work: Floats
+    peaks: Floats
 
 
 @njit(cache=True)
-def headed(target: float, before: float, rate: float, time: float) -> float:
+def at_rest(system: System, n_samples: int) -> State:
+    """The state of a system at rest, for a motion over so many samples."""
+    m, n = system.at_actuators.shape
+    size = 2 * n + m + system.laws.shape[0]
+    targets, before, earlier, z = np.zeros((4, m))
+    return State(
+        np.zeros(size), np.zeros((m, n_samples)), targets, before, np.zeros(1), earlier, z, np.zeros((5, size))
+    )
+
+
+@njit(cache=True)
+def _headed(target: float, before: float, rate: float, time: float) -> float:
     """The rate-limited output of an actuator, a time after the target changed, from its output before."""
     if np.isinf(rate):
         return target
@@ -32,7 +97,7 @@ def headed(target: float, before: float, rate: float, time: float) -> float:
 
 
 @njit(cache=True)
-def hysteretic(z: float, change: float, width: float) -> float:
+def _hysteretic(z: float, change: float, width: float) -> float:
     """z after a command has changed, z' = u' - (|u'| z + u' |z|) / (2 width), in small steps of the command."""
     h = change / HYSTERESIS_STEPS
     for _ in range(HYSTERESIS_STEPS):
@@ -50,203 +115,158 @@ def _hysteretic_rate(z: float, change: float, width: float) -> float:
 
 
 @njit(cache=True)
-def _rates(t: float, y: Floats, dy: Floats, system: System, drive: tuple[Floats, Floats, float], held: Floats) -> None:
-    """Fill dy = dy/dt under the actuator forces and the modal forces held over the interval.
-
-    drive: targets (m,) of the actuators, their outputs at the last change of target (m,), and the time of that, s.
-    """
-    structure, (lags, shapes, rates, biases), (tones, tone_shapes), (laws, law_shapes), (drag, field) = system
-    targets, before, begun = drive
-    omega2, damping, gram, stretching, rate = structure
-    m, n = shapes.shape
-    factor = 1.0 + rate * t
+def _rates(t: float, y: Floats, dy: Floats, system: System, state: State, held: Floats) -> None:
+    """Fill dy = dy/dt under the actuators' forces and the modal forces held over the interval."""
+    m, n = system.at_actuators.shape
+    factor = 1.0 + system.stiffness_rate * t
     for i in range(n):
         dy[i] = y[n + i]
-        dy[n + i] = -factor * omega2[i] * y[i] - damping[i] * y[n + i] + held[i]
+        dy[n + i] = -factor * system.omega2[i] * y[i] - system.damping[i] * y[n + i] + held[i]
     for j in range(m):
-        force = headed(targets[j], before[j], rates[j], t - begun)
-        if lags[j] > 0.0:
-            dy[2 * n + j] = (force - y[2 * n + j]) / lags[j]
+        force = _headed(state.targets[j], state.before[j], system.rate_limits[j], t - state.begun[0])
+        if system.lags[j] > 0.0:
+            dy[2 * n + j] = (force - y[2 * n + j]) / system.lags[j]
             force = y[2 * n + j]
-        force += biases[j]
+        force += system.biases[j]
         if force != 0.0:
             for i in range(n):
-                dy[n + i] += shapes[j, i] * force
-    for j in range(tones.shape[0]):
-        force = tones[j, 0] * np.sin(tones[j, 1] * t + tones[j, 2])
+                dy[n + i] += system.at_actuators[j, i] * force
+    for j in range(system.tones.shape[0]):
+        force = system.tones[j, 0] * np.sin(system.tones[j, 1] * t + system.tones[j, 2])
         for i in range(n):
-            dy[n + i] += tone_shapes[j, i] * force
-    for j in range(laws.shape[0]):
+            dy[n + i] += system.at_tones[j, i] * force
+    for j in range(system.laws.shape[0]):
+        law, shape = system.laws[j], system.at_laws[j]
         w = 0.0
         v = 0.0
         for i in range(n):
-            w += law_shapes[j, i] * y[i]
-            v += law_shapes[j, i] * y[n + i]
+            w += shape[i] * y[i]
+            v += shape[i] * y[n + i]
         z = y[2 * n + m + j]
-        dy[2 * n + m + j] = v - (abs(v) * z + v * abs(z)) / (2.0 * laws[j, 2]) if laws[j, 0] == BOUC_WEN else 0.0
-        force = law_force(int(laws[j, 0]), laws[j, 1:], w, v, z)
+        dy[2 * n + m + j] = v - (abs(v) * z + v * abs(z)) / (2.0 * law[2]) if law[0] == BOUC_WEN else 0.0
+        force = law_force(int(law[0]), law[1:], w, v, z)
         for i in range(n):
-            dy[n + i] += law_shapes[j, i] * force
-    if stretching > 0.0:
-        pull = gram @ y[:n]
-        tension = stretching * np.dot(pull, y[:n])
+            dy[n + i] += shape[i] * force
+    if system.stretching > 0.0:
+        pull = system.gram @ y[:n]
+        tension = system.stretching * np.dot(pull, y[:n])
         for i in range(n):
             dy[n + i] -= tension * pull[i]
-    if drag > 0.0:
-        for k in range(field.shape[0]):
+    if system.drag > 0.0:
+        for k in range(system.field.shape[0]):
             v = 0.0
             for i in range(n):
-                v += field[k, i] * y[n + i]
-            force = -drag * field[k, n] * abs(v) * v
+                v += system.field[k, i] * y[n + i]
+            force = -system.drag * system.field[k, n] * abs(v) * v
             for i in range(n):
-                dy[n + i] += field[k, i] * force
+                dy[n + i] += system.field[k, i] * force
 
 
 @njit(cache=True)
-def aim(commands: Floats, drive: tuple[Floats, Floats], earlier: Floats, z: Floats, aims: Floats) -> None:
-    """Fill `aims` (m,), the actuators' targets for the commands (m,) of a sample; earlier, z: state of hysteresis."""
-    mix, table = drive
+def _aim(k: int, state: State, drive: Drive, commands: Floats) -> None:
+    """Set what the actuators aim at from sample k on."""
     m = commands.size
     for j in range(m):
         u = 0.0
         for i in range(m):
-            u += mix[j, i] * commands[i]
-        u += table[j, 4] * u * abs(u)
-        if table[j, 5] > 0.0:
-            z[j] = hysteretic(z[j], u - earlier[j], table[j, 6])
-            earlier[j] = u
-            u = (1.0 - table[j, 5]) * u + table[j, 5] * z[j]
-        u *= table[j, 0]
-        u = np.sign(u) * max(abs(u) - table[j, 1], 0.0)
-        aims[j] = min(max(u, -table[j, 2]), table[j, 2])
+            u += drive.mix[j, i] * commands[i]
+        u += drive.curvature[j] * u * abs(u)
+        if drive.share[j] > 0.0:
+            state.z[j] = _hysteretic(state.z[j], u - state.earlier[j], drive.width[j])
+            state.earlier[j] = u
+            u = (1.0 - drive.share[j]) * u + drive.share[j] * state.z[j]
+        u *= drive.gain[j]
+        u = np.sign(u) * max(abs(u) - drive.dead_zone[j], 0.0)
+        state.aims[j, k] = min(max(u, -drive.limit[j]), drive.limit[j])
 
 
 @njit(cache=True)
 def interval(
     k: int,
-    y: Floats,
+    state: State,
     system: System,
-    delays: Floats,
-    aims: Floats,
-    headed_for: tuple[Floats, Floats, Floats],
+    drive: Drive,
+    pieces: Pieces,
+    commands: Floats,
     held: Floats,
-    dt: float,
-    edges: Floats,
-    steps: Floats,
-    work: Floats,
     out: Floats,
-    forces: tuple[Floats, Floats, Floats, Floats],
+    sums: Sums,
 ) -> None:
-    """Step y over a sample interval, and fill `out` with the motion at the start of each of its pieces.
+    """Step the state over the interval from sample k on, and fill `out` with the motion at the start of its pieces.
 
     Args:
-        k: the sample.
-        y: (size,) state, in place.
-        system: see `integrate`.
-        delays: (m,) s.
-        aims: (m, n_samples) targets of the actuators, by sample.
-        headed_for: targets (m,), forces before them (m,), and the time of the last change (1,), in place.
+        commands: (m,) at the sample.
         held: (n,) unmeasured modal forces.
-        dt: sample time, s.
-        edges, steps: see `integrate`.
-        work: (5, size) work space.
-        out: (3, n_edges, n) displacement, velocity and acceleration at the start of each piece.
-        forces: integrals of the actuators' forces (m,), of their squares (m,), of their work by mode (n,), and the
-            largest force (m,), in place; empty arrays to omit them.
+        out: (3, n_pieces, n) displacement, velocity and acceleration.
+        sums: increased by those of the interval; empty arrays to omit them.
     """
-    targets, before, begun = headed_for
-    trial, k1, k2, k3, k4 = work[0], work[1], work[2], work[3], work[4]
+    _aim(k, state, drive, commands)
+    y, targets, before = state.y, state.targets, state.before
+    trial, k1, k2, k3, k4 = state.work[0], state.work[1], state.work[2], state.work[3], state.work[4]
     n, size, m = held.size, y.size, targets.size
-    lags, shapes, rates, biases = system[1]
+    lags, rates, dt = system.lags, system.rate_limits, pieces.sample_time
     start = 0.0
-    for piece in range(edges.size):
-        middle = k + 0.5 * (start + edges[piece])
+    for piece in range(pieces.edges.size):
+        end = pieces.edges[piece]
+        middle = k + 0.5 * (start + end)
         now = (k + start) * dt
         for j in range(m):
-            before[j] = headed(targets[j], before[j], rates[j], now - begun[0])
-            index = int(np.floor(middle - delays[j] / dt))
-            targets[j] = aims[j, index] if index >= 0 else 0.0
-        begun[0] = now
-        h = (edges[piece] - start) * dt / steps[piece]
-        for step in range(steps[piece]):
+            before[j] = _headed(targets[j], before[j], rates[j], now - state.begun[0])
+            index = int(np.floor(middle - drive.delays[j] / dt))
+            targets[j] = state.aims[j, index] if index >= 0 else 0.0
+        state.begun[0] = now
+        h = (end - start) * dt / pieces.steps[piece]
+        for step in range(pieces.steps[piece]):
             t = (k + start) * dt + step * h
-            _rates(t, y, k1, system, (targets, before, begun[0]), held)
+            _rates(t, y, k1, system, state, held)
             if step == 0:
                 for i in range(n):
                     out[0, piece, i], out[1, piece, i], out[2, piece, i] = y[i], y[n + i], k1[n + i]
             for i in range(size):
                 trial[i] = y[i] + 0.5 * h * k1[i]
-            _rates(t + 0.5 * h, trial, k2, system, (targets, before, begun[0]), held)
+            _rates(t + 0.5 * h, trial, k2, system, state, held)
             for i in range(size):
                 trial[i] = y[i] + 0.5 * h * k2[i]
-            _rates(t + 0.5 * h, trial, k3, system, (targets, before, begun[0]), held)
+            _rates(t + 0.5 * h, trial, k3, system, state, held)
             for i in range(size):
                 trial[i] = y[i] + h * k3[i]
-            _rates(t + h, trial, k4, system, (targets, before, begun[0]), held)
-            if forces[0].size > 0:
+            _rates(t + h, trial, k4, system, state, held)
+            if sums.squares.size > 0:
                 for j in range(m):
                     # by the midpoint rule
-                    force = headed(targets[j], before[j], rates[j], t + 0.5 * h - begun[0])
+                    force = _headed(targets[j], before[j], rates[j], t + 0.5 * h - state.begun[0])
                     if lags[j] > 0.0:
                         force = y[2 * n + j] + 0.5 * h * k2[2 * n + j]
-                    force += biases[j]
-                    forces[0][j] += h * force
-                    forces[1][j] += h * force * force
-                    forces[3][j] = max(forces[3][j], abs(force))
+                    force += system.biases[j]
+                    sums.squares[j] += h * force * force
+                    sums.peaks[j] = max(sums.peaks[j], abs(force))
                     for i in range(n):
-                        forces[2][i] += force * shapes[j, i] * h * (y[n + i] + 0.5 * h * k2[n + i])
+                        sums.work[i] += force * system.at_actuators[j, i] * h * (y[n + i] + 0.5 * h * k2[n + i])
             for i in range(size):
                 y[i] += h * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]) / 6.0
-        start = edges[piece]
+        start = end
 
 
 @njit(cache=True)
-def integrate(
-    system: System,
-    drive: tuple[Floats, Floats],
-    commands: Floats,
-    feedback: Floats,
-    held: Floats,
-    sample_time: float,
-    edges: Floats,
-    steps: Floats,
-) -> Floats:
+def integrate(system: System, drive: Drive, pieces: Pieces, commands: Floats, feedback: Floats, held: Floats) -> Floats:
     """Modal motion at the samples, from rest.
 
     Args:
-        system: the structure (omega2 (n,), damping (n,), gram (n, n), stretching, stiffness rate); the actuators
-            (lags (m,), shapes (m, n), rate limits (m,), biases (m,)); tones (n_tones, 3) of amplitude, rad/s, phase,
-            and shapes; laws (n_laws, 4) of code and parameters, and shapes; air drag: coefficient, and shapes and
-            weights (n_points, n + 1).
-        drive: mix (m, m), the share of every command in that of each actuator, and a table (m, 7): gain, dead zone,
-            limit, delay, curvature (u + curvature u |u| of the command, before the gain), share and width of
-            hysteresis.
         commands: (m, n_samples); the feedback is subtracted, in place.
         feedback: (m, n) gain from modal velocities to commands, at each sample.
         held: (n_samples, n) unmeasured modal forces, constant over each interval.
-        sample_time: s.
-        edges: fractions of a sample interval at which its pieces end, the last one 1.
-        steps: number of steps in each piece.
 
     Returns:
-        (3, n_edges, n_samples, n) displacement, velocity and acceleration at the start of each piece of a sample
+        (3, n_pieces, n_samples, n) displacement, velocity and acceleration at the start of each piece of a sample
         interval; the first is at the sample.
     """
-    dt = sample_time
-    m, n_samples = commands.shape
-    n = held.shape[1]
-    size = 2 * n + m + system[3][0].shape[0]
-    y, work = np.zeros(size), np.zeros((5, size))
-    out = np.zeros((3, edges.size, n_samples, n))
-    aims = np.zeros((m, n_samples))
-    now, earlier, z = np.zeros(m), np.zeros(m), np.zeros(m)
-    headed_for, none = (np.zeros(m), np.zeros(m), np.zeros(1)), (np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
+    (m, n_samples), n = commands.shape, held.shape[1]
+    state = at_rest(system, n_samples)
+    none = Sums(np.zeros(0), np.zeros(0), np.zeros(0))
+    out = np.zeros((3, pieces.edges.size, n_samples, n))
     for k in range(n_samples):
         for j in range(m):
             for i in range(n):
-                commands[j, k] -= feedback[j, i] * y[n + i]
-        aim(commands[:, k], drive, earlier, z, now)
-        for j in range(m):
-            aims[j, k] = now[j]
-        interval(k, y, system, drive[1][:, 3], aims, headed_for, held[k], dt, edges, steps, work, out[:, :, k], none)
+                commands[j, k] -= feedback[j, i] * state.y[n + i]
+        interval(k, state, system, drive, pieces, commands[:, k], held[k], out[:, :, k], none)
     return out

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.special import ndtr
 
 from workbench.arrays import Floats
@@ -89,12 +90,41 @@ class Plant:
             [noise[0] for noise in self.noises],
             field_places,
         ]
-        places = [x for group in groups for x in group]
-        modes = self._modes(places)
-        shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
-        inputs, sensors, laws, tones, noises, field = shapes
-        drag = np.c_[field, weights]
-        return SolvedPlant(self, modes, inputs, sensors, laws, tones, noises, drag)
+        modes = self._modes([x for group in groups for x in group])
+        shapes = np.split(modes.shapes, np.cumsum([len(group) for group in groups])[:-1])
+        at_actuators, at_sensors, at_laws, at_tones, at_noises, field = map(np.ascontiguousarray, shapes)
+
+        def each(name: str) -> Floats:
+            return np.array([getattr(a, name) for a in self.actuators], float)
+
+        system = motion.System(
+            omega2=modes.omega**2,
+            damping=2.0 * self._damping_ratios() * modes.omega,
+            gram=modes.gram,
+            stretching=float(self.stretching),
+            stiffness_rate=float(self.stiffness_rate),
+            lags=each("time_constant"),
+            rate_limits=each("rate_limit"),
+            biases=each("bias"),
+            at_actuators=at_actuators,
+            tones=np.array([[a, 2.0 * np.pi * f, p] for _, a, f, p in self.tones]).reshape(-1, 3),
+            at_tones=at_tones,
+            laws=np.array([[code, *p, *[1.0] * (3 - len(p))] for code, _, p in self.laws]).reshape(-1, 4),
+            at_laws=at_laws,
+            drag=float(self.drag),
+            field=np.ascontiguousarray(np.c_[field, weights]),
+        )
+        drive = motion.Drive(
+            mix=np.eye(len(self.actuators)) if self.mix is None else self.mix,
+            curvature=np.zeros(len(self.actuators)) if self.curvature is None else self.curvature,
+            share=each("hysteresis_share"),
+            width=each("hysteresis_width"),
+            gain=each("gain"),
+            dead_zone=each("dead_zone"),
+            limit=each("limit"),
+            delays=each("delay"),
+        )
+        return SolvedPlant(self, modes, system, drive, at_actuators, at_sensors, at_noises)
 
     def _modes(self, places: list[Any]) -> ElementModes:
         structure = self.nominal.structure
@@ -107,6 +137,14 @@ class Plant:
             altered = replace(self.altered, stiffness_waves=(), mass_waves=())
             return matrix_modes(frame, places, self.n_modes, altered=altered)
         return modal_modes(self.nominal.modes, places, altered=self.altered)
+
+    def _damping_ratios(self) -> Floats:
+        """The damping ratio of each mode; modes above the nominal ones have the last nominal ratio."""
+        zeta, factors = self.nominal.modes.zeta, np.ones(self.n_modes)
+        padded: Floats = np.r_[zeta, np.full(max(self.n_modes - zeta.size, 0), zeta[-1])][: self.n_modes]
+        known = self.damping_factors[: self.n_modes]
+        factors[: len(known)] = known
+        return self.damping_factor * factors * padded
 
 
 class ModalMotion(NamedTuple):
@@ -126,16 +164,15 @@ class ModalMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SolvedPlant:
-    """A plant with its modes; shapes are (n_places, n_modes), `field` carries the weights of a quadrature too."""
+    """A plant with its modes, as `motion` integrates it; shapes are (n_places, n_modes)."""
 
     plant: Plant
     modes: ElementModes
+    system: motion.System
+    drive: motion.Drive
     at_actuators: np.ndarray
     at_sensors: np.ndarray
-    at_laws: np.ndarray
-    at_tones: np.ndarray
     at_noises: np.ndarray
-    field: np.ndarray
 
     def move(
         self,
@@ -155,15 +192,13 @@ class SolvedPlant:
             rng: generator of the random forces; None for no random forces.
             finest: radians of the highest mode in one step.
         """
-        plant = self.plant
-        system, drive, edges, steps = self.system(sample_time, finest)
+        pieces = self.pieces(sample_time, finest)
         held = self.random_forces(commands.shape[1], sample_time, rng)
-        acting = np.array([not a.direct for a in plant.actuators], float)
-        sent = np.ascontiguousarray(commands, float).copy()
-        pieces = motion.integrate(
-            system, drive, sent, feedback * acting[:, None] * self.at_actuators, held, float(sample_time), edges, steps
-        )
-        return ModalMotion(pieces[0, 0], pieces[1, 0], pieces[2, 0], np.r_[0.0, edges[:-1]], pieces), sent
+        acting = np.array([not a.direct for a in self.plant.actuators], float)
+        sent = np.array(commands, float, order="C")
+        feedbacks = feedback * acting[:, None] * self.at_actuators
+        moved = motion.integrate(self.system, self.drive, pieces, sent, feedbacks, held)
+        return ModalMotion(moved[0, 0], moved[1, 0], moved[2, 0], np.r_[0.0, pieces.edges[:-1]], moved), sent
 
     def random_forces(self, n_samples: int, sample_time: float, rng: np.random.Generator | None) -> np.ndarray:
         """Unmeasured random modal forces (n_samples, n_modes), constant over each sample; zero without `rng`."""
@@ -173,36 +208,15 @@ class SolvedPlant:
                 held += np.outer(rms * coloured_noise(rng, n_samples, sample_time, corner), shape)
         return held
 
-    def system(self, sample_time: float, finest: float = FINEST) -> tuple[Any, Any, np.ndarray, np.ndarray]:
-        """The arguments system, drive, edges and steps of `motion.integrate`."""
-        plant, modes = self.plant, self.modes
-        zeta = _damping_ratios(plant)
-        m = len(plant.actuators)
-        drives = np.array([[a.gain, a.dead_zone, a.limit, a.delay] for a in plant.actuators])
-        hysteresis = np.array([[a.hysteresis_share, a.hysteresis_width] for a in plant.actuators])
-        curvature = np.zeros(m) if plant.curvature is None else plant.curvature
-        mix = np.eye(m) if plant.mix is None else plant.mix
+    def pieces(self, sample_time: float, finest: float = FINEST) -> motion.Pieces:
+        """The pieces of a sample interval, which end where a command arrives or a late sensor reads."""
+        plant = self.plant
         late = [a.delay / sample_time for a in plant.actuators] + [-s.delay / sample_time for s in plant.sensors]
         ends = np.unique(np.round([*(delay % 1.0 for delay in late), 1.0], 12))
         edges = ends[ends > 0]
-        turns = max(modes.omega[-1] * sample_time / finest, 8.0)
+        turns = max(self.modes.omega[-1] * sample_time / finest, 8.0)
         steps = np.ceil(turns * np.diff(np.r_[0.0, edges])).astype(np.int64)
-        laws = np.array([[code, *p, *[1.0] * (3 - len(p))] for code, _, p in plant.laws]).reshape(-1, 4)
-        tones = np.array([[a, 2.0 * np.pi * f, p] for _, a, f, p in plant.tones]).reshape(-1, 3)
-        damping = 2.0 * zeta * modes.omega
-        system = (
-            (modes.omega**2, damping, modes.gram, float(plant.stretching), float(plant.stiffness_rate)),
-            (
-                np.array([a.time_constant for a in plant.actuators]),
-                np.ascontiguousarray(self.at_actuators),
-                np.array([a.rate_limit for a in plant.actuators]),
-                np.array([a.bias for a in plant.actuators]),
-            ),
-            (tones, np.ascontiguousarray(self.at_tones)),
-            (laws, np.ascontiguousarray(self.at_laws)),
-            (float(plant.drag), np.ascontiguousarray(self.field)),
-        )
-        return system, (mix, np.ascontiguousarray(np.c_[drives, curvature, hysteresis])), edges, steps
+        return motion.Pieces(float(sample_time), edges, steps)
 
     def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
         """The readings (n_outputs, n_samples) of perfect sensors, each with its delay."""
@@ -232,11 +246,8 @@ class SolvedPlant:
             y = law(y, sample_time)
         rows = []
         for sensor, row in zip(self.plant.sensors, y, strict=True):
-            row = _lag(row, sensor.time_constant, sample_time)
-            row = sensor.gain * row + sensor.bias + sensor.drift * np.arange(row.size) / (row.size - 1)
-            if rng is not None:
-                row = row + sensor.noise_std * sensor_noise(rng, row.size, self.plant.noise_memory)
-            row = np.clip(row, -sensor.limit, sensor.limit)
+            noise = 0.0 if rng is None else sensor.noise_std * sensor_noise(rng, row.size, self.plant.noise_memory)
+            row = measured(sensor, _lag(row, sensor.time_constant, sample_time), np.arange(row.size), row.size, noise)
             if sensor.step > 0:
                 mean = rng is None and sensor.noise_std > 0
                 rounded = sensor.step * np.round(row / sensor.step)
@@ -245,7 +256,7 @@ class SolvedPlant:
         return np.array(rows)
 
 
-def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float, corner_hz: float) -> np.ndarray:
+def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float, corner_hz: float) -> Floats:
     """Gaussian noise (n_samples,) of unit rms, white up to a corner frequency, with a steep roll-off above it."""
     spectrum = np.fft.rfft(rng.standard_normal(2 * n_samples))
     frequency = np.fft.rfftfreq(2 * n_samples, sample_time)
@@ -253,37 +264,36 @@ def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float,
     return noise / float(np.sqrt(np.mean(noise**2)))
 
 
-def _damping_ratios(plant: Plant) -> Floats:
-    """The damping ratio of each mode of the plant; modes above the nominal ones have the last nominal ratio."""
-    zeta = plant.nominal.modes.zeta
-    padded: Floats = np.r_[zeta, np.full(max(plant.n_modes - zeta.size, 0), zeta[-1])][: plant.n_modes]
-    factors = np.ones(plant.n_modes)
-    known = plant.damping_factors[: plant.n_modes]
-    factors[: len(known)] = known
-    return plant.damping_factor * factors * padded
-
-
 def sensor_noise(rng: np.random.Generator, n_samples: int, memory: float) -> np.ndarray:
-    """Gaussian noise of unit standard deviation, e_k = memory e_{k-1} + sqrt(1 - memory²) white."""
+    """Gaussian noise of unit standard deviation, e_k = memory e_{k-1} + sqrt(1 - memory²) white, e_0 white."""
     white = rng.standard_normal(n_samples)
     if memory == 0:
         return white
-    noise = white.copy()
-    for k in range(1, n_samples):
-        noise[k] = memory * noise[k - 1] + np.sqrt(1.0 - memory**2) * white[k]
-    return noise
+    later, _ = lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], white[1:], zi=[memory * white[0]])
+    return np.asarray(np.r_[white[0], later])
+
+
+def lagged(out: float, before: float, now: float, time_constant: float, sample_time: float) -> Any:
+    """The output of a first-order lag a sample after `out`, as its input goes evenly from `before` to `now`."""
+    slope = (now - before) / sample_time
+    behind = out - before + slope * time_constant
+    return now - slope * time_constant + behind * np.exp(-sample_time / time_constant)
 
 
 def _lag(y: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
     """First-order lag of a signal that is linear between samples, initially settled at its first value."""
     if time_constant == 0:
         return y
-    fade, out = np.exp(-sample_time / time_constant), y.copy()
+    out = y.copy()
     for k in range(1, y.size):
-        slope = (y[k] - y[k - 1]) / sample_time
-        behind = out[k - 1] - y[k - 1] + slope * time_constant
-        out[k] = y[k] - slope * time_constant + behind * fade
+        out[k] = lagged(out[k - 1], y[k - 1], y[k], time_constant, sample_time)
     return out
+
+
+def measured(sensor: Sensor, y: Any, k: Any, n_samples: int, noise: Any) -> Any:
+    """The unrounded readings of a sensor at the samples k of a record, from its lagged input y there, and its noise."""
+    drifted = sensor.gain * y + sensor.bias + sensor.drift * k / (n_samples - 1)
+    return np.clip(drifted + noise, -sensor.limit, sensor.limit)
 
 
 def _mean_rounded(y: Floats, step: float, noise_std: float) -> Floats:
@@ -293,13 +303,3 @@ def _mean_rounded(y: Floats, step: float, noise_std: float) -> Floats:
     above: Floats = ndtr((y - (nearest + reach) * step) / noise_std).sum(axis=0)
     below: Floats = ndtr(((nearest - reach) * step - y) / noise_std).sum(axis=0)
     return step * (nearest + above - below)
-
-
-def with_ports(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
-    """The plant with one actuator or sensor changed, or all of them (except hammers) for the name "all"."""
-
-    def meant(port: Actuator | Sensor) -> bool:
-        return port.name == name or (name == "all" and not getattr(port, "direct", False))
-
-    ports: Any = tuple(replace(port, **changes) if meant(port) else port for port in getattr(plant, side))
-    return replace(plant, **{side: ports})

@@ -18,7 +18,7 @@ from workbench.arrays import Floats
 from workbench.structure.domain import Patch, gauss_between
 from workbench.structure.plate import Plate
 from workbench.structure.supports import HELD
-from workbench.trials.finite_elements import AS_NOMINAL, Alterations, ElementModes, waves
+from workbench.trials.finite_elements import AS_NOMINAL, Alterations, Buckled, ElementModes, waves
 
 ELEMENTS = 60  # along the longer side
 CROWDED = 0.7  # grading of the mesh towards the edges, for the singular corner of a clamped and a free edge; below 1
@@ -41,6 +41,7 @@ def plate_modes(
 
     Raises:
         ValueError: a plate with varying properties, tension or attachments; alterations that only a member can have.
+        Buckled: the plate buckles.
     """
     constant = plate.mass_per_area.is_constant and plate.bending_stiffness.is_constant
     if not constant or any(plate.tension) or plate.attachments:
@@ -82,7 +83,7 @@ def plate_modes(
     order = np.argsort(values)
     omega2 = np.where(np.abs(values[order]) < ROUNDED * abs(shift), 0.0, values[order])
     if (omega2 < 0).any():
-        raise ValueError("the altered plate is unstable: it buckles; draw a weaker spring")
+        raise Buckled("the altered plate is unstable: it buckles; draw a weaker spring")
     full = np.zeros((x.size * y.size, n_modes))
     full[kept] = vectors[:, order] / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))[order]
     shapes = np.array([_row(x, y, at) @ full for at in places]).reshape(-1, n_modes)
@@ -139,7 +140,7 @@ class _Cubics:
         row = np.zeros(self.size)
         dofs = (self.values[i], self.slopes_at[i], self.values[i + 1], self.slopes_at[i + 1])
         for dof, cubic, size in zip(dofs, CUBICS, (1.0, h, 1.0, h)):
-            row[dof] = size * (cubic.deriv(derivative) if derivative else cubic)(t) / h**derivative
+            row[dof] = size * cubic.deriv(derivative)(t) / h**derivative
         return row
 
     def integral(self, start: float, stop: float) -> Floats:
@@ -158,7 +159,7 @@ def _row(x: _Cubics, y: _Cubics, at: Any) -> Floats:
         bottom, top = at.y - 0.5 * at.height, at.y + 0.5 * at.height
         across_x = np.kron(x.at(right, 1) - x.at(left, 1), y.integral(bottom, top))
         return np.asarray(across_x + np.kron(x.integral(left, right), y.at(top, 1) - y.at(bottom, 1)))
-    return np.asarray(np.kron(x.at(at[0]), y.at(at[1])).astype(float))
+    return np.asarray(np.kron(x.at(at[0]), y.at(at[1])))
 
 
 def _square(row: Floats) -> csc_array:

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,11 +63,11 @@ def score(
         diagonal, 1 for another named point; "positions": whether right, None without any; "shrinkage": by validation
         record}.
     """
-    hidden = [e for e in label["effects"] if e["kind"] != NONE]
+    hidden = _hidden(label, inputs, outputs)
     named = verdict["effects"]
     kinds = sorted(e["kind"] for e in hidden) == sorted(e["kind"] for e in named)
-    pairs = _matched(hidden, named, domain) if kinds else []
-    channels = [_same_channel(h, t, inputs, outputs) for h, t in pairs if "input" in h or "output" in h]
+    pairs = [(hidden[i], named[j]) for i, j in sorted(_pairs(hidden, named, domain))] if kinds else []
+    channels = [_same_channel(h, t) for h, t in pairs if "input" in h or "output" in h]
     errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
     return {
         "hidden": _words(hidden),
@@ -92,10 +91,7 @@ def score_imperfect(
 ) -> dict[str, Any]:
     """The agreement of a verdict (as JSON) with the label of a trial with imperfections.
 
-    Args:
-        domain: of the structure, or its length; a place is right within 3 % of the length or diagonal, a named point
-            only exactly.
-        inputs, outputs: names in order, needed if a label has indices from zero.
+    The arguments are those of `score`; a place is right within 3 % of the length or diagonal.
 
     Returns:
         {"class", "size": of the imperfections; "hidden", "diagnosed": sets of kinds as text;
@@ -108,9 +104,10 @@ def score_imperfect(
         "claims": (probability, whether right) of the named set and of each alternative, if effects explain the gap; an
         alternative is right if it has the hidden kinds}.
     """
-    hidden = [e for e in label["effects"] if e["kind"] not in (NONE, UNKNOWN)]
+    hidden = [e for e in _hidden(label, inputs, outputs) if e["kind"] != UNKNOWN]
     named = [e for e in verdict["effects"] if e["kind"] != UNKNOWN]
-    pairs = _pairs(hidden, named, domain, inputs, outputs)
+    pairs = [(hidden[i], named[j]) for i, j in _pairs(hidden, named, domain)]
+    pairs = [(h, t) for h, t in pairs if _same_channel(h, t)]
     errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
     covered = [inside for h, t in pairs for inside in _inside(h, t)]
     budget = verdict.get("budget", {}).get("unexplained")
@@ -182,25 +179,29 @@ def _share(flags: Sequence[bool]) -> float:
     return float(np.mean(flags)) if flags else float("nan")
 
 
-def _pairs(
-    hidden: list[dict[str, Any]],
-    named: list[dict[str, Any]],
-    domain: Domain | float,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Pairs of a hidden and a named effect of the same kind and channel, each used once, nearest pairs first."""
+def _hidden(label: dict[str, Any], inputs: Sequence[str], outputs: Sequence[str]) -> list[dict[str, Any]]:
+    """The hidden effects of a label, with the names of their channels for indices."""
+    names = {"input": inputs, "output": outputs}
+    return [
+        {key: names[key][item] if key in names and isinstance(item, int) else item for key, item in effect.items()}
+        for effect in label["effects"]
+        if effect["kind"] != NONE
+    ]
+
+
+def _pairs(hidden: list[dict[str, Any]], named: list[dict[str, Any]], domain: Domain | float) -> list[tuple[int, int]]:
+    """Indices of a hidden and a named effect of the same kind, each used once: same channels first, then nearest."""
     alike = [
-        (_off(h, t, domain), i, j)
+        (not _same_channel(h, t), _off(h, t, domain), i, j)
         for i, h in enumerate(hidden)
         for j, t in enumerate(named)
-        if h["kind"] == t["kind"] and _same_channel(h, t, inputs, outputs)
+        if h["kind"] == t["kind"]
     ]
     pairs: list[tuple[int, int]] = []
-    for _, i, j in sorted(alike):
+    for _, _, i, j in sorted(alike):
         if all(i != k and j != m for k, m in pairs):
             pairs.append((i, j))
-    return [(hidden[i], named[j]) for i, j in pairs]
+    return pairs
 
 
 def _off(hidden: dict[str, Any], named: dict[str, Any], domain: Domain | float) -> float:
@@ -257,25 +258,9 @@ def _words(effects: list[dict[str, Any]]) -> str:
     return " + ".join(sorted(e["kind"] for e in effects)) or NONE
 
 
-def _matched(
-    hidden: list[dict[str, Any]], named: list[dict[str, Any]], domain: Domain | float
-) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Pairs of hidden and named effects of the same kind; two of the same kind are paired by their places."""
-
-    def cost(order: Iterable[dict[str, Any]]) -> float:
-        pairs = list(zip(hidden, order, strict=True))
-        if any(h["kind"] != t["kind"] for h, t in pairs):
-            return float("inf")
-        return sum(_off(h, t, domain) for h, t in pairs)
-
-    return list(zip(hidden, min(permutations(named), key=cost), strict=True)) if hidden else []
-
-
-def _same_channel(hidden: dict[str, Any], named: dict[str, Any], inputs: Sequence[str], outputs: Sequence[str]) -> bool:
-    for side, names in (("input", inputs), ("output", outputs)):
+def _same_channel(hidden: dict[str, Any], named: dict[str, Any]) -> bool:
+    for side in ("input", "output"):
         if side in hidden:
-            name = hidden[side]
-            channels = {names[name] if isinstance(name, int) else name, hidden.get("with")}
-            source = hidden.get("from") == named.get("from")
-            return source and channels == {named.get(side), named.get("with")}
+            channels = {named.get(side), named.get("with")} == {hidden[side], hidden.get("with")}
+            return channels and hidden.get("from") == named.get("from")
     return True

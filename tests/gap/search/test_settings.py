@@ -14,7 +14,7 @@ from workbench.gap.search import settings
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import SEARCH
 from workbench.study.runs.outcome import Outcome
-from workbench.trials.make import write_trials
+from workbench.trials.hold import write_trials
 
 ROOT = Path(workbench.__file__).parents[1]
 

@@ -4,7 +4,7 @@ import csv
 import io
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from workbench.identification.free_decay.preparation import decay_start, decays
 from workbench.identification.signal.data_quality import DataFault, data_faults, input_faults
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
+from workbench.structure.printed import counted
 from workbench.study.pages.page import PageContent, block
 
 HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strongest at [Hz]")
@@ -75,10 +76,9 @@ def _record(record: Record, path: Path) -> Look:
     signals = (*record.inputs, *record.outputs)
     shown = [*zip(channels, signals, strict=True)][:MOST_ROWS]
     rows = tuple(_row(channel, row, record.sample_rate_hz) for channel, row in shown)
-    inputs, outputs = record.n_inputs, record.n_outputs
     seconds = record.n_samples * record.sample_time
     heading = (
-        f"{outputs} output{'s' * (outputs != 1)} and {inputs} input{'s' * (inputs != 1)}, {record.n_samples} samples at"
+        f"{counted(record.n_outputs, 'output')} and {counted(record.n_inputs, 'input')}, {record.n_samples} samples at"
         f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
     )
     quiet = _quiet(record.select_outputs(kept)) if kept else []
@@ -90,29 +90,17 @@ def _record(record: Record, path: Path) -> Look:
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
     if unstated:
         remarks.append(f"the file states no quantity for {', '.join(unstated)}: their units are as recorded")
-    options = ["--inputs", _listed(forces or record.input_names)] if forces or inputs else []
-    if forces:
-        remarks.append(f"{', '.join(forces)}: taken as input by name or unit; leave --inputs out if this is wrong")
-    if not options:
-        free = bool(kept) and decays(record.select_outputs(kept))
-        start = decay_start(record.select_outputs(kept)) if free else record.start_time
-        if free and start > record.start_time:
-            remarks.append(f"the free decay begins at {start:.6g} s")
-        options += [] if free else ["--ambient"]
-    if forces and kept and _is_band_limited(record):
-        options += ["--input-hold", "band-limited"]
-    if faulty and kept:
-        options += ["--outputs", _listed(kept)]
-    moving = (
-        record.select_outputs([name for name in record.output_names if name not in faulty])
-        if kept or forces
-        else record
-    )
+    options, notes = _options(record, forces, kept, faulty)
+    remarks += notes
+    command = shlex.join(["workbench", "identify", str(path), *options])
+    moving = record
+    if kept or forces:
+        moving = record.select_outputs([name for name in record.output_names if name not in faulty])
     driven = moving.n_inputs == 1 and bool(np.ptp(moving.inputs)) and moving.n_samples >= 16 * SEGMENTS
     page_content = PageContent(
         title=f"What {path.name} holds",
         lead=heading,
-        lines=[*remarks, f"Go on with: {_command(path, options)}"],
+        lines=[*remarks, f"Go on with: {command}"],
         blocks=[
             block(plot(record), "The signals as recorded."),
             block(plot_spectra(moving), "Power spectral density, by Welch's method."),
@@ -121,7 +109,29 @@ def _record(record: Record, path: Path) -> Look:
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
     )
-    return Look(heading, rows, tuple(remarks), _command(path, options), page_content)
+    return Look(heading, rows, tuple(remarks), command, page_content)
+
+
+def _options(
+    record: Record, forces: Sequence[str], kept: Sequence[str], faulty: Set[str]
+) -> tuple[list[str], list[str]]:
+    """The options of `workbench identify` for a record, and remarks on them."""
+    options, remarks = [], []
+    if forces or record.n_inputs:
+        options += ["--inputs", _listed(forces or record.input_names)]
+    else:
+        free = bool(kept) and decays(record.select_outputs(kept))
+        start = decay_start(record.select_outputs(kept)) if free else record.start_time
+        if start > record.start_time:
+            remarks.append(f"the free decay begins at {start:.6g} s")
+        options += [] if free else ["--ambient"]
+    if forces:
+        remarks.append(f"{', '.join(forces)}: taken as input by name or unit; leave --inputs out if this is wrong")
+    if forces and kept and _is_band_limited(record):
+        options += ["--input-hold", "band-limited"]
+    if faulty and kept:
+        options += ["--outputs", _listed(kept)]
+    return options, remarks
 
 
 def _messages(faults: Sequence[DataFault]) -> list[str]:
@@ -171,18 +181,19 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
         rows.append((channel.name, "magnitude", *(f"{v:.4g}" for v in (row.min(), row.max(), row.mean(), rms)), at))
     n, m = len(measured.output_channels), len(measured.references)
     heading = (
-        f"transfer functions of {n} output{'s' * (n > 1)} and {m} input{'s' * (m > 1)}, {lines.size} lines from"
+        f"transfer functions of {counted(n, 'output')} and {counted(m, 'input')}, {lines.size} lines from"
         f" {lines[0]:.6g} to {lines[-1]:.6g} Hz"
     )
+    command = shlex.join(["workbench", "identify", str(path)])
     page_content = PageContent(
         title=f"What {path.name} holds",
         lead=heading,
-        lines=[*measured.remarks, f"Go on with: {_command(path, [])}"],
+        lines=[*measured.remarks, f"Go on with: {command}"],
         blocks=[block(plot_transfer(measured), "Magnitude and phase of the transfer functions.")],
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
     )
-    return Look(heading, tuple(rows), measured.remarks, _command(path, []), page_content)
+    return Look(heading, tuple(rows), measured.remarks, command, page_content)
 
 
 def _row(channel: Channel, row: np.ndarray, rate_hz: float) -> tuple[str, ...]:
@@ -228,7 +239,3 @@ def _listed(names: Sequence[str]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="").writerow(names)
     return text.getvalue()
-
-
-def _command(path: Path, options: Sequence[str]) -> str:
-    return shlex.join(["workbench", "identify", str(path), *options])

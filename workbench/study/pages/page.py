@@ -88,15 +88,12 @@ def write_page(path: Path, page_content: PageContent) -> Path:
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((ASSETS / "page.html").read_text(encoding="utf-8"))
     moving = [{key: one[key] for key in ("figure", "motion") if key in one} for one in page_content.blocks]
+    tables = [
+        {"title": title, "heads": heads, "rows": [[_cell(cell) for cell in row] for row in rows[:MOST_ROWS]]}
+        for title, heads, rows in page_content.tables
+    ]
     html = template.render(
-        **{
-            name: getattr(page_content, name)
-            for name in ("title", "lead", "lines", "blocks", "inputs", "made_by", "standing", "versions")
-        },
-        tables=[
-            {"title": title, "heads": heads, "rows": [[_cell(cell) for cell in row] for row in rows[:MOST_ROWS]]}
-            for title, heads, rows in page_content.tables
-        ],
+        {**vars(page_content), "tables": tables},
         css=asset("page.css"),
         scripts=Markup("\n").join(map(asset, SCRIPTS)),
         data=in_script(moving),
@@ -118,26 +115,27 @@ def in_script(content: object) -> Markup:
     return Markup(text)
 
 
-def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | None = None, made_by: str = "") -> Path:
+def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str], made_by: str) -> Path:
     """Write the page of a study: results, figures, checks, and tables of its runs."""
-    checks = [
-        (c["name"], _cell(c["value"]), ("≥ " if c["at_least"] else "≤ ") + str(_cell(c["limit"])), c["holds"])
-        for c in outcome.checks
-    ]
     runs = [(name, *_table_of(found.rows())) for name, found in outcome.runs.items()]
     page_content = PageContent(
         title=outcome.title or outcome.name,
         lines=tuple(outcome.lines),
         blocks=[block(shown, caption) for shown, caption in outcome.shown],
-        tables=[
-            *tables_of(outcome.tables),
-            *([("Checks", ("what", "value", "limit", ""), checks)] if checks else ()),
-            *runs,
-        ],
-        inputs=inputs or {},
-        made_by=made_by or f"workbench study {outcome.name}",
+        tables=[*tables_of(outcome.tables), *checks_of(outcome.checks), *runs],
+        inputs=inputs,
+        made_by=made_by,
     )
     return write_page(folder / f"{outcome.name}.html", page_content)
+
+
+def checks_of(checks: Sequence[Mapping[str, Any]]) -> list[Table]:
+    """The table of a study's checks; none without any."""
+    rows = [
+        [c["name"], c["value"], f"{'≥' if c.get('at_least') else '≤'} {_cell(c['limit'])}", bool(c["holds"])]
+        for c in checks
+    ]
+    return [("Checks", ("what", "value", "limit", ""), rows)] if rows else []
 
 
 def tables_of(content: Mapping[str, Any]) -> list[Table]:
@@ -152,7 +150,7 @@ def tables_of(content: Mapping[str, Any]) -> list[Table]:
 def _table_of(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], list[list[str | bool]]]:
     heads = tuple(dict.fromkeys(head for row in rows for head in row if head != "versions"))
     shown = [[row.get(head) for head in heads] for row in rows]
-    return heads, [["" if v is None else v if isinstance(v, bool) else _cell(v) for v in row] for row in shown]
+    return heads, [["" if v is None else _cell(v) for v in row] for row in shown]
 
 
 def to_its_error(value: object, error: object) -> tuple[str | bool, str | bool]:
@@ -163,6 +161,11 @@ def to_its_error(value: object, error: object) -> tuple[str | bool, str | bool]:
     if 0 <= digits <= 6 and abs(value) < 1e6:
         return f"{value:.{digits}f}", f"{error:.{digits}f}"
     return f"{value:.{max(1, 2 + math.floor(math.log10(max(abs(value), error) / error)))}g}", f"{error:.2g}"
+
+
+def short(number: float | None) -> float | str:
+    """The number to four significant digits, enough for a comparison; "" for None."""
+    return "" if number is None else float(f"{float(number):.4g}")
 
 
 def _cell(value: object) -> str | bool:

@@ -19,17 +19,15 @@ def prediction_page(
     folder: Path,
     check: PredictionCheck | None = None,
     measured: Record | None = None,
-    made_by: str = "",
+    made_by: str,
 ) -> Path:
     """Write the page.
 
     Args:
-        prediction: of the test.
         path: of the HTML file.
-        name: of the case.
-        folder: of the case.
+        name, folder: of the case.
         check, measured: the check of the prediction and the record of the test, if the test was made.
-        made_by: the command that makes the page again; derived from the case and the record unless given.
+        made_by: the command that makes the page again.
     """
     draws = prediction.expected.shape[0]
     caption = f"{100 * LEVEL:g} % prediction bands of the readings of each sensor, from {draws} draws."
@@ -45,6 +43,6 @@ def prediction_page(
         blocks=[block(plot_prediction(prediction, measured), caption)],
         tables=[("By sensor" if check is None else "Readings inside the bands", heads, rows)],
         inputs=case_inputs(folder),
-        made_by=made_by or f"workbench {'predict' if check is None else 'check'} {folder} {prediction.name}",
+        made_by=made_by,
     )
     return write_page(path, page_content)

@@ -25,53 +25,33 @@ DRAWN_LIMIT = 4.0  # largest drawn modal displacement of the present loop, over 
 NEGLIGIBLE = 1e-4  # loss, relative to vibration and effort, up to which the figure of steps is omitted
 
 
-def redesign_page(
-    found: Redesign,
-    path: Path,
-    *,
-    name: str,
-    record: Record | None = None,
-    folder: Path | None = None,
-    made_by: str = "",
-) -> Path:
+def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, folder: Path, made_by: str) -> Path:
     """Write the page.
 
     Args:
-        found: the redesign.
         path: of the HTML file.
         name: of the case.
         record: a measured record, whose inputs are applied as forces to both loops.
         folder: of the case.
-        made_by: the command that makes the page again; derived from the case unless given.
+        made_by: the command that makes the page again.
     """
-    blocks = []
-    if record is not None:
-        blocks += _replayed(found, record)
-    if record is None and found.test.impulse_at is not None and _drawn(found):
-        blocks.append(_moving(found, found.before.response, found.after.response, "The test"))
-    blocks += [
-        block(
-            plot_redesign(found),
-            "Both controllers after the impulse of the test, on the same samples of the uncertain model, including all"
-            " dead zones, delays, friction and noise. The controller with the lower curve is better; a wide band means"
-            " that the records leave much uncertain.",
-        )
-    ]
+    blocks = _replayed(found, record)
+    compared = (
+        "Both controllers after the impulse of the test, on the same samples of the uncertain model, including all"
+        " dead zones, delays, friction and noise. The controller with the lower curve is better; a wide band means"
+        " that the records leave much uncertain."
+    )
+    blocks.append(block(plot_redesign(found), compared))
     if max(s.loss for s in found.steps) > NEGLIGIBLE:
-        blocks.append(
-            block(
-                plot_steps(found),
-                "From the present controller to the redesigned one, step by step: the excess of vibration and effort"
-                " over the redesigned law with perfect actuators and sensors.",
-            )
+        stepwise = (
+            "From the present controller to the redesigned one, step by step: the excess of vibration and effort"
+            " over the redesigned law with perfect actuators and sensors."
         )
+        blocks.append(block(plot_steps(found), stepwise))
+    steps = [(s.name, s.what, s.lost, "yes" if s.kept else "no") for s in found.steps]
     tables: list[Table] = [
         ("On the same samples: median (95 % interval)", ("", "present", "redesigned"), _figures(found)),
-        (
-            "Steps",
-            ("step", "what", "loss", "kept"),
-            [(s.name, s.what, s.lost, "yes" if s.kept else "no") for s in found.steps],
-        ),
+        ("Steps", ("step", "what", "loss", "kept"), steps),
     ]
     used = found.verification if found.improves else found.present_verification
     moved = [] if found.relocation is None else [found.relocation.sentence]
@@ -82,8 +62,8 @@ def redesign_page(
         lines=[found.comparison, *moved, *found.notes],
         blocks=blocks,
         tables=tables,
-        inputs={} if folder is None else case_inputs(folder),
-        made_by=made_by or f"workbench redesign {folder or name}",
+        inputs=case_inputs(folder),
+        made_by=made_by,
     )
     return write_page(path, page_content)
 
@@ -120,11 +100,8 @@ def _rounded(values: np.ndarray) -> str:
 
 
 def _margin(verification: Verification) -> str:
-    return (
-        "no linear bound"
-        if np.isnan(verification.small_gain_margin)
-        else f"{100.0 * verification.small_gain_margin:.3g}"
-    )
+    margin = verification.small_gain_margin
+    return "no linear bound" if np.isnan(margin) else f"{100.0 * margin:.3g}"
 
 
 def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
@@ -141,19 +118,15 @@ def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
         return []
     caption = f"Under the inputs of the measured record {record.name or ''}".rstrip()
     shown = []
-    if _drawn(found) and old.bounded and new.bounded:
+    domain = rig.modes.domain
+    placed = not (isinstance(domain, NamedPoints) and domain.positions is None)
+    if placed and old.bounded and new.bounded:
         shown.append(_moving(found, old.response, new.response, caption))
     read = any(s.quantity == "displacement" for s in rig.sensors)
     where = "the sensor with the largest reading, and that measured without control" if read else "an actuator"
     readings = _readings(found, record, {"present": old.response, "redesigned": new.response})
     shown.append(block(readings, f"{caption}: the displacement at {where}."))
     return shown
-
-
-def _drawn(found: Redesign) -> bool:
-    """Whether the positions of the structure are known, so that it can be drawn."""
-    domain = found.uncertain_rig.rig.modes.domain
-    return not (isinstance(domain, NamedPoints) and domain.positions is None)
 
 
 def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict[str, Any]:

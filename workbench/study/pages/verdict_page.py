@@ -21,24 +21,23 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
-from workbench.study.pages.page import PageContent, Table, block, to_its_error, write_page
+from workbench.study.pages.page import PageContent, Table, block, short, to_its_error, write_page
 
 MOVING = (
     "The modes of the nominal model, and of the corrected one where it differs; circles are sensors, triangles inputs."
 )
 
+GAPS = ("before", "after", "floor")
 STANDING_OF = {"none": "good", "explained": "good", "part": "part", "unknown": "bad"}  # by outcome
 
 
-def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | None = None, made_by: str = "") -> Path:
+def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | None, made_by: str) -> Path:
     """Write the page: verdict, responses, localisation, unmodelled force, alternatives.
 
     Args:
-        verdict: of the diagnosis.
-        case: the diagnosed case.
         path: of the HTML file.
-        folder: of the case, whose files are then listed on the page.
-        made_by: the command that makes the page again; derived from the case unless given.
+        folder: of the case, whose files are then listed on the page; None for a case from records alone.
+        made_by: the command that makes the page again.
     """
     nominal, corrected = verdict.nominal.modes, verdict.corrected.modes
     changed = nominal.n_modes != corrected.n_modes or not np.allclose(nominal.omega, corrected.omega, rtol=1e-6)
@@ -47,33 +46,31 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     rigs, fitted = {"nominal": verdict.nominal}, "corrected" if verdict.outcome == "explained" else "nearest"
     if verdict.outcome != "none" and better:  # a model that makes the gap larger is not a correction
         rigs[fitted] = verdict.corrected
-    figures = [
-        (
+    blocks = [
+        block(
             plot_budget(verdict.budget),
             "What causes the gap: the power of the nominal residual, split by cause, on"
             + (" the validation records." if case.validation else " the records that were fitted."),
         ),
-        (
+        block(
             plot_responses(rigs, records, time_unit=verdict.units.time),
             f"Measured and simulated response ({', '.join(rigs)}) where they differ most. Nothing was fitted"
             " to the validation records.",
         ),
     ]
     if verdict.shows_gap:  # without a gap the residual is noise, and has no place
-        figures += [
-            (
-                plot_where(verdict),
-                "Where the gap is: its power above the noise, by sensor, mode and record; and the likelihood of a"
-                " single unknown force at each place, without an assumed law.",
-            ),
-        ]
+        where = (
+            "Where the gap is: its power above the noise, by sensor, mode and record; and the likelihood of a single"
+            " unknown force at each place, without an assumed law."
+        )
+        blocks.append(block(plot_where(verdict), where))
         acting = any(effect.at is not None and effect.kind.path == "structure" for effect in verdict.effects)
         if acting or verdict.where.place.is_single_force is not False:  # else a single force explains nothing
             made = "The unmodelled force reconstructed from the records, over the motion at its place."
-            figures.append((plot_unmodelled_force(verdict), made))
+            blocks.append(block(plot_unmodelled_force(verdict), made))
         if verdict.attribution.singles:  # single effects are not fitted if model errors were fitted from the start
             each = "Residual with each effect alone, without model errors; an effect at the noise floor explains all."
-            figures.append((plot_single_effects(verdict), each))
+            blocks.append(block(plot_single_effects(verdict), each))
     distortions = _of_lowest_and_highest(records)
     if distortions:
         seen = (
@@ -81,24 +78,19 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             + " Only odd lines are excited, so even ones reveal an even nonlinearity."
             * all(d.parity_resolved for d in distortions)
         )
-        figures.append((plot_distortion(distortions), seen))
-    moving = moving_modes(
-        verdict.nominal,
-        {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})},
-        length=verdict.units.length,
-    )
+        blocks.append(block(plot_distortion(distortions), seen))
+    if verdict.shows_gap:
+        modes = {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})}
+        blocks += moving_modes(verdict.nominal, modes, length=verdict.units.length)
     page_content = PageContent(
         title=f"Diagnosis of {verdict.case}",
         lead=verdict.sentence,
         standing=STANDING_OF[verdict.outcome],
         lines=[*verdict.notes, *([verdict.experiment.sentence] if verdict.experiment else []), _could_show(verdict)],
-        blocks=[
-            *(block(figure, caption) for figure, caption in figures),
-            *(moving if verdict.shows_gap else []),
-        ],
+        blocks=blocks,
         tables=verdict_tables(verdict.to_json()),
         inputs={} if folder is None else case_inputs(folder),
-        made_by=made_by or f"workbench diagnose {folder or verdict.case}",
+        made_by=made_by,
     )
     return write_page(path, page_content)
 
@@ -122,7 +114,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     gap, closed = content["gap"], content.get("shrinkage", {})
     length = content.get("units", {}).get("length", "m")
     gaps = [
-        [record, *(_short(gap[name].get(record)) for name in ("before", "after", "floor")), _short(closed.get(record))]
+        [record, *(short(gap[name].get(record)) for name in GAPS), short(closed.get(record))]
         for record in gap["before"]
     ]
     rivals = [
@@ -132,15 +124,10 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
         rivals.insert(0, ["the set named", content["probability"]])
     tables = [
         (title, ("effect", "parameter", "value", "standard error", f"place [{length}]", "input or output"), effects),
-        ("Gap (rms error / rms signal)", ("record", "before", "after", "floor", "share closed"), gaps),
+        ("Gap (rms error / rms signal)", ("record", *GAPS, "share closed"), gaps),
         ("Alternatives that the records do not exclude", ("set of effects", "probability"), rivals),
     ]
     return [table for table in tables if table[2]]
-
-
-def _short(number: float | None) -> float | str:
-    """The number to four significant digits; "" for None."""
-    return "" if number is None else float(f"{number:.4g}")
 
 
 def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:

@@ -3,10 +3,10 @@
 import csv
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -55,34 +55,18 @@ class Result:
         raise KeyError(f"no value or parameter {name!r}; there are {', '.join((*self.parameters, *self.values))}")
 
 
-@dataclass(frozen=True, eq=False)
-class Results(Sequence[Result]):
+class Results(tuple[Result, ...]):
     """Results in the order of their cases."""
-
-    every: tuple[Result, ...]
-
-    def __len__(self) -> int:
-        return len(self.every)
-
-    @overload
-    def __getitem__(self, index: int) -> Result: ...
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Result, ...]: ...
-    def __getitem__(self, index: int | slice) -> Result | tuple[Result, ...]:
-        return self.every[index]
-
-    def __iter__(self) -> Iterator[Result]:
-        return iter(self.every)
 
     @property
     def failed(self) -> tuple[Result, ...]:
         """The results of the cases that failed."""
-        return tuple(result for result in self.every if result.error is not None)
+        return tuple(result for result in self if result.error is not None)
 
     @property
     def seconds(self) -> float:
         """Total computation time of all cases, s."""
-        return sum(result.seconds for result in self.every)
+        return sum(result.seconds for result in self)
 
     def rows(self) -> list[dict[str, Any]]:
         """One dict per case, all with the same keys: parameters, values, seed, error, seconds, versions.
@@ -93,10 +77,10 @@ class Results(Sequence[Result]):
             StudyError: two different values of the same name.
         """
         used = ", ".join(f"{name} {version}" for name, version in versions().items())
-        parts = [(_flat(r.parameters), _flat(r.values)) for r in self.every]
+        parts = [(_flat(r.parameters), _flat(r.values)) for r in self]
         names = dict.fromkeys(name for part in (0, 1) for pair in parts for name in pair[part])
         rows = []
-        for result, (parameters, values) in zip(self.every, parts):
+        for result, (parameters, values) in zip(self, parts):
             both = parameters.keys() & values.keys()
             twice = [n for n in both if json.dumps(_plain(parameters[n])) != json.dumps(_plain(values[n]))]
             if twice:
@@ -156,9 +140,9 @@ def _plain(value: object) -> object:
         return _plain(value.tolist())
     if isinstance(value, list):
         return [_plain(item) for item in value]
-    if isinstance(value, complex):
-        return str(value)
-    return str(value) if isinstance(value, Path) else value
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return str(value) if isinstance(value, complex | Path) else value
 
 
 def _finite(value: Any) -> Any:

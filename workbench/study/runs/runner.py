@@ -56,34 +56,38 @@ def run(
     print_ = fingerprint(function) if cache is not None else ""
     keys = [key_of(case, print_, s) for case, s in zip(checked_cases, seeds)]
     folder = None if cache is None else Path(cache).resolve() / f"{_name(function)}-{print_[:12]}"
-    records = {} if folder is None else _kept(folder, keys)
+    files = dict.fromkeys(keys) if folder is None else {key: folder / f"{key}.json" for key in keys}
+    found = {key: read_record(file) for key, file in files.items() if file is not None}
+    records = {key: record for key, record in found.items() if record is not None}
     jobs = {
-        key: Job(
-            key, case if s is None else {**case, "seed": s}, None if folder is None or scheduler else _file(folder, key)
-        )
+        key: Job(key, case if s is None else {**case, "seed": s}, None if scheduler else files[key])
         for key, case, s in zip(keys, checked_cases, seeds)
         if key not in records
     }
-    _report(report, len(records), len(set(keys)))
-    unkept: list[str] = []
+
+    def progress(text: str) -> None:
+        if report is not None:
+            report(text, len(records) / len(files))
 
     def awaiting(n: int) -> None:
-        if report is not None:
-            report(f"waiting for {n} cases of another run", len(records) / len(set(keys)))
+        progress(f"waiting for {n} cases of another run")
 
+    progress(f"{len(records)} of {len(files)} cases")
+    unkept: list[str] = []
     for key, record in _computed(function, list(jobs.values()), workers, scheduler, awaiting):
         records[key] = record
-        if folder is not None and scheduler:
-            record["unkept"] = keep(_file(folder, key), record)
+        file = files[key]
+        if scheduler and file is not None:
+            record["unkept"] = keep(file, record)
         unkept += filter(None, [record.get("unkept")])
-        _report(report, len(records), len(set(keys)))
+        progress(f"{len(records)} of {len(files)} cases")
     if unkept:
         warnings.warn(
-            f"{len(unkept)} of {len(set(keys))} results could not be written to {folder} and would be computed again:"
+            f"{len(unkept)} of {len(files)} results could not be written to {folder} and would be computed again:"
             f" {unkept[0]}",
             stacklevel=2,
         )
-    return Results(tuple(_result(case, s, records[key]) for case, s, key in zip(checked_cases, seeds, keys)))
+    return Results(_result(case, s, records[key]) for case, s, key in zip(checked_cases, seeds, keys))
 
 
 def _computed(
@@ -116,20 +120,6 @@ def _result(case: dict[str, Any], seed: int | None, record: dict[str, Any]) -> R
     return Result(case, shown, decoded(record["result"] or {}), record["error"], record["trace"], record["seconds"])
 
 
-def _kept(folder: Path, keys: list[str]) -> dict[str, dict[str, Any]]:
-    found = {key: read_record(_file(folder, key)) for key in set(keys)}
-    return {key: record for key, record in found.items() if record is not None}
-
-
-def _file(folder: Path, key: str) -> Path:
-    return folder / f"{key}.json"
-
-
 def _name(function: Callable[..., Any]) -> str:
     name = getattr(function, "__name__", type(function).__name__)
     return "".join(c if c.isalnum() or c == "_" else "-" for c in name)
-
-
-def _report(report: Callable[[str, float], None] | None, done: int, of: int) -> None:
-    if report is not None:
-        report(f"{done} of {of} cases", done / of)
