@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter, sosfilt
 
 from workbench.deadline import Deadline
 from workbench.gap.diagnose import diagnose, diagnose_case
@@ -17,9 +17,14 @@ from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import cost_of, fit, sensitivity
 from workbench.gap.search.search import Search
 from workbench.gap.search.stepwise import Stepwise
+from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+from workbench.structure.supports import PointMass
 from workbench.trials.hold import hold_trials
 from workbench.trials.make import make_trial
 from workbench.trials.scoring import score_imperfect
@@ -304,3 +309,40 @@ def test_one_sensor_is_late_by_straight_lines_too(rig, measured):
     assert found.errors.target.interpolated
     assert found.effects[0].values["delay"] == pytest.approx(1.4 * DT, rel=1e-3)
     assert beside.explains(found)
+
+
+@pytest.mark.slow
+def test_a_mass_at_the_tip_is_not_taken_for_errors_of_the_model():
+    """It shifts all frequencies of a cantilever alike, as smooth errors of stiffness and mass do."""
+    mass = 0.0223
+    rng = np.random.default_rng(4)
+    beam = Beam(
+        length=1.2,
+        mass_per_length=0.62,
+        bending_stiffness=60.0,
+        left="clamped",
+        right="free",
+        damping=ModalDamping(0.006),
+    )
+    sensors = tuple(Sensor(f"a{i}", x, "acceleration", noise_std=0.12) for i, x in enumerate((0.5, 0.8, 1.2)))
+    rig = Rig(beam.modes(7), (Actuator("F", 0.4),), sensors, structure=beam)
+    real = replace(
+        beam,
+        attachments=(PointMass(1.2, mass),),
+        frequency_errors=tuple(0.003 * rng.standard_normal(7)),
+        damping=ModalDamping(0.006 * np.exp(0.15 * rng.standard_normal(7))),
+    )
+    plant = replace(rig, modes=real.modes(7), structure=real)
+    records, low_pass = [], butter(6, (0.02, 0.8), "bandpass", output="sos")
+    for name, level in (("low", 2.0), ("high", 20.0), ("check", 10.0)):
+        force = level * sosfilt(low_pass, rng.standard_normal((1, 3000)))
+        read = simulate(plant, force, sample_time=0.001).outputs
+        read = read + 0.12 * rng.standard_normal(read.shape)
+        logged = force + 0.005 * force.std() * rng.standard_normal(force.shape)
+        records.append(rig.record(logged, read, sample_time=0.001, name=name))
+    verdict = diagnose(rig, records[:2], validation=records[2:])
+    (found,) = (effect for effect in verdict.effects if effect.kind is not NOMINAL_ERRORS)
+    assert found.kind.name == "point_mass", verdict.sentence
+    assert found.at == pytest.approx(1.2, abs=0.012)
+    assert found.values["mass"] == pytest.approx(mass, abs=2.5 * found.deviations["mass"])
+    assert found.deviations["mass"] < 0.2 * mass

@@ -116,12 +116,19 @@ class Stepwise:
         )
         found = [s for s in (*self.known, *fresh) if not self._may_be_port_errors(s)]
         best = sorted(found, key=lambda s: s.fit.cost)
-        if not (best and self.explains(best[0]) and (self.search.by_mode or not self.has_plausible_errors)):
+        if not best or (self.has_plausible_errors and not self.search.by_mode):
             return best
-        # nominal errors of each mode, or implausibly large ones, absorb the residual of any linear effect: the effect
-        # that needs the smallest nominal errors is preferred
+        # nominal errors of each mode, or implausibly large ones, absorb the residual of any linear effect: of effects
+        # that leave as little, the one that needs the smallest nominal errors is preferred
         noise, nats_per_parameter = best[0].noise_power, 0.0 if self.search.by_mode else self._nats_per_parameter
-        return sorted(found, key=lambda s: s.description(noise) + nats_per_parameter * self._size(s)[0])
+        least = best[0].excess(noise) + STEPWISE.no_gap * float(noise.mean())
+
+        def order(step: Step) -> tuple[bool, float]:
+            if self.explains(best[0]) or step.excess(noise) < least:
+                return False, step.description(noise) + nats_per_parameter * self._size(step)[0]
+            return True, step.fit.cost
+
+        return sorted(found, key=order)
 
     def _likeliest_singles(self) -> list[Fit]:
         """The best single effects by one-step-ahead prediction, nominal errors re-estimated to first order.
