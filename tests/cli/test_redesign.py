@@ -76,7 +76,7 @@ def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
     plain = tmp_path / "plain.json"
     plain.write_text('{"effects": []}')
     refused = run("redesign", folder, "--verdict", plain)
-    assert refused.exit_code == 2 and "workbench diagnose CASE --json plain.json" in refused.output
+    assert refused.exit_code == 2 and "workbench diagnose CASE --json verdict.json" in refused.output
     none = run("redesign", folder, "--verdict", tmp_path / "none.json")
     assert none.exit_code == 2 and "workbench diagnose CASE --json none.json" in none.output
     assert "there is no such file" in none.output and "not a verdict" not in none.output

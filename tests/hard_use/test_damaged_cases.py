@@ -237,7 +237,7 @@ def test_a_thousand_damaged_cases(whole, tmp_path):
         ("length = 2.0", "length = 1" + "0" * 400, "length must be a number"),
         ("length = 2.0", "length = 1" + "0" * 5000, "TOML"),
         ("length = 2.0", "length = " + "[" * 100_000, "TOML"),
-        ("[structure]", "[units]\nlength = 0.0\n\n[structure]", r"case\.toml: \[units\]: length must be a text"),
+        ("[structure]", "[units]\nlength = 0.0\n\n[structure]", r"case\.toml: \[units\]: mass is missing"),
         ('name = "d1"', 'name = "d1 [mm]"', "'d1 \\[mm\\]' of an input or output ends in a unit, mm"),
         ('name = "tap"', r'name = "tap\u001b[2J"', "printable"),
         ('file = "records/one.npz"', r'file = "records/one\u0000.npz"', "printable"),
