@@ -472,7 +472,7 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
         input_channels=in_units(record.input_channels, units),
         output_channels=in_units(record.output_channels, units),
     )
-    for known in (*record.input_channels, *record.output_channels):
+    for _, known, _ in record.signals():
         unit = stated.get(known.name, "")
         if unit not in ("", known.unit):
             raise CaseError(
@@ -483,8 +483,7 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
 
 def signals_of(record: Record) -> dict[str, np.ndarray]:
     """The time t and the channels of a record, by name."""
-    channels = (*zip(record.input_names, record.inputs), *zip(record.output_names, record.outputs))
-    return {"t": record.time, **dict(channels)}
+    return {"t": record.time, **{channel.name: row for _, channel, row in record.signals()}}
 
 
 def _arrays(file: Path, where: str, units: Units) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -499,7 +498,7 @@ def _arrays(file: Path, where: str, units: Units) -> tuple[dict[str, np.ndarray]
         else:
             record = read_record(file, units=units)
             arrays = signals_of(record)
-            stated = {channel.name: channel.unit for channel in (*record.input_channels, *record.output_channels)}
+            stated = {channel.name: channel.unit for _, channel, _ in record.signals()}
     except RecordFileError as error:
         raise CaseError(str(error)) from error
     for name, values in arrays.items():

@@ -31,7 +31,7 @@ LARGEST_SMALL = (
     ("place", 1.0),
     ("shape", 10.0),
 )
-MOSTLY = 0.5  # of the gap: if more is unexplained, the fitted nominal errors have over-fitted it
+MOSTLY = 0.5  # of the gap: its greater part; if that is unexplained, the fitted nominal errors have over-fitted it
 RUNAWAY = 1e30  # mean square of a divergent residual, in units of the signal's
 COMMON = 2.0  # times the scatter of delays: a larger mean is reported as a common delay
 DRAWS = 400  # bootstrap draws, for the interval of the shrinkage

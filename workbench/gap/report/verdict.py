@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import ALL, COORDINATES, Effect, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.where import Where
-from workbench.gap.report.budget import REMARKED, Budget, RecordToRecord, Shrinkage, labels_of
+from workbench.gap.report.budget import MOSTLY, REMARKED, Budget, RecordToRecord, Shrinkage, labels_of
 from workbench.gap.report.experiment import Experiment
 from workbench.gap.report.record_checks import Detectability
 from workbench.gap.search.attribute import Attribution
@@ -119,7 +119,7 @@ class Verdict:
         Small errors of the model act all over the structure, so nothing is said where they cause most of the gap.
         """
         place = self.where.place
-        if self.outcome == "explained" and self.budget.nominal > 0.5:
+        if self.outcome == "explained" and self.budget.nominal > MOSTLY:
             return ""
         at = place_in_words(place.at, dict.fromkeys(COORDINATES, place.at_std))
         if self.is_located:

@@ -121,14 +121,13 @@ class Stepwise:
         # nominal errors of each mode, or implausibly large ones, absorb the residual of any linear effect: of effects
         # that leave as little, the one that needs the smallest nominal errors is preferred
         noise, nats_per_parameter = best[0].noise_power, 0.0 if self.search.by_mode else self._nats_per_parameter
-        least = best[0].excess(noise) + STEPWISE.no_gap * float(noise.mean())
-
-        def order(step: Step) -> tuple[bool, float]:
-            if self.explains(best[0]) or step.excess(noise) < least:
-                return False, step.description(noise) + nats_per_parameter * self._size(step)[0]
-            return True, step.fit.cost
-
-        return sorted(found, key=order)
+        little = best[0].excess(noise) + STEPWISE.no_gap * float(noise.mean())
+        as_good = found if self.explains(best[0]) else [s for s in best if s.excess(noise) < little]
+        others = [s for s in best if s not in as_good]
+        return [
+            *sorted(as_good, key=lambda s: s.description(noise) + nats_per_parameter * self._size(s)[0]),
+            *others,
+        ]
 
     def _likeliest_singles(self) -> list[Fit]:
         """The best single effects by one-step-ahead prediction, nominal errors re-estimated to first order.

@@ -8,13 +8,14 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.records.band_limited import later
 from workbench.records.record import Record
+from workbench.records.units import STANDARD_GRAVITY
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 
 Corrected = tuple[Rig, tuple[Record, ...]]
 Correction = Callable[[Rig, Sequence[Record]], Corrected]
-G, TURN = 9.80665, 2.0 * np.pi
+G, TURN = STANDARD_GRAVITY, 2.0 * np.pi
 # measured over predicted amplitude: what is wrong with outputs that have this ratio, and with inputs that cause it
 FACTORS = {
     -1.0: ("have the wrong sign", "have the wrong sign"),
