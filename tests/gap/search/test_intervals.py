@@ -75,6 +75,23 @@ def test_a_gain_is_known_no_better_than_calibrations_and_is_relative_to_that_of_
     assert told.deviations["gain"] == pytest.approx(1.8 * 0.01 * np.sqrt(2.0), rel=0.05)  # of both ports
 
 
+def test_a_law_is_known_no_better_than_the_scale_of_the_shapes_at_all_ports(hinged_rig):
+    """Errors of the shapes at all ports, of standard deviation s: records show their product of input and output alone.
+
+    Motion (1 + x) times as large, with an input 1 + x times as strong and readings 1 - x times, has the same readings
+    if the stiffness of a cubic spring falls by 2 x; the priors of p ports and m modes know x to s / √(p m).
+    """
+    rig, stiffness, size = hinged_rig(n_modes=2), 4000.0, 0.05
+    law = Effect(kind_named("cubic_spring"), None, {"at": 0.62, "stiffness": stiffness})
+    rng = np.random.default_rng(0)
+    record = simulate(apply_all(rig, (law,)), np.repeat(rng.normal(size=120), 5)[None], sample_time=0.01)
+    data = FitData((record,), 1e-5 * record.outputs.std(axis=1))
+    found = fit(rig, (law, nominal_errors(rig, NominalPrior(shape=size))), data)
+    told = with_intervals(rig, found, data).effects[0]
+    ports, modes = len(rig.actuators) + len(rig.sensors), rig.modes.n_modes
+    assert told.deviations["stiffness"] == pytest.approx(2.0 * stiffness * size / np.sqrt(ports * modes), rel=0.05)
+
+
 @pytest.mark.slow
 def test_noise_of_the_inputs_widens_the_interval_of_a_law_as_fits_to_other_draws_of_it_do(hinged_rig):
     """A strong cubic spring: the scatter of its stiffness over fits to records whose inputs were logged anew."""

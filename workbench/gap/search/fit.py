@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, islice
 from operator import mul
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -201,7 +201,8 @@ class _Problem:
         for j in indices:
             parameter = self.parameters[j][1]
             step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name in COORDINATES else self.steps[j]
-            moved[j] = free[j] - step if self.high[j] < free[j] + step else free[j] + step
+            is_inside = self.low[j] <= free[j] + step <= self.high[j]
+            moved[j] = free[j] + step if is_inside else free[j] - step
         return moved
 
     def _groups_of_sensors(self, indices: Sequence[int]) -> list[list[int]]:
@@ -342,18 +343,21 @@ def slopes(
     held: Sequence[Effect] = (),
     workers: Workers = ALONE,
     *,
-    wide: bool = False,
+    differences: Literal["forward", "central", "wide"] = "forward",
 ) -> tuple[np.ndarray, np.ndarray]:
     """The residual (n_values,) and its derivatives (n_values, n_parameters) by the free coordinates of effects.
 
     Args:
-        wide: central differences with long steps, which average out numerical errors of the modes.
+        differences: forward, as in a fit; central, with shorter steps, so that what parameters could do for each other
+            cancels to second order; or central with long steps, which average out numerical errors of the modes.
 
     Raises:
         ValueError: the rig cannot be simulated with these effects.
     """
     problem = _Problem(rig, effects, data, held, workers)
-    if wide:
+    if differences == "central":
+        problem.steps *= FIT.shorter
+    if differences == "wide":
         problem.steps *= [
             FIT.wider_place if p.name in COORDINATES else FIT.wider * (1e-2 / FIT.short if p.prior_std else 1.0)
             for _, p in problem.parameters
@@ -364,7 +368,7 @@ def slopes(
     with workers.pool(problem.run) as share:
         slope_base = problem.slope_base(problem.start, residual)
         jacobian = problem.jacobian(problem.start, *slope_base, share)
-        if wide:
+        if differences != "forward":
             jacobian, problem.steps = jacobian.copy(), -problem.steps
             jacobian = 0.5 * (jacobian + problem.jacobian(problem.start, *slope_base, share))
     return residual[: data.n_values], jacobian[: data.n_values]

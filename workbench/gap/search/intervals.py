@@ -40,11 +40,11 @@ def with_intervals(
         found: effects, and nominal errors if they were fitted.
         data: fit records.
         workers: processes that share the work.
-        wide: as in `slopes`.
+        wide: long steps, for numerical errors of identified modes; as in `slopes`.
         logged: input noise, as a share of the inputs' rms.
     """
     data = data.finely(SELECTION.fine)  # integration errors would count as scatter
-    residual, jacobian = slopes(rig, found.effects, data, workers=workers, wide=wide)
+    residual, jacobian = slopes(rig, found.effects, data, workers=workers, differences="wide" if wide else "central")
     if jacobian.shape[1] == 0:
         return found
     level = max(float(residual @ residual) / residual.size, 1.0)
