@@ -31,7 +31,12 @@ from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import with_all_errors
 from workbench.gap.search.nominal_figures import with_mode_errors, with_record_deviations
 from workbench.gap.search.pairs import Pairs
-from workbench.gap.search.plain import are_uniform_errors, is_plausible_error, uniform_as_nominal_errors
+from workbench.gap.search.plain import (
+    NO_UNIFORM_ERROR,
+    are_uniform_errors,
+    is_plausible_error,
+    uniform_as_nominal_errors,
+)
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, best_of_each_kind, most_informative, nearest, promise
 from workbench.gap.search.settings import ATTRIBUTION, LAW, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
@@ -440,8 +445,10 @@ def _decide_beyond_singles(
     is_explained = stepwise.is_sufficient or stepwise.without_errors() or stepwise.by_singles() or stepwise.by_few()
     is_explained = is_explained or stepwise.by_almost_alone(singles)
     is_explained = is_explained or (stepwise.is_noise_only and stepwise.has_plausible_errors)
-    if not (is_explained or is_near_noise or search.is_over):
-        random = random_with_effects(search, singles) or random_with_nominal_errors(search, stepwise.steps[0])
+    if not ((is_explained and stepwise.is_noise_only) or is_near_noise or search.is_over):
+        random = random_with_effects(search, singles)
+        if random is None and not is_explained:
+            random = random_with_nominal_errors(search, stepwise.steps[0])
         if random is not None:
             return random
     if is_explained:
@@ -481,8 +488,8 @@ def _decide_beyond_singles(
 def _pair_at_noise_floor(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> Decision | None:
     """Two effects that explain the records with the stated sensor noise, or None.
 
-    None also if one is a plausible error of the model, or has no significant parameter. A search with nominal errors
-    takes longer, so these pairs come first.
+    None also if one is a plausible error of the model or has no significant parameter, or if one is a uniform error and
+    the other uniform error surely explains more. A search with nominal errors takes longer, so these pairs come first.
     """
     search = pairs.search
     near = [effect for f in singles if search.near(f, PAIRS.most) for effect in f.effects]
@@ -492,6 +499,11 @@ def _pair_at_noise_floor(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> De
     effects = decision.best.effects
     if are_uniform_errors(effects) or any(is_plausible_error(effect, search) for effect in effects):
         return None
+    missing = [effect for effect in NO_UNIFORM_ERROR if effect.kind not in {e.kind for e in effects}]
+    if len(missing) == 1:  # an imperfect model has both uniform errors, and a damper may stand for one of damping
+        both = fit(search.rig, (*effects, *missing), search.data, iterations=ATTRIBUTION.together)
+        if search.surely_better(both, decision.best.cost, 1):
+            return None
     sure = with_intervals(search.rig, decision.best, search.data, search.workers).effects
     return decision if all(effect.stands_out(search.rig) for effect in sure) else None
 
