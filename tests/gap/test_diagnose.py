@@ -310,7 +310,7 @@ def test_a_rest_of_the_model_is_noted_with_its_size_and_not_called_noise():
         " cause was not searched for."
     ]
     assert [note.endswith("an effect is missing.") for note in _note_of_residual(rest, 1.0, 0.001)] == [True]
-    assert rest.noise_remark.startswith("What looks like noise is 1.8 times the stated noise_std; part of it may be")
+    assert rest.noise_remark.startswith("What looks like noise is 1.8 times the model's noise_std; part of it may be")
     assert not [*_note_of_residual(Budget({}, 0.9, 0.04, 0.06, {}, **noise), 1.0, 0.01)]
 
 

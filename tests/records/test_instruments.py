@@ -334,6 +334,16 @@ def test_universal_files_that_are_no_record(tmp_path, axes, words):
         universal(tmp_path / "x.uff", axes)
 
 
+def test_channels_of_one_node_are_called_by_their_own_text(tmp_path):
+    alike = {"rsp_node": 0, "rsp_dir": 0, "ordinate_axis_units_lab": "g"}
+    record = universal(tmp_path / "x.uff", alike | {"id1": "tip"}, alike | {"id1": "root"})
+    assert record.output_names == ("tip", "root") and record.remarks == ("tip, root: g taken as 9.80665 m/s^2",)
+    apart = universal(tmp_path / "y.uff", {"id1": "tip"}, {"id1": "root", "rsp_node": 5})
+    assert apart.output_names == ("node 1 direction 3", "node 5 direction 3")
+    with pytest.raises(RecordFileError, match="its own node and direction, or its own text in ID line 1"):
+        universal(tmp_path / "z.uff", alike | {"id1": "tip"}, alike | {"id1": "tip"})
+
+
 def test_spectra_beside_signals_are_left_out(tmp_path):
     record = universal(tmp_path / "x.uff", {"func_type": 6, "abscissa_spec_data_type": 18}, {})
     assert record.output_names == ("node 1 direction 3",) and record.sample_time == 0.5

@@ -79,6 +79,11 @@ def tables(table: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
     return entries
 
 
+def _got(entry: dict[str, Any], key: str) -> str:
+    """What stands under a key, for a message."""
+    return f"got {shown(entry[key])}" if key in entry else "it is missing"
+
+
 def text(entry: dict[str, Any], key: str, where: str) -> str:
     """The text of printable characters under `key`.
 
@@ -87,7 +92,7 @@ def text(entry: dict[str, Any], key: str, where: str) -> str:
     """
     value = entry.get(key)
     if not isinstance(value, str) or not value or not value.isprintable() or len(value) > 255:
-        raise CaseError(f"{where}: {key} must be a text of up to 255 printable characters; got {shown(value)}")
+        raise CaseError(f"{where}: {key} must be a text of up to 255 printable characters; {_got(entry, key)}")
     return value
 
 
@@ -119,7 +124,7 @@ def number(entry: dict[str, Any], key: str, where: str, *, low: float = -np.inf)
         as_float = np.inf
     if not np.isfinite(as_float) or as_float < low:
         limit = "" if low == -np.inf else f" of {low:g} or more"
-        raise CaseError(f"{where}: {key} must be a number{limit}; got {shown(value)}")
+        raise CaseError(f"{where}: {key} must be a number{limit}; {_got(entry, key)}")
     return as_float
 
 
@@ -137,7 +142,7 @@ def numbers(entry: dict[str, Any], key: str, where: str, length: int | None = No
         values = np.zeros(0)
     if values.size == 0 or not np.isfinite(values).all() or values.size != (length or values.size):
         many = "numbers" if length is None else f"{length} numbers"
-        raise CaseError(f"{where}: {key} must be a list of {many}; got {shown(given)}")
+        raise CaseError(f"{where}: {key} must be a list of {many}; {_got(entry, key)}")
     return values
 
 
@@ -162,5 +167,5 @@ def count(entry: dict[str, Any], key: str, most: int) -> int:
     """
     value = entry.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-        raise CaseError(f"[structure]: {key} must be a whole number from 1 to {most}; got {shown(value)}")
+        raise CaseError(f"[structure]: {key} must be a whole number from 1 to {most}; {_got(entry, key)}")
     return value

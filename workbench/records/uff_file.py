@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -62,17 +63,21 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         )
     arrays: dict[str, np.ndarray] = {}
     channels, record = [], None
-    for number, entry in over_time:
+    names = _names([entry for _, entry in over_time])
+    for (number, entry), name in zip(over_time, names, strict=True):
         where = f"{path}, data set {number}"
         data = np.asarray(entry["data"])
         if np.iscomplexobj(data):
             raise RecordFileError(f"{where} is complex, but not marked as a transfer function (function type 4)")
         if data.size != entry["num_pts"]:
             raise RecordFileError(f"{where} holds {data.size} samples and states {entry['num_pts']}: it is damaged")
-        key, facts = _channel(where, entry, system)
+        key, facts = _channel(where, entry, name, system)
         record = facts.pop("record", record)
         if key in arrays:
-            raise RecordFileError(f"{where}: a second channel is called {key.partition(':')[2]!r}")
+            raise RecordFileError(
+                f"{where}: a second channel is called {key.partition(':')[2]!r}; export each with its own node and"
+                " direction, or its own text in ID line 1"
+            )
         time = _abscissa(where, entry, "time")
         first = arrays.setdefault("t [s]", time)
         if time.size != first.size or np.abs(time - first).max() > 1e-6 * max(np.abs(first).max(), 1e-300):
@@ -158,14 +163,21 @@ def as_stored(values: np.ndarray) -> np.ndarray:
     return np.array(("%.11e " * values.size % tuple(values)).split(), float)
 
 
-def _channel(where: str, entry: dict[str, Any], system: dict[str, Any] | None) -> tuple[str, dict[str, Any]]:
+def _names(entries: Sequence[dict[str, Any]]) -> list[str]:
+    """Names of channels: node and direction of the response, or ID line 1 where only that differs between them."""
+    nodes = [_node(entry, "rsp") for entry in entries]
+    lines = [str(entry.get("id1", "")).strip() for entry in entries]
+    return lines if len(set(nodes)) < len(nodes) and len(set(lines)) == len(lines) and all(lines) else nodes
+
+
+def _channel(where: str, entry: dict[str, Any], name: str, system: dict[str, Any] | None) -> tuple[str, dict[str, Any]]:
     """Key and description of a channel, from the text lines written by this program or from the data set itself.
 
-    The description is empty where a known unit follows the name.
+    The description is empty where a known unit follows the name, of `_names`.
     """
     text = "".join(str(entry.get(f"id{i}", "")) for i in range(1, 6))
     if not any(sign in text for sign in OURS):
-        name, (quantity, unit) = _node(entry, "rsp"), _measured(where, entry, "ordinate", system)
+        quantity, unit = _measured(where, entry, "ordinate", system)
         if unit_named(unit) is not None:
             return f"output:{name} [{unit}]", {}
         return f"output:{name}", {"kind": "output", "name": name, "quantity": quantity, "unit": unit}

@@ -177,12 +177,12 @@ class Budget:
             return None
         if ratio > AT_BOUND * JOINT.credible:
             return (
-                f"The residual is {ratio:.2g} times the stated noise_std or more: louder noise, or errors of the model"
+                f"The residual is {ratio:.2g} times the model's noise_std or more: louder noise, or errors of the model"
                 " that neither effects nor small errors describe."
             )
         if self.leaves_more_than_noise:
-            return f"What looks like noise is {ratio:.2g} times the stated noise_std; part of it may be of the model."
-        return f"The noise of the sensors is {ratio:.2g} times the stated noise_std."
+            return f"What looks like noise is {ratio:.2g} times the model's noise_std; part of it may be of the model."
+        return f"The noise of the sensors is {ratio:.2g} times the model's noise_std."
 
     @property
     def leaves_more_than_noise(self) -> bool:
