@@ -91,8 +91,8 @@ class _Linearised:
         scale = np.sqrt(np.maximum((self.jacobian**2).sum(axis=0) + level * priors, 1e-300))
         jacobian, priors = self.jacobian / scale, priors / scale**2
         information = jacobian.T @ jacobian + level * np.diag(priors)
-        inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
         root = _square_root(information)
+        inverse = root @ root.T
         without = _jackknife(self.residual, jacobian, self.data, root)
         spread = without.T @ without + level**2 * inverse @ np.diag(priors) @ inverse
         by_noise = self.drawn @ jacobian @ inverse
@@ -207,10 +207,12 @@ def _model_scatter(effect: Effect, parameter: Parameter) -> float:
 
 
 def _square_root(information: np.ndarray) -> np.ndarray:
-    """R of A⁻¹ = R Rᵀ, without directions of no information."""
-    values, vectors = np.linalg.eigh(information)
-    there = values > 1e-12 * values[-1]
-    return np.asarray(vectors[:, there] / np.sqrt(values[there]))
+    """R of A⁻¹ = R Rᵀ, without parameters of no information; a direction of none has the largest variance."""
+    there = np.diag(information) > 0
+    values, vectors = np.linalg.eigh(information[np.ix_(there, there)])
+    root = np.zeros((there.size, values.size))
+    root[there] = vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    return root
 
 
 def _no_smaller_sandwich(root: np.ndarray, scatter: np.ndarray, level: float, n_blocks: int) -> np.ndarray:
