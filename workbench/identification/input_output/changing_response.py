@@ -40,8 +40,8 @@ class ChangingResponseSettings:
     step: float = 0.005  # time constants: largest step of a free decay
     largest: float = 1e3  # times the amplitude of the constant mode: beyond this a motion diverges
     # logarithm of the squares beyond those that the linear modes leave, from which a law is given up after its first
-    # step. Of laws that were right in the end it was 1 at most, of two linear modes in place of one it is 9
-    hopeless: float = 5.0
+    # step. Of laws that were right in the end it was 1 at most, of two linear modes in place of one it is 4 to 9
+    hopeless: float = 2.5
 
 
 RESPONSE = ChangingResponseSettings()
