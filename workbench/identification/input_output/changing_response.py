@@ -42,6 +42,8 @@ class ChangingResponseSettings:
     # logarithm of the squares beyond those that the linear modes leave, from which a law is given up after its first
     # step. Of laws that were right in the end it was 1 at most, of two linear modes in place of one it is 4 to 9
     hopeless: float = 2.5
+    # stalled: the same, by which a fit that leaves more than the linear modes must fall within so many evaluations
+    stalled: tuple[float, int] = (0.02, 4)
 
 
 RESPONSE = ChangingResponseSettings()
@@ -63,7 +65,7 @@ INVERSES = (1 / 6, 1 / 5, 1 / 4, 1 / 3, 1 / 2, 1.0)  # of the terms of an expone
 
 
 class _GivenUp(Exception):
-    """A law is hopeless after its first step, or the time is spent."""
+    """A law is hopeless after its first step or stalls, or the time is spent."""
 
 
 def in_place_of(
@@ -243,7 +245,7 @@ class _Response:
             threshold: largest logarithm of the squares of the residual.
 
         Raises:
-            _GivenUp: the first step leaves far more, or the time is spent.
+            _GivenUp: the first step leaves far more, the fit stalls above the threshold, or the time is spent.
         """
         once = Once(lambda x: self._residual(self._motions(_with_neighbours(x), law)))
         start = self._start(law)
@@ -262,12 +264,16 @@ class _Response:
         def among_active(x: Floats) -> tuple[Floats, Floats]:
             unknowns[active] = x
             if len(beyond) == 1:  # without the Jacobian, which takes most of the time
-                beyond.append(beyond_threshold(self._residual(self._motions(unknowns[None], law))[0]))
-            if (len(beyond) == 2 and min(beyond) > RESPONSE.hopeless) or budget.spent(CHANGE_CHECK):
+                first = beyond_threshold(self._residual(self._motions(unknowns[None], law))[0])
+                if min(*beyond, first) > RESPONSE.hopeless:
+                    raise _GivenUp
+            if budget.spent(CHANGE_CHECK):
                 raise _GivenUp
             residual, jacobian = once(unknowns)
-            if not beyond:
-                beyond.append(beyond_threshold(residual))
+            beyond.append(beyond_threshold(residual))
+            fall, within = RESPONSE.stalled
+            if 0.0 < min(beyond) and min(beyond[:-within], default=np.inf) < min(beyond) + fall:
+                raise _GivenUp
             return residual, jacobian[:, active]
 
         unknowns[active] = Once(among_active).least(unknowns[active], RESPONSE.most_tries)
