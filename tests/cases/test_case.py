@@ -276,8 +276,8 @@ def test_units_that_a_file_states_become_those_of_the_case(case, tmp_path, heads
 @pytest.mark.parametrize(
     ("heads", "words"),
     [
-        (["d1", "a1 [mm/s]"], r"channel 'a1' is in m/s, by case.toml in m/s\^2: correct one of them"),
-        (["d1 [N]", "a1"], "channel 'd1' is in N, by case.toml in m: correct one of them"),
+        (["d1", "a1 [mm/s]"], r"channel 'a1' is in m/s by its header, .* and in m/s\^2 by case.toml: correct one"),
+        (["d1 [N]", "a1"], "channel 'd1' is in N by its header, .* and in m by case.toml: correct one of them"),
     ],
 )
 def test_a_file_whose_units_are_of_another_quantity_is_refused(case, tmp_path, heads, words):

@@ -476,7 +476,8 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
         unit = stated.get(known.name, "")
         if unit not in ("", known.unit):
             raise CaseError(
-                f"{file}: channel {known.name!r} is in {unit}, by case.toml in {known.unit}: correct one of them"
+                f"{file}: channel {known.name!r} is in {unit} by its header, in the units of the case, and in"
+                f" {known.unit} by case.toml: correct one of them"
             )
     return record
 
