@@ -38,7 +38,7 @@ class FitSettings:
     slope_substeps: int = 2  # of a sample, for sensitivities, which need less accuracy than residuals
     # times the usual finite-difference step, for standard errors: with the usual one, the strength of a law and the
     # scale of all readings, which compensate each other, seemed known to 0.03 % where priors know them to 1.2 %
-    shorter: float = 0.1
+    shorter: float = 0.3
     wider: float = 30.0  # times the usual finite-difference step, where wide steps are asked for: a hundredth
     wider_place: float = 1000.0  # likewise for coordinates of places: a thousandth of the extent
     attempts: int = 7  # steps that are tried from one point
