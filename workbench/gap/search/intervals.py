@@ -211,7 +211,7 @@ def _square_root(information: np.ndarray) -> np.ndarray:
     there = np.diag(information) > 0
     values, vectors = np.linalg.eigh(information[np.ix_(there, there)])
     root = np.zeros((there.size, values.size))
-    root[there] = vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    root[there] = vectors / np.sqrt(np.maximum(values, 1e-12 * values.max(initial=0.0)))
     return root
 
 

@@ -59,8 +59,6 @@ LAWS: tuple[Law, ...] = (
     (False, (0.5, 1.0, 2.0)),
     (False, (-1.0, 1.0, 2.0)),
 )
-
-
 INVERSES = (1 / 6, 1 / 5, 1 / 4, 1 / 3, 1 / 2, 1.0)  # of the terms of an exponential series, last first
 
 
