@@ -259,8 +259,11 @@ def _neighbours(at: np.ndarray) -> list[list[int]]:
 
 
 def _places(actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
+    """Places along a member; an actuator between two places is not drawn."""
     return {
-        "actuators": [{"name": a.name, "at": float(cast(float, a.at))} for a in actuators],
+        "actuators": [
+            {"name": a.name, "at": float(cast(float, a.at))} for a in actuators if not isinstance(a.at, Between)
+        ],
         "sensors": [{"name": s.name, "at": float(cast(float, s.at))} for s in sensors],
     }
 
