@@ -6,6 +6,7 @@ import pytest
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import placement_task
+from workbench.draw.interactive import described
 from workbench.draw.plot import plot
 from workbench.draw.surface import (
     plot_point_modes,
@@ -88,6 +89,13 @@ def test_named_points_are_drawn_moved_along_their_directions():
     np.testing.assert_allclose(moved[:, 1], [1.0, 2.0])
     np.testing.assert_allclose(moved[0, 0], -moved[1, 0])
     assert abs(moved[0, 0]) > 0.1
+
+
+def test_a_page_has_a_panel_for_each_mode_alone():
+    names = ("a", "b", "c")
+    domain = NamedPoints(names, np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 1]]), ("x", "z", "x"))
+    modes = Modes(np.arange(1.0, 6.0), np.zeros(5), lambda index, _: np.ones((3, 5))[index], domain)
+    assert [panel["title"][:6] for panel in described(plot(modes))["panels"]] == [f"mode {r}" for r in range(1, 6)]
 
 
 def test_points_that_move_up_from_a_plane_are_seen_to():

@@ -227,7 +227,7 @@ def _net_panels(net: Net, modes: Modes | SampledModes, count: int) -> Figure:
         draw_moved(ax, net, moves[:, :, r])
         ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
     for ax in grid.flat[count:]:
-        ax.axis("off")
+        ax.set_visible(False)
     states = ((GREY, "at rest"), (COLOURS[0], "moved"))
     handles = [Line2D([], [], color=colour, marker="o", label=state) for colour, state in states]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
