@@ -7,13 +7,9 @@ from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import placement_task
 from workbench.draw.interactive import described
+from workbench.draw.placement import plot_surface_placement
 from workbench.draw.plot import plot
-from workbench.draw.surface import (
-    plot_point_modes,
-    plot_surface_modes,
-    plot_surface_motion,
-    plot_surface_placement,
-)
+from workbench.draw.surface import plot_point_modes, plot_surface_modes, plot_surface_motion
 from workbench.rig.actuators import piezo_patch
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes

@@ -221,9 +221,8 @@ def _draw(
     units: "Units",
 ) -> None:
     """Draw the placements along a member or over the nodal lines of a plate; at points, the best one's work by mode."""
-    from workbench.draw.design import plot_member_placement
+    from workbench.draw.placement import plot_member_placement, plot_surface_placement
     from workbench.draw.plot import plot
-    from workbench.draw.surface import plot_surface_placement
 
     domain = task.modes.domain
     if isinstance(domain, Rectangle):
