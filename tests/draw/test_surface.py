@@ -10,6 +10,7 @@ from workbench.draw.interactive import described
 from workbench.draw.placement import plot_surface_placement
 from workbench.draw.plot import plot
 from workbench.draw.surface import plot_point_modes, plot_surface_modes, plot_surface_motion
+from workbench.records.units import Units
 from workbench.rig.actuators import piezo_patch
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
@@ -62,6 +63,14 @@ def test_a_placement_is_drawn_over_the_nodal_lines_of_the_next_mode(size):
     np.testing.assert_allclose(boxes, [(0.2, 0.2), *([size] * 4 if size else [])])
     heights = [[bar.get_height() for bar in bars] for bars in right.containers]
     np.testing.assert_allclose(heights, [placement.by_mode for placement in placed.values()])
+
+
+def test_a_placement_on_a_plate_is_drawn_in_the_units_of_the_case():
+    task = placement_task(panel(), 2, impulse_at=(0.35, 0.3), weight=0.1)
+    placed = {"here": task.placed([(0.3, 0.2), (0.8, 0.5)], "")}
+    left, right = plot_surface_placement(task, placed, units=Units("mm", "t", "s", "N")).axes
+    assert left.get_title("left").startswith("1.2 mm by 0.8 mm\n") and left.get_xlabel() == "x [mm]"
+    assert right.get_ylabel() == "spillover work, W_r [N mm]"
 
 
 def test_sensors_are_drawn_where_they_stand_and_coloured_as_they_read():

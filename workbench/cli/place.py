@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -221,16 +221,14 @@ def _draw(
     units: "Units",
 ) -> None:
     """Draw the placements along a member or over the nodal lines of a plate; at points, the best one's work by mode."""
-    from workbench.draw.placement import plot_member_placement, plot_surface_placement
-    from workbench.draw.plot import plot
+    from workbench.draw.placement import plot_member_placement, plot_placement, plot_surface_placement
 
-    domain = task.modes.domain
-    if isinstance(domain, Rectangle):
-        figure = plot_surface_placement(task, placements, limits=limits, impulse_at=impulse_point)  # type: ignore[arg-type]
-    elif isinstance(domain, Interval):
-        figure = plot_member_placement(task, placements, limits=limits, impulse_at=impulse_point, units=units)  # type: ignore[arg-type]
+    options: Any = {"limits": limits, "impulse_at": impulse_point, "units": units}
+    if isinstance(task.modes.domain, NamedPoints):
+        figure = plot_placement(next(iter(placements.values())), units=units)
+    elif isinstance(task.modes.domain, Rectangle):
+        figure = plot_surface_placement(task, placements, **options)
     else:
-        figure = plot(next(iter(placements.values())))
-        figure.axes[0].set_ylabel(units.named(figure.axes[0].get_ylabel()))
+        figure = plot_member_placement(task, placements, **options)
     figure.savefig(path)
     say(f"  figure     {short(path)}")

@@ -114,6 +114,7 @@ def plot_surface_placement(
     *,
     limits: Limits | None = None,
     impulse_at: tuple[float, float] | None = None,
+    units: Units = SI,
 ) -> Figure:
     """Actuators on a plate with the nodal lines of mode n + 1, and the work in each residual mode.
 
@@ -123,6 +124,7 @@ def plot_surface_placement(
         placements: by name, each in its own colour.
         limits: forbidden zones are hatched.
         impulse_at: place of the impulse, m, marked by a star.
+        units: of the axes.
     """
     n, modes = task.n_controlled, task.modes
     assert isinstance(modes.domain, Rectangle)
@@ -147,11 +149,12 @@ def plot_surface_placement(
     if impulse_at is not None:
         left.plot(*impulse_at, **IMPULSE, zorder=3)
     (a, b), lines = modes.domain.length, f"nodal lines of mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz"
-    left.set_title(f"{modes.domain}\n{lines}, the lowest residual mode", fontsize=10)
+    left.set_title(f"{units.named(str(modes.domain))}\n{lines}, the lowest residual mode", fontsize=10)
     # anchored at the top, else the layout leaves no room for the title above the axes
-    left.set(anchor="N", xticks=(0.0, a), yticks=(0.0, b), xlabel="x [m]", ylabel="y [m]")
+    labels = {"xlabel": units.named("x [m]"), "ylabel": units.named("y [m]")}
+    left.set(anchor="N", xticks=(0.0, a), yticks=(0.0, b), **labels)
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", fontsize=9, ncols=4)
-    most, least = _draw_works(right, task, placements, SI)
+    most, least = _draw_works(right, task, placements, units)
     # a mode with all actuators at its nodes has no work but rounding
     right.set_ylim(max(SHOWN_WORK * most, 0.3 * least), 3.0 * most)
     return figure
