@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.rig_file import impulse_place, read_structure_rig, toml_of
+from workbench.cli.design_options import impulse_place, read_structure_rig
 from workbench.cli.terminal import check_target, guarded, say, show_table, write_json
 from workbench.structure.printed import command_headings
 
@@ -40,14 +40,13 @@ def design(
     """
     import numpy as np
 
-    from workbench.cases.case import read_units
     from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.comparison import compare, laws_of, through_sensors
     from workbench.design.spillover.robustness import perturbed_modes, stable_share
     from workbench.rig.actuators import command_unit
 
     check_target(json_path)
-    found, units = read_structure_rig(rig), read_units(toml_of(rig))
+    found, units = read_structure_rig(rig)
     actuators = [a for a in found.actuators if not a.direct]
     n = len(actuators) if control is None else control
     modes, at = found.modes, impulse_place(found, impulse_at)
