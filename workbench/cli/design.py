@@ -1,6 +1,6 @@
 """`workbench design`: a comparison of control laws."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -73,34 +73,17 @@ def design(
     if {row.law.name for row in rows} >= {"IMSC", "coupled LQR"}:
         say("  R weights FᵀF in the cost and coupled LQR, but fᵀf of modal forces in IMSC: the ranking depends on")
         say("  masses and units; --damping compares the laws at equal poles")
-    tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
-    heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
-    heads += [] if errors is None else [f"stable share, {errors:.2g} model error"]
-    sensed, written = [], []
-    for controller, explained, why in tried:
+    sensed = []
+    for controller, explained, why in through_sensors(modes, laws, [s.at for s in found.sensors], found.structure):
         if controller is None or explained is None:
             say(f"  {why}")
-            continue
-        share = None if perturbed is None else stable_share(perturbed, controller)
-        robust = [] if share is None else [f"{share:.0%}"]
-        stability, margin = explained.loop.stability, f"{explained.margin:.3g}"
-        margin = {"stable": margin, "unstable": f"{margin} unstable"}.get(stability, stability)
-        limiting, path = _limit(explained)
-        sensed.append((controller.name, margin, limiting, path, *robust))
-        written.append(
-            {
-                "design": controller.name,
-                "margin": explained.margin,
-                "stable": explained.loop.stable,
-                "limited_by": limiting,
-                "path": path,
-                "robustness": share,
-                "poles_real": explained.poles.real,
-                "poles_imag": explained.poles.imag,
-            }
-        )
-    show_table(heads, sensed)
+        else:
+            share = None if perturbed is None else stable_share(perturbed, controller)
+            sensed.append(_sensed(controller.name, explained, share))
+    heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
+    heads += [] if errors is None else [f"stable share, {errors:.2g} model error"]
+    show_table(heads, [row for row, _ in sensed])
     write_json(
         json_path,
         {
@@ -122,9 +105,26 @@ def design(
                 }
                 for row in rows
             ],
-            "through_sensors": written,
+            "through_sensors": [content for _, content in sensed],
         },
     )
+
+
+def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[list[str], dict[str, Any]]:
+    """A controller that works through sensors, as a row of the table and as JSON; `share` is its robustness."""
+    margin, stability = f"{explained.margin:.3g}", explained.loop.stability
+    limiting, path = _limit(explained)
+    row = [name, {"stable": margin, "unstable": f"{margin} unstable"}.get(stability, stability), limiting, path]
+    return row + ([] if share is None else [f"{share:.0%}"]), {
+        "design": name,
+        "margin": explained.margin,
+        "stable": explained.loop.stable,
+        "limited_by": limiting,
+        "path": path,
+        "robustness": share,
+        "poles_real": explained.poles.real,
+        "poles_imag": explained.poles.imag,
+    }
 
 
 def _limit(explained: "Explanation") -> tuple[str, str]:
@@ -136,7 +136,4 @@ def _limit(explained: "Explanation") -> tuple[str, str]:
         return "none: unstable without residual modes" if explained.reduced_margin <= 0 else "no single mode", ""
     grows = explained.loop.stable or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without this mode"
-    return (
-        f"mode {worst.mode + 1}: {pole}",
-        f"sensor at {worst.dominant.text}",
-    )
+    return f"mode {worst.mode + 1}: {pole}", f"sensor at {worst.dominant.text}"
