@@ -48,10 +48,8 @@ def export(
     chosen = law_from(found, law, count_of(found, control), weight, damping)
     unread = [s.name for s in found.sensors if MEASURED[s.quantity][1] > 1]
     observer = observed(found, chosen, estimator, disturbance=disturbance, sample_time=1.0 / rate_hz)
-    design = export_controller(
-        found.modes, observer, to,
-        sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms, units=units,
-    )  # fmt: skip
+    delay = 1e-3 * computing_delay_ms
+    design = export_controller(found.modes, observer, to, sample_rate_hz=rate_hz, computing_delay=delay, units=units)
     print_result(design)
     say(f"  {damping_by(found.modes, chosen)}")
     if unread:

@@ -46,13 +46,10 @@ def response_motion(
     if any(r.time.shape != first.time.shape or (r.time != first.time).any() for r in responses.values()):
         raise ValueError("responses in one animation must have the same time axis; simulate them with one")
     step = -(-first.time.size // MOST_FRAMES)
+    modal = [response.modal[: response.modes.n_modes, ::step] for response in responses.values()]
     tracks: list[dict[str, Any]] = [
-        {
-            "label": name,
-            "modal": _numbers(response.modal[: response.modes.n_modes, ::step]),
-            "colour": (colours or {}).get(name),
-        }
-        for name, response in responses.items()
+        {"label": name, "modal": _numbers(q), "colour": (colours or {}).get(name)}
+        for name, q in zip(responses, modal, strict=True)
     ]
     shown = {"kind": "response", "time": _numbers(first.time[::step]), "seconds": SHOWN_SECONDS, "tracks": tracks}
     if isinstance(first.modes.domain, Interval):
@@ -62,10 +59,7 @@ def response_motion(
         return shown | {"x": _numbers(x), "label": f"x [{length}]", **_marked(actuators, sensors, float)}
     net = _net(first.modes.domain)
     moves = [net.moves(response.modes) for response in responses.values()]
-    largest = max(
-        float(np.abs(moved @ response.modal[: response.modes.n_modes, ::step]).max())
-        for moved, response in zip(moves, responses.values(), strict=True)
-    )
+    largest = max(float(np.abs(moved @ q).max()) for moved, q in zip(moves, modal, strict=True))
     for track, moved in zip(tracks, moves, strict=True):
         scaled = moved * SWAY * np.ptp(net.rest, axis=0).max() / max(largest, 1e-300)
         track["moves"] = _numbers(np.moveaxis(scaled, 2, 0))
