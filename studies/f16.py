@@ -9,7 +9,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.optimize import least_squares
 
-from workbench.draw.spectra import plot_distortion
+from workbench.draw.signals import plot_distortion
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all

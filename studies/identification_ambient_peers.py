@@ -32,7 +32,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.signal import cont2discrete, lfilter, ss2tf
 
-from workbench.draw.accuracy import peers_errors
+from workbench.draw.identification import peers_errors
 from workbench.identification.ambient import identify_ambient
 from workbench.records.record import Channel, Record
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ndtri
 
-from workbench.draw.accuracy import plot_bands
+from workbench.draw.identification import plot_bands
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
 from workbench.identification.shapes.bands import eigenfunction_bands

@@ -28,7 +28,7 @@ import control
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from workbench.draw.accuracy import peers_errors
+from workbench.draw.identification import peers_errors
 from workbench.identification.free_decay.ibrahim import two_delays
 from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound

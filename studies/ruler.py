@@ -14,8 +14,8 @@ from scipy.optimize import least_squares
 
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task
+from workbench.draw.identification import stabilisation_diagram
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.draw.tables import stabilisation_diagram
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.identification.free_decay.refinement import modal_amplitudes

@@ -6,7 +6,8 @@ import pytest
 from workbench.design.loop.closed_loop import Response
 from workbench.draw.motion import SWAY, frame_net, mode_motion, response_motion
 from workbench.rig.actuators import Actuator
-from workbench.structure.domain import NamedPoints
+from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.member import Beam
 from workbench.structure.modes import Modes, PointShapes, SampledModes
 from workbench.structure.plate import Plate
 
@@ -43,6 +44,12 @@ def test_a_plate_moves_as_its_modal_coordinates_say_both_responses_in_one_scale(
     place = (at[0] - 0.4 * at[1] / 0.45, at[1] / 0.45)
     up = modes.phi_at(place) @ modal[:3]
     np.testing.assert_allclose(new[:, middle, 1] / np.abs(new[:, middle, 1]).max(), up / np.abs(up).max(), atol=1e-3)
+
+
+def test_an_actuator_between_two_places_of_a_beam_is_not_marked():
+    modes = Beam(length=2.0, mass_per_length=1.0, bending_stiffness=4.0, left="hinged", right="hinged").modes(2)
+    shown = mode_motion({"nominal": modes}, actuators=[Actuator("F", 0.3), Actuator("pair", Between(0.5, 1.5))])
+    assert shown["actuators"] == [{"name": "F", "at": 0.3}]
 
 
 def test_a_frame_moves_each_node_in_its_directions_and_closes_its_loop():

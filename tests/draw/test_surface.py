@@ -6,13 +6,11 @@ import pytest
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import placement_task
+from workbench.draw.interactive import described
+from workbench.draw.placement import plot_surface_placement
 from workbench.draw.plot import plot
-from workbench.draw.surface import (
-    plot_point_modes,
-    plot_surface_modes,
-    plot_surface_motion,
-    plot_surface_placement,
-)
+from workbench.draw.surface import plot_point_modes, plot_surface_modes, plot_surface_motion
+from workbench.records.units import Units
 from workbench.rig.actuators import piezo_patch
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
@@ -67,6 +65,14 @@ def test_a_placement_is_drawn_over_the_nodal_lines_of_the_next_mode(size):
     np.testing.assert_allclose(heights, [placement.by_mode for placement in placed.values()])
 
 
+def test_a_placement_on_a_plate_is_drawn_in_the_units_of_the_case():
+    task = placement_task(panel(), 2, impulse_at=(0.35, 0.3), weight=0.1)
+    placed = {"here": task.placed([(0.3, 0.2), (0.8, 0.5)], "")}
+    left, right = plot_surface_placement(task, placed, units=Units("mm", "t", "s", "N")).axes
+    assert left.get_title("left").startswith("1.2 mm by 0.8 mm\n") and left.get_xlabel() == "x [mm]"
+    assert right.get_ylabel() == "spillover work, W_r [N mm]"
+
+
 def test_sensors_are_drawn_where_they_stand_and_coloured_as_they_read():
     modes, places = panel(), np.array([(0.3, 0.2), (0.9, 0.2)])
     dots = plot_surface_modes(modes, places=places, values=modes.phi(places)).axes[1].collections[-1]
@@ -88,6 +94,13 @@ def test_named_points_are_drawn_moved_along_their_directions():
     np.testing.assert_allclose(moved[:, 1], [1.0, 2.0])
     np.testing.assert_allclose(moved[0, 0], -moved[1, 0])
     assert abs(moved[0, 0]) > 0.1
+
+
+def test_a_page_has_a_panel_for_each_mode_alone():
+    names = ("a", "b", "c")
+    domain = NamedPoints(names, np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 1]]), ("x", "z", "x"))
+    modes = Modes(np.arange(1.0, 6.0), np.zeros(5), lambda index, _: np.ones((3, 5))[index], domain)
+    assert [panel["title"][:6] for panel in described(plot(modes))["panels"]] == [f"mode {r}" for r in range(1, 6)]
 
 
 def test_points_that_move_up_from_a_plane_are_seen_to():

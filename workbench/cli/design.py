@@ -1,11 +1,11 @@
 """`workbench design`: a comparison of control laws."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from workbench.cli import options
-from workbench.cli.rig_file import impulse_place, read_structure_rig, toml_of
+from workbench.cli.design_options import impulse_place, read_structure_rig
 from workbench.cli.terminal import check_target, guarded, say, show_table, write_json
 from workbench.structure.printed import command_headings
 
@@ -40,14 +40,13 @@ def design(
     """
     import numpy as np
 
-    from workbench.cases.case import read_units
     from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.comparison import compare, laws_of, through_sensors
     from workbench.design.spillover.robustness import perturbed_modes, stable_share
     from workbench.rig.actuators import command_unit
 
     check_target(json_path)
-    found, units = read_structure_rig(rig), read_units(toml_of(rig))
+    found, units = read_structure_rig(rig)
     actuators = [a for a in found.actuators if not a.direct]
     n = len(actuators) if control is None else control
     modes, at = found.modes, impulse_place(found, impulse_at)
@@ -74,34 +73,17 @@ def design(
     if {row.law.name for row in rows} >= {"IMSC", "coupled LQR"}:
         say("  R weights FᵀF in the cost and coupled LQR, but fᵀf of modal forces in IMSC: the ranking depends on")
         say("  masses and units; --damping compares the laws at equal poles")
-    tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
-    heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
-    heads += [] if errors is None else [f"stable share, {errors:.2g} model error"]
-    sensed, written = [], []
-    for controller, explained, why in tried:
+    sensed = []
+    for controller, explained, why in through_sensors(modes, laws, [s.at for s in found.sensors], found.structure):
         if controller is None or explained is None:
             say(f"  {why}")
-            continue
-        share = None if perturbed is None else stable_share(perturbed, controller)
-        robust = [] if share is None else [f"{share:.0%}"]
-        stability, margin = explained.loop.stability, f"{explained.margin:.3g}"
-        margin = {"stable": margin, "unstable": f"{margin} unstable"}.get(stability, stability)
-        limiting, path = _limit(explained)
-        sensed.append((controller.name, margin, limiting, path, *robust))
-        written.append(
-            {
-                "design": controller.name,
-                "margin": explained.margin,
-                "stable": explained.loop.stable,
-                "limited_by": limiting,
-                "path": path,
-                "robustness": share,
-                "poles_real": explained.poles.real,
-                "poles_imag": explained.poles.imag,
-            }
-        )
-    show_table(heads, sensed)
+        else:
+            share = None if perturbed is None else stable_share(perturbed, controller)
+            sensed.append(_sensed(controller.name, explained, share))
+    heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
+    heads += [] if errors is None else [f"stable share, {errors:.2g} model error"]
+    show_table(heads, [row for row, _ in sensed])
     write_json(
         json_path,
         {
@@ -123,9 +105,26 @@ def design(
                 }
                 for row in rows
             ],
-            "through_sensors": written,
+            "through_sensors": [content for _, content in sensed],
         },
     )
+
+
+def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[list[str], dict[str, Any]]:
+    """A controller that works through sensors, as a row of the table and as JSON; `share` is its robustness."""
+    margin, stability = f"{explained.margin:.3g}", explained.loop.stability
+    limiting, path = _limit(explained)
+    row = [name, {"stable": margin, "unstable": f"{margin} unstable"}.get(stability, stability), limiting, path]
+    return row + ([] if share is None else [f"{share:.0%}"]), {
+        "design": name,
+        "margin": explained.margin,
+        "stable": explained.loop.stable,
+        "limited_by": limiting,
+        "path": path,
+        "robustness": share,
+        "poles_real": explained.poles.real,
+        "poles_imag": explained.poles.imag,
+    }
 
 
 def _limit(explained: "Explanation") -> tuple[str, str]:
@@ -137,7 +136,4 @@ def _limit(explained: "Explanation") -> tuple[str, str]:
         return "none: unstable without residual modes" if explained.reduced_margin <= 0 else "no single mode", ""
     grows = explained.loop.stable or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without this mode"
-    return (
-        f"mode {worst.mode + 1}: {pole}",
-        f"sensor at {worst.dominant.text}",
-    )
+    return f"mode {worst.mode + 1}: {pole}", f"sensor at {worst.dominant.text}"

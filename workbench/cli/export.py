@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.control import check_rate, count_of, damping_by, law_from, observed
-from workbench.cli.rig_file import toml_of
+from workbench.cli.design_options import check_rate, count_of, damping_by, law_from, observed, read_rig_and_units
 from workbench.cli.terminal import check_target, guarded, print_result, say, short
 
 
@@ -40,20 +39,17 @@ def export(
 
     Example: workbench export case.toml --control 2 --damping 0.05 --rate-hz 500 --to controller.c
     """
-    from workbench.cases.case import read_rig, read_units
     from workbench.design.export.export import export as export_controller
     from workbench.rig.sensors import MEASURED
 
     check_target(to)
     check_rate(rate_hz)
-    found = read_rig(toml_of(rig))
+    found, units = read_rig_and_units(rig)
     chosen = law_from(found, law, count_of(found, control), weight, damping)
     unread = [s.name for s in found.sensors if MEASURED[s.quantity][1] > 1]
     observer = observed(found, chosen, estimator, disturbance=disturbance, sample_time=1.0 / rate_hz)
-    design = export_controller(
-        found.modes, observer, to,
-        sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms, units=read_units(toml_of(rig)),
-    )  # fmt: skip
+    delay = 1e-3 * computing_delay_ms
+    design = export_controller(found.modes, observer, to, sample_rate_hz=rate_hz, computing_delay=delay, units=units)
     print_result(design)
     say(f"  {damping_by(found.modes, chosen)}")
     if unread:

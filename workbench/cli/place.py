@@ -3,12 +3,13 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from workbench.cli import options
-from workbench.cli.rig_file import impulse_place, place_in, read_structure_rig, toml_of, typed_place
+from workbench.cli.design_options import impulse_place, place_in, read_structure_rig, typed_place
 from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, listed, middle, reach
 from workbench.structure.printed import command_headings, place_text
@@ -69,9 +70,6 @@ def place(
 
     Example: workbench place case.toml --control 3 --weight 20 --effort 1.2 --forbid 0.2:0.3 --certify 0.05
     """
-    import numpy as np
-
-    from workbench.cases.case import read_units
     from workbench.design.laws.law import DesignError
     from workbench.design.placement.certificate import certify
     from workbench.design.placement.limits import Limits
@@ -83,7 +81,7 @@ def place(
     check_target(json_path, picture)
     if certified_gap is not None and not 0 < certified_gap < 1:
         raise ValueError(f"--certify is a share between 0 and 1; got {certified_gap:g}")
-    found, units = read_structure_rig(rig), read_units(toml_of(rig))
+    found, units = read_structure_rig(rig)
     modes, impulse_point = found.modes, impulse_place(found, impulse_at)
     if not modes.proportional:
         say("damping couples the modes: placements are compared without its coupling terms")
@@ -94,18 +92,10 @@ def place(
         raise ValueError("--certify on a plate needs candidate places; give their spacing by --grid M, or --at PLACES")
     with reporting("placing actuators") as report:
         task = placement_task(modes, control, impulse_at=impulse_point, weight=weight, actuator=patch_of(found))
-        if isinstance(domain, Interval):
-            standard = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
-        else:
-            standard = task.placed(_own(found, control), "of the rig")
-            if not math.isfinite(standard.effort):
-                raise ValueError(
-                    "the rig's own actuators cannot control these modes (B is singular), so --effort has no reference:"
-                    " move one off the nodal lines"
-                )
+        reference = _reference(task, found)
         least = 0.0 if isinstance(domain, NamedPoints) else max(LEAST_SPACING * domain.size, extent(task.actuator))
         limits = Limits(
-            effort=effort * standard.effort,
+            effort=effort * reference.effort,
             spacing=least if spacing is None else spacing,
             peak_force=peak_force,
             condition=condition,
@@ -117,18 +107,18 @@ def place(
         except DesignError as error:
             if "effort" not in str(error):
                 raise
-            reference = f"--effort is a multiple of {standard.effort:.4g}, that of actuators {standard.status}"
-            raise DesignError(f"{error}; {reference}") from error
+            multiple = f"--effort is a multiple of {reference.effort:.4g}, that of actuators {reference.status}"
+            raise DesignError(f"{error}; {multiple}") from error
         certificate = None
         if certified_gap is not None:
-            wanted = 1.0 - certified_gap
 
             def proving(bound: float, work: float, cells: int) -> None:
                 share = bound / work
-                report(f"proving: at least {share:.1%} of W_R, {cells:,} cells", 0.5 + 0.5 * min(share / wanted, 1.0))
+                done = min(share / (1.0 - certified_gap), 1.0)
+                report(f"proving: at least {share:.1%} of W_R, {cells:,} cells", 0.5 + 0.5 * done)
 
             certificate = certify(task, limits, placement=best, gap=certified_gap, progress=proving)
-    rows = [best, standard]
+    rows = [best, reference]
     if isinstance(domain, Interval):
         nodes, (first, last) = nodes_of_mode(modes, control), task.reach
         if nodes.size == control and first <= nodes.min() and nodes.max() <= last:  # a patch may reach beyond the end
@@ -150,7 +140,7 @@ def place(
     if certificate is not None:
         say(f"  {certificate}")
     if picture is not None:
-        _draw(picture, task, {"least work": best, standard.status: standard}, limits, impulse_point, units)
+        _draw(picture, task, {"least work": best, reference.status: reference}, limits, impulse_point, units)
     write_json(
         json_path,
         {
@@ -165,43 +155,44 @@ def place(
     )
 
 
-def _own(rig: "Rig", control: int) -> list[Place]:
-    """The places of the rig's own actuators; their number must be that of the controlled modes."""
+def _reference(task: "PlacementTask", rig: "Rig") -> "Placement":
+    """The placement whose effort is the unit of --effort: evenly spaced along a member, else that of the rig."""
+    n = task.n_controlled
+    if isinstance(task.modes.domain, Interval):
+        return task.placed(task.modes.length * np.arange(1, n + 1) / (n + 1), "evenly spaced")
     own = [middle(a.at) for a in rig.actuators if not a.direct]
-    if len(own) != control:
+    if len(own) != n:
         raise ValueError(
-            f"--effort is relative to the rig's own actuators here, and there are {len(own)} for {control} modes:"
-            f" describe {control} [[input]] of kind actuator"
+            f"--effort is relative to the rig's own actuators here, and there are {len(own)} for {n} modes:"
+            f" describe {n} [[input]] of kind actuator"
         )
-    return own
-
-
-def _places(domain: Domain, text: str) -> tuple[Place, ...]:
-    """Candidate places from text: separated by semicolons on a plate, else by commas."""
-    parts = text.split(";" if isinstance(domain, Rectangle) else ",")
-    if isinstance(domain, Interval) and not all(_is_number(part) for part in parts):
-        raise ValueError(f"--at takes places separated by commas, such as 0.1,0.25,0.4; got {text!r}")
-    return tuple(dict.fromkeys(place_in(domain, part, "--at") for part in parts))
+    found = task.placed(own, "of the rig")
+    if not math.isfinite(found.effort):
+        raise ValueError(
+            "the rig's own actuators cannot control these modes (B is singular), so --effort has no reference:"
+            " move one off the nodal lines"
+        )
+    return found
 
 
 def _candidates(domain: Domain, at: str | None, grid: float | None) -> tuple[Place, ...] | None:
-    """The places of --at or --grid; None if neither is given."""
-    if grid is None:
-        return None if at is None else _places(domain, at)
-    if at is not None or not isinstance(domain, Rectangle):
-        raise ValueError("--grid is for a plate, instead of --at; leave one of them out")
-    widest = 0.5 * min(domain.length)
-    if not 0.0 < grid <= widest:
-        raise ValueError(f"--grid must be between 0 and half the shorter side, {widest:g} m; got {grid:g}")
-    return domain.grid(round(max(domain.length) / grid))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    """The places of --grid, or of --at, separated by semicolons on a plate, else by commas; None without both."""
+    if grid is not None:
+        if at is not None or not isinstance(domain, Rectangle):
+            raise ValueError("--grid is for a plate, instead of --at; leave one of them out")
+        widest = 0.5 * min(domain.length)
+        if not 0.0 < grid <= widest:
+            raise ValueError(f"--grid must be between 0 and half the shorter side, {widest:g} m; got {grid:g}")
+        return domain.grid(round(max(domain.length) / grid))
+    if at is None:
+        return None
+    parts = at.split(";" if isinstance(domain, Rectangle) else ",")
+    if isinstance(domain, Interval):
+        try:
+            [float(part) for part in parts]
+        except ValueError:
+            raise ValueError(f"--at takes places separated by commas, such as 0.1,0.25,0.4; got {at!r}") from None
+    return tuple(dict.fromkeys(place_in(domain, part, "--at") for part in parts))
 
 
 def _zone(domain: Domain, text: str) -> tuple[Place, Place]:
@@ -221,17 +212,14 @@ def _draw(
     units: "Units",
 ) -> None:
     """Draw the placements along a member or over the nodal lines of a plate; at points, the best one's work by mode."""
-    from workbench.draw.design import plot_member_placement
-    from workbench.draw.plot import plot
-    from workbench.draw.surface import plot_surface_placement
+    from workbench.draw.placement import plot_member_placement, plot_placement, plot_surface_placement
 
-    domain = task.modes.domain
-    if isinstance(domain, Rectangle):
-        figure = plot_surface_placement(task, placements, limits=limits, impulse_at=impulse_point)  # type: ignore[arg-type]
-    elif isinstance(domain, Interval):
-        figure = plot_member_placement(task, placements, limits=limits, impulse_at=impulse_point, units=units)  # type: ignore[arg-type]
+    options: Any = {"limits": limits, "impulse_at": impulse_point, "units": units}
+    if isinstance(task.modes.domain, NamedPoints):
+        figure = plot_placement(next(iter(placements.values())), units=units)
+    elif isinstance(task.modes.domain, Rectangle):
+        figure = plot_surface_placement(task, placements, **options)
     else:
-        figure = plot(next(iter(placements.values())))
-        figure.axes[0].set_ylabel(units.named(figure.axes[0].get_ylabel()))
+        figure = plot_member_placement(task, placements, **options)
     figure.savefig(path)
     say(f"  figure     {short(path)}")

@@ -1,10 +1,32 @@
-"""`workbench predict`: the readings of the next test of a case, with prediction bands."""
+"""`workbench predict` and `workbench check`: the readings of the next test of a case, and whether a test agrees."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
 
 from workbench.cli import options
-from workbench.cli.terminal import as_typed, check_target, guarded, print_result, reporting, say, short, write_json
-from workbench.cli.uncertain import predicted, record_of
+from workbench.cli.terminal import (
+    as_typed,
+    check_target,
+    guarded,
+    print_result,
+    reporting,
+    say,
+    short,
+    stretch,
+    write_json,
+)
+from workbench.cli.uncertain import uncertain_rig
+from workbench.records.record import Record
+
+if TYPE_CHECKING:
+    from workbench.cases.case import Case
+    from workbench.robust.prediction import Prediction
+
+LOG = "tests.csv"
 
 
 @guarded
@@ -28,9 +50,8 @@ def predict(
 
     check_target(json_path)
     found = read_case(case)
-    planned = record_of(found, record, sample_rate_hz)
-    with reporting("reading") as report:
-        prediction = predicted(found, planned, verdict, draws=draws, seed=seed, workers=workers, report=report)
+    planned = _record_of(found, record, sample_rate_hz)
+    prediction = _predicted(found, planned, verdict, draws=draws, seed=seed, workers=workers)
     print_result(prediction)
     write_json(
         json_path,
@@ -44,3 +65,107 @@ def predict(
     )
     target = page or Path("out") / f"{found.name}-prediction.html"
     say(f"  page       {short(prediction_page(prediction, target, name=found.name, folder=case, made_by=as_typed()))}")
+
+
+@guarded
+def check(
+    case: options.CasePath,
+    record: options.RecordName,
+    verdict: options.VerdictPath = None,
+    sample_rate_hz: options.SampleRate = None,
+    draws: options.Draws = 200,
+    seed: options.Seed = 0,
+    workers: options.Workers = None,
+    log: Annotated[Path | None, typer.Option(help=f"Log of tests; CASE/{LOG} unless given.")] = None,
+    json_path: options.JsonPath = None,
+    page: options.PagePath = None,
+) -> None:
+    """Check whether a new record lies inside the bands that the corrected model predicts, and log it.
+
+    Example: workbench check cases/arm friday.csv --verdict verdict.json
+    """
+    from workbench.cases.case import read_case
+    from workbench.robust.check import check_length, check_prediction, log_test, read_log
+    from workbench.study.pages.prediction_page import prediction_page
+
+    check_target(json_path, log)
+    log = case / LOG if log is None else log
+    read_log(log)  # an invalid log is refused before the computation
+    found = read_case(case)
+    measured = _record_of(found, record, sample_rate_hz)
+    check_length(measured)
+    fitted = [one.name for one in found.fit if np.array_equal(one.outputs, measured.outputs)]
+    if fitted:
+        raise ValueError(f"record {fitted[0]!r} was fitted, so it is no test of the model; give another record")
+    prediction = _predicted(found, measured, verdict, draws=draws, seed=seed, workers=workers)
+    result = check_prediction(prediction, measured)
+    print_result(result)
+    for note in prediction.notes:
+        say(note)
+    log_test(log, result)
+    tests = {test["record"]: test for test in read_log(log)}  # the last check of each record
+    held = sum(test["holds"] == "yes" for test in tests.values())
+    say(f"  log        {short(log)}: the model held on {held} of {len(tests)} tests")
+    write_json(
+        json_path,
+        {
+            "record": result.name,
+            "holds": result.holds,
+            "sentence": result.sentence,
+            "probability": result.probability,
+            "coverage": dict(zip(result.sensors, result.coverage)),
+            "bands_hz": result.bands_hz,
+            "band_coverage": dict(zip(result.sensors, result.band_coverage)),
+            "expected_least": result.expected_least,
+            "expected_least_in_bands": result.expected_least_in_bands,
+        },
+    )
+    target = page or Path("out") / f"{found.name}-check.html"
+    shown = prediction_page(
+        prediction, target, name=found.name, folder=case, check=result, measured=measured, made_by=as_typed()
+    )
+    say(f"  page       {short(shown)}")
+
+
+def _predicted(
+    case: "Case", record: Record, verdict: Path | None, *, draws: int, seed: int, workers: int | None
+) -> "Prediction":
+    """The prediction of a record by the corrected rig, with bands from its uncertainty."""
+    from workbench.cases.case import in_units
+    from workbench.robust.prediction import check_draws
+    from workbench.robust.prediction import predict as predict_record
+
+    check_draws(draws)  # before the diagnosis
+    with reporting("reading") as report:
+        uncertain, noise = uncertain_rig(case, verdict, workers=workers, report=stretch(report, 0.0, 0.7))
+        progress = stretch(report, 0.7, 1.0)
+        found = predict_record(uncertain, record, noise_std=noise, draws=draws, seed=seed, progress=progress)
+    return replace(found, channels=in_units(found.channels, case.units))
+
+
+def _record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
+    """A record of the case by name, or a file with columns named as the case's inputs and outputs."""
+    from workbench.records.files import read_record
+
+    own = {record.name: record for record in (*case.fit, *case.validation)}
+    if name in own:
+        return own[name]
+    if not Path(name).is_file():
+        raise ValueError(f"{name!r} is neither a file nor a record of the case, which are {', '.join(own)}")
+    read = read_record(name, sample_rate_hz=sample_rate_hz, units=case.units)
+    return _with_inputs(read, tuple(actuator.name for actuator in case.rig.actuators))
+
+
+def _with_inputs(read: Record, names: tuple[str, ...]) -> Record:
+    """The record with the channels of these names as inputs; without other channels, they are also the outputs."""
+    channels = (*read.input_channels, *read.output_channels)
+    rows = (*read.inputs, *read.outputs)
+    into = [i for i, channel in enumerate(channels) if channel.name in names]
+    out = [i for i in range(len(channels)) if i not in into] or into
+    return replace(
+        read,
+        inputs=np.array([rows[i] for i in into]),
+        input_channels=tuple(channels[i] for i in into),
+        outputs=np.array([rows[i] for i in out]),
+        output_channels=tuple(channels[i] for i in out),
+    )

@@ -6,9 +6,18 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.control import check_rate, count_of, damping_by, law_from, observed
-from workbench.cli.rig_file import impulse_place
-from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, show_table, write_json
+from workbench.cli.design_options import check_rate, count_of, damping_by, impulse_place, law_from, observed
+from workbench.cli.terminal import (
+    as_typed,
+    check_target,
+    guarded,
+    reporting,
+    say,
+    short,
+    show_table,
+    stretch,
+    write_json,
+)
 from workbench.cli.uncertain import uncertain_rig
 
 
@@ -96,9 +105,7 @@ def redesign(
     if estimator is not None:
         in_use = observed(rig, own, estimator, disturbance=disturbance, sample_time=sample_time)
     with reporting("reading") as report:
-        uncertain, _ = uncertain_rig(
-            found, verdict, workers=workers, report=lambda what, share: report(what, 0.7 * share)
-        )
+        uncertain, _ = uncertain_rig(found, verdict, workers=workers, report=stretch(report, 0.0, 0.7))
         result = run(
             uncertain,
             in_use,
@@ -109,7 +116,7 @@ def redesign(
             more_cost=more_cost,
             more_work=more_work,
             units=found.units,
-            progress=lambda what, share: report(what, 0.7 + 0.3 * share),
+            progress=stretch(report, 0.7, 1.0),
         )
     say(f"{result.advice} {result.guarantee}".rstrip(), bold=True)
     say(result.comparison)

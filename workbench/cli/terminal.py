@@ -120,6 +120,11 @@ def reporting(first: str) -> Iterator[Callable[[str, float], None]]:
         yield report
 
 
+def stretch(report: Callable[[str, float], None], start: float, end: float) -> Callable[[str, float], None]:
+    """A report from 0 to 1 that moves the progress bar from one share to another."""
+    return lambda what, share: report(what, start + (end - start) * share)
+
+
 def print_result(result: object) -> None:
     """Print a result, its first line bold."""
     head, *rest = str(result).splitlines()

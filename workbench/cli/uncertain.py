@@ -1,22 +1,17 @@
-"""The corrected rig with its uncertainty, for `predict`, `check` and `redesign`."""
+"""The corrected rig with its uncertainty, from a verdict or a diagnosis, and the file of a verdict."""
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from workbench.cli.terminal import errors, short
-from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 if TYPE_CHECKING:
     from workbench.cases.case import Case
     from workbench.gap.report.verdict import Verdict
     from workbench.robust.posterior import UncertainRig
-    from workbench.robust.prediction import Prediction
 
 
 def uncertain_rig(
@@ -63,29 +58,6 @@ def write_verdict(verdict: "Verdict", path: Path) -> None:
     write_whole(path, json.dumps(shown, indent=1, allow_nan=False) + "\n")
 
 
-def predicted(
-    case: "Case",
-    record: Record,
-    verdict: Path | None,
-    *,
-    draws: int,
-    seed: int,
-    workers: int | None,
-    report: Callable[[str, float], None],
-) -> "Prediction":
-    """The prediction of a record by the corrected rig, with bands from its uncertainty."""
-    from workbench.cases.case import in_units
-    from workbench.robust.prediction import check_draws, predict
-
-    check_draws(draws)  # before the diagnosis
-    uncertain, noise = uncertain_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))
-    found = predict(
-        uncertain, record, noise_std=noise, draws=draws, seed=seed,
-        progress=lambda what, done: report(what, 0.7 + 0.3 * done),
-    )  # fmt: skip
-    return replace(found, channels=in_units(found.channels, case.units))
-
-
 def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...] | None]":
     """The uncertain rig of a verdict in JSON, and the estimated noise (n_outputs,).
 
@@ -109,31 +81,3 @@ def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...]
         raise ValueError(f"{path} is not a verdict of this case: it has no {error}; diagnose the case again") from None
     except (TypeError, IndexError, AttributeError):
         raise ValueError(f"{path} is not a verdict of this case: it is damaged; diagnose the case again") from None
-
-
-def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
-    """A record of the case by name, or a file with columns named as the case's inputs and outputs."""
-    from workbench.records.files import read_record
-
-    own = {record.name: record for record in (*case.fit, *case.validation)}
-    if name in own:
-        return own[name]
-    if not Path(name).is_file():
-        raise ValueError(f"{name!r} is neither a file nor a record of the case, which are {', '.join(own)}")
-    read = read_record(name, sample_rate_hz=sample_rate_hz, units=case.units)
-    return _with_inputs(read, tuple(actuator.name for actuator in case.rig.actuators))
-
-
-def _with_inputs(read: Record, names: tuple[str, ...]) -> Record:
-    """The record with the channels of these names as inputs; without other channels, they are also the outputs."""
-    channels = (*read.input_channels, *read.output_channels)
-    rows = (*read.inputs, *read.outputs)
-    into = [i for i, channel in enumerate(channels) if channel.name in names]
-    out = [i for i in range(len(channels)) if i not in into] or into
-    return replace(
-        read,
-        inputs=np.array([rows[i] for i in into]),
-        input_channels=tuple(channels[i] for i in into),
-        outputs=np.array([rows[i] for i in out]),
-        output_channels=tuple(channels[i] for i in out),
-    )

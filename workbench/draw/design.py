@@ -1,4 +1,4 @@
-"""Figures of control design: motion, work by mode, placements."""
+"""Figures of control design: motion, work by mode, poles, spillover paths."""
 
 from collections.abc import Mapping
 
@@ -7,13 +7,9 @@ from matplotlib.figure import Figure
 
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.controlled_modes import ControlledModeCount
-from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import Placement
-from workbench.design.placement.task import PlacementTask, extent
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
-from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, new_figure
-from workbench.records.units import SI, Units
+from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, grouped_bars, new_figure
 from workbench.structure.printed import place_text
 
 SHOWN_SHARE = 1e-5
@@ -41,10 +37,10 @@ def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
 def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
     """Work put into each residual mode, a group of bars per mode; `first` is the zero-based index of the first one."""
     figure, ax = new_figure(width=9, height=4)
-    width = 0.8 / len(works)
-    for i, (name, work) in enumerate(works.items()):
+    shifts, width = grouped_bars(len(works))
+    for shift, (name, work) in zip(shifts, works.items(), strict=True):
         numbers = first + 1 + np.arange(work.size)
-        ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, work, width, label=f"{name}: W_R = {work.sum():.3g} J")
+        ax.bar(numbers + shift, work, width, label=f"{name}: W_R = {work.sum():.3g} J")
     ax.set(xticks=few_ticks(numbers), xlabel="residual mode", ylabel="spillover work in the mode, W_r [J]")
     ax.set_title("spillover work by residual mode")
     ax.legend()
@@ -58,12 +54,12 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
         return _without_residual_modes()
     figure, ax = new_figure(1, 1, width=9, height=4)
     modes = np.array(first.residual) + 1
-    width = 0.8 / len(spillovers)
+    shifts, width = grouped_bars(len(spillovers))
     total = max(float(np.abs(work.residual_work).sum()) for work in spillovers.values()) or 1.0
     least, lowest = SHOWN_SHARE * total, min(float(work.residual_work.min()) for work in spillovers.values())
     signed = lowest <= -least  # a residual mode in motion may lose energy
-    for i, (name, work) in enumerate(spillovers.items()):
-        at, small = modes + (i - 0.5 * (len(spillovers) - 1)) * width, np.abs(work.residual_work) < least
+    for shift, (name, work) in zip(shifts, spillovers.items(), strict=True):
+        at, small = modes + shift, np.abs(work.residual_work) < least
         values = np.where(small, 0.0 if signed else 0.1 * least, work.residual_work)
         bars = ax.bar(at, values, width, label=f"{name}: W_R = {work.residual_total:.3g} J")
         for x in at[small] if modes.size <= MOST_TICKS else ():
@@ -88,44 +84,15 @@ def _without_residual_modes() -> Figure:
     return figure
 
 
-def plot_member_placement(
-    task: PlacementTask,
-    placements: Mapping[str, Placement],
-    *,
-    limits: Limits | None = None,
-    impulse_at: float | None = None,
-    units: Units = SI,
-) -> Figure:
-    """Actuators along a structure with mode n + 1, the lowest residual one, and the work in each residual mode.
-
-    Args:
-        placements: by name, each in its own colour and row.
-        limits: forbidden zones are hatched.
-        impulse_at: place of the impulse, m, marked by a star.
-        units: of the axes.
-    """
-    n, modes = task.n_controlled, task.modes
-    figure, (left, right) = new_figure(1, 2, width=11, height=3.8)
-    x = np.linspace(0.0, modes.length, 201)
-    shape = modes.phi(x)[:, n]
-    left.plot(x, shape / np.abs(shape).max(), color=GREY, label=f"mode {n + 1}, the lowest residual one")
-    left.axhline(0.0, color=GREY, linewidth=0.8)
-    for i, (low, high) in enumerate(limits.forbidden if limits is not None else ()):
-        left.axvspan(low, high, facecolor="white", edgecolor=GREY, hatch="////", label="forbidden" if i == 0 else None)
-    numbers, width = n + 1 + np.arange(modes.n_modes - n), 0.8 / len(placements)
-    for i, (name, placement) in enumerate(placements.items()):
-        label = f"{name}: W_R = {placement.residual_work:.2g}"
-        height = np.full(n, -1.25 - 0.2 * i)
-        half = 0.5 * extent(task.actuator)
-        left.errorbar(placement.positions, height, xerr=half, fmt="o", color=COLOURS[i], markersize=8, label=label)
-        right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
-    if impulse_at is not None:
-        left.plot(impulse_at, 1.2, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse")
-    left.set(xlabel=units.named("x [m]"), yticks=[], title="positions of the actuators")
-    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=9, ncols=2)
-    most = max(float(placement.by_mode.max()) for placement in placements.values())
-    right.set(xlabel="residual mode", ylabel=units.named("spillover work, W_r [J]"), xticks=few_ticks(numbers))
-    right.set(yscale="log", ylim=(SHOWN_SHARE * most, 3.0 * most))
+def plot_poles(poles: Mapping[str, np.ndarray]) -> Figure:
+    """Closed-loop poles (complex, rad/s) of each law in the upper half plane."""
+    figure, ax = new_figure(width=9, height=4.5)
+    ax.axvline(0.0, color=GREY, linewidth=0.8)
+    for (name, values), colour, marker in zip(poles.items(), COLOURS, "ox+s^v."):
+        upper = values[values.imag >= 0]
+        ax.plot(upper.real, upper.imag, marker, color=colour, label=name, linestyle="none")
+    ax.set(xlabel="real part [rad/s]", ylabel="imaginary part [rad/s]", title="closed-loop poles")
+    ax.legend()
     return figure
 
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, few_ticks, in_units, new_figure, plain_ticks
-from workbench.gap.effects.effect import Effect, apply_all, label_in_words
+from workbench.gap.effects.effect import apply_all, label_in_words
 from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.report.budget import Budget
@@ -86,33 +86,29 @@ def plot_where(verdict: Verdict) -> Figure:
     """The gap by mode, band, sensor, level and time, and the likelihood of each place of a force."""
     where = verdict.where
     figure, axes = new_figure(3, 2, width=10, height=9.2)
-    _plot_modes(axes[0, 0], verdict)
+    (by_mode, by_octave), (by_sensor, by_level), (by_time, by_place) = axes
+    _plot_modes(by_mode, verdict)
     tops = [f"{top:.3g}" if top < 1000.0 else f"{top:.0f}" for top in where.band_edges_hz[1:]]
-    axes[0, 1].bar(tops, 100 * where.band_shares, color=COLOURS[0])
-    axes[0, 1].set(title="by octave", xlabel="up to [Hz]", ylabel="share of the gap [%]")
+    by_octave.bar(tops, 100 * where.band_shares, color=COLOURS[0])
+    by_octave.set(title="by octave", xlabel="up to [Hz]", ylabel="share of the gap [%]")
     names = [s.name for s in verdict.nominal.sensors]
-    axes[1, 0].bar(names, 100 * where.sensor_shares, color=COLOURS[2])
-    axes[1, 0].set(title="by sensor", ylabel="share of the gap [%]")
-    axes[1, 0].tick_params(axis="x", rotation=90 if len(names) > FEW_BARS else 0)
+    by_sensor.bar(names, 100 * where.sensor_shares, color=COLOURS[2])
+    by_sensor.set(title="by sensor", ylabel="share of the gap [%]")
+    by_sensor.tick_params(axis="x", rotation=90 if len(names) > FEW_BARS else 0)
     order = np.argsort(where.input_levels)
-    axes[1, 1].plot(where.input_levels[order], where.record_gaps[order], "o-", color=COLOURS[1])
-    axes[1, 1].margins(0.15)
+    by_level.plot(where.input_levels[order], where.record_gaps[order], "o-", color=COLOURS[1])
+    by_level.margins(0.15)
     for i in order:
         at = (where.input_levels[i], where.record_gaps[i])
-        axes[1, 1].annotate(where.record_names[i], at, (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    axes[1, 1].set(
-        title="by record and level",
-        xlabel="rms of the inputs",
-        ylabel="gap (rms error / rms signal)",
-        xscale="log",
-        yscale="log",
-    )
-    axes[2, 0].imshow(100 * where.time_shares, aspect="auto", cmap="Blues", vmin=0.0, extent=(0, 8, len(order), 0))
-    axes[2, 0].set(title="by time: darker is more of the record's gap", xlabel="eighth of the record")
-    axes[2, 0].set_xticks(np.arange(8) + 0.5, np.arange(1, 9))
-    axes[2, 0].set_yticks(np.arange(len(order)) + 0.5, where.record_names)
-    axes[2, 0].grid(False)
-    _plot_places(axes[2, 1], verdict)
+        by_level.annotate(where.record_names[i], at, (0, 6), textcoords="offset points", ha="center", fontsize=8)
+    by_level.set(title="by record and level", xlabel="rms of the inputs", ylabel="gap (rms error / rms signal)")
+    by_level.set(xscale="log", yscale="log")
+    by_time.imshow(100 * where.time_shares, aspect="auto", cmap="Blues", vmin=0.0, extent=(0, 8, len(order), 0))
+    by_time.set(title="by time: darker is more of the record's gap", xlabel="eighth of the record")
+    by_time.set_xticks(np.arange(8) + 0.5, np.arange(1, 9))
+    by_time.set_yticks(np.arange(len(order)) + 0.5, where.record_names)
+    by_time.grid(False)
+    _plot_places(by_place, verdict)
     return plain_ticks(figure)
 
 
@@ -237,23 +233,16 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force:
     ):
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=3, alpha=0.6)
         ax.set_xlabel(f"{name} {there} [{unit}]")
-        law = _law(chosen, series, name)
-        if law is not None:  # beneath the points, which it would otherwise hide
+        law = chosen[0].kind.force_laws.get(name) if chosen else None
+        if law is not None:  # it depends on this variable alone; beneath the points, which it would otherwise hide
             explains = verdict.outcome == "explained" or any_beyond(verdict.effects)
             label = "fitted law" if explains else "nearest law: it does not explain the gap"
-            ax.plot(*law, color=COLOURS[1], linewidth=5.0, alpha=0.6, zorder=1, label=label)
+            grid = np.linspace(series.min(), series.max(), 400)
+            look = {"color": COLOURS[1], "linewidth": 5.0, "alpha": 0.6, "zorder": 1, "label": label}
+            ax.plot(grid, law(chosen[0].values, grid), **look)
             ax.legend()
     axes[0].set(ylabel=f"unmodelled force [{force}]", title="unmodelled force, without an assumed law")
     return figure
-
-
-def _law(chosen: Sequence[Effect], series: Floats, name: str) -> tuple[Floats, Floats] | None:
-    """The fitted law (values, forces) over one variable; None if it does not depend on that variable alone."""
-    if not chosen:
-        return None
-    law = chosen[0].kind.force_laws.get(name)
-    grid = np.linspace(series.min(), series.max(), 400)
-    return None if law is None else (grid, law(chosen[0].values, grid))
 
 
 def plot_single_effects(verdict: Verdict) -> Figure:
@@ -269,10 +258,6 @@ def plot_single_effects(verdict: Verdict) -> Figure:
     ax.barh(labels[::-1], costs[::-1], color=colours[::-1])
     ax.axvline(1.0, color=COLOURS[2], label="noise floor")
     ax.axvline(verdict.attribution.nominal_cost, color=COLOURS[1], linestyle="--", label="nominal")
-    ax.set(
-        xscale="log",
-        xlabel="mean square residual / noise power [-]",
-        title="best fit of each effect alone",
-    )
+    ax.set(xscale="log", xlabel="mean square residual / noise power [-]", title="best fit of each effect alone")
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure

@@ -64,26 +64,23 @@ def described(figure: Figure) -> dict[str, Any]:
 
 
 def _panel(ax: Axes, axes: list[Axes], height: float) -> dict[str, Any]:
-    marks = [mark for artist in _artists(ax) for mark in _described(ax, artist)]
     return {
         "title": _text(ax.get_title("left") or ax.get_title()),
         "height": round(ax.get_position().height * height),
-        "x": _axis(ax, ax.xaxis, ax.get_xlim(), ax.get_xscale(), ax.get_shared_x_axes(), axes),
-        "y": _axis(ax, ax.yaxis, ax.get_ylim(), ax.get_yscale(), ax.get_shared_y_axes(), axes),
+        "x": _axis(ax, ax.xaxis, ax.get_shared_x_axes(), axes),
+        "y": _axis(ax, ax.yaxis, ax.get_shared_y_axes(), axes),
         "legend": ax.get_legend() is not None,
-        "marks": marks,
+        "marks": [mark for artist in _artists(ax) for mark in _described(ax, artist)],
     }
 
 
-def _axis(
-    ax: Axes, axis: Axis, limits: tuple[float, float], scale: str, shared: "GrouperView[Axes]", axes: list[Axes]
-) -> dict[str, Any]:
-    if scale not in ("linear", "log"):
-        raise Undescribed(f"an axis with scale {scale!r}")
+def _axis(ax: Axes, axis: Axis, shared: "GrouperView[Axes]", axes: list[Axes]) -> dict[str, Any]:
+    if axis.get_scale() not in ("linear", "log"):
+        raise Undescribed(f"an axis with scale {axis.get_scale()!r}")
     found = {
         "label": _text(axis.get_label().get_text()),
-        "limits": [float(v) for v in limits],
-        "log": scale == "log",
+        "limits": [float(v) for v in axis.get_view_interval()],
+        "log": axis.get_scale() == "log",
         "group": min(axes.index(other) for other in shared.get_siblings(ax) if other in axes),
     }
     if not isinstance(axis.get_major_locator(), MaxNLocator | LogLocator):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,30 +46,24 @@ def response_motion(
     if any(r.time.shape != first.time.shape or (r.time != first.time).any() for r in responses.values()):
         raise ValueError("responses in one animation must have the same time axis; simulate them with one")
     step = -(-first.time.size // MOST_FRAMES)
+    modal = [response.modal[: response.modes.n_modes, ::step] for response in responses.values()]
     tracks: list[dict[str, Any]] = [
-        {
-            "label": name,
-            "modal": _numbers(response.modal[: response.modes.n_modes, ::step]),
-            "colour": (colours or {}).get(name),
-        }
-        for name, response in responses.items()
+        {"label": name, "modal": _numbers(q), "colour": (colours or {}).get(name)}
+        for name, q in zip(responses, modal, strict=True)
     ]
     shown = {"kind": "response", "time": _numbers(first.time[::step]), "seconds": SHOWN_SECONDS, "tracks": tracks}
-    if not isinstance(first.modes.domain, Interval):
-        spots = _net(first.modes.domain)
-        moves = [spots.moves(response.modes) for response in responses.values()]
-        largest = max(
-            float(np.abs(moved @ response.modal[: response.modes.n_modes, ::step]).max())
-            for moved, response in zip(moves, responses.values(), strict=True)
-        )
-        for track, moved in zip(tracks, moves, strict=True):
-            scaled = moved * SWAY * np.ptp(spots.rest, axis=0).max() / max(largest, 1e-300)
-            track["moves"] = _numbers(np.moveaxis(scaled, 2, 0))
-        return shown | _on_net(spots, actuators, sensors)
-    x = np.linspace(0.0, first.modes.length, N_PLACES)
-    for track, response in zip(tracks, responses.values(), strict=True):
-        track["shapes"] = _numbers(response.modes.phi(x))
-    return shown | {"x": _numbers(x), "label": f"x [{length}]", **_places(actuators, sensors)}
+    if isinstance(first.modes.domain, Interval):
+        x = np.linspace(0.0, first.modes.length, N_PLACES)
+        for track, response in zip(tracks, responses.values(), strict=True):
+            track["shapes"] = _numbers(response.modes.phi(x))
+        return shown | {"x": _numbers(x), "label": f"x [{length}]", **_marked(actuators, sensors, float)}
+    net = _net(first.modes.domain)
+    moves = [net.moves(response.modes) for response in responses.values()]
+    largest = max(float(np.abs(moved @ q).max()) for moved, q in zip(moves, modal, strict=True))
+    for track, moved in zip(tracks, moves, strict=True):
+        scaled = moved * SWAY * np.ptp(net.rest, axis=0).max() / max(largest, 1e-300)
+        track["moves"] = _numbers(np.moveaxis(scaled, 2, 0))
+    return shown | _on_net(net, actuators, sensors)
 
 
 def mode_motion(
@@ -85,9 +79,9 @@ def mode_motion(
     """
     first = next(iter(modes.values()))
     if isinstance(first, SampledModes) and first.on_plate:
-        return _net_motion(scattered_net(first.positions), modes, actuators, sensors)
+        return _modes_on_net(scattered_net(first.positions), modes, actuators, sensors)
     if isinstance(first, Modes) and not isinstance(first.domain, Interval):
-        return _net_motion(_net(first.domain), modes, actuators, sensors)
+        return _modes_on_net(_net(first.domain), modes, actuators, sensors)
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
         if isinstance(found, SampledModes):
@@ -98,60 +92,64 @@ def mode_motion(
             shapes = found.phi(x).astype(complex)
         order = np.argsort(x)
         shapes = shapes[order] / np.maximum(np.abs(shapes).max(axis=0), 1e-300)
-        # align the signs of two sets of modes
         if tracks and isinstance(found, Modes) and tracks[0]["x"] == _numbers(x):
-            n = min(shapes.shape[1], len(tracks[0]["real"][0]))
-            aligned = np.sign(np.sum(shapes[:, :n].real * np.array(tracks[0]["real"])[:, :n], axis=0))
-            shapes[:, :n] *= np.where(aligned < 0, -1.0, 1.0)
-        tracks.append(
-            {
-                "label": name,
-                "x": _numbers(x[order]),
-                "sampled": isinstance(found, SampledModes),
-                "real": _numbers(shapes.real),
-                "imaginary": _numbers(shapes.imag),
-                "frequencies_hz": _numbers(found.frequencies_hz),
-                "damping": _numbers(found.zeta),
-            }
-        )
+            shapes = _aligned(shapes, np.array(tracks[0]["real"]))
+        places = {"x": _numbers(x[order]), "sampled": isinstance(found, SampledModes)}
+        tracks.append(_track(name, found, **places, real=_numbers(shapes.real), imaginary=_numbers(shapes.imag)))
     label = "sensor" if isinstance(first, SampledModes) and not first.on_interval else ALONG
-    return {"kind": "modes", "x": tracks[0]["x"], "label": label, "tracks": tracks, **_places(actuators, sensors)}
+    return {
+        "kind": "modes",
+        "x": tracks[0]["x"],
+        "label": label,
+        "tracks": tracks,
+        **_marked(actuators, sensors, float),
+    }
 
 
-def _net_motion(
-    spots: "Net", modes: Mapping[str, Modes | SampledModes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]
+def _modes_on_net(
+    net: "Net", modes: Mapping[str, Modes | SampledModes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]
 ) -> dict[str, Any]:
-    size = np.ptp(spots.rest, axis=0).max()
+    size = np.ptp(net.rest, axis=0).max()
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
-        moves = spots.moves(found)
+        moves = net.moves(found)
         moves = moves * SWAY * size / np.maximum(np.abs(moves).max(axis=(0, 1)), 1e-300)
-        if tracks:  # align the signs of two sets of modes
-            n = min(moves.shape[2], len(tracks[0]["moves"]))
-            other = np.moveaxis(np.array(tracks[0]["moves"])[:n], 0, 2)
-            moves[:, :, :n] *= np.where((moves[:, :, :n].real * other).sum(axis=(0, 1)) < 0, -1.0, 1.0)
+        if tracks:
+            moves = _aligned(moves, np.moveaxis(np.array(tracks[0]["moves"]), 0, 2))
         moves = np.moveaxis(moves, 2, 0)
-        tracks.append(
-            {
-                "label": name,
-                "moves": _numbers(moves.real),
-                **({"imaginary": _numbers(moves.imag)} if np.iscomplexobj(moves) else {}),
-                "frequencies_hz": _numbers(found.frequencies_hz),
-                "damping": _numbers(found.zeta),
-            }
-        )
-    return {"kind": "modes", "tracks": tracks, **_on_net(spots, actuators, sensors)}
+        phase = {"imaginary": _numbers(moves.imag)} if np.iscomplexobj(moves) else {}
+        tracks.append(_track(name, found, moves=_numbers(moves.real), **phase))
+    return {"kind": "modes", "tracks": tracks, **_on_net(net, actuators, sensors)}
 
 
-def _on_net(spots: "Net", actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
+def _track(name: str, modes: Modes | SampledModes, **shapes: Any) -> dict[str, Any]:
+    numbers = {"frequencies_hz": _numbers(modes.frequencies_hz), "damping": _numbers(modes.zeta)}
+    return {"label": name, **shapes, **numbers}
+
+
+def _aligned(shapes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Shapes (..., n_modes), each with the sign that agrees with the other of its number, if there is one."""
+    n = min(shapes.shape[-1], others.shape[-1])
+    agreement = (shapes[..., :n].real * others[..., :n]).sum(axis=tuple(range(shapes.ndim - 1)))
+    signs = np.ones(shapes.shape[-1])
+    signs[:n] = np.where(agreement < 0, -1.0, 1.0)
+    return shapes * signs
+
+
+def _on_net(net: "Net", actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
     """A net at rest, and the places of actuators and sensors."""
-    marked = {
-        key: [
-            {"name": part.name, "at": _numbers(spots.at(part.at))} for part in parts if not isinstance(part.at, Between)
-        ]
+    rest = {"net": {"rest": _numbers(net.rest), "lines": net.lines}}
+    return rest | _marked(actuators, sensors, lambda place: _numbers(net.at(place)))
+
+
+def _marked(
+    actuators: Sequence[Actuator], sensors: Sequence[Sensor], at: Callable[[Any], float | list[float]]
+) -> dict[str, Any]:
+    """Actuators and sensors by name, at their drawn places; those between two places are not drawn."""
+    return {
+        key: [{"name": part.name, "at": at(part.at)} for part in parts if not isinstance(part.at, Between)]
         for key, parts in (("actuators", actuators), ("sensors", sensors))
     }
-    return {"net": {"rest": _numbers(spots.rest), "lines": spots.lines}, **marked}
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,11 +174,6 @@ def _projected(at: np.ndarray) -> np.ndarray:
     return np.asarray(np.stack([at[..., 0] + 0.4 * at[..., 1], at[..., 2] + 0.45 * at[..., 1]], axis=-1))
 
 
-def _upwards(shapes: np.ndarray) -> np.ndarray:
-    """Projected displacements (n_spots, 2, n_modes) of transverse ones (n_spots, n_modes), drawn upwards."""
-    return np.stack([np.zeros_like(shapes), shapes], axis=1)
-
-
 def _net(domain: Domain) -> Net:
     return _plate_net(domain) if isinstance(domain, Rectangle) else frame_net(domain)
 
@@ -192,25 +185,25 @@ def _plate_net(domain: Rectangle) -> Net:
     places = np.column_stack([np.repeat(x, m), np.tile(y, n)])
     lines = [[i * m + j, i * m + j + 1] for i in range(n) for j in range(m - 1)]
     lines += [[i * m + j, i * m + j + m] for i in range(n - 1) for j in range(m)]
-    flat = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-
-    return Net(
-        _projected(places @ flat),
-        lines,
-        lambda modes: _upwards(modes.phi(places)),
-        lambda place: _projected(np.asarray(place)[:2] @ flat),
-    )
+    return _flat_net(places, lines, lambda modes: modes.phi(places))
 
 
 def scattered_net(places: np.ndarray) -> Net:
     """The net of sensors on a plate, at places (n_sensors, 2), neighbours joined; readings are drawn upwards."""
-    at = np.column_stack([places, np.zeros(len(places))])
-    return Net(
-        _projected(at),
-        _neighbours(at),
-        lambda modes: _upwards(modes.shapes),
-        lambda place: _projected(np.r_[place, 0.0]),
-    )
+    return _flat_net(places, _neighbours(places), lambda modes: modes.shapes)
+
+
+def _flat_net(places: np.ndarray, lines: list[list[int]], shapes: Callable[[Any], np.ndarray]) -> Net:
+    """The net of places (n_spots, 2) in the plane z = 0, whose transverse shapes are drawn upwards."""
+
+    def upwards(modes: Modes | SampledModes) -> np.ndarray:
+        transverse = shapes(modes)
+        return np.stack([np.zeros_like(transverse), transverse], axis=1)
+
+    def at(place: Any) -> np.ndarray:
+        return _projected(np.r_[np.asarray(place)[:2], 0.0])
+
+    return Net(_projected(np.column_stack([places, np.zeros(len(places))])), lines, upwards, at)
 
 
 def frame_net(domain: Domain) -> Net:
@@ -256,13 +249,6 @@ def _neighbours(at: np.ndarray) -> list[list[int]]:
         between = (np.maximum(distance[i], distance) < distance[i][:, None] * (1.0 - 1e-9)).any(axis=1)
         pairs += [[i, int(j)] for j in np.flatnonzero(~between & (distance[i] < longest)) if j > i]
     return pairs
-
-
-def _places(actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
-    return {
-        "actuators": [{"name": a.name, "at": float(cast(float, a.at))} for a in actuators],
-        "sensors": [{"name": s.name, "at": float(cast(float, s.at))} for s in sensors],
-    }
 
 
 def _numbers(values: ArrayLike) -> list[Any]:

@@ -14,13 +14,13 @@ from workbench.design.placement.sensor_placement import SensorPlacement
 from workbench.design.placement.task import Placement
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
-from workbench.draw.accuracy import plot_bands
 from workbench.draw.design import plot_controlled_mode_count, plot_motion, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
+from workbench.draw.identification import plot_bands, plot_standard_errors
+from workbench.draw.placement import plot_placement, plot_sensor_placement
 from workbench.draw.robust import plot_prediction, plot_redesign
-from workbench.draw.sensors import plot_sensor_placement
-from workbench.draw.spectra import plot_distortion, plot_transfer
-from workbench.draw.style import COLOURS, GREY, envelope, few_ticks, in_units, new_figure
+from workbench.draw.signals import plot_distortion, plot_record, plot_transfer
+from workbench.draw.style import COLOURS, GREY, new_figure, panels
 from workbench.draw.surface import (
     plot_point_modes,
     plot_scattered_modes,
@@ -36,9 +36,8 @@ from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.robust.prediction import Prediction
 from workbench.robust.redesign import Redesign
-from workbench.structure.domain import NamedPoints, Rectangle, listed
+from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.modes import Modes, SampledModes
-from workbench.structure.printed import place_text
 
 MOST_PANELS = 12
 MOST_INSTANTS = 5
@@ -58,38 +57,16 @@ def plot(result: object) -> Figure:
 
 
 @plot.register
-def _(result: Record) -> Figure:
-    rows = [*zip(result.input_channels, result.inputs), *zip(result.output_channels, result.outputs)][:MOST_PANELS]
-    figure, axes = new_figure(len(rows), 1, width=9, height=0.8 + 1.3 * len(rows), sharex=True, squeeze=False)
-    for i, (ax, (channel, values)) in enumerate(zip(axes[:, 0], rows)):
-        colour = COLOURS[1] if i < result.n_inputs else COLOURS[0]
-        at = envelope(values)
-        ax.plot(result.start_time + result.sample_time * at, values[at], color=colour, linewidth=0.9)
-        ax.set_ylabel(in_units(channel.name, channel.unit), fontsize=8)
-    axes[0, 0].set_title(result.name)
-    axes[-1, 0].set_xlabel("time [s]")
-    return figure
-
-
-@plot.register
-def _(result: TransferFunctions) -> Figure:
-    return plot_transfer(result)
-
-
-@plot.register
 def _(result: Modes) -> Figure:
     if isinstance(result.domain, Rectangle):
         return plot_surface_modes(result, count=MOST_PANELS)
     if isinstance(result.domain, NamedPoints):
         return plot_point_modes(result, count=MOST_PANELS)
     x = np.linspace(0.0, result.length, 401)
-    shapes = result.phi(x)[:, :MOST_PANELS]
-    figure, axes = _panels(shapes.shape[1])
-    for r, ax in enumerate(axes):
-        ax.axhline(0.0, color=GREY, linewidth=0.6)
-        ax.plot(x, shapes[:, r])
-        ax.set_title(_named(r, result.frequencies_hz[r], result.zeta[r]), fontsize=10)
-        ax.set_xlabel("x [m]")
+    shapes = result.phi(x)
+    figure, axes = _panel_per_mode(result, "x [m]")
+    for ax, shape in zip(axes, shapes.T):
+        ax.plot(x, shape)
     axes[0].set_ylabel("φ(x) [1/√kg]")
     return figure
 
@@ -98,32 +75,19 @@ def _(result: Modes) -> Figure:
 def _(result: SampledModes) -> Figure:
     if result.on_plate:
         return plot_scattered_modes(result, count=MOST_PANELS)
-    shapes = result.shapes[:, :MOST_PANELS]
-    figure, axes = _panels(shapes.shape[1])
-    placed = result.on_interval
-    x = result.positions if placed else np.arange(1, result.n_outputs + 1)
-    for r, ax in enumerate(axes):
-        ax.axhline(0.0, color=GREY, linewidth=0.6)
-        ax.plot(x, shapes[:, r].real, "o-", label="real")
-        ax.plot(x, shapes[:, r].imag, ".", color=COLOURS[1], label="imaginary")
-        ax.set_title(_named(r, result.frequencies_hz[r], result.zeta[r]), fontsize=10)
-        ax.set_xlabel("x [m]" if placed else "sensor")
+    x = result.positions if result.on_interval else np.arange(1, result.n_outputs + 1)
+    figure, axes = _panel_per_mode(result, "x [m]" if result.on_interval else "sensor")
+    for ax, shape in zip(axes, result.shapes.T):
+        ax.plot(x, shape.real, "o-", label="real")
+        ax.plot(x, shape.imag, ".", color=COLOURS[1], label="imaginary")
     axes[0].legend(fontsize=8)
     return figure
 
 
-@plot.register
-def _(result: Refined) -> Figure:
-    figure, axes = new_figure(2, 1, width=9, height=5, sharex=True)
-    modes = np.arange(1, result.modes.n_modes + 1)
-    relative = result.omega_std / result.modes.omega, result.zeta_std / np.maximum(np.abs(result.modes.zeta), 1e-300)
-    for ax, values, title in zip(axes, relative, ("frequency", "damping ratio")):
-        ax.semilogy(modes, values, "o-")
-        ax.set_title(f"standard error of the {title}, relative")
-    axes[1].set(xlabel="mode", xticks=few_ticks(modes))
-    return figure
-
-
+plot.register(Record, plot_record)
+plot.register(TransferFunctions, plot_transfer)
+plot.register(Refined, plot_standard_errors)
+plot.register(Placement, plot_placement)
 plot.register(Explanation, plot_spillover_paths)
 plot.register(Verdict, plot_where)
 plot.register(Redesign, plot_redesign)
@@ -150,17 +114,6 @@ def _(result: Response) -> Figure:
 
 
 @plot.register
-def _(result: Placement) -> Figure:
-    figure, ax = new_figure(width=9, height=3.5)
-    numbers = len(result.positions) + 1 + np.arange(result.by_mode.size)
-    ax.bar(numbers, result.by_mode)
-    where = "; ".join(place_text(place) for place in listed(result.positions))
-    ax.set(xlabel="residual mode", ylabel="spillover work, W_r [J]", xticks=few_ticks(numbers))
-    ax.set_title(f"actuators at {where}: W_R = {result.residual_work:.3g}, effort {result.effort:.3g}")
-    return figure
-
-
-@plot.register
 def _(result: ModalFilter) -> Figure:
     figure, ax = new_figure(width=9, height=4)
     along = result.positions.ndim == 1
@@ -170,6 +123,17 @@ def _(result: ModalFilter) -> Figure:
     ax.set(xlabel="x of the sensor" if along else "sensor", ylabel="weight of its displacement", title="modal filter")
     ax.legend(ncols=2)
     return figure
+
+
+def _panel_per_mode(modes: Modes | SampledModes, label: str) -> tuple[Figure, list[Axes]]:
+    """Panels with a line at zero, titled by the frequency and damping ratio of each mode."""
+    figure, axes = panels(min(modes.n_modes, MOST_PANELS), 3, width=10, row_height=2.1, margin=0.6, sharex=True)
+    for r, ax in enumerate(axes):
+        ax.axhline(0.0, color=GREY, linewidth=0.6)
+        name = f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz, ζ = {100 * modes.zeta[r]:.2g} %"
+        ax.set_title(name, fontsize=10)
+        ax.set_xlabel(label)
+    return figure, axes
 
 
 def _point_motion(result: Response, names: Sequence[str]) -> Figure:
@@ -186,16 +150,3 @@ def _point_motion(result: Response, names: Sequence[str]) -> Figure:
     axes[0, 0].set_title(f"displacement [m]{fewer}")
     axes[-1, 0].set_xlabel("time [s]")
     return figure
-
-
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    columns = min(count, 3)
-    rows = -(-count // columns)
-    figure, axes = new_figure(rows, columns, width=10, height=0.6 + 2.1 * rows, squeeze=False, sharex=True)
-    for ax in axes.flat[count:]:
-        ax.set_visible(False)
-    return figure, list(axes.flat[:count])
-
-
-def _named(r: int, frequency_hz: float, zeta: float) -> str:
-    return f"mode {r + 1}: {frequency_hz:.4g} Hz, ζ = {100 * zeta:.2g} %"

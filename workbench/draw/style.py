@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from cycler import cycler
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -44,6 +45,24 @@ def new_figure(
     """A figure and the axes of `Figure.subplots`: one, or an array."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, cols, **options)
+
+
+def panels(
+    count: int, columns: int, *, width: float, row_height: float, margin: float, **options: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure with `count` axes in rows of `columns` at most; its height is that of the rows and a margin."""
+    columns = min(columns, count)
+    rows = -(-count // columns)
+    figure, grid = new_figure(rows, columns, width=width, height=margin + row_height * rows, squeeze=False, **options)
+    for ax in grid.flat[count:]:
+        ax.set_visible(False)
+    return figure, list(grid.flat[:count])
+
+
+def grouped_bars(count: int) -> tuple[np.ndarray, float]:
+    """Shifts (count,) of the bars in a group, and the width of each; the groups are 1 apart."""
+    width = 0.8 / count
+    return (np.arange(count) - 0.5 * (count - 1)) * width, width
 
 
 def in_units(name: str, unit: str) -> str:

@@ -13,21 +13,17 @@ from matplotlib.patches import Patch as Swatch
 from matplotlib.ticker import MaxNLocator
 
 from workbench.design.loop.closed_loop import Response
-from workbench.design.placement.limits import Limits
-from workbench.design.placement.task import Placement, PlacementTask
 from workbench.draw.motion import SWAY, Net, frame_net, scattered_net
-from workbench.draw.style import COLOURS, GREY, few_ticks, new_figure
+from workbench.draw.style import COLOURS, GREY, new_figure, panels
 from workbench.identification.shapes.bands import Bands
 from workbench.renamed import former_arguments
-from workbench.structure.domain import Patch, Rectangle
+from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, SampledModes
 
 PER_SIDE = 121  # grid points of a drawn shape along the longer side
-SHOWN_WORK = 1e-8  # least work that is drawn, over the largest in one mode
 LEVELS = 12  # of colour on each side of zero
 COLUMNS = 4
 HELD = 1e-6  # of a shape's largest value: an edge with less is held
-CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a rectangle, anticlockwise
 RED, BLUE = "#b2182b", "#2166ac"  # ends of the colour map, up and down
 DOT: Any = {"color": "none", "marker": "o", "markeredgecolor": "black", "markerfacecolor": "none", "markersize": 7}
 
@@ -45,8 +41,10 @@ def plot_surface_modes(
     count = min(count or modes.n_modes, modes.n_modes)
     x, y, fields = _over(modes, np.eye(modes.n_modes)[:, :count])
     columns = min(COLUMNS, count)
-    figure, axes = _panels(modes, count, columns)
+    row_height = 2.7 * min(y[-1] / x[-1], 1.6) + 0.45
+    figure, axes = panels(count, columns, width=2.7 * columns, row_height=row_height, margin=0.9)
     for r, ax in enumerate(axes):
+        _bare(ax, modes)
         limit = np.abs(fields[r]).max()
         _coloured(ax, x, y, fields[r], limit)
         _nodal_lines(ax, x, y, fields[r], 1.2)
@@ -148,55 +146,6 @@ def plot_surface_motion(
     return figure
 
 
-@former_arguments(struck="impulse_at")
-def plot_surface_placement(
-    task: PlacementTask,
-    placements: Mapping[str, Placement],
-    *,
-    limits: Limits | None = None,
-    impulse_at: tuple[float, float] | None = None,
-) -> Figure:
-    """Actuators on a plate with the nodal lines of mode n + 1, and the work in each residual mode.
-
-    Piezo patches are drawn to scale.
-
-    Args:
-        placements: by name, each in its own colour.
-        limits: forbidden zones are hatched.
-        impulse_at: place of the impulse, m, marked by a star.
-    """
-    n, modes = task.n_controlled, task.modes
-    assert isinstance(modes.domain, Rectangle)
-    figure, (left, right) = new_figure(1, 2, width=11, height=4.2)
-    draw_nodal_lines(left, modes, n)
-    for i, ((x0, y0), (x1, y1)) in enumerate(limits.forbidden if limits is not None else ()):  # type: ignore[misc, str-unpack]
-        left.fill([x0, x1, x1, x0], [y0, y0, y1, y1], facecolor="white", edgecolor=GREY, hatch="////", zorder=2,
-                  label="forbidden" if i == 0 else None)  # fmt: skip
-    numbers = n + 1 + np.arange(modes.n_modes - n)
-    width = 0.8 / len(placements)
-    for i, (name, placement) in enumerate(placements.items()):
-        label = f"{name}: W_R = {placement.residual_work:.2g}"
-        left.plot(*placement.positions.T, "o", color=COLOURS[i], markersize=10, label=label, zorder=3, clip_on=False)
-        if isinstance(task.actuator.at, Patch):
-            half = 0.5 * np.array(task.actuator.at[2:])
-            for middle in placement.positions:
-                left.fill(*(middle + half * CORNERS).T, facecolor=COLOURS[i], edgecolor=COLOURS[i], alpha=0.3, zorder=2)
-        right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
-    if impulse_at is not None:
-        left.plot(*impulse_at, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
-    (a, b), lines = modes.domain.length, f"nodal lines of mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz"
-    left.set_title(f"{modes.domain}\n{lines}, the lowest residual mode", fontsize=10)
-    # anchored at the top, else the layout leaves no room for the title above the axes
-    left.set(anchor="N", xticks=(0.0, a), yticks=(0.0, b), xlabel="x [m]", ylabel="y [m]")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", fontsize=9, ncols=4)
-    work = np.concatenate([placement.by_mode for placement in placements.values()])
-    most, least = float(work.max()), float(work.min())
-    right.set(xlabel="residual mode", ylabel="spillover work, W_r [J]", xticks=few_ticks(numbers), yscale="log")
-    # a mode with all actuators at its nodes has no work but rounding
-    right.set_ylim(max(SHOWN_WORK * most, 0.3 * least), 3.0 * most)
-    return figure
-
-
 def plot_point_modes(modes: Modes, *, count: int | None = None) -> Figure:
     """Shapes at named points, a panel per mode: the structure at rest grey, displaced blue, neighbouring nodes joined.
 
@@ -220,18 +169,19 @@ def plot_scattered_modes(modes: SampledModes, *, count: int) -> Figure:
 
 def _net_panels(net: Net, modes: Modes | SampledModes, count: int) -> Figure:
     moves = net.moves(modes).real
-    columns = min(COLUMNS, count)
-    rows = -(-count // columns)
-    figure, grid = new_figure(rows, columns, width=2.8 * columns, height=0.4 + 2.8 * rows, squeeze=False)
-    for r, ax in enumerate(grid.flat[:count]):
+    width = 2.8 * min(COLUMNS, count)
+    figure, axes = panels(count, COLUMNS, width=width, row_height=2.8, margin=0.4)
+    for r, ax in enumerate(axes):
         draw_moved(ax, net, moves[:, :, r])
         ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
-    for ax in grid.flat[count:]:
-        ax.axis("off")
-    states = ((GREY, "at rest"), (COLOURS[0], "moved"))
-    handles = [Line2D([], [], color=colour, marker="o", label=state) for colour, state in states]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
+    figure.legend(handles=rest_and_moved(), loc="outside lower center", ncols=2, fontsize=9)
     return figure
+
+
+def rest_and_moved() -> list[Line2D]:
+    """Legend handles of a net at rest and displaced."""
+    states = (GREY, "at rest"), (COLOURS[0], "moved")
+    return [Line2D([], [], color=colour, marker="o", label=state) for colour, state in states]
 
 
 def draw_nodal_lines(ax: Axes, modes: Modes, mode: int) -> None:
@@ -289,19 +239,6 @@ def _over(modes: Modes, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 def _coloured(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, limit: float) -> QuadContourSet:
     levels = limit * np.linspace(-1.0, 1.0, 2 * LEVELS + 1)
     return ax.contourf(x, y, field.T, levels=levels, cmap="RdBu_r", extend="both")
-
-
-def _panels(modes: Modes, count: int, columns: int) -> tuple[Figure, list[Axes]]:
-    assert isinstance(modes.domain, Rectangle)
-    rows, (a, b) = -(-count // columns), modes.domain.length
-    figure, grid = new_figure(
-        rows, columns, width=2.7 * columns, height=rows * (2.7 * min(b / a, 1.6) + 0.45) + 0.9, squeeze=False
-    )
-    for ax in grid.flat:
-        _bare(ax, modes)
-    for ax in grid.flat[count:]:
-        ax.set_visible(False)
-    return figure, list(grid.flat[:count])
 
 
 def _bare(ax: Axes, modes: Modes) -> None:

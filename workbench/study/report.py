@@ -10,11 +10,12 @@ import numpy as np
 
 from workbench.cases.case import read_case
 from workbench.design.loop.closed_loop import stability
-from workbench.draw.design import plot_two_works
+from workbench.draw.design import plot_poles, plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
+from workbench.draw.identification import plot_deviations, plot_mac, stabilisation_diagram
 from workbench.draw.motion import mode_motion
-from workbench.draw.spectra import plot_frf, plot_spectra, plot_transfer
-from workbench.draw.tables import plot_deviations, plot_mac, plot_places, plot_poles, stabilisation_diagram
+from workbench.draw.placement import plot_places
+from workbench.draw.signals import plot_frf, plot_spectra, plot_transfer
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions

@@ -14,7 +14,7 @@ from scipy.ndimage import median_filter
 from scipy.signal import find_peaks
 
 from workbench.draw.plot import plot
-from workbench.draw.spectra import SEGMENTS, plot_frf, plot_spectra, plot_transfer, power_spectrum
+from workbench.draw.signals import SEGMENTS, plot_frf, plot_spectra, plot_transfer, power_spectrum
 from workbench.identification.free_decay.preparation import decay_start, decays
 from workbench.identification.signal.data_quality import DataFault, data_faults, input_faults
 from workbench.records.record import Channel, Record

@@ -11,7 +11,7 @@ import numpy as np
 from workbench.cases.case import Case, files_of
 from workbench.draw.gap import plot_budget, plot_responses, plot_single_effects, plot_unmodelled_force, plot_where
 from workbench.draw.motion import ALONG, mode_motion
-from workbench.draw.spectra import plot_distortion
+from workbench.draw.signals import plot_distortion
 from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import label_in_words
 from workbench.gap.effects.nonlinear import BEYOND

@@ -1,14 +1,16 @@
-"""Figures of measured signals over frequency: spectra, frequency response functions, distortion."""
+"""Figures of measured signals: over time, spectra, frequency response functions, distortion."""
 
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.signal import coherence, csd, welch
 
-from workbench.draw.style import COLOURS, GREY, in_units, new_figure
+from workbench.arrays import Floats
+from workbench.draw.style import COLOURS, GREY, envelope, in_units, new_figure
 from workbench.identification.signal.distortion import Distortion
-from workbench.records.record import Record
+from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
 
 SEGMENT_SAMPLES = 4096  # at most
@@ -29,7 +31,7 @@ def power_spectrum(values: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.n
         values: (n_samples,).
         rate_hz: sampling rate.
     """
-    segment = min(SEGMENT_SAMPLES, max(values.size // SEGMENTS, 1))
+    segment = _segment(values.size)
     step = segment - segment // 2
     n_segments, mean = (values.size - segment // 2) // step, values.mean()
     power = np.zeros(segment // 2 + 1)
@@ -42,19 +44,43 @@ def power_spectrum(values: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.n
     return lines, power
 
 
+def _segment(n_samples: int) -> int:
+    return min(SEGMENT_SAMPLES, max(n_samples // SEGMENTS, 1))
+
+
+def plot_record(record: Record) -> Figure:
+    """Each signal over time, inputs first."""
+    figure, panels = _panel_per_signal(record, height=1.3)
+    for ax, channel, values, colour in panels:
+        at = envelope(values)
+        ax.plot(record.start_time + record.sample_time * at, values[at], color=colour, linewidth=0.9)
+        ax.set_ylabel(in_units(channel.name, channel.unit), fontsize=8)
+    panels[0][0].set_title(record.name)
+    panels[-1][0].set_xlabel("time [s]")
+    return figure
+
+
 def plot_spectra(record: Record) -> Figure:
     """Power spectral density of each signal, inputs first, by Welch's method."""
-    rows = [*zip(record.input_channels, record.inputs), *zip(record.output_channels, record.outputs)][:MOST_PANELS]
-    figure, axes = new_figure(len(rows), 1, width=9, height=0.8 + 1.6 * len(rows), sharex=True, squeeze=False)
-    for i, (ax, (channel, values)) in enumerate(zip(axes[:, 0], rows)):
+    figure, panels = _panel_per_signal(record, height=1.6)
+    for ax, channel, values, colour in panels:
         lines, power = power_spectrum(values, record.sample_rate_hz)
         if power[1:].max(initial=0.0) > 0:
-            ax.semilogy(lines[1:], power[1:], color=COLOURS[1] if i < record.n_inputs else COLOURS[0], linewidth=0.9)
+            ax.semilogy(lines[1:], power[1:], color=colour, linewidth=0.9)
             ax.set_ylim(bottom=max(ax.get_ylim()[0], SHOWN * power[1:].max()))
         ax.set_ylabel(in_units(channel.name, f"({channel.unit})^2/Hz" if channel.unit else "1/Hz"), fontsize=8)
-    axes[0, 0].set_title("power spectral density")
-    axes[-1, 0].set_xlabel("frequency [Hz]")
+    panels[0][0].set_title("power spectral density")
+    panels[-1][0].set_xlabel("frequency [Hz]")
     return figure
+
+
+def _panel_per_signal(record: Record, *, height: float) -> tuple[Figure, list[tuple[Axes, Channel, Floats, str]]]:
+    """A figure, and the axes, channel, samples and colour of each signal, inputs first."""
+    signals = [(channel, values, COLOURS[1]) for channel, values in zip(record.input_channels, record.inputs)]
+    signals += [(channel, values, COLOURS[0]) for channel, values in zip(record.output_channels, record.outputs)]
+    signals = signals[:MOST_PANELS]
+    figure, axes = new_figure(len(signals), 1, width=9, height=0.8 + height * len(signals), sharex=True, squeeze=False)
+    return figure, [(ax, *signal) for ax, signal in zip(axes[:, 0], signals)]
 
 
 def plot_transfer(measured: TransferFunctions, fitted: TransferFunctions | None = None) -> Figure:
@@ -94,7 +120,7 @@ def plot_frf(record: Record) -> Figure:
     """
     if record.n_inputs != 1:
         raise ValueError(f"a frequency response by H1 needs one input; record {record.name!r} has {record.n_inputs}")
-    rate, segment = record.sample_rate_hz, min(SEGMENT_SAMPLES, max(record.n_samples // SEGMENTS, 1))
+    rate, segment = record.sample_rate_hz, _segment(record.n_samples)
     u = record.inputs[0] - record.inputs[0].mean()
     lines, power = welch(u, rate, nperseg=segment)
     figure, axes = new_figure(2, 1, width=9, height=5.5, sharex=True, height_ratios=(3, 1))

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter, welch
 
 from workbench.draw.plot import plot
-from workbench.draw.spectra import plot_frf, plot_transfer, power_spectrum
+from workbench.draw.signals import plot_frf, plot_transfer, power_spectrum
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
 

@@ -1,17 +1,99 @@
-"""The controller of the options of `export` and `redesign`: law, modes and estimator."""
+"""The rig, the places and the controller that the options of the design commands name."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from workbench.cli.options import DAMPING, ESTIMATORS
+from workbench.rig.rig import Rig
+from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Patch, Place, PlaceError, Where
 
 if TYPE_CHECKING:
     from workbench.design.estimation.controller import Controller
     from workbench.design.laws.law import Law
     from workbench.design.laws.on_off import OnOffLaw
-    from workbench.rig.rig import Rig
-    from workbench.structure.domain import Where
+    from workbench.records.units import Units
     from workbench.structure.modes import Modes
+
+
+def read_rig_and_units(path: Path) -> "tuple[Rig, Units]":
+    """The rig and the units of a TOML file, or of case.toml in a case folder."""
+    from workbench.cases.case import read_rig, read_units
+
+    file = path / "case.toml" if path.is_dir() else path
+    return read_rig(file), read_units(file)
+
+
+def read_structure_rig(path: Path) -> "tuple[Rig, Units]":
+    """As `read_rig_and_units`, with an actuator at a node moved to the point of its direction.
+
+    Raises:
+        ValueError: modal data without a table of points, whose shapes are known only at the inputs and outputs.
+    """
+    found, units = read_rig_and_units(path)
+    domain = found.modes.domain
+    if not isinstance(domain, NamedPoints):
+        return found, units
+    if domain.positions is None:
+        raise ValueError(
+            f'{path}: plain modal data have no shapes between points; name a file of points (points = "points.csv"), or'
+            " describe a beam, a rod or a plate"
+        )
+    actuators = [
+        replace(a, at=domain.slope(a.at, int(a.kind == "moment"), a.direction)[0][0], direction=None)
+        if isinstance(a.at, str)
+        else a
+        for a in found.actuators
+    ]
+    return replace(found, actuators=tuple(actuators)), units
+
+
+def typed_place(domain: Domain, text: str, option: str) -> Place:
+    """The place of a text: a position in m along a beam, X,Y on a plate, or the name of a point.
+
+    Raises:
+        ValueError: another form; the message names the option.
+    """
+    if isinstance(domain, NamedPoints):
+        return text.strip()
+    form = "a position in m, such as 0.4" if isinstance(domain, Interval) else "X,Y in m, such as 0.4,0.25"
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != (1 if isinstance(domain, Interval) else 2):
+        raise ValueError(f"{option} takes {form}; got {text!r}")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+def place_in(domain: Domain, text: str, option: str) -> Place:
+    """The place of a text, which must be on the structure.
+
+    Raises:
+        ValueError: another form, or a place outside the structure.
+    """
+    at = typed_place(domain, text, option)
+    try:
+        domain.locate(at)
+    except PlaceError as error:
+        raise ValueError(f"{option}: {error}") from None
+    return at
+
+
+def impulse_place(rig: Rig, at: str | None) -> Place:
+    """The place of the impulse: as given, by place or by input, or that of the rig's hammer."""
+    inputs = {a.name: a.at for a in rig.actuators if not isinstance(a.at, Between | Patch)}
+    if at is not None and at.strip() in inputs:
+        return inputs[at.strip()]
+    if at is not None:
+        try:
+            return place_in(rig.modes.domain, at, "--impulse-at")
+        except ValueError as error:
+            raise ValueError(f"{error}; or name an input: {', '.join(inputs) or 'there is none'}") from None
+    hammers = [inputs[a.name] for a in rig.actuators if a.direct and a.name in inputs]
+    if not hammers:
+        raise ValueError("the place of the impulse is missing: give --impulse-at, or an [[input]] of kind hammer")
+    return hammers[0]
 
 
 def check_rate(rate_hz: float | None) -> None:
@@ -24,19 +106,19 @@ def check_rate(rate_hz: float | None) -> None:
         raise ValueError(f"--rate-hz is the sample rate of the controller, above 0 Hz; got {rate_hz:g}")
 
 
-def count_of(rig: "Rig", control: int | None) -> int:
+def count_of(rig: Rig, control: int | None) -> int:
     """The number of controlled modes: as given, or that of the actuators, at least 1."""
     return max(sum(not a.direct for a in rig.actuators), 1) if control is None else control
 
 
 def law_from(
-    rig: "Rig",
+    rig: Rig,
     law: str,
     count: int,
     weight: float | None,
     damping: float | None,
     *,
-    impulse_at: "Where | None" = None,
+    impulse_at: Where | None = None,
     impulse: float = 1.0,
 ) -> "Law | OnOffLaw":
     """The law of this name, with a weight or a damping ratio.
@@ -80,7 +162,7 @@ def damping_by(modes: "Modes", law: "Law | OnOffLaw") -> str:
 
 
 def observed(
-    rig: "Rig", law: "Law | OnOffLaw", estimator: str, *, disturbance: float, sample_time: float
+    rig: Rig, law: "Law | OnOffLaw", estimator: str, *, disturbance: float, sample_time: float
 ) -> "Controller":
     """The law with an observer of all displacements and velocities, or a modal filter of places that have both.
 
