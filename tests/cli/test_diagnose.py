@@ -54,6 +54,12 @@ def test_exchanged_inputs_stop_a_diagnosis_and_are_corrected_on_request(run, tmp
             np.testing.assert_array_equal(record.inputs[:2], exact.inputs[order])
 
 
+def test_a_page_that_cannot_be_written_is_refused_before_the_search(run, tmp_path, nothing_hidden):
+    write_case(nothing_hidden, tmp_path / "plain")
+    refused = run("diagnose", tmp_path / "plain", "--page", tmp_path)
+    assert refused.exit_code == 2 and "is a folder; name a file in it" in " ".join(refused.output.split())
+
+
 def test_a_former_name_of_an_option_is_taken_for_the_new_one(run):
     assert "--mend is now --correct" in run("diagnose", "no-case", "--mend").output
 

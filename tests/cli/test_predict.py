@@ -88,6 +88,8 @@ def test_tests_are_checked_and_logged_beside_the_case(run, case):
         (("predict", "late", "nothing.csv"), "neither a file nor a record of the case, which are low"),
         (("check", "late", "friday.csv", "--log", "friday.csv"), "friday.csv is no log of tests"),
         (("check", "late", "friday.csv", "--log", "no/tests.csv"), "there is no folder no; make it first"),
+        (("check", "late", "friday.csv", "--page", "late"), "late is a folder; name a file in it"),
+        (("predict", "late", "friday.csv", "--page", "friday.csv/a.html"), "friday.csv is a file, not a folder"),
         (("predict", "late", "friday.csv", "--draws", "3"), "need 40 draws or more"),
     ],
 )

@@ -127,6 +127,7 @@ def test_a_damaged_verdict_is_named(run, case, tmp_path, change, said):
         ("--control", 7, "7 modes cannot be controlled of 5"),
         ("--to", "anew.m", ".c, .py or .mat"),
         ("--to", "no/anew.c", "make it first"),
+        ("--page", ".", "is a folder; name a file in it"),
     ],
 )
 def test_what_cannot_be_is_refused_before_any_work(run, case, option, value, said):

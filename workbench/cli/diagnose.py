@@ -69,7 +69,7 @@ def diagnose(
     from workbench.study.measured_case import measured_case
     from workbench.study.pages.verdict_page import verdict_page
 
-    check_target(json_path)
+    check_target(json_path, page=page)
     if (case is None) == (nominal is None):
         raise ValueError("give a case folder, or --nominal and --records; not both")
     if case is not None and input_hold is not None:

@@ -67,7 +67,7 @@ def identify(
     from workbench.records.limits import Limits
     from workbench.study.pages.identification_report import identification_report
 
-    check_target(json_path, page)
+    check_target(json_path, page=page)
     limits = Limits.of_gib(memory)
     with reporting("reading") as report:
         read = [

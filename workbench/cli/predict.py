@@ -48,7 +48,7 @@ def predict(
     from workbench.cases.case import read_case
     from workbench.study.pages.prediction_page import prediction_page
 
-    check_target(json_path)
+    check_target(json_path, page=page)
     found = read_case(case)
     planned = _record_of(found, record, sample_rate_hz)
     prediction = _predicted(found, planned, verdict, draws=draws, seed=seed, workers=workers)
@@ -88,7 +88,7 @@ def check(
     from workbench.robust.check import check_length, check_prediction, log_test, read_log
     from workbench.study.pages.prediction_page import prediction_page
 
-    check_target(json_path, log)
+    check_target(json_path, log, page=page)
     log = case / LOG if log is None else log
     read_log(log)  # an invalid log is refused before the computation
     found = read_case(case)

@@ -86,7 +86,7 @@ def redesign(
     from workbench.robust.redesign import redesign as run
     from workbench.study.pages.redesign_page import redesign_page
 
-    check_target(json_path, to)
+    check_target(json_path, to, page=page)
     if to is not None:
         check_name(to)
     if criterion not in (None, *CRITERIA):

@@ -143,17 +143,25 @@ def show_table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, right:
     console.print(table)
 
 
-def check_target(*paths: Path | None) -> None:
+def check_target(*paths: Path | None, page: Path | None = None) -> None:
     """Refuse paths that cannot be written, before the computation.
 
+    Args:
+        paths: files in folders that exist.
+        page: an HTML file, whose folder is made if there is none.
+
     Raises:
-        ValueError: a folder, or a file in a folder that does not exist.
+        ValueError: a folder, or a file in a folder that does not exist or cannot be made.
     """
-    for path in filter(None, paths):
+    for path in filter(None, (*paths, page)):
         if path.is_dir():
             raise ValueError(f"{path} is a folder; name a file in it")
+    for path in filter(None, paths):
         if not path.parent.is_dir():
             raise ValueError(f"{path}: there is no folder {path.parent}; make it first")
+    is_file = next((folder for folder in page.parents if folder.is_file()), None) if page else None
+    if is_file is not None:
+        raise ValueError(f"{page}: {is_file} is a file, not a folder; name another place")
 
 
 def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
