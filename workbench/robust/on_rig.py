@@ -342,7 +342,7 @@ def _redesigned_estimator(
         new = design.func(modes, law, [sensors[i] for i in kept], **{**design.keywords, "noise": chosen})
     else:
         new = design(modes, law, [sensors[i] for i in kept])
-    if new.state.size == 0:  # a modal filter places its own sensors; those of the rig are at the same places
+    if new.static:  # a modal filter places its own sensors; those of the rig are at the same places
         new = replace(new, sensors=tuple(sensors))
     return new
 

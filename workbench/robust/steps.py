@@ -231,7 +231,7 @@ def _tuning(loop: Loop, weight: float, noise: float) -> str:
 
 def _faulty(rig: Rig, loop: Loop) -> list[str]:
     """Names of faulty sensors that an observer may leave out; none for a modal filter, which needs all its sensors."""
-    if loop.controller.state.size == 0 or len(loop.controller.sensors) < 2:
+    if loop.controller.static or len(loop.controller.sensors) < 2:
         return []
     read = [named(rig.sensors, one.name) for one in loop.controller.sensors]
     return [s.name for s, faultless in zip(read, without_faults(read), strict=True) if s != faultless]
