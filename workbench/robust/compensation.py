@@ -205,7 +205,7 @@ def _model(a: Floats, b: Floats, actuators: Sequence[Actuator], sample_time: flo
     return _Model(augmented, into, n, delays, lags, 0.5 * sample_time if compensate else 0.0, sample_time)
 
 
-def _matrices(model: _Model, loop: Loop, estimator: Floats, output: Floats) -> tuple[Floats, ...]:
+def _matrices(model: _Model, loop: Loop, estimator: Floats, output: Floats) -> tuple[np.ndarray, ...]:
     """A, B, C, D, E of the `DigitalController`: states X̂, then the delayed commands, newest first.
 
     Args:

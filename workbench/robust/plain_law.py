@@ -64,13 +64,23 @@ def plain_law(
         return coupled_lqr(modes, index, actuators, weight=float(np.mean(0.5 * squared / (damping * omega) ** 2)))
     if kind == "poles":
         return coupled_poles(modes, index, actuators, poles=omega * (-damping + 1j * np.sqrt(1.0 - damping**2)))
-    shape = unit_participation(modes, actuators[0]) if impulse_at is None else modes.phi_at(impulse_at)
-    speed = np.abs(impulse * shape[list(index)])
-    speed = np.maximum(speed, 0.1 * speed.max())
+    speed = impulse_speeds(modes, list(index), impulse, impulse_at, actuators[0])
     # a relay reduces the amplitude q'/ω by 4 k / ω² per period
     return on_off(modes, index, actuators, force=speed * omega / (4.0 * PERIODS), dead_band=BAND * speed)
 
 
-def unit_participation(modes: Modes, actuator: Actuator) -> np.ndarray:
-    """Modal forces (n_modes,) of a unit force or moment at an actuator's place."""
-    return input_matrix(modes, [replace(actuator, gain=1.0)])[:, 0]
+def impulse_speeds(
+    modes: Modes, index: Sequence[int], impulse: float, at: Where | None, actuator: Actuator
+) -> np.ndarray:
+    """|q_r'| (n_index,) just after an impulse, at least a tenth of the largest.
+
+    Args:
+        modes: of the structure.
+        index: of the modes wanted, zero-based.
+        impulse: N s.
+        at: the place; None for that of the actuator.
+        actuator: in whose direction the impulse then acts.
+    """
+    shape = input_matrix(modes, [replace(actuator, gain=1.0)])[:, 0] if at is None else modes.phi_at(at)
+    speeds = np.abs(impulse * shape[list(index)])
+    return np.asarray(np.maximum(speeds, 0.1 * speeds.max()))

@@ -13,6 +13,7 @@ from workbench.design.placement.placement import place_actuators
 from workbench.design.placement.task import Placement, placement_task
 from workbench.records.units import SI, Units
 from workbench.robust.compensation import Loop
+from workbench.robust.on_rig import settings
 from workbench.structure.domain import Interval, position
 
 SPACING, STARTS = 0.05, 4  # of the length; random starts of the search
@@ -61,7 +62,6 @@ def relocated(loop: Loop, test: LoopTest, units: Units = SI) -> Relocation | Non
     """
     law, modes = loop.law, loop.modes
     n = len(law.controlled)
-    settings = getattr(law.designed_by, "keywords", {})
     if getattr(law.designed_by, "func", None) is not imsc or test.impulse_at is None or n == modes.n_modes:
         return None
     if not isinstance(modes.domain, Interval) or law.controlled != tuple(range(n)) or len(law.actuators) != n:
@@ -70,7 +70,7 @@ def relocated(loop: Loop, test: LoopTest, units: Units = SI) -> Relocation | Non
         return None
     try:
         task = placement_task(
-            modes, n, impulse_at=position(test.impulse_at), weight=settings["weight"], impulse=test.impulse
+            modes, n, impulse_at=position(test.impulse_at), weight=settings(law)["weight"], impulse=test.impulse
         )
         present = task.placed(np.array([position(a.at) for a in law.actuators]), "present places")
         limits = Limits(effort=present.effort, spacing=SPACING * modes.length)

@@ -15,7 +15,7 @@ from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.robust.compensation import STEPS, Loop, compensated, without_faults
-from workbench.robust.on_rig import redesigned_for, tuned
+from workbench.robust.on_rig import redesigned_for, settings, tuned
 from workbench.robust.small_motion import loop_poles
 from workbench.robust.verification import settling
 
@@ -220,7 +220,7 @@ def _retuned(rig: Rig, loop: Loop, weight: float, noise: float) -> Loop | None:
 
 def weighted(loop: Loop) -> bool:
     """Whether the law minimises a cost that weights its forces."""
-    return "weight" in getattr(loop.law.designed_by, "keywords", {})
+    return "weight" in settings(loop.law)
 
 
 def _tuning(loop: Loop, weight: float, noise: float) -> str:
