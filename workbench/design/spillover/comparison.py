@@ -1,6 +1,6 @@
 """Comparison of laws on one structure after the same impulse: cost, effort, spillover and poles."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,26 +65,32 @@ def laws_of(
     Raises:
         DesignError: no law can be designed.
     """
-    independent: list[Callable[[], Law]] = [lambda: imsc(modes, controlled, actuators, weight=weight)]
-    coupled: list[Callable[[], Law]] = [lambda: coupled_lqr(modes, controlled, actuators, weight=weight)]
-    refused: list[str] = []
     if damping is not None and not 0 < damping < 1:
         raise DesignError(f"the damping ratio wanted must lie between 0 and 1; got {damping:g}")
-    omega = modes.omega[list(controlled_indices(modes, controlled))]
-    rigid = numbered(np.flatnonzero(omega == 0).tolist())
-    if damping is not None and rigid:
+    independent, refused, poles = controlled <= len(actuators), [], None
+    if not independent:
         refused.append(
-            f"no pole assignment: the rigid mode(s) {rigid} have no damping ratio; design by the weight, or give poles"
-            " for all modes to coupled_poles"
+            f"IMSC needs as many actuators as controlled modes, {controlled}; there are {len(actuators)}: add actuators"
         )
-    elif damping is not None:
-        poles = omega * (-damping + 1j * np.sqrt(1 - damping**2))
-        independent.append(lambda: imsc_poles(modes, controlled, actuators, poles=poles))
-        coupled.append(lambda: coupled_poles(modes, controlled, actuators, poles=poles))
-    if controlled <= len(actuators):
-        return [design() for design in (*independent, *coupled)], refused
-    why = f"IMSC needs as many actuators as controlled modes, {controlled}; there are {len(actuators)}: add actuators"
-    return [design() for design in coupled], [why, *refused]
+    if damping is not None:
+        omega = modes.omega[list(controlled_indices(modes, controlled))]
+        rigid = np.flatnonzero(omega == 0).tolist()
+        if rigid:
+            refused.append(
+                f"no pole assignment: the rigid mode(s) {numbered(rigid)} have no damping ratio; design by the weight,"
+                " or give poles for all modes to coupled_poles"
+            )
+        else:
+            poles = omega * (-damping + 1j * np.sqrt(1 - damping**2))
+    laws = []
+    if independent:
+        laws.append(imsc(modes, controlled, actuators, weight=weight))
+        if poles is not None:
+            laws.append(imsc_poles(modes, controlled, actuators, poles=poles))
+    laws.append(coupled_lqr(modes, controlled, actuators, weight=weight))
+    if poles is not None:
+        laws.append(coupled_poles(modes, controlled, actuators, poles=poles))
+    return laws, refused
 
 
 @one_blas_thread
@@ -132,11 +138,11 @@ def through_sensors(
     Returns:
         (controller, explanation on the full plant, "") each, or (None, None, reason) where the design fails.
     """
-    sensor_places = sorted(dict.fromkeys(places))
+    sensor_places = sorted(set(places))
+    sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensor_places)]
     tried: list[tuple[Controller | None, Explanation | None, str]] = []
     estimators = (True, False) if structure is not None or isinstance(modes.domain, NamedPoints) else (False,)
     for law in laws:
-        sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensor_places)]
         for by_filter in estimators:
             try:
                 if by_filter:

@@ -48,8 +48,7 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
     margin = loop.margin
     if not loop.stable:
         return Performance(np.inf, np.inf, np.inf, margin)
-    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
-    moments = second_moments(loop.matrix, state, final_time)
+    moments = second_moments(loop.matrix, loop.start(state), final_time)
     own = list(loop.law.controlled)
     energy = modes.omega[own] ** 2 @ np.diag(moments)[own] + np.diag(moments)[[n + r for r in own]].sum()
     effort = float(np.trace(loop.feedback @ moments @ loop.feedback.T))
