@@ -19,7 +19,8 @@ from workbench.gap.effects.effect import Effect
 from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
-from workbench.robust.on_rig import default_estimator, impulse_test, loop_on_rig, tuned
+from workbench.robust.impulse import impulse_test
+from workbench.robust.on_rig import default_estimator, loop_on_rig, tuned
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.redesign import redesign

@@ -21,17 +21,13 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
-from workbench.robust.compensation import Loop, check_rate, without_faults
-from workbench.robust.plain_law import impulse_speeds
+from workbench.robust.compensation import Loop, without_faults
+from workbench.robust.impulse import impulse_speeds
 from workbench.robust.small_motion import loop_poles
-from workbench.structure.domain import Between, Domain, NamedPoints, Patch, Where
 from workbench.structure.modes import Modes, mac
 
 Design = Law | OnOffLaw | Controller | PlacementTask
 
-PERIODS = 25  # of the lowest controlled mode: the length of a test
-MOST_SAMPLES = 6000
-UNMOVED, GRID = 1e-9, 33  # a place does not move below this share of the largest displacement; points to find that
 SAME_PLACE = 0.01  # of the size of the structure: largest distance of two places that count as the same
 SPEEDS = tuple(10.0**k for k in np.arange(8.0, -2.1, -0.5))  # of the default Kalman filter: noise over the stated
 ENOUGH, BETTER = 0.8, 1.02  # sufficient share of the designed damping; least factor by which a faster filter is better
@@ -54,86 +50,6 @@ def controlled_by(design: Design) -> tuple[int, ...]:
             " by imsc, coupled_lqr, coupled_poles or on_off, with an estimator by luenberger or kalman"
         )
     return tuple(range(design.n_controlled)) if isinstance(design, PlacementTask) else law_of(design).controlled
-
-
-def impulse_test(
-    rig: Rig,
-    controlled: Sequence[int],
-    sample_time: float,
-    impulse_at: Where | None = None,
-    *,
-    level: np.ndarray | None = None,
-    seed: int | None = 0,
-) -> LoopTest:
-    """A test by an impulse, with the free motion after it for 25 periods of the lowest controlled mode.
-
-    Args:
-        rig: nominal.
-        controlled: zero-based modes.
-        sample_time: s.
-        impulse_at: the place; by default that of a hammer or of the first actuator. If that moves none of the
-            controlled modes, as at a clamp turned by a motor, the place where all of them move most.
-        level: (n_outputs,) peak readings of the nominal rig without control, to which the impulse is scaled (by the
-            median of the sensors); None for a unit impulse.
-        seed: of the noise.
-
-    Raises:
-        DesignError: rigid modes alone, a sample time too long for the modes, or a place where none of them moves.
-        ValueError: a place outside the structure.
-    """
-    check_rate(rig.modes, controlled, sample_time)
-    omega = rig.modes.omega[list(controlled)]
-    omega = omega[omega > 0]
-    if not omega.size:
-        raise DesignError("the controlled modes are all rigid, so they have no period: give the test")
-    impulse_at = _impulse_place(rig, controlled, impulse_at)
-    shape = rig.modes.phi_at(impulse_at)
-    n_samples = int(min(max(PERIODS * 2.0 * np.pi / omega.min() / sample_time, 64), MOST_SAMPLES))
-    test = LoopTest(n_samples, sample_time, impulse_at, seed=seed)
-    if level is None:
-        return test
-    damped = np.exp(-0.5 * np.diag(rig.modes.damping)[:, None] * test.time)
-    omega = np.maximum(rig.modes.omega, 1e-9)[:, None]
-    motion = (
-        damped * np.sin(omega * test.time) * (shape[:, None] / omega),
-        damped * np.cos(omega * test.time) * shape[:, None],
-    )
-    peaks = []
-    for sensor, reached in zip(rig.sensors, level, strict=True):
-        derivative, order = MEASURED[sensor.quantity]
-        if order < 2:
-            row = sensor.gain * rig.modes.phi_at(sensor.at, derivative, direction=sensor.direction)
-            peaks.append(reached / max(np.abs(row @ motion[order]).max(), 1e-300))
-    return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
-
-
-def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> Where:
-    """A place where an impulse moves the controlled modes: the given one, or by default that of `impulse_test`."""
-    places = rig.modes.domain.grid(GRID)
-    shapes = np.abs(rig.modes.phi(places))
-    at = given
-    if at is None:
-        at = _place_of(rig.modes.domain, next((a for a in rig.actuators if a.direct), rig.actuators[0]))
-    patch = isinstance(at, Patch)  # acts by moments along its edges, so that an impulse there is not defined
-    if not patch and np.abs(rig.modes.phi_at(at)[list(controlled)]).max() > UNMOVED * shapes.max():
-        return at
-    if given is not None:
-        raise DesignError(
-            f"an impulse at {rig.modes.domain.text(at)} moves none of the controlled modes, so it tests no"
-            " controller; choose another place"
-        )
-    moved = shapes[:, list(controlled)]
-    most: Where = places[int((moved / np.maximum(moved.max(axis=0), 1e-300)).min(axis=1).argmax())]
-    return most
-
-
-def _place_of(domain: Domain, port: Actuator) -> Where:
-    """The place of an actuator; of a node with a direction, the point that moves in that direction."""
-    if not isinstance(domain, NamedPoints) or port.direction is None:
-        return port.at
-    places = port.at if isinstance(port.at, Between) else (port.at,)
-    names, _, _ = domain.slope(list(places), int(port.kind == "moment"), port.direction)
-    return Between(*names) if isinstance(port.at, Between) else names[0]
 
 
 def loop_on_rig(rig: Rig, design: Design, test: LoopTest) -> Loop:

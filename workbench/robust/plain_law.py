@@ -1,7 +1,6 @@
 """A law by a rule of thumb, from the damping wanted of its controlled modes."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -9,11 +8,10 @@ from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.on_off import OnOffLaw, on_off
-from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.statespace import input_matrix
+from workbench.robust.impulse import impulse_speeds
 from workbench.structure.domain import Where
-from workbench.structure.modes import Modes
 
 KINDS = ("imsc", "coupled", "poles", "on-off")
 PERIODS = 5.0  # within which on-off control stops each mode
@@ -67,20 +65,3 @@ def plain_law(
     speed = impulse_speeds(modes, list(index), impulse, impulse_at, actuators[0])
     # a relay reduces the amplitude q'/ω by 4 k / ω² per period
     return on_off(modes, index, actuators, force=speed * omega / (4.0 * PERIODS), dead_band=BAND * speed)
-
-
-def impulse_speeds(
-    modes: Modes, index: Sequence[int], impulse: float, at: Where | None, actuator: Actuator
-) -> np.ndarray:
-    """|q_r'| (n_index,) just after an impulse, at least a tenth of the largest.
-
-    Args:
-        modes: of the structure.
-        index: of the modes wanted, zero-based.
-        impulse: N s.
-        at: the place; None for that of the actuator.
-        actuator: in whose direction the impulse then acts.
-    """
-    shape = input_matrix(modes, [replace(actuator, gain=1.0)])[:, 0] if at is None else modes.phi_at(at)
-    speeds = np.abs(impulse * shape[list(index)])
-    return np.asarray(np.maximum(speeds, 0.1 * speeds.max()))

@@ -340,9 +340,8 @@ def _inputs(rig: Rig, inputs: Record | Floats, sample_time: float | None) -> tup
                 f"record {inputs.name!r} has no input {missing[0]!r}: it has {', '.join(given) or 'none'}; the rig's"
                 f" are {', '.join(names)}"
             )
-        sent, period, hold, start = (
-            np.array([given[name] for name in names]), inputs.sample_time, inputs.input_hold, inputs.start_time,
-        )  # fmt: skip
+        sent: Floats = np.array([given[name] for name in names])
+        period, hold, start = inputs.sample_time, inputs.input_hold, inputs.start_time
     else:
         if inputs is None or isinstance(inputs, str | Path):
             raise TypeError(
@@ -351,7 +350,8 @@ def _inputs(rig: Rig, inputs: Record | Floats, sample_time: float | None) -> tup
             )
         if sample_time is None or not (np.isfinite(number(sample_time, "sample_time", "s")) and sample_time > 0):
             raise ValueError(f"inputs as an array need a positive sample_time; got {sample_time}")
-        sent, period, hold, start = np.atleast_2d(np.asarray(inputs, float)), sample_time, "zero", 0.0
+        sent = np.atleast_2d(np.asarray(inputs, float))
+        period, hold, start = sample_time, "zero", 0.0
     if sent.shape[0] != len(names) or sent.shape[1] < 2 or not np.isfinite(sent).all():
         raise ValueError(
             f"inputs must be finite, one row for each of {', '.join(names)} and 2 samples or more; got {sent.shape}"

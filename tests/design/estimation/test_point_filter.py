@@ -8,7 +8,7 @@ from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import filter_on, point_filter
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, close_with
-from workbench.design.spillover.comparison import through_sensors
+from workbench.design.spillover.performance import through_sensors
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
