@@ -517,6 +517,16 @@ def test_an_estimator_that_is_too_slow_for_a_late_loop_is_made_faster(rig, contr
     assert found.after.effort == faster.effort
 
 
+def test_the_speed_of_the_estimator_is_stated_against_the_design(rig):
+    """Of a filter first made a hundred times faster and then ten times slower it was said that it is slower."""
+    law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
+    designed = kalman(rig.modes, law, rig.sensors[:4], disturbance=1.0, noise=1e-5)
+    late = uncertain(rig, effect("actuator_delay", "all", delay=6.0 * DT))
+    found = redesign(late, designed, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    times = found.loop.controller.designed_by.keywords["noise"] / 1e-5
+    assert [step.what for step in found.steps if step.name == "estimator"] == [f"measurement noise × {times:.3g}"]
+
+
 def test_more_gain_wins_back_nearly_all_that_a_limit_leaves_to_be_won(rig):
     """One mode, its force held to half of its peak; what any controller can win back is known, see the theory.
 

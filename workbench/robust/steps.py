@@ -27,7 +27,7 @@ WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # weight, where actuators s
 SLOWER = (1.0, 2.0, 5.0, 10.0)  # noise, with these
 SOFTER = (1.0, 3.0, 10.0, 30.0, 100.0)  # weight, where the law is unstable as designed
 SLOWEST = tuple(10.0**k for k in np.arange(0.0, 9.1, 0.5))  # noise, with these
-SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # noise, for the law as designed
+SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # noise, with the law unchanged
 # what a step compensates in an actuator: in words, and by its attribute
 COMPENSATED = {
     "delay": (("delay", "delay"), ("lag", "time_constant")),
@@ -156,8 +156,9 @@ class Search:
             for noise in SLOWER:
                 for weight in WEIGHTS:
                     self._tune_once("gain", designed, weight, noise)
+        designed = self.loop
         for noise in SPEEDS:
-            self._tune_once("estimator", self.loop, 1.0, noise)
+            self._tune_once("estimator", designed, 1.0, noise)
 
     def _tune_once(self, name: str, loop: Loop, weight: float, noise: float) -> None:
         other = _retuned(self._rig, loop, weight, noise)
