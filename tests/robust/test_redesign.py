@@ -123,6 +123,14 @@ def test_a_residual_mode_that_control_leaves_undamped_is_named(rig, controller):
     assert not replace(found, **alike).left_undamped
 
 
+def test_what_the_shapes_are_at_an_actuator_is_no_imperfection_of_it(rig, controller):
+    """Errors of the shapes at the places of the actuators are of the structure: a rig without faults loses nothing."""
+    shaped = tuple(replace(a, shape_error=(-0.1, 0.1, -0.05, -0.1, 0.0, -0.1)) for a in rig.actuators)
+    corrected = uncertain(replace(rig, actuators=shaped))
+    found = redesign(corrected, controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    assert found.steps[1].name == "law and estimator" and found.steps[1].loss == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_loop_that_a_long_delay_destabilises_is_made_stable(rig, controller):
     late = uncertain(rig, effect("actuator_delay", "all", delay=6.0 * DT))
     found = redesign(late, controller, sample_time=DT, impulse_at=0.8, draws=8, placement=False)

@@ -240,7 +240,8 @@ def _faulty(rig: Rig, loop: Loop) -> list[str]:
 
 def _perfect(a: Actuator) -> Actuator:
     """The actuator with its gain, without delay, lag, limits and other imperfections."""
-    return Actuator(a.name, a.at, a.kind, a.gain, direct=a.direct, direction=a.direction)
+    unlimited = replace(a, limit=np.inf, rate_limit=np.inf, dead_zone=0.0, hysteresis_share=0.0)
+    return replace(unlimited, delay=0.0, time_constant=0.0, bias=0.0)
 
 
 def force_weight(run: LoopRun, controlled: Sequence[int]) -> float:
