@@ -26,7 +26,7 @@ from workbench.robust.posterior import UncertainRig
 from workbench.robust.redesign import redesign
 from workbench.robust.steps import _losses
 from workbench.robust.verification import Verification, verify
-from workbench.structure.domain import Patch
+from workbench.structure.domain import Between, Patch
 from workbench.trials.controlled import control_plant
 from workbench.trials.make import find_trial_with_plant
 from workbench.trials.plant import Plant
@@ -73,6 +73,12 @@ def test_a_step_says_what_it_takes_out_and_no_more(rig, step, lost, words):
     one = replace(rig.actuators[0], **lost)
     loop = SimpleNamespace(law=SimpleNamespace(actuators=[one]))
     assert _losses(replace(rig, actuators=(one, *rig.actuators[1:])), loop, step, SI) == words
+
+
+def test_an_impulse_between_two_places_is_no_disturbance_of_a_placement(rig):
+    law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
+    found = redesign(uncertain(rig), law, sample_time=DT, impulse_at=Between(0.5, 0.9), draws=1)
+    assert found.relocation is None and found.safe
 
 
 @pytest.mark.parametrize("fault", FAULTS)
