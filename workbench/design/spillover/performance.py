@@ -22,6 +22,7 @@ from workbench.design.spillover.spillover import (
     finite_spillover,
     on_off_motion,
     quadratic_cost,
+    work_by_mode,
 )
 from workbench.renamed import Renamed
 from workbench.rig.actuators import Actuator
@@ -72,9 +73,7 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
     own = list(loop.law.controlled)
     energy = modes.omega[own] ** 2 @ np.diag(moments)[own] + np.diag(moments)[[n + r for r in own]].sum()
     used = float(np.trace(loop.feedback @ moments @ loop.feedback.T))
-    rest = [r for r in range(n) if r not in own]
-    push = input_matrix(modes, loop.law.actuators)[rest] @ loop.feedback
-    spillover = float(sum(row @ moments[:, n + r] for row, r in zip(push, rest)))
+    spillover = float(np.delete(work_by_mode(loop, moments), own).sum())
     return Performance(float(energy) + weight * used, used, spillover, margin)
 
 

@@ -154,11 +154,15 @@ def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> 
     W_r = ∫ b_rᵀF q_r' dt is the integral of a quadratic form of the state, by one matrix exponential.
     """
     check_final_time(final_time)
-    n = loop.modes.n_modes
     moments = second_moments(loop.matrix, loop.start(state), final_time)
-    force_rows = input_matrix(loop.modes, loop.law.actuators) @ loop.feedback
-    work = np.array([force_rows[r] @ moments[:, n + r] for r in range(n)])
-    return Spillover(work, loop.law.controlled, final_time)
+    return Spillover(work_by_mode(loop, moments), loop.law.controlled, final_time)
+
+
+def work_by_mode(loop: ClosedLoop, moments: Floats) -> Floats:
+    """W_r = ∫ b_rᵀF q_r' dt (n_modes,) from the second moments ∫ x xᵀ dt of the state."""
+    n = loop.modes.n_modes
+    forces = input_matrix(loop.modes, loop.law.actuators) @ loop.feedback
+    return np.array([forces[r] @ moments[:, n + r] for r in range(n)])
 
 
 def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> Spillover:
