@@ -142,10 +142,11 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
     sensors = [named(rig.sensors, s.name) for s in loop.controller.sensors]
     own, forced, reads = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
     model = _model(own, forced, actuators, sample_time, "delay" in steps)
-    if loop.controller.estimator is None:
+    estimator = loop.controller.estimator
+    if estimator is None:
         raise DesignError("the controller does not name its estimator; make it by luenberger, kalman or filtered")
     output = _output(loop, reads, sensors, model.hold, "sensors" in steps)
-    a, b, c, d, e = _matrices(model, loop, loop.controller.estimator, output)
+    a, b, c, d, e = _matrices(model, loop, estimator, output)
     gain, dead_zone = _values(actuators, "gain"), _values(actuators, "dead_zone")
     parts: dict[str, Any] = {}
     if "dead zone" in steps:
@@ -157,12 +158,12 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
     if "sensors" in steps:
         parts |= {"offset": _values(sensors, "bias"), "scale": 1.0 / _values(sensors, "gain")}
         uncoupling = np.linalg.inv(crosstalk(sensors))
-        b, d = b @ uncoupling, d @ uncoupling
+        b, d, estimator = b @ uncoupling, d @ uncoupling, estimator @ uncoupling
     if isinstance(loop.law, OnOffLaw):
         relays = loop.law.relays
         parts["relays"] = Relays(loop.law.spread, _values(relays, "force"), _values(relays, "dead_band"))
     if "friction" in steps:
-        parts["friction"] = _friction(rig, loop, forced, len(a))
+        parts["friction"] = _friction(rig, loop, forced, estimator, len(a))
     names = tuple(s.name for s in sensors), tuple(x.name for x in actuators)
     parts |= {"name": loop.controller.name, "states": _states(model, loop, names[1])}
     return DigitalController(sample_time, *names, a, b, c, d, e, **parts)
@@ -295,18 +296,19 @@ def _output(loop: Loop, reads: Floats, sensors: Sequence[Sensor], hold: float, r
     )
 
 
-def _friction(rig: Rig, loop: Loop, forced: Floats, n_states: int) -> FrictionForward | None:
+def _friction(rig: Rig, loop: Loop, forced: Floats, estimator: Floats, n_states: int) -> FrictionForward | None:
     """Feed-forward commands that cancel the rig's Coulomb friction in the controlled modes; None without friction.
 
     Args:
         rig, loop: as of `compensated`.
         forced: B of the controlled modes.
+        estimator: of the loop's controller, from readings without cross-talk where that is compensated.
         n_states: of the digital controller.
     """
     frictions = [element for element in rig.elements if isinstance(element, CoulombFriction)]
     if not frictions or isinstance(loop.law, OnOffLaw):
         return None
-    index, estimator = list(loop.law.controlled), np.array(loop.controller.estimator)
+    index = list(loop.law.controlled)
     n, shapes = len(index), np.array([loop.modes.phi_at(f.at)[index] for f in frictions])
     of_state, of_reading = np.zeros((len(frictions), n_states)), np.zeros((len(frictions), estimator.shape[1]))
     if loop.controller.static:
