@@ -10,7 +10,7 @@ from workbench.design.loop.rig_loop import LoopTest
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED
-from workbench.rig.statespace import input_matrix
+from workbench.rig.statespace import input_matrix, output_matrix
 from workbench.robust.compensation import check_rate
 from workbench.structure.domain import Between, Domain, NamedPoints, Patch, Where
 from workbench.structure.modes import Modes
@@ -63,10 +63,9 @@ def impulse_test(
         damped * np.cos(omega * test.time) * shape[:, None],
     )
     peaks = []
-    for sensor, reached in zip(rig.sensors, level, strict=True):
-        derivative, order = MEASURED[sensor.quantity]
+    for sensor, row, reached in zip(rig.sensors, output_matrix(rig.modes, rig.sensors), level, strict=True):
+        order = MEASURED[sensor.quantity][1]
         if order < 2:
-            row = sensor.gain * rig.modes.phi_at(sensor.at, derivative, direction=sensor.direction)
             peaks.append(reached / max(np.abs(row @ motion[order]).max(), 1e-300))
     return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
 
