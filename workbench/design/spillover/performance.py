@@ -11,7 +11,6 @@ from workbench.design.estimation.observers import luenberger, usual_poles
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices, numbered
-from workbench.design.laws.moments import second_moments
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop, close_loop, peak_force
 from workbench.design.spillover.explain import Explanation, explain_spillover
@@ -22,6 +21,7 @@ from workbench.design.spillover.spillover import (
     finite_spillover,
     on_off_motion,
     quadratic_cost,
+    second_moments,
     work_by_mode,
 )
 from workbench.renamed import Renamed

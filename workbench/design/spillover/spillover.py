@@ -5,23 +5,24 @@ residual ones. For an undamped residual mode at rest and t_f to infinity the dou
 
     W_r = ½ |b_rᵀ F(iω_r)|²,   F(s) = -K (s I - A_C)⁻¹ x_C(0),
 
-the energy that the actuators' forces leave in the mode.
+the energy that the actuators' forces leave in the mode. Work, cost and effort are linear in the second moments
+∫ x xᵀ dt of the state.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
 
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.design.laws.coupled import ON_AXIS
 from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
-from workbench.design.laws.moments import second_moments, settled_moments
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop
 from workbench.design.loop.on_off_response import motion, switchings
+from workbench.rig.linear import integrated
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import gauss_between
 from workbench.structure.modes import Modes, freeze
@@ -234,6 +235,24 @@ def distributed_cost(modes: Modes, controlled: int | Sequence[int], state: np.nd
     p = riccati_matrices(modes.omega[index], weight, np.diag(modes.damping)[index])
     x = np.array([state[index], state[[modes.n_modes + r for r in index]]])
     return float(np.einsum("ir,rij,jr->", x, p, x))
+
+
+def settled_moments(a: Floats, starts: Floats) -> Floats:
+    """∫_0^∞ x xᵀ dt (n, n) for a stable A, summed over the initial states `starts`, (n,) or (n, n_starts)."""
+    # balanced: displacements and rates differ by the frequency, and their rounding errors by its square
+    a, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    starts = starts.reshape(len(a), -1) / scale[:, None]
+    moments: Floats = solve_continuous_lyapunov(a, -starts @ starts.T)
+    return np.asarray(scale[:, None] * moments * scale)
+
+
+def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
+    """∫_0^t x xᵀ dt (n, n), from dM/dt = A M + M Aᵀ + x0 x0ᵀ over a short time that is doubled repeatedly."""
+    a, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    state = state / scale
+    halvings = max(0, int(np.ceil(np.log2(max(np.abs(a).sum(axis=1).max() * final_time, 1.0)))))
+    _, moments = integrated(a, np.outer(state, state), final_time, halvings)
+    return np.asarray(scale[:, None] * moments * scale)
 
 
 def _energies(modes: Modes, state: Floats) -> Floats:
