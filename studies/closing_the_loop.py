@@ -15,7 +15,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.rig.simulate import predict
-from workbench.robust.on_rig import impulse_test
+from workbench.robust.impulse import impulse_test
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.prediction import predict_loop

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag, expm
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
-from workbench.robust.on_rig import impulse_test
+from workbench.robust.impulse import impulse_test
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.redesign import redesign

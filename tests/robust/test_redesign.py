@@ -19,13 +19,14 @@ from workbench.gap.effects.effect import Effect
 from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
-from workbench.robust.on_rig import default_estimator, impulse_test, loop_on_rig, tuned
+from workbench.robust.impulse import impulse_test
+from workbench.robust.on_rig import default_estimator, loop_on_rig, tuned
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.redesign import redesign
 from workbench.robust.steps import _losses
 from workbench.robust.verification import Verification, verify
-from workbench.structure.domain import Patch
+from workbench.structure.domain import Between, Patch
 from workbench.trials.controlled import control_plant
 from workbench.trials.make import find_trial_with_plant
 from workbench.trials.plant import Plant
@@ -74,6 +75,12 @@ def test_a_step_says_what_it_takes_out_and_no_more(rig, step, lost, words):
     assert _losses(replace(rig, actuators=(one, *rig.actuators[1:])), loop, step, SI) == words
 
 
+def test_an_impulse_between_two_places_is_no_disturbance_of_a_placement(rig):
+    law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
+    found = redesign(uncertain(rig), law, sample_time=DT, impulse_at=Between(0.5, 0.9), draws=1)
+    assert found.relocation is None and found.safe
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_at_least_half_of_what_a_fault_costs_is_won_back(rig, controller, fault):
     found = redesign(
@@ -120,6 +127,14 @@ def test_a_residual_mode_that_control_leaves_undamped_is_named(rig, controller):
         )
     }
     assert not replace(found, **alike).left_undamped
+
+
+def test_what_the_shapes_are_at_an_actuator_is_no_imperfection_of_it(rig, controller):
+    """Errors of the shapes at the places of the actuators are of the structure: a rig without faults loses nothing."""
+    shaped = tuple(replace(a, shape_error=(-0.1, 0.1, -0.05, -0.1, 0.0, -0.1)) for a in rig.actuators)
+    corrected = uncertain(replace(rig, actuators=shaped))
+    found = redesign(corrected, controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    assert found.steps[1].name == "law and estimator" and found.steps[1].loss == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_loop_that_a_long_delay_destabilises_is_made_stable(rig, controller):
@@ -514,6 +529,16 @@ def test_an_estimator_that_is_too_slow_for_a_late_loop_is_made_faster(rig, contr
     assert np.all(np.array(faster.excess) < found.steps[0].excess)
     assert found.verification.stable.all()
     assert found.after.effort == faster.effort
+
+
+def test_the_speed_of_the_estimator_is_stated_against_the_design(rig):
+    """Of a filter first made a hundred times faster and then ten times slower it was said that it is slower."""
+    law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
+    designed = kalman(rig.modes, law, rig.sensors[:4], disturbance=1.0, noise=1e-5)
+    late = uncertain(rig, effect("actuator_delay", "all", delay=6.0 * DT))
+    found = redesign(late, designed, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    times = found.loop.controller.designed_by.keywords["noise"] / 1e-5
+    assert [step.what for step in found.steps if step.name == "estimator"] == [f"measurement noise × {times:.3g}"]
 
 
 def test_more_gain_wins_back_nearly_all_that_a_limit_leaves_to_be_won(rig):

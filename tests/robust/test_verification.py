@@ -13,7 +13,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.elements import LinearSpring, PeriodicForce
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.robust.on_rig import impulse_test
+from workbench.robust.impulse import impulse_test
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.verification import verify

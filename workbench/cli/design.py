@@ -41,7 +41,7 @@ def design(
     import numpy as np
 
     from workbench.design.loop.closed_loop import impulse_state
-    from workbench.design.spillover.comparison import compare, laws_of, through_sensors
+    from workbench.design.spillover.performance import compare, laws_of, through_sensors
     from workbench.design.spillover.robustness import perturbed_modes, stable_share
     from workbench.rig.actuators import command_unit
 

@@ -81,7 +81,8 @@ def redesign(
     from workbench.cases.case import read_case
     from workbench.design.export.export import check_name
     from workbench.design.laws.law import controlled_indices
-    from workbench.robust.on_rig import Design, impulse_test
+    from workbench.robust.impulse import impulse_test
+    from workbench.robust.on_rig import Design
     from workbench.robust.redesign import CRITERIA
     from workbench.robust.redesign import redesign as run
     from workbench.study.pages.redesign_page import redesign_page

@@ -18,7 +18,13 @@ from scipy.linalg import expm
 
 from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
-from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays, modal_states
+from workbench.design.estimation.digital import (
+    DigitalController,
+    FrictionForward,
+    Relays,
+    modal_states,
+    zero_order_hold,
+)
 from workbench.design.estimation.observers import observed_plant
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
@@ -57,6 +63,7 @@ class _Model:
         a, b: (n_x, n_x) and (n_x, n_actuators).
         n: number of modal states, the first of X.
         delays, lags: (n_actuators,) s.
+        hold: half a sample, by which a command that is held acts late, s; 0 where delays are not compensated.
         sample_time: s.
     """
 
@@ -65,6 +72,7 @@ class _Model:
     n: int
     delays: np.ndarray
     lags: np.ndarray
+    hold: float
     sample_time: float
 
     @property
@@ -75,31 +83,24 @@ class _Model:
         """
         return np.ceil(np.round(self.delays / self.sample_time, 9)).astype(int)
 
-    def moved(self, a: np.ndarray, horizon: float) -> tuple[np.ndarray, list[dict[int, np.ndarray]]]:
-        """e^{a h}, and for each actuator {age: (n_x,)}, the effect on X over h of its command of that age in samples.
+    def moved(self, a: np.ndarray, horizon: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """e^{a h}, and the effect on X over h of the commands.
 
-        Age 0 is the command to be sent.
+        Those to be sent are (n_x, n_actuators); the past ones (n_x, n_past), actuator by actuator, newest first.
         """
-        added: list[dict[int, np.ndarray]] = []
+        whole, step = self.late, self.sample_time
+        now, past, starts = np.zeros_like(self.b), np.zeros((len(a), whole.sum())), np.cumsum(whole) - whole
         for j, delay in enumerate(self.delays):
-            edges = {0.0, horizon}
-            whole, step = self.late[j], self.sample_time
-            edges |= {e for k in range(-whole, 2) if 0.0 < (e := delay + k * step) < horizon}
-            times = sorted(edges)
-            by_age: dict[int, np.ndarray] = {}
+            changes = (delay + k * step for k in range(-whole[j], 2))
+            times = sorted({0.0, horizon, *(t for t in changes if 0.0 < t < horizon)})
             for start, end in zip(times, times[1:]):
                 age = -int(np.floor(round((0.5 * (start + end) - delay) / step, 9)))
-                share = _held(a, self.b[:, [j]], end - start)[:, 0]
-                by_age[max(age, 0)] = by_age.get(max(age, 0), 0.0) + expm(a * (horizon - end)) @ share
-            added.append(by_age)
-        return expm(a * horizon), added
-
-
-def _held(a: np.ndarray, b: np.ndarray, span: float) -> np.ndarray:
-    """∫_0^span e^{a s} ds b, (n_x, n_inputs)."""
-    block = np.zeros((len(a) + b.shape[1],) * 2)
-    block[: len(a), : len(a)], block[: len(a), len(a) :] = a, b
-    return np.asarray(expm(block * span)[: len(a), len(a) :])
+                effect = expm(a * (horizon - end)) @ zero_order_hold(a, self.b[:, [j]], end - start)[1][:, 0]
+                if age > 0:
+                    past[:, starts[j] + age - 1] += effect
+                else:
+                    now[:, j] += effect
+        return expm(a * horizon), now, past
 
 
 def check_rate(modes: Modes, controlled: Sequence[int], sample_time: float) -> None:
@@ -139,9 +140,13 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
     check_rate(loop.modes, loop.law.controlled, sample_time)
     actuators = [named(rig.actuators, a.name) for a in loop.law.actuators]
     sensors = [named(rig.sensors, s.name) for s in loop.controller.sensors]
-    delays = "delay" in steps
-    model = _model(loop, actuators, sample_time, delays)
-    a, b, c, d, e = _matrices(model, loop, sensors, delays, "sensors" in steps)
+    own, forced, reads = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
+    model = _model(own, forced, actuators, sample_time, "delay" in steps)
+    estimator = loop.controller.estimator
+    if estimator is None:
+        raise DesignError("the controller does not name its estimator; make it by luenberger, kalman or filtered")
+    output = _output(loop, reads, sensors, model.hold, "sensors" in steps)
+    a, b, c, d, e = _matrices(model, loop, estimator, output)
     gain, dead_zone = _values(actuators, "gain"), _values(actuators, "dead_zone")
     parts: dict[str, Any] = {}
     if "dead zone" in steps:
@@ -153,12 +158,12 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
     if "sensors" in steps:
         parts |= {"offset": _values(sensors, "bias"), "scale": 1.0 / _values(sensors, "gain")}
         uncoupling = np.linalg.inv(crosstalk(sensors))
-        b, d = b @ uncoupling, d @ uncoupling
+        b, d, estimator = b @ uncoupling, d @ uncoupling, estimator @ uncoupling
     if isinstance(loop.law, OnOffLaw):
         relays = loop.law.relays
         parts["relays"] = Relays(loop.law.spread, _values(relays, "force"), _values(relays, "dead_band"))
     if "friction" in steps:
-        parts["friction"] = _friction(rig, loop, model, a, b, d)
+        parts["friction"] = _friction(rig, loop, forced, estimator, len(a))
     names = tuple(s.name for s in sensors), tuple(x.name for x in actuators)
     parts |= {"name": loop.controller.name, "states": _states(model, loop, names[1])}
     return DigitalController(sample_time, *names, a, b, c, d, e, **parts)
@@ -171,8 +176,7 @@ def _values(parts: Sequence[object], name: str) -> np.ndarray:
 
 def _states(model: _Model, loop: Loop, actuators: Sequence[str]) -> tuple[str, ...]:
     """The states in words: estimates of the modes, lagged commands, and delayed commands."""
-    filters = loop.controller.state.size == 0  # a modal filter has no state
-    own = ["always zero"] * model.n if filters else modal_states(loop.law.controlled)
+    own = ["always zero"] * model.n if loop.controller.static else modal_states(loop.law.controlled)
     lagging = [f"command of {actuators[int(j)]} after its lag" for j in np.flatnonzero(model.lags)]
     past = [
         f"command of {name}, {k + 1} {'sample' if k == 0 else 'samples'} ago"
@@ -182,9 +186,8 @@ def _states(model: _Model, loop: Loop, actuators: Sequence[str]) -> tuple[str, .
     return (*own, *lagging, *past)
 
 
-def _model(loop: Loop, actuators: Sequence[Actuator], sample_time: float, compensate: bool) -> _Model:
+def _model(a: Floats, b: Floats, actuators: Sequence[Actuator], sample_time: float, compensate: bool) -> _Model:
     """The model of the controlled modes, with delays and lags of the actuators where these are compensated."""
-    a, b, _ = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
     delays, lags = (compensate * _values(actuators, name) for name in ("delay", "time_constant"))
     if (delays > LONGEST * sample_time).any():
         latest = max(actuators, key=lambda x: x.delay)
@@ -200,80 +203,56 @@ def _model(loop: Loop, actuators: Sequence[Actuator], sample_time: float, compen
     for i, j in enumerate(lagging):
         augmented[:n, n + i], into[:n, j] = b[:, j], 0.0
         augmented[n + i, n + i], into[n + i, j] = -1.0 / lags[j], 1.0 / lags[j]
-    return _Model(augmented, into, n, delays, lags, sample_time)
+    return _Model(augmented, into, n, delays, lags, 0.5 * sample_time if compensate else 0.0, sample_time)
 
 
-def _matrices(
-    model: _Model, loop: Loop, sensors: Sequence[Sensor], delays: bool, recalibrated: bool
-) -> tuple[np.ndarray, ...]:
+def _matrices(model: _Model, loop: Loop, estimator: Floats, output: Floats) -> tuple[np.ndarray, ...]:
     """A, B, C, D, E of the `DigitalController`: states X̂, then the delayed commands, newest first.
 
     Args:
         model, loop: of the controlled modes.
-        sensors: of the rig.
-        delays: whether delays and lags of actuators, and the hold, are compensated.
-        recalibrated: whether delays and lags of sensors are.
+        estimator: of the loop's controller.
+        output: of `_output`.
     """
-    n_x, n, n_y, n_u = len(model.a), model.n, len(sensors), model.b.shape[1]
-    late = model.late
-    starts = n_x + np.r_[0, np.cumsum(late)[:-1]].astype(int)
+    static, late, n = loop.controller.static, model.late, model.n
+    (n_x, n_u), n_y = model.b.shape, estimator.shape[1]
     size = n_x + int(late.sum())
-    estimator = loop.controller.estimator
-    if estimator is None:
-        raise DesignError("the controller does not name its estimator; make it by luenberger, kalman or filtered")
-    filters = loop.controller.state.size == 0
-    output = _output(loop, sensors, 0.5 * model.sample_time if delays and not filters else 0.0, recalibrated)
     a, b, e = np.zeros((size, size)), np.zeros((size, n_y)), np.zeros((size, n_u))
     # X at a sample from the states, and of a modal filter from the readings
     by_state, by_reading = np.eye(n_x, size), np.zeros((n_x, n_y))
     observer = model.a.copy()
-    if filters:
-        by_state[:n] = 0.0
-        by_reading[:n] = output
+    if static:
+        by_state[:n], by_reading[:n] = 0.0, output
     else:
         observer[:n, :n] -= estimator @ output
-        correction = np.zeros((n_x, n_y))
-        correction[:n] = estimator
-        b[:n_x] = _held(observer, correction, model.sample_time)
-    step, added = model.moved(observer, model.sample_time)
-    own = slice(n if filters else 0, n_x)
-    a[own, :n_x] = step[own]
-    for j, by_age in enumerate(added):
-        for age, share in by_age.items():
-            if age == 0:
-                e[own, j] += share[own]
-            else:
-                a[own, starts[j] + age - 1] += share[own]
-        if late[j]:
-            past = slice(starts[j], starts[j] + late[j])
-            e[starts[j], j], a[past, past] = 1.0, np.eye(late[j], k=-1)
+        correction = np.vstack([estimator, np.zeros((n_x - n, n_y))])
+        b[:n_x] = zero_order_hold(observer, correction, model.sample_time)[1]
+    step, now, past = model.moved(observer, model.sample_time)
+    own = slice(n if static else 0, n_x)
+    a[own, :n_x], a[own, n_x:], e[own] = step[own], past[own], now[own]
+    for j, (count, end) in enumerate(zip(late, n_x + np.cumsum(late), strict=True)):
+        if count:
+            sent = slice(end - count, end)
+            e[end - count, j], a[sent, sent] = 1.0, np.eye(count, k=-1)
+
+    def predicted(horizon: float) -> tuple[Floats, Floats, Floats]:
+        """X̂ at a horizon from X̂ now (n_x, n_x), from the states, and from the commands to be sent."""
+        step, now, past = model.moved(model.a, horizon)
+        rows = step @ by_state
+        rows[:, n_x:] += past
+        return step, rows, now
+
     feedback = _feedback(model, loop)
     if isinstance(loop.law, OnOffLaw):
-        horizon = float(model.delays.max()) + 0.5 * model.sample_time if delays else 0.0
-        step, predicted, _ = _predicted(model, horizon, starts, by_state)
-        return a, b, feedback @ predicted, feedback @ step @ by_reading, e
-    rows, direct, now = np.zeros((n_u, size)), np.zeros((n_u, n_y)), np.zeros((n_u, n_u))
-    for j in range(n_u):
-        horizon = model.delays[j] + 0.5 * model.sample_time if delays else 0.0
-        step, predicted, by_now = _predicted(model, horizon, starts, by_state)
-        rows[j], direct[j], now[j] = feedback[j] @ predicted, feedback[j] @ step @ by_reading, feedback[j] @ by_now
-    algebraic = np.linalg.inv(np.eye(n_u) - now)  # the command to be sent acts within the horizon that it depends on
-    return a, b, algebraic @ rows, algebraic @ direct, e
-
-
-def _predicted(
-    model: _Model, horizon: float, starts: np.ndarray, by_state: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """X̂ predicted at a horizon: from X̂ now (n_x, n_x), from the states, and from the commands to be sent."""
-    step, added = model.moved(model.a, horizon)
-    rows, now = step @ by_state, np.zeros_like(model.b)
-    for j, by_age in enumerate(added):
-        for age, share in by_age.items():
-            if age == 0:
-                now[:, j] += share
-            else:
-                rows[:, starts[j] + age - 1] += share
-    return step, rows, now
+        step, rows, _ = predicted(float(model.delays.max()) + model.hold)
+        return a, b, feedback @ rows, feedback @ step @ by_reading, e
+    c, d, algebraic = np.zeros((n_u, size)), np.zeros((n_u, n_y)), np.eye(n_u)
+    for j, k in enumerate(feedback):
+        step, rows, now = predicted(model.delays[j] + model.hold)
+        c[j], d[j] = k @ rows, k @ step @ by_reading
+        algebraic[j] -= k @ now  # the command to be sent acts within the horizon that it depends on
+    inverse = np.linalg.inv(algebraic)
+    return a, b, inverse @ c, inverse @ d, e
 
 
 def _feedback(model: _Model, loop: Loop) -> np.ndarray:
@@ -290,46 +269,56 @@ def _feedback(model: _Model, loop: Loop) -> np.ndarray:
     return feedback
 
 
-def _output(loop: Loop, sensors: Sequence[Sensor], hold_delay: float, recalibrated: bool) -> np.ndarray:
+def _output(loop: Loop, reads: Floats, sensors: Sequence[Sensor], hold: float, recalibrated: bool) -> Floats:
     """C (n_channels, n) from x to the readings, with delays and lags of the sensors at each mode's frequency.
 
     For a modal filter its estimator (n, n_channels) with the inverse of delays and lags at each mode's frequency.
+
+    Args:
+        loop: of the controlled modes.
+        reads: C of the faultless sensors.
+        sensors: of the rig.
+        hold: delay of the command by its hold, s, which an observer models as one of the sensors.
+        recalibrated: whether delays and lags of the sensors are compensated.
     """
-    _, _, c = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
     omega = loop.modes.omega[list(loop.law.controlled)]
-    n = omega.size
     delays, lags = (recalibrated * _values(sensors, name) for name in ("delay", "time_constant"))
-    if loop.controller.state.size == 0:
-        estimator = np.array(loop.controller.estimator)
-        inverse = 1.0 / lag_response(omega, delays + hold_delay, lags).T  # (n, n_channels)
-        q, v = estimator[:n], estimator[n:]
-        # the part in quadrature of a displacement adds to q' / ω, and that of a velocity to -ω q
-        safe = np.maximum(omega, 1e-12)[:, None]
-        orders = np.array([MEASURED[s.quantity][1] for s in sensors])
-        of_q, of_v = np.where(orders == 0, q, 0.0), np.where(orders == 1, v, 0.0)
-        return np.vstack(
-            [of_q * inverse.real + of_v * inverse.imag / safe, of_v * inverse.real - of_q * inverse.imag * safe]
-        )
-    return late_output(c[:, :n], c[:, n:], omega, delays + hold_delay, lags)
+    if not loop.controller.static:
+        return late_output(reads, omega, delays + hold, lags)
+    q, v = np.split(np.array(loop.controller.estimator), 2)
+    inverse = 1.0 / lag_response(omega, delays, lags).T  # (n, n_channels)
+    # the part in quadrature of a displacement adds to q' / ω, and that of a velocity to -ω q
+    safe = np.maximum(omega, 1e-12)[:, None]
+    orders = np.array([MEASURED[s.quantity][1] for s in sensors])
+    of_q, of_v = np.where(orders == 0, q, 0.0), np.where(orders == 1, v, 0.0)
+    return np.vstack(
+        [of_q * inverse.real + of_v * inverse.imag / safe, of_v * inverse.real - of_q * inverse.imag * safe]
+    )
 
 
-def _friction(rig: Rig, loop: Loop, model: _Model, a: Floats, b: Floats, d: Floats) -> FrictionForward | None:
-    """Feed-forward commands that cancel the rig's Coulomb friction in the controlled modes; None without friction."""
+def _friction(rig: Rig, loop: Loop, forced: Floats, estimator: Floats, n_states: int) -> FrictionForward | None:
+    """Feed-forward commands that cancel the rig's Coulomb friction in the controlled modes; None without friction.
+
+    Args:
+        rig, loop: as of `compensated`.
+        forced: B of the controlled modes.
+        estimator: of the loop's controller, from readings without cross-talk where that is compensated.
+        n_states: of the digital controller.
+    """
     frictions = [element for element in rig.elements if isinstance(element, CoulombFriction)]
     if not frictions or isinstance(loop.law, OnOffLaw):
         return None
     index = list(loop.law.controlled)
     n, shapes = len(index), np.array([loop.modes.phi_at(f.at)[index] for f in frictions])
-    _, forced, _ = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
-    of_state = np.zeros((len(frictions), len(a)))
-    of_reading = np.zeros((len(frictions), b.shape[1]))
-    if loop.controller.state.size:
-        of_state[:, n : 2 * n] = shapes
+    of_state, of_reading = np.zeros((len(frictions), n_states)), np.zeros((len(frictions), estimator.shape[1]))
+    if loop.controller.static:
+        of_reading = shapes @ estimator[n:]
     else:
-        of_reading = shapes @ np.array(loop.controller.estimator)[n:]
+        of_state[:, n : 2 * n] = shapes
     push = np.linalg.pinv(forced[n:]) @ shapes.T
-    speeds = _values(frictions, "smoothing_speed")
-    return FrictionForward(push, of_state, of_reading, _values(frictions, "force"), speeds)
+    return FrictionForward(
+        push, of_state, of_reading, _values(frictions, "force"), _values(frictions, "smoothing_speed")
+    )
 
 
 def without_faults(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:

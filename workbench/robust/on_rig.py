@@ -1,6 +1,6 @@
 """A design on a rig: its law and estimator on the rig's actuators and sensors, and their redesign for another rig."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,17 +21,13 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
-from workbench.robust.compensation import Loop, check_rate, without_faults
-from workbench.robust.plain_law import unit_participation
+from workbench.robust.compensation import Loop, without_faults
+from workbench.robust.impulse import impulse_speeds
 from workbench.robust.small_motion import loop_poles
-from workbench.structure.domain import Between, Domain, NamedPoints, Patch, Where
 from workbench.structure.modes import Modes, mac
 
 Design = Law | OnOffLaw | Controller | PlacementTask
 
-PERIODS = 25  # of the lowest controlled mode: the length of a test
-MOST_SAMPLES = 6000
-UNMOVED, GRID = 1e-9, 33  # a place does not move below this share of the largest displacement; points to find that
 SAME_PLACE = 0.01  # of the size of the structure: largest distance of two places that count as the same
 SPEEDS = tuple(10.0**k for k in np.arange(8.0, -2.1, -0.5))  # of the default Kalman filter: noise over the stated
 ENOUGH, BETTER = 0.8, 1.02  # sufficient share of the designed damping; least factor by which a faster filter is better
@@ -54,86 +50,6 @@ def controlled_by(design: Design) -> tuple[int, ...]:
             " by imsc, coupled_lqr, coupled_poles or on_off, with an estimator by luenberger or kalman"
         )
     return tuple(range(design.n_controlled)) if isinstance(design, PlacementTask) else law_of(design).controlled
-
-
-def impulse_test(
-    rig: Rig,
-    controlled: Sequence[int],
-    sample_time: float,
-    impulse_at: Where | None = None,
-    *,
-    level: np.ndarray | None = None,
-    seed: int | None = 0,
-) -> LoopTest:
-    """A test by an impulse, with the free motion after it for 25 periods of the lowest controlled mode.
-
-    Args:
-        rig: nominal.
-        controlled: zero-based modes.
-        sample_time: s.
-        impulse_at: the place; by default that of a hammer or of the first actuator. If that moves none of the
-            controlled modes, as at a clamp turned by a motor, the place where all of them move most.
-        level: (n_outputs,) peak readings of the nominal rig without control, to which the impulse is scaled (by the
-            median of the sensors); None for a unit impulse.
-        seed: of the noise.
-
-    Raises:
-        DesignError: rigid modes alone, a sample time too long for the modes, or a place where none of them moves.
-        ValueError: a place outside the structure.
-    """
-    check_rate(rig.modes, controlled, sample_time)
-    omega = rig.modes.omega[list(controlled)]
-    omega = omega[omega > 0]
-    if not omega.size:
-        raise DesignError("the controlled modes are all rigid, so they have no period: give the test")
-    impulse_at = _impulse_place(rig, controlled, impulse_at)
-    shape = rig.modes.phi_at(impulse_at)
-    n_samples = int(min(max(PERIODS * 2.0 * np.pi / omega.min() / sample_time, 64), MOST_SAMPLES))
-    test = LoopTest(n_samples, sample_time, impulse_at, seed=seed)
-    if level is None:
-        return test
-    damped = np.exp(-0.5 * np.diag(rig.modes.damping)[:, None] * test.time)
-    omega = np.maximum(rig.modes.omega, 1e-9)[:, None]
-    motion = (
-        damped * np.sin(omega * test.time) * (shape[:, None] / omega),
-        damped * np.cos(omega * test.time) * shape[:, None],
-    )
-    peaks = []
-    for sensor, reached in zip(rig.sensors, level, strict=True):
-        derivative, order = MEASURED[sensor.quantity]
-        if order < 2:
-            row = sensor.gain * rig.modes.phi_at(sensor.at, derivative, direction=sensor.direction)
-            peaks.append(reached / max(np.abs(row @ motion[order]).max(), 1e-300))
-    return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
-
-
-def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> Where:
-    """A place where an impulse moves the controlled modes: the given one, or by default that of `impulse_test`."""
-    places = rig.modes.domain.grid(GRID)
-    shapes = np.abs(rig.modes.phi(places))
-    at = given
-    if at is None:
-        at = _place_of(rig.modes.domain, next((a for a in rig.actuators if a.direct), rig.actuators[0]))
-    patch = isinstance(at, Patch)  # acts by moments along its edges, so that an impulse there is not defined
-    if not patch and np.abs(rig.modes.phi_at(at)[list(controlled)]).max() > UNMOVED * shapes.max():
-        return at
-    if given is not None:
-        raise DesignError(
-            f"an impulse at {rig.modes.domain.text(at)} moves none of the controlled modes, so it tests no"
-            " controller; choose another place"
-        )
-    moved = shapes[:, list(controlled)]
-    most: Where = places[int((moved / np.maximum(moved.max(axis=0), 1e-300)).min(axis=1).argmax())]
-    return most
-
-
-def _place_of(domain: Domain, port: Actuator) -> Where:
-    """The place of an actuator; of a node with a direction, the point that moves in that direction."""
-    if not isinstance(domain, NamedPoints) or port.direction is None:
-        return port.at
-    places = port.at if isinstance(port.at, Between) else (port.at,)
-    names, _, _ = domain.slope(list(places), int(port.kind == "moment"), port.direction)
-    return Between(*names) if isinstance(port.at, Between) else names[0]
 
 
 def loop_on_rig(rig: Rig, design: Design, test: LoopTest) -> Loop:
@@ -184,10 +100,7 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
             " a sensor"
         )
     index = list(law.controlled)
-    at = test.impulse_at
-    shape = unit_participation(rig.modes, rig.actuators[0]) if at is None else rig.modes.phi_at(at)
-    speed = np.abs(test.impulse * shape[index])
-    speed = np.maximum(speed, 0.1 * speed.max())
+    speed = impulse_speeds(rig.modes, index, test.impulse, test.impulse_at, rig.actuators[0])
     disturbance = speed**2 / (test.n_samples * test.sample_time)
     shapes = np.abs(output_matrix(rig.modes, sensors)[:, index])
     rates = np.array([MEASURED[s.quantity][1] for s in sensors])[:, None]
@@ -265,12 +178,17 @@ def redesigned_for(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = 
         DesignError: modes that cannot be controlled or observed on that rig.
     """
     controlled = paired(loop.modes, modes, loop.law.controlled)
-    actuators = [named(rig.actuators, old.name) for old in loop.law.actuators]
+    actuators = [named(rig.actuators, one.name) for one in loop.law.actuators]
     assert loop.law.designed_by is not None and loop.controller.designed_by is not None
     if isinstance(loop.law, OnOffLaw):
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
-    law = _scaled_design(loop, modes, controlled)(modes, controlled=controlled, actuators=actuators)
-    sensors = without_faults([named(rig.sensors, old.name) for old in loop.controller.sensors])
+    design: Any = loop.law.designed_by
+    if "poles" in settings(loop.law):
+        old, new = loop.modes.omega[list(loop.law.controlled)], modes.omega[list(controlled)]
+        scale = np.where((old > 0) & (new > 0), new / np.where(old > 0, old, 1.0), 1.0)
+        design = partial(design, poles=scale * np.asarray(settings(loop.law)["poles"]))
+    law = design(modes, controlled=controlled, actuators=actuators)
+    sensors = without_faults([named(rig.sensors, one.name) for one in loop.controller.sensors])
     return Loop(modes, law, _redesigned_estimator(loop.controller, modes, _linear(law), sensors, removed))
 
 
@@ -288,31 +206,27 @@ def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> L
     Raises:
         DesignError: settings without a design.
     """
-    parts: dict[str, Any] = {}
-    for name, setting, factor in (("law", "weight", weight), ("controller", "noise", noise)):
-        part: Any = getattr(loop, name)
-        keywords = getattr(part.designed_by, "keywords", {})
-        if factor == 1.0:
-            continue
-        if setting in keywords:
-            changed = {setting: factor * np.asarray(keywords[setting])}
-        elif name == "law" and "poles" in keywords:
-            changed = {"poles": _poles_of_gain(np.asarray(keywords["poles"]), loop, 1.0 / np.sqrt(factor))}
+    law: Any = loop.law
+    controller: Any = loop.controller
+    if weight != 1.0:
+        if "weight" in settings(law):
+            changed = {"weight": weight * np.asarray(settings(law)["weight"])}
+        elif "poles" in settings(law):
+            changed = {"poles": _poles_of_gain(np.asarray(settings(law)["poles"]), loop, 1.0 / np.sqrt(weight))}
         else:
             return None
-        parts[name] = replace(part, designed_by=partial(part.designed_by.func, **{**keywords, **changed}))
-    return redesigned_for(loop._replace(**parts), rig, loop.modes)
+        law = replace(law, designed_by=partial(law.designed_by, **changed))
+    if noise != 1.0:
+        if "noise" not in settings(controller):
+            return None
+        design = partial(controller.designed_by, noise=noise * np.asarray(settings(controller)["noise"]))
+        controller = replace(controller, designed_by=design)
+    return redesigned_for(Loop(loop.modes, law, controller), rig, loop.modes)
 
 
-def _scaled_design(loop: Loop, modes: Modes, controlled: Sequence[int]) -> Any:
-    """The design function of the loop's law, with given poles scaled by the natural frequencies of other modes."""
-    design: Any = loop.law.designed_by
-    poles = getattr(design, "keywords", {}).get("poles")
-    if poles is None:
-        return design
-    old, new = loop.modes.omega[list(loop.law.controlled)], modes.omega[list(controlled)]
-    scale = np.where((old > 0) & (new > 0), new / np.where(old > 0, old, 1.0), 1.0)
-    return partial(design.func, **{**design.keywords, "poles": scale * np.asarray(poles)})
+def settings(part: Law | OnOffLaw | Controller) -> Mapping[str, Any]:
+    """The settings by which a law or an estimator was designed, as {"weight": R}; empty where not known."""
+    return getattr(part.designed_by, "keywords", {})
 
 
 def _poles_of_gain(poles: np.ndarray, loop: Loop, gain: float) -> np.ndarray:
@@ -333,18 +247,14 @@ def _redesigned_estimator(
     old: Controller, modes: Modes, law: Law, sensors: Sequence[Sensor], removed: Sequence[str]
 ) -> Controller:
     """The controller with its estimator redesigned for other modes, a law and sensors without the removed ones."""
-    assert old.designed_by is not None
     kept = [i for i, s in enumerate(sensors) if s.name not in removed]
     design: Any = old.designed_by
-    new: Controller
-    if removed and np.ndim(noise := getattr(design, "keywords", {}).get("noise", 0.0)):
-        chosen = np.asarray(noise)[kept] if np.ndim(noise) == 1 else np.asarray(noise)[np.ix_(kept, kept)]
-        new = design.func(modes, law, [sensors[i] for i in kept], **{**design.keywords, "noise": chosen})
-    else:
-        new = design(modes, law, [sensors[i] for i in kept])
-    if new.state.size == 0:  # a modal filter places its own sensors; those of the rig are at the same places
-        new = replace(new, sensors=tuple(sensors))
-    return new
+    noise = np.asarray(settings(old).get("noise", 0.0))
+    if removed and noise.ndim:
+        design = partial(design, noise=noise[kept] if noise.ndim == 1 else noise[np.ix_(kept, kept)])
+    new: Controller = design(modes, law, [sensors[i] for i in kept])
+    # a modal filter places its own sensors; those of the rig are at the same places
+    return replace(new, sensors=tuple(sensors)) if new.static else new
 
 
 def paired(nominal: Modes, modes: Modes, controlled: Sequence[int]) -> tuple[int, ...]:

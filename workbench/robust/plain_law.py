@@ -1,7 +1,6 @@
 """A law by a rule of thumb, from the damping wanted of its controlled modes."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -9,11 +8,10 @@ from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.on_off import OnOffLaw, on_off
-from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.statespace import input_matrix
+from workbench.robust.impulse import impulse_speeds
 from workbench.structure.domain import Where
-from workbench.structure.modes import Modes
 
 KINDS = ("imsc", "coupled", "poles", "on-off")
 PERIODS = 5.0  # within which on-off control stops each mode
@@ -64,13 +62,6 @@ def plain_law(
         return coupled_lqr(modes, index, actuators, weight=float(np.mean(0.5 * squared / (damping * omega) ** 2)))
     if kind == "poles":
         return coupled_poles(modes, index, actuators, poles=omega * (-damping + 1j * np.sqrt(1.0 - damping**2)))
-    shape = unit_participation(modes, actuators[0]) if impulse_at is None else modes.phi_at(impulse_at)
-    speed = np.abs(impulse * shape[list(index)])
-    speed = np.maximum(speed, 0.1 * speed.max())
+    speed = impulse_speeds(modes, list(index), impulse, impulse_at, actuators[0])
     # a relay reduces the amplitude q'/ω by 4 k / ω² per period
     return on_off(modes, index, actuators, force=speed * omega / (4.0 * PERIODS), dead_band=BAND * speed)
-
-
-def unit_participation(modes: Modes, actuator: Actuator) -> np.ndarray:
-    """Modal forces (n_modes,) of a unit force or moment at an actuator's place."""
-    return input_matrix(modes, [replace(actuator, gain=1.0)])[:, 0]

@@ -146,7 +146,9 @@ class UncertainRig:
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         deviations = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
-        widest = np.array([_widest(p) for _, p in self._parameters])
+        widest = [
+            WIDEST_PLACE if p.name in COORDINATES else WIDEST if p.logarithmic else np.inf for _, p in self._parameters
+        ]
         return np.asarray(root * np.minimum(1.0, widest / deviations)[:, None])
 
     def _at(self, offsets: np.ndarray) -> tuple[Effect, ...]:
@@ -228,24 +230,17 @@ def _listed(values: Sequence[Any]) -> str:
     return ", ".join(f"{v:.4g}" if isinstance(v, float) else str(v) for v in values)
 
 
-def _widest(parameter: Parameter) -> float:
-    """The largest standard deviation of a parameter's free coordinate."""
-    if parameter.name in COORDINATES:
-        return WIDEST_PLACE
-    return WIDEST if parameter.logarithmic else np.inf
-
-
 def _covariance(nominal: Rig, fit: Fit) -> np.ndarray:
     """The joint covariance of a fit's free coordinates; diagonal where only standard deviations are known."""
     parameters = parameters_of(nominal, fit.effects)
     if fit.covariance is not None and fit.covariance.shape == (len(parameters),) * 2:
         return fit.covariance
-    return np.diag([_variance(fit.effects[i], parameter) for i, parameter in parameters])
-
-
-def _variance(effect: Effect, parameter: Parameter) -> float:
-    slope, deviation = parameter.slope(effect.values[parameter.name]), effect.deviations.get(parameter.name, 0.0)
-    return (deviation / slope) ** 2 if slope and np.isfinite(deviation) else 0.0
+    variances = []
+    for i, parameter in parameters:
+        effect, name = fit.effects[i], parameter.name
+        slope, deviation = parameter.slope(effect.values[name]), effect.deviations.get(name, 0.0)
+        variances.append((deviation / slope) ** 2 if slope and np.isfinite(deviation) else 0.0)
+    return np.diag(variances)
 
 
 def _unexplained(verdict: Verdict) -> float:

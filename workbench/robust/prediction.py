@@ -16,6 +16,7 @@ from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import RandomForce
 from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import Motion, read, simulate
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.verification import LEVEL, QUANTILES, check_loop_kinds, drawn_with_errors
@@ -150,7 +151,7 @@ def predict(
         truths.append(truth)
     time = np.asarray(start + period * np.arange(n_samples), float)
     name = inputs.name if isinstance(inputs, Record) else "prediction"
-    banded = _banded(uncertain, uncertain.rig, truths, time, noise, rng, name)
+    banded = _banded(uncertain, _with_noise(uncertain.rig, noise).sensors, truths, time, rng, name)
     return replace(banded, notes=(*banded.notes, *_above_nyquist(uncertain.rig.modes, period)))
 
 
@@ -202,10 +203,8 @@ def predict_loop(
     runs = run_loops(rigs, controller, replace(test, seed=seed))
     truths = [_loop_truth(drawn, run, controller, test.sample_time) for drawn, run in zip(rigs, runs, strict=True)]
     sensors = _with_noise(uncertain.rig, noise).sensors
-    read_by = replace(uncertain.rig, sensors=tuple(named(sensors, name) for name in controller.sensors))
-    of_sensors = np.array([s.noise_std for s in read_by.sensors])
-    rng = np.random.default_rng([seed, 1])
-    return _banded(uncertain, read_by, truths, test.time, of_sensors, rng, controller.name)
+    read_by = [named(sensors, name) for name in controller.sensors]
+    return _banded(uncertain, read_by, truths, test.time, np.random.default_rng([seed, 1]), controller.name)
 
 
 def _uncertain(rig: Verdict | UncertainRig, noise_std: Sequence[float] | Floats | None) -> tuple[UncertainRig, Floats]:
@@ -263,27 +262,25 @@ def _loop_truth(rig: Rig, run: LoopRun, controller: DigitalController, sample_ti
 
 def _banded(
     uncertain: UncertainRig,
-    rig: Rig,
+    sensors: Sequence[Sensor],
     drawn: Sequence[Floats],
     time: Floats,
-    noise: Floats,
     rng: np.random.Generator,
     name: str,
 ) -> Prediction:
     """The prediction with its bands, from the noise-free readings of each draw; diverging draws are left out.
 
     Args:
-        uncertain: gives the unexplained share that the bands allow for.
-        rig: gives the sensors.
+        uncertain: gives the modes, and the unexplained share that the bands allow for.
+        sensors: (n_outputs,) with the noise to be added.
         drawn: (n_outputs, n_samples) noise-free readings of each draw.
         time: (n_samples,) s.
-        noise: (n_outputs,) standard deviation.
         rng: of the noise.
         name: of the prediction.
     """
     period = float(time[1] - time[0])
     frequencies = np.asarray(np.fft.rfftfreq(time.size, period), float)
-    bands = _bands(rig.modes, frequencies)
+    bands = _bands(uncertain.rig.modes, frequencies)
     truths = [
         truth + _unexplained(truth, uncertain.unexplained, frequencies, bands, rng)
         for truth in drawn
@@ -303,14 +300,14 @@ def _banded(
             f" {100 * uncertain.unexplained:.3g} % of the readings, of any phase and in any frequency band."
         )
     readings = np.array(truths)
-    median, low, high = _over_time(readings, rig, noise, rng)
+    median, low, high = _over_time(readings, sensors, rng)
     for i, truth in enumerate(readings):
-        readings[i] = _read(truth, rig, noise, rng)
+        readings[i] = _read(truth, sensors, rng)
     sizes = np.array([amplitudes(reading) for reading in readings])
     spectrum = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
     prediction = Prediction(
         time,
-        tuple(Channel(s.name, s.quantity, at=s.at, noise_std=n) for s, n in zip(rig.sensors, noise)),
+        tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in sensors),
         median,
         low,
         high,
@@ -319,7 +316,7 @@ def _banded(
         spectrum[1],
         spectrum[2],
         bands,
-        np.zeros((0, len(rig.sensors), 1 + len(bands))),
+        np.zeros((0, len(sensors), 1 + len(bands))),
         name,
         tuple(notes),
         uncertain.unexplained,
@@ -343,9 +340,8 @@ def _inputs(rig: Rig, inputs: Record | Floats, sample_time: float | None) -> tup
                 f"record {inputs.name!r} has no input {missing[0]!r}: it has {', '.join(given) or 'none'}; the rig's"
                 f" are {', '.join(names)}"
             )
-        sent, period, hold, start = (
-            np.array([given[name] for name in names]), inputs.sample_time, inputs.input_hold, inputs.start_time,
-        )  # fmt: skip
+        sent: Floats = np.array([given[name] for name in names])
+        period, hold, start = inputs.sample_time, inputs.input_hold, inputs.start_time
     else:
         if inputs is None or isinstance(inputs, str | Path):
             raise TypeError(
@@ -354,7 +350,8 @@ def _inputs(rig: Rig, inputs: Record | Floats, sample_time: float | None) -> tup
             )
         if sample_time is None or not (np.isfinite(number(sample_time, "sample_time", "s")) and sample_time > 0):
             raise ValueError(f"inputs as an array need a positive sample_time; got {sample_time}")
-        sent, period, hold, start = np.atleast_2d(np.asarray(inputs, float)), sample_time, "zero", 0.0
+        sent = np.atleast_2d(np.asarray(inputs, float))
+        period, hold, start = sample_time, "zero", 0.0
     if sent.shape[0] != len(names) or sent.shape[1] < 2 or not np.isfinite(sent).all():
         raise ValueError(
             f"inputs must be finite, one row for each of {', '.join(names)} and 2 samples or more; got {sent.shape}"
@@ -400,21 +397,20 @@ def _unexplained(truth: Floats, share: float, frequencies: Floats, bands: Floats
     return np.asarray(np.fft.irfft(error * np.fft.rfft(truth, axis=1), truth.shape[1], axis=1))
 
 
-def _read(truth: Floats, rig: Rig, noise: Floats, rng: np.random.Generator) -> Floats:
+def _read(truth: Floats, sensors: Sequence[Sensor], rng: np.random.Generator) -> Floats:
     """Readings of noise-free signals `truth` (..., n_outputs, n_samples): with noise, then clipping, then rounding."""
-    reading = truth + noise[:, None] * rng.standard_normal(truth.shape)
-    for j, sensor in enumerate(rig.sensors):
+    reading: Floats = truth + np.array([[s.noise_std] for s in sensors]) * rng.standard_normal(truth.shape)
+    for j, sensor in enumerate(sensors):
         reading[..., j, :] = np.clip(reading[..., j, :], -sensor.limit, sensor.limit)
         if sensor.step > 0:
             reading[..., j, :] = sensor.step * np.round(reading[..., j, :] / sensor.step)
     return reading
 
 
-def _over_time(truths: Floats, rig: Rig, noise: Floats, rng: np.random.Generator) -> list[Floats]:
-    """Quantiles (n_outputs, n_samples) of the readings of all draws, sensor by sensor."""
+def _over_time(truths: Floats, sensors: Sequence[Sensor], rng: np.random.Generator) -> Floats:
+    """Quantiles (3, n_outputs, n_samples) of the readings of all draws, sensor by sensor."""
     rows = []
-    for j, sensor in enumerate(rig.sensors):
-        one = replace(rig, sensors=(sensor,))
-        readings = [_read(truths[:, [j]], one, noise[[j]], rng)[:, 0] for _ in range(NOISES)]
+    for j, sensor in enumerate(sensors):
+        readings = [_read(truths[:, [j]], [sensor], rng)[:, 0] for _ in range(NOISES)]
         rows.append(np.quantile(np.concatenate(readings), QUANTILES, axis=0, method="weibull"))
-    return list(np.array(rows).transpose(1, 0, 2))
+    return np.stack(rows, axis=1)

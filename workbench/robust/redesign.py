@@ -15,7 +15,8 @@ from workbench.renamed import former_arguments
 from workbench.rig.rig import Rig
 from workbench.robust.advice import MORE_COST, Redesign
 from workbench.robust.compensation import Loop, check_rate, compensated
-from workbench.robust.on_rig import Design, controlled_by, impulse_test, loop_on_rig, redesigned_for
+from workbench.robust.impulse import impulse_test
+from workbench.robust.on_rig import Design, controlled_by, loop_on_rig, redesigned_for
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.relocation import relocated
 from workbench.robust.small_motion import modes_in_motion

@@ -13,7 +13,8 @@ from workbench.design.placement.placement import place_actuators
 from workbench.design.placement.task import Placement, placement_task
 from workbench.records.units import SI, Units
 from workbench.robust.compensation import Loop
-from workbench.structure.domain import Interval, position
+from workbench.robust.on_rig import settings
+from workbench.structure.domain import Between, Interval, position
 
 SPACING, STARTS = 0.05, 4  # of the length; random starts of the search
 
@@ -57,21 +58,23 @@ class Relocation:
 def relocated(loop: Loop, test: LoopTest, units: Units = SI) -> Relocation | None:
     """The optimal placement of the law's actuators; None where it is no better than the present one, or not known.
 
-    It is known for IMSC of the lowest modes along an interval, by point forces, after an impulse.
+    It is known for IMSC of the lowest modes along an interval, by point forces, after an impulse at one place.
     """
-    law, modes = loop.law, loop.modes
+    law, modes, at = loop.law, loop.modes, test.impulse_at
     n = len(law.controlled)
-    settings = getattr(law.designed_by, "keywords", {})
-    if getattr(law.designed_by, "func", None) is not imsc or test.impulse_at is None or n == modes.n_modes:
+    if (
+        getattr(law.designed_by, "func", None) is not imsc
+        or at is None
+        or isinstance(at, Between)
+        or n == modes.n_modes
+    ):
         return None
     if not isinstance(modes.domain, Interval) or law.controlled != tuple(range(n)) or len(law.actuators) != n:
         return None
     if not all(isinstance(a.at, float) and a.kind == "force" for a in law.actuators):
         return None
     try:
-        task = placement_task(
-            modes, n, impulse_at=position(test.impulse_at), weight=settings["weight"], impulse=test.impulse
-        )
+        task = placement_task(modes, n, impulse_at=position(at), weight=settings(law)["weight"], impulse=test.impulse)
         present = task.placed(np.array([position(a.at) for a in law.actuators]), "present places")
         limits = Limits(effort=present.effort, spacing=SPACING * modes.length)
         moved = place_actuators(task, limits, starts=STARTS)

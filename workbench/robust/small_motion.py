@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from workbench.design.estimation.controller import reading
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.export.sampled_loop import closed_by, held, linear_plant
 from workbench.design.loop.rig_loop import LoopRun, named
 from workbench.rig.elements import PointElement
 from workbench.rig.rig import Rig
-from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.statespace import output_matrix
+from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
 from workbench.structure.supports import PointDamper, PointSpring
@@ -97,10 +97,9 @@ def _closed(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.n
 def _output(rig: Rig, controller: DigitalController, modes: Modes, total: int) -> np.ndarray:
     """C (n_sensors, total) of the readings, modal states first, with sensors' lags and delays at modal frequencies."""
     sensors = [named(rig.sensors, name) for name in controller.sensors]
-    rates = np.array([[MEASURED[s.quantity][1]] for s in sensors])
-    shapes, gains = output_matrix(modes, sensors), np.array([s.gain for s in sensors])
     delays, lags = np.array([max(s.delay, 0.0) for s in sensors]), np.array([s.time_constant for s in sensors])
-    reads = late_output(shapes * (rates == 0), shapes * (rates != 0), modes.omega, delays, lags)
+    reads = late_output(reading(modes, sensors), modes.omega, delays, lags)
+    gains = np.array([s.gain for s in sensors])
     mixed = gains[:, None] * crosstalk(sensors) / gains
     return np.asarray(mixed @ np.pad(reads, ((0, 0), (0, total - reads.shape[1]))))
 
@@ -110,10 +109,9 @@ def lag_response(omega: np.ndarray, delays: np.ndarray, lags: np.ndarray) -> np.
     return np.asarray(np.exp(-1j * np.outer(delays, omega)) / (1.0 + 1j * np.outer(lags, omega)))
 
 
-def late_output(
-    c_q: np.ndarray, c_v: np.ndarray, omega: np.ndarray, delays: np.ndarray, lags: np.ndarray
-) -> np.ndarray:
-    """C (n_sensors, 2 n_modes) of y = Re(H (c_q + iω c_v) (q - i q'/ω)), H of `lag_response`, states (q, q')."""
+def late_output(reads: np.ndarray, omega: np.ndarray, delays: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """C (n_sensors, 2 n_modes) of y = Re(H (c_q + iω c_v) (q - i q'/ω)), H of `lag_response`, for reads (c_q c_v)."""
+    c_q, c_v = np.hsplit(reads, 2)
     h, safe = lag_response(omega, delays, lags), np.where(omega > 0, omega, 1.0)
     return np.hstack([c_q * h.real - c_v * omega * h.imag, c_v * h.real + c_q * h.imag / safe])
 

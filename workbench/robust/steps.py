@@ -15,7 +15,7 @@ from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.robust.compensation import STEPS, Loop, compensated, without_faults
-from workbench.robust.on_rig import redesigned_for, tuned
+from workbench.robust.on_rig import redesigned_for, settings, tuned
 from workbench.robust.small_motion import loop_poles
 from workbench.robust.verification import settling
 
@@ -27,7 +27,7 @@ WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # weight, where actuators s
 SLOWER = (1.0, 2.0, 5.0, 10.0)  # noise, with these
 SOFTER = (1.0, 3.0, 10.0, 30.0, 100.0)  # weight, where the law is unstable as designed
 SLOWEST = tuple(10.0**k for k in np.arange(0.0, 9.1, 0.5))  # noise, with these
-SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # noise, for the law as designed
+SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # noise, with the law unchanged
 # what a step compensates in an actuator: in words, and by its attribute
 COMPENSATED = {
     "delay": (("delay", "delay"), ("lag", "time_constant")),
@@ -156,8 +156,9 @@ class Search:
             for noise in SLOWER:
                 for weight in WEIGHTS:
                     self._tune_once("gain", designed, weight, noise)
+        designed = self.loop
         for noise in SPEEDS:
-            self._tune_once("estimator", self.loop, 1.0, noise)
+            self._tune_once("estimator", designed, 1.0, noise)
 
     def _tune_once(self, name: str, loop: Loop, weight: float, noise: float) -> None:
         other = _retuned(self._rig, loop, weight, noise)
@@ -220,7 +221,7 @@ def _retuned(rig: Rig, loop: Loop, weight: float, noise: float) -> Loop | None:
 
 def weighted(loop: Loop) -> bool:
     """Whether the law minimises a cost that weights its forces."""
-    return "weight" in getattr(loop.law.designed_by, "keywords", {})
+    return "weight" in settings(loop.law)
 
 
 def _tuning(loop: Loop, weight: float, noise: float) -> str:
@@ -231,7 +232,7 @@ def _tuning(loop: Loop, weight: float, noise: float) -> str:
 
 def _faulty(rig: Rig, loop: Loop) -> list[str]:
     """Names of faulty sensors that an observer may leave out; none for a modal filter, which needs all its sensors."""
-    if loop.controller.state.size == 0 or len(loop.controller.sensors) < 2:
+    if loop.controller.static or len(loop.controller.sensors) < 2:
         return []
     read = [named(rig.sensors, one.name) for one in loop.controller.sensors]
     return [s.name for s, faultless in zip(read, without_faults(read), strict=True) if s != faultless]
@@ -239,7 +240,8 @@ def _faulty(rig: Rig, loop: Loop) -> list[str]:
 
 def _perfect(a: Actuator) -> Actuator:
     """The actuator with its gain, without delay, lag, limits and other imperfections."""
-    return Actuator(a.name, a.at, a.kind, a.gain, direct=a.direct, direction=a.direction)
+    unlimited = replace(a, limit=np.inf, rate_limit=np.inf, dead_zone=0.0, hysteresis_share=0.0)
+    return replace(unlimited, delay=0.0, time_constant=0.0, bias=0.0)
 
 
 def force_weight(run: LoopRun, controlled: Sequence[int]) -> float:

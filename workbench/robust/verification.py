@@ -13,7 +13,7 @@ from workbench.design.loop.rig_loop import LoopRun, LoopTest, of_loops, run_loop
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import PeriodicForce, RandomForce
-from workbench.rig.rig import Rig
+from workbench.rig.rig import Rig, shape_of
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
 from workbench.structure.domain import NamedPoints, middle
@@ -310,7 +310,7 @@ def settling(energy: np.ndarray, sample_time: float) -> float:
 def displacement_at(modes: Modes, actuator: Actuator) -> np.ndarray:
     """Displacement (n_modes,) of each mode at an actuator: at the middle of a patch; at named points its own motion."""
     if actuator.kind == "force" or isinstance(modes.domain, NamedPoints):
-        return modes.phi_at(actuator.at, int(actuator.kind == "moment"), direction=actuator.direction)
+        return shape_of(modes, actuator)
     return np.asarray(modes.phi(middle(actuator.at))[0])
 
 

@@ -8,7 +8,7 @@ from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import filter_on, point_filter
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, close_with
-from workbench.design.spillover.comparison import through_sensors
+from workbench.design.spillover.performance import through_sensors
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
@@ -66,6 +66,14 @@ def test_a_law_through_it_leaves_the_controlled_modes_as_they_were_designed():
     exact = close_loop(modes(), law)
     np.testing.assert_allclose(close_loop(modes(), law, filter_).matrix, exact.matrix, rtol=1e-9, atol=1e-7)
     np.testing.assert_allclose(close_with(modes(), filtered(law, filter_)).matrix, exact.matrix, rtol=1e-9, atol=1e-7)
+
+
+def test_its_design_can_be_repeated_for_other_modes():
+    points = [f"P{i}" for i in (1, 3, 4, 6, 8, 11)]
+    law = imsc(modes(), 2, [Actuator("F1", "P3"), Actuator("F2", "P7")], weight=1e-4)
+    controller, other = filtered(law, point_filter(modes(), points, law.controlled)), modes(4)
+    again = controller.designed_by(other, law, controller.sensors)
+    np.testing.assert_array_equal(again.direct, filtered(law, point_filter(other, points, law.controlled)).direct)
 
 
 def test_a_filter_is_tried_where_only_points_are_known():

@@ -8,7 +8,7 @@ import pytest
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response, peak_force
-from workbench.design.spillover.comparison import compare
+from workbench.design.spillover.performance import compare
 from workbench.rig.actuators import Actuator
 
 

@@ -64,6 +64,14 @@ def test_models_are_wrong_by_what_was_asked():
         perturbed_modes(modes, np.nan)
 
 
+def test_models_that_are_hardly_wrong_keep_the_damping_that_couples_the_modes():
+    damping = np.diag(np.diag(beam().damping)) + 0.02 * (np.ones((6, 6)) - np.eye(6))
+    modes = replace(beam(), damping=damping)
+    covariance = 1e-22 * np.eye(12)
+    for model in (*perturbed_modes(modes, 1e-9, count=1), *draw_modes(replace(modes, covariance=covariance), 1)):
+        np.testing.assert_allclose(model.damping, damping, rtol=1e-7)
+
+
 @pytest.mark.slow
 def test_robustness_is_the_share_of_positive_damping():
     """Without gain a loop is stable where every damping ratio drawn is positive: normal, so known."""

@@ -59,6 +59,11 @@ class Controller(Printed):
         return f"{line}, {counted(len(self.state), 'state')}", ("name", "quantity", "at"), rows, ()
 
     @property
+    def static(self) -> bool:
+        """Whether it has no state, as a law through a modal filter."""
+        return self.state.size == 0
+
+    @property
     def places(self) -> tuple[Place, ...]:
         """Distinct places of the sensors, in order."""
         return tuple(sorted({sensor.at for sensor in self.sensors}))

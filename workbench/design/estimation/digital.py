@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 
 import control
 import numpy as np
-from scipy.linalg import expm
+from scipy.signal import cont2discrete
 
 from workbench.arguments import number
+from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import freeze, frozen
@@ -182,19 +183,22 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
         )
     if not 0 < number(sample_time, "sample_time", "s") < np.inf:
         raise ValueError(f"sample_time must be above 0; got {sample_time:g} s")
-    n, n_sensors = controller.state.shape[0], len(controller.sensors)
-    augmented = np.zeros((n + n_sensors, n + n_sensors))
-    augmented[:n] = np.hstack([controller.state, controller.reads])
-    held = expm(sample_time * augmented)
+    a, b = zero_order_hold(controller.state, controller.reads, sample_time)
     return DigitalController(
         sample_time,
         tuple(sensor.name for sensor in controller.sensors),
         tuple(actuator.name for actuator in controller.law.actuators),
-        held[:n, :n],
-        held[:n, n:],
+        a,
+        b,
         controller.commands,
         controller.direct,
-        np.zeros((n, len(controller.law.actuators))),
+        np.zeros(controller.commands.T.shape),
         name=controller.name,
-        states=modal_states(controller.law.controlled) if n else (),
+        states=() if controller.static else modal_states(controller.law.controlled),
     )
+
+
+def zero_order_hold(a: Floats, b: Floats, span: float) -> tuple[Floats, Floats]:
+    """e^{A t} and ∫_0^t e^{A s} ds B over a span t (s), for an input that is held."""
+    transition, into, *_ = cont2discrete((a, b, np.eye(len(a)), np.zeros(b.shape)), span)
+    return transition, into

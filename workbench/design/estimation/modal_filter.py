@@ -172,8 +172,12 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
     slowest = modes.omega[modes.omega > 0].min(initial=np.inf)
     compliance = 1.0 / np.maximum(modes.omega, RIGID * slowest if np.isfinite(slowest) else 1.0)
     weights: Floats = (compliance[:, None] * np.linalg.pinv(shapes * compliance))[index]
-    again = partial(point_filter, points=names)
-    return ModalFilter(np.array(names, object), weights, np.zeros((len(index), 0)), again)
+    return ModalFilter(
+        np.array(names, object),
+        weights,
+        np.zeros((len(index), 0)),
+        lambda others, wanted: point_filter(others, names, wanted),
+    )
 
 
 def anew(design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[int], **settings: Any) -> ModalFilter:

@@ -78,6 +78,10 @@ class ClosedLoop:
         """Whether no pole is to the right of the axis; those of undamped residual modes lie on it."""
         return self.stability != "unstable"
 
+    def start(self, state: ArrayLike) -> Floats:
+        """The state (n_states,) at t = 0 from that of the modes, (2 n_modes,), or more; the others start from zero."""
+        return np.concatenate([state, np.zeros(len(self.matrix) - np.size(state))])
+
     def behind(self, states: Flags) -> Flags:
         """Which states (n_states,) drive the given ones, directly or through others; the given ones are included.
 
@@ -198,7 +202,7 @@ def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] 
     if np.shape(state) not in ((sizes[0],), (sizes[1],)) or not np.isfinite(state).all():
         more = f", or ({sizes[1]},) with the controller" if sizes[1] > sizes[0] else ""
         raise ValueError(f"the state must be finite, ({sizes[0]},) of the modes{more}; got {np.shape(state)}")
-    state = np.r_[state, np.zeros(sizes[1] - np.size(state))]
+    state = loop.start(state)
     modal = _cascade(loop, state, time)
     if modal is None:
         modal = _stepped(loop.matrix, state, time)
@@ -220,7 +224,7 @@ def peak_force(loop: ClosedLoop, state: np.ndarray, final_time: float) -> float:
     own = np.flatnonzero(loop.behind(np.asarray(loop.feedback.any(axis=0))))
     if not own.size:
         return 0.0
-    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
+    state = loop.start(state)
     poles, vectors = np.linalg.eig(loop.matrix[np.ix_(own, own)])
     amplitudes = (loop.feedback[:, own] @ vectors) * np.linalg.solve(vectors, state[own].astype(complex))
     return largest(poles, amplitudes, final_time)

@@ -13,10 +13,10 @@ from scipy.optimize import OptimizeResult, minimize
 
 from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError, Law, weighed_states
-from workbench.design.laws.moments import settled_moments
 from workbench.design.loop.peak import largest
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement, check_uncoupled
+from workbench.design.spillover.spillover import settled_moments
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, modal_state_matrix
 from workbench.structure.printed import counted

@@ -16,9 +16,9 @@ from scipy.linalg import expm
 from workbench.arrays import Floats, symmetric_root
 from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError, Law, weighed_states
-from workbench.design.laws.moments import settled_moments
 from workbench.design.loop.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
+from workbench.design.spillover.spillover import settled_moments
 from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig

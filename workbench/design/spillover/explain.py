@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import eig
 from scipy.optimize import linear_sum_assignment
 
-from workbench.arrays import Complexes, Flags, Floats
+from workbench.arrays import Complexes, Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.laws.law import DesignError, linear
 from workbench.design.loop.closed_loop import ClosedLoop, close_with, rounding
@@ -168,11 +168,14 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
             " an observer (luenberger, kalman) or through a modal filter, and give the controller"
         )
     loop = close_with(modes, controller)
-    rest = _LoopWithoutOne(modes, controller)
     residual = [r for r in range(modes.n_modes) if r not in controller.law.controlled]
     open_loop = _open_loop_poles(modes)
     closed = [_nearest_pole(loop, pole) for pole in _poles_of(loop.matrix, modes.n_modes, residual)]
-    shifts = [_ResidualMode(rest, r, open_loop[r]).shifted(pole) for r, pole in zip(residual, closed, strict=True)]
+    ports = input_matrix(modes, controller.law.actuators), reading(modes, controller.sensors)
+    shifts = [
+        _ResidualMode(modes, controller, *ports, r, open_loop[r]).shifted(pole)
+        for r, pole in zip(residual, closed, strict=True)
+    ]
     shifts.sort(key=lambda m: -m.closed_pole.real)
     reduced = close_with(modes.select(controller.law.controlled), controller)
     cause = _destabilising(modes, controller, loop, shifts, reduced.stable)
@@ -227,38 +230,79 @@ def _destabilising(
     return suspects[best] if loops[best].stable else None
 
 
-class _LoopWithoutOne:
-    """A loop without one of its modes: T = (I - C G)⁻¹ C, C the controller and G all other modes."""
+class _ResidualMode:
+    """Residual mode r, of open-loop pole λ, in the loop of all the others: T = (I - C G)⁻¹ C, C the controller.
 
-    def __init__(self, modes: Modes, controller: Controller) -> None:
-        self.modes, self.controller = modes, controller
-        self.slowest = modes.omega[modes.omega > 0].min() if modes.omega.any() else 1.0
-        self.inputs = input_matrix(modes, controller.law.actuators)
-        self.outputs = reading(modes, controller.sensors)
+    Args:
+        modes, controller: of the loop.
+        inputs: (n_modes, n_actuators) modal forces per command.
+        outputs: (n_channels, 2 n_modes) from the state to the readings.
+        r: zero-based.
+        pole: λ.
+    """
 
-    def forces(self, r: int, s: complex) -> np.ndarray:
-        """T(s) (n_actuators, n_channels) without mode r."""
-        c, others = self.controller, np.arange(self.modes.n_modes) != r
-        plant = self.output(s)[:, others] @ self.displacements(others, s, self.inputs[others])
+    def __init__(
+        self, modes: Modes, controller: Controller, inputs: Floats, outputs: Floats, r: int, pole: complex
+    ) -> None:
+        self._modes, self._controller, self._inputs, self._outputs = modes, controller, inputs, outputs
+        self._r, self._pole, self._others = r, pole, np.arange(modes.n_modes) != r
+        coupled = not modes.proportional
+        self._row, self._column = coupled * modes.damping[r, self._others], coupled * modes.damping[self._others, r]
+        self._slowest = modes.omega[modes.omega > 0].min() if modes.omega.any() else 1.0
+
+    def shifted(self, closed: complex) -> PoleShift:
+        """The shift of the pole to that of the closed loop, by path."""
+        exact = self._terms(closed)
+        double = abs(self._slope(self._pole)) <= DOUBLE * abs(self._pole)
+        first = np.full_like(exact, complex(np.nan, np.nan)) if double else self._terms(self._pole)
+        paths = []
+        for j, actuator in enumerate(self._controller.law.actuators):
+            for place in self._controller.places:
+                here = [sensor.at == place for sensor in self._controller.sensors]
+                paths.append(Path(actuator.name, place, complex(exact[j, here].sum()), complex(first[j, here].sum())))
+        return PoleShift(self._r, self._pole, closed, tuple(sorted(paths, key=lambda path: -path.shift.real)))
+
+    def _terms(self, s: complex) -> Complexes:
+        """Terms (n_actuators, n_channels) of the shift Δ, evaluated at s."""
+        r, others, n = self._r, self._others, self._modes.n_modes
+        output = self._outputs[:, :n] + s * self._outputs[:, n:]  # readings per displacement, without lags and delays
+        response = self._displacements(s, self._inputs[others])
+        slope = self._slope(s)
+        b = self._inputs[r] - s * self._row @ response
+        c = output[:, r] - s * output[:, others] @ self._displacements(s, self._column[:, None])[:, 0]
+        terms: Complexes = b[:, None] * self._forces(s, output[:, others] @ response) * c
+        # one of a double pole may not move, as that of a rigid mode whose velocity alone is read
+        return 0.0 * terms if abs(slope) <= DOUBLE * self._slowest else terms / slope
+
+    def _forces(self, s: complex, plant: Complexes) -> Complexes:
+        """T(s) (n_actuators, n_channels), with the plant G(s) of the other modes."""
+        c = self._controller
         own = c.direct + c.commands @ np.linalg.solve(s * np.eye(len(c.state)) - c.state, c.reads)
         own = self._lags(c.law.actuators, s)[:, None] * own * self._lags(c.sensors, s)
         # least squares, because the matrix is singular where the loop without mode r has the pole s too, as with
         # several rigid modes that one sensor reads
         return np.asarray(np.linalg.lstsq(np.eye(len(own)) - own @ plant, own, rcond=None)[0])
 
-    def output(self, s: complex) -> Complexes:
-        """C_q + s C_v (n_channels, n_modes): readings per modal displacement, without lags and delays of sensors."""
-        n = self.modes.n_modes
-        return np.asarray(self.outputs[:, :n] + s * self.outputs[:, n:])
+    def _slope(self, s: complex) -> complex:
+        """E(s), without cancellation: Z(s)⁻¹ - Z(λ)⁻¹ by the resolvent identity."""
+        damping, others, own = self._modes.damping, self._others, s + self._pole
+        uncoupled = complex(own + damping[self._r, self._r])
+        if self._modes.proportional:
+            return uncoupled
+        response = self._displacements(self._pole, self._column[:, None])
+        between = own * response + damping[np.ix_(others, others)] @ response
+        inner = self._displacements(s, own * self._column[:, None] - self._pole**2 * between)
+        return uncoupled - complex(self._row @ inner[:, 0])
 
-    def displacements(self, others: Flags, s: complex, forces: np.ndarray) -> Complexes:
-        """Z(s)⁻¹ F: modal displacements (n_others, n) of some modes under modal forces F (n_others, n) on them."""
-        diagonal = s**2 + s * np.diag(self.modes.damping)[others] + self.modes.omega[others] ** 2
+    def _displacements(self, s: complex, forces: np.ndarray) -> Complexes:
+        """Z(s)⁻¹ F: modal displacements (n_others, n) of the other modes under modal forces F (n_others, n) on them."""
+        modes, others = self._modes, self._others
+        diagonal = s**2 + s * np.diag(modes.damping)[others] + modes.omega[others] ** 2
         # an undamped mode equal to mode r has an infinite response at their pole: a small stiffness bounds it
-        diagonal = np.where(diagonal == 0, TWIN * max(abs(s), self.slowest) ** 2, diagonal)
-        if self.modes.proportional:
+        diagonal = np.where(diagonal == 0, TWIN * max(abs(s), self._slowest) ** 2, diagonal)
+        if modes.proportional:
             return np.asarray(forces / diagonal[:, None])
-        stiffness = s * self.modes.damping[np.ix_(others, others)]
+        stiffness = s * modes.damping[np.ix_(others, others)]
         np.fill_diagonal(stiffness, diagonal)
         return np.asarray(np.linalg.solve(stiffness, forces))
 
@@ -266,52 +310,6 @@ class _LoopWithoutOne:
         """Transfer functions (n_parts,) of the lag and delay of each actuator or sensor at s."""
         transfer = np.ones(len(parts), complex)
         for j, part in enumerate(parts):
-            for _, (a, b, c) in lateness(part, self.modes):
+            for _, (a, b, c) in lateness(part, self._modes):
                 transfer[j] *= c @ np.linalg.solve(s * np.eye(len(b)) - a, b)
         return transfer
-
-
-class _ResidualMode:
-    """Residual mode r, of open-loop pole λ, in the loop of all the others."""
-
-    def __init__(self, rest: _LoopWithoutOne, r: int, pole: complex) -> None:
-        self._rest, self._r, self.pole = rest, r, pole
-        damping, self._others = rest.modes.damping, np.arange(rest.modes.n_modes) != r
-        coupled = not rest.modes.proportional
-        self._row, self._column = coupled * damping[r, self._others], coupled * damping[self._others, r]
-
-    def _slope(self, s: complex) -> complex:
-        """E(s), without cancellation: Z(s)⁻¹ - Z(λ)⁻¹ by the resolvent identity."""
-        rest, others, own = self._rest, self._others, s + self.pole
-        uncoupled = complex(own + rest.modes.damping[self._r, self._r])
-        if rest.modes.proportional:
-            return uncoupled
-        response = rest.displacements(others, self.pole, self._column[:, None])
-        between = own * response + rest.modes.damping[np.ix_(others, others)] @ response
-        inner = rest.displacements(others, s, own * self._column[:, None] - self.pole**2 * between)
-        return uncoupled - complex(self._row @ inner[:, 0])
-
-    def _terms(self, s: complex) -> Complexes:
-        """Terms (n_actuators, n_channels) of the shift Δ, evaluated at s."""
-        rest, others = self._rest, self._others
-        output, slope = rest.output(s), self._slope(s)
-        b = rest.inputs[self._r] - s * self._row @ rest.displacements(others, s, rest.inputs[others])
-        c = output[:, self._r] - s * output[:, others] @ rest.displacements(others, s, self._column[:, None])[:, 0]
-        terms: Complexes = b[:, None] * rest.forces(self._r, s) * c
-        # one of a double pole may not move, as that of a rigid mode whose velocity alone is read
-        return 0.0 * terms if abs(slope) <= DOUBLE * rest.slowest else terms / slope
-
-    def shifted(self, closed: complex) -> PoleShift:
-        return PoleShift(self._r, self.pole, closed, self._paths(closed))
-
-    def _paths(self, closed: complex) -> tuple[Path, ...]:
-        exact = self._terms(closed)
-        double = abs(self._slope(self.pole)) <= DOUBLE * abs(self.pole)
-        first = np.full_like(exact, complex(np.nan, np.nan)) if double else self._terms(self.pole)
-        sensors = self._rest.controller.sensors
-        paths = []
-        for j, actuator in enumerate(self._rest.controller.law.actuators):
-            for place in self._rest.controller.places:
-                here = [sensor.at == place for sensor in sensors]
-                paths.append(Path(actuator.name, place, complex(exact[j, here].sum()), complex(first[j, here].sum())))
-        return tuple(sorted(paths, key=lambda path: -path.shift.real))

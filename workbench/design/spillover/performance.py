@@ -1,17 +1,38 @@
-"""Performance of a design on the full plant: cost, effort, spillover and stability margin."""
+"""Performance of designs after a disturbance: cost, effort, spillover and stability of one, or of several compared."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.design.laws.law import DesignError
-from workbench.design.laws.moments import second_moments
+from workbench.design.estimation.controller import Controller, filtered
+from workbench.design.estimation.modal_filter import filter_on
+from workbench.design.estimation.observers import luenberger, usual_poles
+from workbench.design.laws.coupled import coupled_lqr, coupled_poles
+from workbench.design.laws.imsc import imsc, imsc_poles
+from workbench.design.laws.law import DesignError, Law, controlled_indices, numbered
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.loop.closed_loop import ClosedLoop
-from workbench.design.spillover.spillover import check_final_time, on_off_motion
+from workbench.design.loop.closed_loop import ClosedLoop, close_loop, peak_force
+from workbench.design.spillover.explain import Explanation, explain_spillover
+from workbench.design.spillover.spillover import (
+    Spillover,
+    check_final_time,
+    effort,
+    finite_spillover,
+    on_off_motion,
+    quadratic_cost,
+    second_moments,
+    work_by_mode,
+)
 from workbench.renamed import Renamed
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix
-from workbench.structure.modes import Modes
+from workbench.structure.domain import NamedPoints, Place
+from workbench.structure.member import Structure
+from workbench.structure.modes import Modes, freeze
+from workbench.structure.plate import Membrane, Plate
+from workbench.threads import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -48,15 +69,12 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
     margin = loop.margin
     if not loop.stable:
         return Performance(np.inf, np.inf, np.inf, margin)
-    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
-    moments = second_moments(loop.matrix, state, final_time)
+    moments = second_moments(loop.matrix, loop.start(state), final_time)
     own = list(loop.law.controlled)
     energy = modes.omega[own] ** 2 @ np.diag(moments)[own] + np.diag(moments)[[n + r for r in own]].sum()
-    effort = float(np.trace(loop.feedback @ moments @ loop.feedback.T))
-    rest = [r for r in range(n) if r not in own]
-    push = input_matrix(modes, loop.law.actuators)[rest] @ loop.feedback
-    spillover = float(sum(row @ moments[:, n + r] for row, r in zip(push, rest)))
-    return Performance(float(energy) + weight * effort, effort, spillover, margin)
+    used = float(np.trace(loop.feedback @ moments @ loop.feedback.T))
+    spillover = float(np.delete(work_by_mode(loop, moments), own).sum())
+    return Performance(float(energy) + weight * used, used, spillover, margin)
 
 
 def on_off_performance(
@@ -70,13 +88,145 @@ def on_off_performance(
     _check_weight(weight)
     check_final_time(final_time)
     response, instants = on_off_motion(modes, law, state, final_time)
-    effort = float((response.forces**2).sum(axis=0) @ instants)
+    used = float((response.forces**2).sum(axis=0) @ instants)
     energy = float(2.0 * response.energy[list(law.controlled)].sum(axis=0) @ instants)
     rest = [r for r in range(modes.n_modes) if r not in law.controlled]
     power = (input_matrix(modes, law.actuators)[rest] @ response.forces) * response.modal[modes.n_modes :][rest]
-    return Performance(energy + weight * effort, effort, float((power @ instants).sum()), np.nan)
+    return Performance(energy + weight * used, used, float((power @ instants).sum()), np.nan)
 
 
 def _check_weight(weight: float) -> None:
     if not weight > 0:
         raise DesignError(f"the control weight R must be positive; got {weight:g}")
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Cost, effort, spillover and stability of one law.
+
+    Attributes:
+        law: the law.
+        cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt of the controlled modes, over all time.
+        effort: ∫ FᵀF dt over all time.
+        peak_force: largest |F| of any actuator in continuous time up to the final time, to a millionth.
+        work: of the actuators in every mode up to the final time.
+        poles: (n_states,) of the loop with exact modal coordinates, rad/s.
+        stability: of that loop, see `ClosedLoop.stability`.
+    """
+
+    law: Law
+    cost: float
+    effort: float
+    peak_force: float
+    work: Spillover
+    poles: np.ndarray
+    stability: str
+
+    def __post_init__(self) -> None:
+        freeze(self, "poles", dtype=complex)
+
+    @property
+    def most_excited(self) -> int | None:
+        """Zero-based index of the residual mode that takes the most work; None where no mode is residual."""
+        residual = self.work.residual
+        return residual[int(np.argmax(self.work.residual_work))] if residual else None
+
+
+def laws_of(
+    modes: Modes, controlled: int, actuators: Sequence[Actuator], *, weight: float, damping: float | None = None
+) -> tuple[list[Law], list[str]]:
+    """The laws that can be designed, IMSC and coupled LQR, and why others cannot.
+
+    With a damping ratio, the same two by pole assignment too.
+
+    Raises:
+        DesignError: no law can be designed.
+    """
+    if damping is not None and not 0 < damping < 1:
+        raise DesignError(f"the damping ratio wanted must lie between 0 and 1; got {damping:g}")
+    independent, refused, poles = controlled <= len(actuators), [], None
+    if not independent:
+        refused.append(
+            f"IMSC needs as many actuators as controlled modes, {controlled}; there are {len(actuators)}: add actuators"
+        )
+    if damping is not None:
+        omega = modes.omega[list(controlled_indices(modes, controlled))]
+        rigid = np.flatnonzero(omega == 0).tolist()
+        if rigid:
+            refused.append(
+                f"no pole assignment: the rigid mode(s) {numbered(rigid)} have no damping ratio; design by the weight,"
+                " or give poles for all modes to coupled_poles"
+            )
+        else:
+            poles = omega * (-damping + 1j * np.sqrt(1 - damping**2))
+    laws = []
+    if independent:
+        laws.append(imsc(modes, controlled, actuators, weight=weight))
+        if poles is not None:
+            laws.append(imsc_poles(modes, controlled, actuators, poles=poles))
+    laws.append(coupled_lqr(modes, controlled, actuators, weight=weight))
+    if poles is not None:
+        laws.append(coupled_poles(modes, controlled, actuators, poles=poles))
+    return laws, refused
+
+
+@one_blas_thread
+def compare(
+    modes: Modes, laws: Sequence[Law], state: np.ndarray, *, weight: float, final_time: float
+) -> tuple[Compared, ...]:
+    """Cost, effort, peak force, work by mode and poles of each law, from the same initial state.
+
+    Args:
+        modes: controlled and residual.
+        laws: to compare; their costs are comparable if they control the same modes.
+        state: (2 n_modes,) at t = 0; with residual modes at rest, W_R is due to control alone.
+        weight: R of the cost.
+        final_time: s, of work and peak force.
+    """
+    check_final_time(final_time)
+    rows = []
+    for law in laws:
+        loop = close_loop(modes, law)
+        rows.append(
+            Compared(
+                law=law,
+                cost=quadratic_cost(modes, law, state, weight),
+                effort=effort(modes, law, state),
+                peak_force=peak_force(loop, state, final_time),
+                work=finite_spillover(loop, state, final_time),
+                poles=loop.poles,
+                stability=loop.stability,
+            )
+        )
+    return tuple(rows)
+
+
+def through_sensors(
+    modes: Modes, laws: Sequence[Law], places: Sequence[Place], structure: Structure | Plate | Membrane | None
+) -> tuple[tuple[Controller | None, Explanation | None, str], ...]:
+    """Each law with each estimator that sensors at the places allow: a modal filter and a Luenberger observer.
+
+    Args:
+        modes: controlled and residual.
+        laws: to try.
+        places: of the sensors: displacement for an observer, displacement and velocity for a filter.
+        structure: gives the mass for the filters; without it filters are tried at named points alone.
+
+    Returns:
+        (controller, explanation on the full plant, "") each, or (None, None, reason) where the design fails.
+    """
+    sensor_places = sorted(set(places))
+    sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensor_places)]
+    tried: list[tuple[Controller | None, Explanation | None, str]] = []
+    estimators = (True, False) if structure is not None or isinstance(modes.domain, NamedPoints) else (False,)
+    for law in laws:
+        for by_filter in estimators:
+            try:
+                if by_filter:
+                    controller = filtered(law, filter_on(structure, modes, law.controlled, sensor_places))
+                else:
+                    controller = luenberger(modes, law, sensors, poles=usual_poles(modes, law.controlled))
+                tried.append((controller, explain_spillover(modes, controller), ""))
+            except ValueError as error:
+                tried.append((None, None, f"{law.name}: {error}"))
+    return tuple(tried)

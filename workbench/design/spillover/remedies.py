@@ -11,11 +11,22 @@ from typing import Any
 import numpy as np
 
 from workbench.design.estimation.controller import Controller
-from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_with, rounding
 from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
-from workbench.structure.domain import Between, Domain, NamedPoints, Place, Where, centred_at, middle, reach, same_place
+from workbench.structure.domain import (
+    Between,
+    Domain,
+    Interval,
+    NamedPoints,
+    Place,
+    Rectangle,
+    Where,
+    centred_at,
+    middle,
+    reach,
+    same_place,
+)
 from workbench.structure.modes import Modes
 from workbench.structure.printed import counted
 from workbench.threads import one_blas_thread
@@ -150,7 +161,7 @@ def _margin(modes: Modes, redesign: Redesign, setting: _Setting) -> tuple[float,
     """The margin of a design and its rounding error, 1/s; -inf where the design fails."""
     try:
         loop = close_with(modes, redesign(setting.actuators, setting.sensors, setting.share))
-    except (DesignError, ValueError):
+    except ValueError:
         return -np.inf, 0.0
     return loop.margin, rounding(loop.poles)
 
@@ -185,9 +196,9 @@ def _smallest_move(
     return best
 
 
-def _directions(domain: Domain, where: Where) -> Iterator[tuple[float, Callable[[float], Where]]]:
+def _directions(domain: Interval | Rectangle, where: Where) -> Iterator[tuple[float, Callable[[float], Where]]]:
     """For each direction along each coordinate: the largest distance of a move, m, and the new place by distance."""
-    if isinstance(domain, NamedPoints) or (isinstance(where, Between) and len(domain.coordinates) > 1):
+    if isinstance(where, Between) and len(domain.coordinates) > 1:
         return
     at, (low, high) = np.atleast_1d(np.asarray(middle(where), float)), reach(domain, where)
     for axis, sign in product(range(at.size), (-1.0, 1.0)):

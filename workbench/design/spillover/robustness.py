@@ -97,10 +97,15 @@ def draw_modes(
 
 
 def _perturbed(modes: Modes, values: np.ndarray, mixing: np.ndarray) -> Modes:
-    """Modes of given ω and ζ, `values` (2 n_modes,), and the shapes φ (I + mixing), mixing (n_modes, n_modes)."""
+    """Modes of given ω and ζ, `values` (2 n_modes,), and the shapes φ (I + mixing), mixing (n_modes, n_modes).
+
+    Damping that couples the modes is kept.
+    """
     n = modes.n_modes
     omega = np.maximum(values[:n], LEAST_OMEGA * modes.omega)
     c = np.diag(2.0 * values[n:] * omega)
+    if not modes.proportional:
+        c += modes.damping - np.diag(np.diag(modes.damping))
     blend = np.eye(n) + mixing
     return Modes(omega, c, lambda x, d: modes.shapes(x, d) @ blend, modes.domain, modes.essential, masses=modes.masses)
 

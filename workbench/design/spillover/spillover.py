@@ -5,23 +5,24 @@ residual ones. For an undamped residual mode at rest and t_f to infinity the dou
 
     W_r = ½ |b_rᵀ F(iω_r)|²,   F(s) = -K (s I - A_C)⁻¹ x_C(0),
 
-the energy that the actuators' forces leave in the mode.
+the energy that the actuators' forces leave in the mode. Work, cost and effort are linear in the second moments
+∫ x xᵀ dt of the state.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
 
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.design.laws.coupled import ON_AXIS
 from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
-from workbench.design.laws.moments import second_moments, settled_moments
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop
 from workbench.design.loop.on_off_response import motion, switchings
+from workbench.rig.linear import integrated
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import gauss_between
 from workbench.structure.modes import Modes, freeze
@@ -81,22 +82,6 @@ class Spillover(Printed):
         return line, ("mode", "", "W_r"), rows, ()
 
 
-def force_transform(modes: Modes, law: Law, state: Floats, s: Complexes) -> Complexes:
-    """Laplace transforms (n_actuators, n_s) of the actuator forces of a law on exact modal coordinates.
-
-    Args:
-        state: (2 n_modes,) at t = 0; only the controlled modes matter.
-        s: (n_s,) complex, rad/s.
-    """
-    loop, start, feedback, _ = _controlled_loop(modes, law, state)
-    values, vectors = np.linalg.eig(loop)
-    if np.linalg.cond(vectors) < 1e6:
-        weights = (feedback @ vectors) * np.linalg.solve(vectors, start.astype(complex))
-        return np.asarray(weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None])))
-    eye = np.eye(loop.shape[0])
-    return np.array([feedback @ np.linalg.solve(si * eye - loop, start) for si in np.asarray(s)]).T
-
-
 def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
     """Work in every mode for t_f to infinity, in closed form, of a law on exact modal coordinates.
 
@@ -113,18 +98,29 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
             "with damping the actuators' work is no longer the energy left in a mode: use"
             " workbench.design.spillover.spillover.finite_spillover(close_loop(modes, law), state, final_time)"
         )
-    if np.linalg.eigvals(_controlled_loop(modes, law, state)[0]).real.max() >= 0:
+    loop, start, feedback, _ = _controlled_loop(modes, law, state)
+    if np.linalg.eigvals(loop).real.max() >= 0:
         raise DesignError("the controlled modes do not settle, so their work has no limit; take a finite time")
     work = np.zeros(n)
     work[index] = -_energies(modes, state)[index]
     if residual:
         omega = modes.omega[residual]
         force = input_matrix(modes, law.actuators)[residual]
-        push = np.einsum("rj,jr->r", force, force_transform(modes, law, state, 1j * omega))
+        push = np.einsum("rj,jr->r", force, _force_transform(loop, start, feedback, 1j * omega))
         moving = state[[n + r for r in residual]] + 1j * omega * state[residual]
         # z = q' + iω q leaves z(∞) e^{-iωt} = z0 + F(iω)
         work[residual] = 0.5 * np.abs(push) ** 2 + (np.conj(moving) * push).real
     return Spillover(work, law.controlled, np.inf)
+
+
+def _force_transform(loop: Floats, start: Floats, feedback: Floats, s: Complexes) -> Complexes:
+    """Laplace transforms (n_actuators, n_s) of the forces of the loop x' = A x from its start, at s (n_s,), rad/s."""
+    values, vectors = np.linalg.eig(loop)
+    if np.linalg.cond(vectors) < 1e6:
+        weights = (feedback @ vectors) * np.linalg.solve(vectors, start.astype(complex))
+        return np.asarray(weights @ (1.0 / (s[None, :] - values[:, None])))
+    eye = np.eye(loop.shape[0])
+    return np.array([feedback @ np.linalg.solve(si * eye - loop, start) for si in s]).T
 
 
 def _controlled_loop(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats, Floats, Flags]:
@@ -140,8 +136,7 @@ def _controlled_loop(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Flo
     own = np.asarray(loop.feedback.any(axis=0))
     own[np.r_[index[modes.omega[index] > 0], modes.n_modes + index]] = True
     needed = loop.behind(own)
-    start = np.r_[state, np.zeros(needed.size - np.size(state))]
-    return loop.matrix[np.ix_(needed, needed)], start[needed], loop.feedback[:, needed], needed
+    return loop.matrix[np.ix_(needed, needed)], loop.start(state)[needed], loop.feedback[:, needed], needed
 
 
 def check_final_time(final_time: float) -> None:
@@ -160,12 +155,15 @@ def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> 
     W_r = ∫ b_rᵀF q_r' dt is the integral of a quadratic form of the state, by one matrix exponential.
     """
     check_final_time(final_time)
+    moments = second_moments(loop.matrix, loop.start(state), final_time)
+    return Spillover(work_by_mode(loop, moments), loop.law.controlled, final_time)
+
+
+def work_by_mode(loop: ClosedLoop, moments: Floats) -> Floats:
+    """W_r = ∫ b_rᵀF q_r' dt (n_modes,) from the second moments ∫ x xᵀ dt of the state."""
     n = loop.modes.n_modes
-    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
-    moments = second_moments(loop.matrix, state, final_time)
-    force_rows = input_matrix(loop.modes, loop.law.actuators) @ loop.feedback
-    work = np.array([force_rows[r] @ moments[:, n + r] for r in range(n)])
-    return Spillover(work, loop.law.controlled, final_time)
+    forces = input_matrix(loop.modes, loop.law.actuators) @ loop.feedback
+    return np.array([forces[r] @ moments[:, n + r] for r in range(n)])
 
 
 def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> Spillover:
@@ -239,6 +237,24 @@ def distributed_cost(modes: Modes, controlled: int | Sequence[int], state: np.nd
     return float(np.einsum("ir,rij,jr->", x, p, x))
 
 
+def settled_moments(a: Floats, starts: Floats) -> Floats:
+    """∫_0^∞ x xᵀ dt (n, n) for a stable A, summed over the initial states `starts`, (n,) or (n, n_starts)."""
+    # balanced: displacements and rates differ by the frequency, and their rounding errors by its square
+    a, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    starts = starts.reshape(len(a), -1) / scale[:, None]
+    moments: Floats = solve_continuous_lyapunov(a, -starts @ starts.T)
+    return np.asarray(scale[:, None] * moments * scale)
+
+
+def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
+    """∫_0^t x xᵀ dt (n, n), from dM/dt = A M + M Aᵀ + x0 x0ᵀ over a short time that is doubled repeatedly."""
+    a, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    state = state / scale
+    halvings = max(0, int(np.ceil(np.log2(max(np.abs(a).sum(axis=1).max() * final_time, 1.0)))))
+    _, moments = integrated(a, np.outer(state, state), final_time, halvings)
+    return np.asarray(scale[:, None] * moments * scale)
+
+
 def _energies(modes: Modes, state: Floats) -> Floats:
     n = modes.n_modes
     return 0.5 * (state[n : 2 * n] ** 2 + (modes.omega * state[:n]) ** 2)
@@ -246,6 +262,6 @@ def _energies(modes: Modes, state: Floats) -> Floats:
 
 def energy_gained(loop: ClosedLoop, state: np.ndarray, final_time: float) -> np.ndarray:
     """Energy gained by each mode (n_modes,) from t = 0 to the final time, from the motion itself."""
-    start = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
+    start = loop.start(state)
     end = expm(loop.matrix * final_time) @ start
     return _energies(loop.modes, end) - _energies(loop.modes, start)
