@@ -18,6 +18,7 @@ from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator
+from workbench.rig.rig import shape_of
 from workbench.rig.sensors import Sensor
 from workbench.robust.impulse import impulse_test
 from workbench.robust.on_rig import default_estimator, loop_on_rig, tuned
@@ -438,6 +439,14 @@ def test_an_impulse_is_as_large_in_volts_as_in_metres(rig):
     peaks = np.abs(rig.modes.phi([s.at for s in rig.sensors[:4]]) @ moved.modal[:6]).max(axis=1)
     speeds = np.abs(rig.modes.phi([s.at for s in rig.sensors[4:]]) @ moved.modal[6:]).max(axis=1)
     assert np.median(level / np.r_[peaks, speeds]) == pytest.approx(1.0, rel=0.02)
+
+
+def test_an_impulse_counts_what_the_shapes_are_at_the_sensors(rig):
+    """Shapes that are half as large again at every sensor: two thirds of the impulse reach the same level."""
+    level = np.linspace(0.01, 0.02, 8)
+    more = (replace(s, shape_error=tuple(0.5 * shape_of(rig.modes, s))) for s in rig.sensors)
+    plain, larger = (impulse_test(r, [0, 1], DT, level=level) for r in (rig, replace(rig, sensors=tuple(more))))
+    assert larger.impulse == pytest.approx(plain.impulse / 1.5)
 
 
 def silent(rig):
