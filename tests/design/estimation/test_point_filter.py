@@ -1,5 +1,7 @@
 """Modal filters at named points: against splines, least squares and sines, and sensors that cannot do it."""
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -74,6 +76,10 @@ def test_its_design_can_be_repeated_for_other_modes():
     controller, other = filtered(law, point_filter(modes(), points, law.controlled)), modes(4)
     again = controller.designed_by(other, law, controller.sensors)
     np.testing.assert_array_equal(again.direct, filtered(law, point_filter(other, points, law.controlled)).direct)
+    sent = pickle.loads(pickle.dumps(point_filter(modes(), points, law.controlled)))  # to another process
+    np.testing.assert_array_equal(
+        sent.designed_by(other, law.controlled).displacement, point_filter(other, points, law.controlled).displacement
+    )
 
 
 def test_a_filter_is_tried_where_only_points_are_known():

@@ -172,12 +172,13 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
     slowest = modes.omega[modes.omega > 0].min(initial=np.inf)
     compliance = 1.0 / np.maximum(modes.omega, RIGID * slowest if np.isfinite(slowest) else 1.0)
     weights: Floats = (compliance[:, None] * np.linalg.pinv(shapes * compliance))[index]
-    return ModalFilter(
-        np.array(names, object),
-        weights,
-        np.zeros((len(index), 0)),
-        lambda others, wanted: point_filter(others, names, wanted),
-    )
+    again = partial(_at_points, names)
+    return ModalFilter(np.array(names, object), weights, np.zeros((len(index), 0)), again)
+
+
+def _at_points(points: Sequence[str], modes: Modes, filtered: Sequence[int]) -> ModalFilter:
+    """`point_filter`, redesigned at the same points: a function of the module, so that a filter can be pickled."""
+    return point_filter(modes, points, filtered)
 
 
 def anew(design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[int], **settings: Any) -> ModalFilter:
