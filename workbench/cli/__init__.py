@@ -1,1 +1,1 @@
-"""The `workbench` command."""
+"""The `workbench` command, one file a command."""

@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from workbench.cli.bench import bench
+from workbench.cli.check import check
 from workbench.cli.design import design
 from workbench.cli.diagnose import diagnose
 from workbench.cli.export import export
@@ -12,7 +13,7 @@ from workbench.cli.identify import identify
 from workbench.cli.look import look
 from workbench.cli.new import new
 from workbench.cli.place import place
-from workbench.cli.predict import check, predict
+from workbench.cli.predict import predict
 from workbench.cli.redesign import redesign
 from workbench.cli.report import report
 from workbench.cli.study import study
