@@ -328,6 +328,20 @@ def test_inputs_that_do_not_fit_are_refused():
         simulate(rig(), np.zeros((100, 2)), sample_time=DT)
 
 
+@pytest.mark.parametrize("input_hold", ["zero", "first", "band-limited"])
+def test_a_rig_without_actuators_is_moved_by_its_periodic_force_alone(input_hold):
+    """Beside a law as without one; a law alone leaves it at rest."""
+    periodic, nothing, no_inputs = PeriodicForce(4.0, 0.13, 0.7, 0.4), CubicSpring(4.0, 0.0), np.zeros((0, 100))
+    sensors = (Sensor("d", 3.1), Sensor("a", 7.0, "acceleration"))
+    given = {"sample_time": DT, "input_hold": input_hold}
+    alone = [
+        simulate(Rig(beam().modes(6), (), sensors, elements), no_inputs, **given).outputs
+        for elements in ((periodic,), (periodic, nothing), (nothing,))
+    ]
+    np.testing.assert_allclose(alone[1], alone[0], rtol=0, atol=1e-9 * np.abs(alone[0]).max())
+    assert not alone[2].any()
+
+
 def test_state_space_names_and_lags():
     system = state_space(
         beam().modes(2), (Actuator("F1", 2.0, time_constant=0.1),), (Sensor("y", 3.0, time_constant=0.2),)

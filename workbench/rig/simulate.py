@@ -373,7 +373,7 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(inputs.shape[1])
     stiffness = modes.omega[:, None] ** 2 * (scale if rig.stiffness_rate else 1.0)
     # coupling by damping is among the forces on the modes, so that the diagonal alone remains
-    bias = np.array([[actuator.bias] for actuator in rig.actuators])
+    bias = np.array([actuator.bias for actuator in rig.actuators]).reshape(-1, 1)
     acting = at_samples[: len(rig.actuators)] - bias
     steps = _steps_within(rig, inputs, acting, participation, sample_time) if input_hold == "zero" else ()
     n_inputs = len(rig.actuators)
