@@ -193,84 +193,52 @@ def straight_response(
         As `held_response`.
     """
     poles, weights = system.poles, system.weights @ participation
-    inputs = _DelayedInputs.of(forces, sample_time, delay, every)
-    response = np.zeros((poles.size, forces.shape[1] // every), complex)
-    for j, own in enumerate(inputs.responses(poles)):
-        response += weights[:, j, None] * own
-    if time_constant == 0:
-        return response, inputs.at_steps
-    denominator = 1.0 + poles * time_constant
-    denominator = np.where(np.abs(denominator) < CLOSE, CLOSE, denominator)
-    of_lag = inputs.responses(np.array([-1.0 / time_constant], complex))
-    lagging = np.reshape([own[0].real for own in of_lag], (len(forces), -1))
-    return (response - weights @ lagging) / denominator[:, None], lagging / time_constant
+    n_inputs, n_samples = forces.shape
+    late, rest = whole_samples(delay, sample_time)
+    remaining = sample_time - rest
+    # of each step: the delayed samples within it, one before and one after it
+    padded = np.concatenate([np.zeros((n_inputs, late + 1)), forces, forces[:, -1:]], axis=1)[:, : n_samples + 2]
+    strided = sliding_window_view(padded, every + 2, axis=1)[:, ::every].transpose(0, 2, 1)
+    windows = np.ascontiguousarray(strided)  # (n_inputs, every + 2, n_steps)
+    share = remaining / (rest + remaining)  # of the next sample in the value at a sample, once delayed
 
-
-@dataclass(frozen=True, eq=False)
-class _DelayedInputs:
-    """Inputs that are linear between samples and delayed, over steps of a number of samples.
-
-    Attributes:
-        windows: (n_inputs, every + 2, n_steps) the inputs delayed by whole samples: at the samples of each step, one
-            before and one after it.
-        first: (n_inputs,) their first samples.
-        late: whole samples of the delay.
-        spans: of the rest of the delay, and from there to the next sample, s.
-        every: number of samples of a step.
-    """
-
-    windows: Floats
-    first: Floats
-    late: int
-    spans: tuple[float, float]
-    every: int
-
-    @classmethod
-    def of(cls, forces: Floats, sample_time: float, delay: float, every: int) -> "_DelayedInputs":
-        n_inputs, n_samples = forces.shape
-        late, rest = whole_samples(delay, sample_time)
-        padded = np.concatenate([np.zeros((n_inputs, late + 1)), forces, forces[:, -1:]], axis=1)[:, : n_samples + 2]
-        windows = sliding_window_view(padded, every + 2, axis=1)[:, ::every].transpose(0, 2, 1)
-        return cls(np.ascontiguousarray(windows), forces[:, 0], late, (rest, sample_time - rest), every)
-
-    @property
-    def _share(self) -> float:
-        """Of the next sample in the value at a sample, once delayed."""
-        rest, remaining = self.spans
-        return remaining / (rest + remaining)
-
-    @property
-    def at_steps(self) -> Floats:
-        """The inputs (n_inputs, n_steps) at the beginning of each step."""
-        values: Floats = (1.0 - self._share) * self.windows[:, 0] + self._share * self.windows[:, 1]
-        step, sample = divmod(self.late, self.every)
-        if self.spans[0] > 0 and sample == 0 and step < values.shape[1]:
-            values[:, step] = 0.0
-        return values
-
-    def responses(self, poles: Complexes) -> Iterator[Complexes]:
+    def responses(poles: Complexes) -> Iterator[Complexes]:
         """Coordinates (n_poles, n_steps) of the poles that each input alone drives."""
-        (rest, remaining), share = self.spans, self._share
         before, after = _ends_of_ramp(poles, rest), _ends_of_ramp(poles, remaining)
         fade = np.exp(poles * remaining)
         # weights of the last, this and the next delayed sample in one interval, two linear pieces
         to_this, to_next = fade * (share * before[0] + before[1]), share * after[1]
         of_samples = fade * (1.0 - share) * before[0], to_this + after[0] + (1.0 - share) * after[1], to_next
-        decay = np.exp(np.outer(poles, (rest + remaining) * np.arange(self.every - 1, -1, -1)))
-        weights = np.zeros((poles.size, self.every + 2), complex)
+        decay = np.exp(np.outer(poles, (rest + remaining) * np.arange(every - 1, -1, -1)))
+        weights = np.zeros((poles.size, every + 2), complex)
         for i, weight in enumerate(of_samples):
-            weights[:, i : i + self.every] += weight[:, None] * decay
-        for window, first in zip(self.windows, self.first, strict=True):
+            weights[:, i : i + every] += weight[:, None] * decay
+        for window, first in zip(windows, forces[:, 0], strict=True):
             # two real products: one of complex by real numbers takes four
             drive = weights.real @ window + 1j * (weights.imag @ window)
             # no ramp from the zero before to the first sample, where the inputs begin with a step
-            for interval, ramp in ((self.late - 1, to_next), (self.late, to_this)):
-                step, sample = divmod(interval, self.every)
+            for interval, ramp in ((late - 1, to_next), (late, to_this)):
+                step, sample = divmod(interval, every)
                 if 0 <= step < drive.shape[1]:
                     drive[:, step] -= first * ramp * decay[:, sample]
             response = np.zeros(drive.shape, complex)
-            _recursion(np.exp(poles * (rest + remaining) * self.every), drive, response)
+            _recursion(np.exp(poles * (rest + remaining) * every), drive, response)
             yield response
+
+    response = np.zeros((poles.size, n_samples // every), complex)
+    for weight, own in zip(weights.T, responses(poles), strict=True):
+        response += weight[:, None] * own
+    if time_constant == 0:
+        at_steps = (1.0 - share) * windows[:, 0] + share * windows[:, 1]
+        step, sample = divmod(late, every)
+        if rest > 0 and sample == 0 and step < at_steps.shape[1]:
+            at_steps[:, step] = 0.0
+        return response, at_steps
+    denominator = 1.0 + poles * time_constant
+    denominator = np.where(np.abs(denominator) < CLOSE, CLOSE, denominator)
+    of_lag = responses(np.array([-1.0 / time_constant], complex))
+    lagging = np.reshape([own[0].real for own in of_lag], (n_inputs, -1))
+    return (response - weights @ lagging) / denominator[:, None], lagging / time_constant
 
 
 def sinusoid_response(
