@@ -17,10 +17,10 @@ from workbench.identification.rig_from import rig_from
 from workbench.identification.signal.distortion import distortion_of
 from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel, Record
+from workbench.rig.force_laws import hysteresis
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import predict
-from workbench.rig.stepping import hysteresis
 from workbench.structure.domain import Between
 from workbench.structure.modes import Modes, PointShapes
 

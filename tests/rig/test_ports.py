@@ -7,10 +7,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from workbench.rig.actuators import Actuator, piezo_patch
+from workbench.rig.driving import actuator_force
 from workbench.rig.elements import CoulombFriction, CubicSpring
+from workbench.rig.readings import read
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import actuator_force, move, read, simulate
+from workbench.rig.simulate import move, simulate
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, PlaceError
 from workbench.structure.member import Beam
@@ -78,9 +80,9 @@ def test_a_late_sensor_of_a_rig_without_closed_form_reads_what_was(options):
 def test_a_late_sensor_of_a_record_cut_at_its_start_goes_on_from_there():
     r, inputs = late(rig(), 0.04), drive()
     whole = move(r, inputs, sample_time=DT)
-    cut = read(r, whole.after(50), sample_time=DT)
-    np.testing.assert_allclose(cut[:, 1:], read(r, whole, sample_time=DT)[:, 51:], atol=1e-12)
-    first = read(r, whole, sample_time=DT)[0, 50]  # a velocity shows that the force before the cut was another one
+    cut = read(r, whole.after(50))
+    np.testing.assert_allclose(cut[:, 1:], read(r, whole)[:, 51:], atol=1e-12)
+    first = read(r, whole)[0, 50]  # a velocity shows that the force before the cut was another one
     assert cut[0, 0] == pytest.approx(first, rel=0.01)
 
 

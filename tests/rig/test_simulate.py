@@ -22,6 +22,7 @@ from workbench.rig.elements import (
     PowerSpring,
     UserLaw,
 )
+from workbench.rig.readings import sensor_reading
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import move, prediction_errors, simulate
@@ -306,16 +307,12 @@ def test_sensor_chain():
 
 
 def test_sensor_lag_of_a_ramp_is_exact():
-    from workbench.rig.simulate import sensor_reading
-
     t = np.arange(50) * DT
     lagged = sensor_reading(Sensor("d", 1.0, time_constant=0.3), 2.0 * t, DT)
     np.testing.assert_allclose(lagged, 2.0 * (t - 0.3 * (1 - np.exp(-t / 0.3))), atol=1e-12)
 
 
 def test_mean_rounded_reading():
-    from workbench.rig.simulate import sensor_reading
-
     sensor = Sensor("d", 1.0, step=1.0, noise_std=0.3)
     truth = np.linspace(-1, 1, 9)
     noise = 0.3 * np.random.default_rng(0).standard_normal((200000, 1))

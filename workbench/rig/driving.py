@@ -4,30 +4,34 @@ A delayed or lagged force is not linear over a substep. Where nonlinear laws are
 force of the same mean and first moment; the difference in the motion of each mode is known in closed form.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import lru_cache
-from math import factorial
-from typing import NamedTuple
+from math import copysign, factorial
+from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
+from numba import njit
 from scipy.signal import lfilter
 
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.records.band_limited import finer
-from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
-from workbench.rig.linear import shifted, whole_samples
+from workbench.rig.elements import PeriodicForce
+from workbench.rig.force_laws import hysteresis
+from workbench.rig.linear import propagators, shifted, whole_samples
 
-DRIVES_KEPT, MOST_KEPT = 16, 2**18  # size of the cache of forces, and the largest array in it
+RECORDS_KEPT, MOST_KEPT = 16, 2**18  # size of a cache for records, and the largest array in it
 ROUND_OFF = 1e-9  # of the largest force
 ALIKE = 1e-5  # least difference of a mode's two poles, times the substep, to avoid 0/0
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
     """The static force of an actuator: hysteresis, gain, dead zone, saturation, before rate limit, delay and lag."""
     if actuator.hysteresis_share:
         share = actuator.hysteresis_share
-        hysteretic = stepping.hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[1:]
+        hysteretic = hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[1:]
         command = (1.0 - share) * command + share * hysteretic
     force = command if actuator.gain == 1 else actuator.gain * command
     if actuator.dead_zone > 0:
@@ -35,6 +39,23 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
     if np.isfinite(actuator.limit):
         force = np.clip(force, -actuator.limit, actuator.limit)
     return force
+
+
+@njit(cache=True, nogil=True)
+def _ramped(targets: Floats, most: float) -> tuple[Floats, Floats]:
+    """Mean over each step, and value at its start, of a signal that follows targets by at most `most` per step."""
+    mean, start = np.empty_like(targets), np.empty_like(targets)
+    value = 0.0
+    for k in range(targets.size):
+        start[k] = value
+        away = targets[k] - value
+        if abs(away) >= most:
+            value += copysign(most, away)
+            mean[k] = 0.5 * (start[k] + value)
+        else:
+            value = targets[k]
+            mean[k] = value - 0.5 * away * abs(away) / most
+    return mean, start
 
 
 class Piece(NamedTuple):
@@ -74,7 +95,7 @@ def _linearised(course: Course, h: float) -> tuple[float, float]:
 def motion_correction(course: Course, omega: Floats, damping: Floats, h: float) -> Floats:
     """Difference (2, n_modes) in q and q' at the end of a substep between a force and its linear replacement."""
     linear = np.empty((2, 4, omega.size))
-    stepping.propagators(omega, damping, h, linear)
+    propagators(omega, damping, h, linear)
     root = np.sqrt((0.5 * damping) ** 2 - omega**2 + 0j)
     root[np.abs(root) * h < ALIKE] = ALIKE / h
     poles = -0.5 * damping + np.array([1.0, -1.0])[:, None] * root
@@ -96,8 +117,7 @@ def _convolution(pole: Complexes, rate: float, power: int) -> Complexes:
     return np.where(near, series, (np.exp(pole) - 1.0 - pole) / x**2 if power else (np.exp(pole) - np.exp(-rate)) / x)
 
 
-@dataclass(frozen=True, eq=False)
-class Drives:
+class Drives(NamedTuple):
     """Forces of the actuators over the substeps.
 
     Attributes:
@@ -116,7 +136,7 @@ class Drives:
     sizes: Floats
 
 
-class Signals:
+class _Inputs:
     """A read-only array as a key of a cache, compared by identity."""
 
     def __init__(self, values: Floats) -> None:
@@ -126,65 +146,50 @@ class Signals:
         return id(self.values)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Signals) and self.values is other.values
+        return isinstance(other, _Inputs) and self.values is other.values
 
 
+def cached_for_records(
+    function: Callable[Concatenate[Floats, int, P], R],
+) -> Callable[Concatenate[Floats, int, P], R]:
+    """A function of inputs and of steps per sample that is cached for the inputs of a record, which are read-only.
+
+    Structure and sensors of a rig change more often.
+    """
+
+    @lru_cache(maxsize=RECORDS_KEPT)
+    def cached(inputs: _Inputs, steps: int, *args: P.args, **kwargs: P.kwargs) -> R:
+        return function(inputs.values, steps, *args, **kwargs)
+
+    def call(inputs: Floats, steps: int, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        if inputs.base is None and not inputs.flags.writeable and inputs.size * steps <= MOST_KEPT:
+            return cached(_Inputs(inputs), steps, *args, **kwargs)  # type: ignore[arg-type]
+        return function(inputs, steps, *args, **kwargs)
+
+    return call
+
+
+on_finer_steps = cached_for_records(finer)
+
+
+@cached_for_records
 def drives(
-    actuators: tuple[Actuator, ...], inputs: Floats, sample_time: float, substeps: int, input_hold: str
+    inputs: Floats, substeps: int, actuators: tuple[Actuator, ...], sample_time: float, input_hold: str
 ) -> Drives:
-    """The forces of the actuators over the substeps, for inputs (n_actuators, n_samples).
-
-    They are cached for the read-only inputs of a record, because structure and sensors of a rig change more often.
-    """
-    compute = _cached_drives if is_cacheable(inputs, substeps) else _cached_drives.__wrapped__
-    return compute(actuators, Signals(inputs), sample_time, substeps, input_hold)
-
-
-def is_cacheable(inputs: Floats, substeps: int) -> bool:
-    """Whether what is computed from inputs may be cached: they are read-only, and so many substeps are not too many."""
-    return inputs.base is None and not inputs.flags.writeable and inputs.size * substeps <= MOST_KEPT
-
-
-@lru_cache(maxsize=DRIVES_KEPT)
-def _cached_drives(
-    actuators: tuple[Actuator, ...], inputs: Signals, sample_time: float, substeps: int, input_hold: str
-) -> Drives:
-    lines, at_samples, nonlinear = _forces_on_substeps(actuators, inputs.values, sample_time, substeps, input_hold)
-    (starts, ends), h = lines, sample_time / substeps
-    driven = np.logical_or(starts.any(axis=1), ends.any(axis=1))
-    least = ROUND_OFF * max(np.abs(starts).max(initial=0.0), np.abs(ends).max(initial=0.0))
-    nonlinear = [
-        (j, course, size)
-        for j, course, size in nonlinear
-        if np.abs(size).max(initial=0.0) * h ** course[0].power > least
-    ]
-    sizes = np.array([size for *_, size in nonlinear]).reshape(len(nonlinear), starts.shape[1])
-    courses = tuple((j, course) for j, course, _ in nonlinear)
-    return Drives(driven, starts[driven], ends[driven], at_samples, courses, sizes)
-
-
-def _forces_on_substeps(
-    actuators: tuple[Actuator, ...], inputs: Floats, sample_time: float, substeps: int, input_hold: str
-) -> tuple[tuple[Floats, Floats], Floats, list[tuple[int, Course, Floats]]]:
-    """Linear forces over the substeps, forces at the samples, and the delayed or lagged forces that are not linear.
-
-    Returns:
-        (starts, ends) of the linear force of the same mean and first moment, (n_actuators, n_samples * substeps) each;
-        forces (n_actuators, n_samples) at the samples; and (actuator, unit course, size in each substep).
-    """
+    """The forces of the actuators over the substeps, for inputs (n_actuators, n_samples)."""
+    h = sample_time / substeps
     mean = np.empty((inputs.shape[0], inputs.shape[1] * substeps))
     rise = np.zeros_like(mean)  # half of it, over a substep
     at_samples = np.empty_like(inputs)
     nonlinear = []
-    h = sample_time / substeps
+    given = finer(inputs, substeps) if input_hold == "band-limited" else inputs
     for j, actuator in enumerate(actuators):
-        given = finer(inputs[j : j + 1], substeps)[0] if input_hold == "band-limited" else inputs[j]
-        force = actuator_force(actuator, given)
+        force = actuator_force(actuator, given[j])
         if input_hold == "zero":
             mean[j] = start = np.repeat(force, substeps)
             if np.isfinite(actuator.rate_limit):
                 most = actuator.rate_limit * h
-                mean[j], start = stepping.ramped(start, most)
+                mean[j], start = _ramped(start, most)
                 change = np.diff(np.r_[start, 2.0 * mean[j, -1] - start[-1]])
                 share = np.minimum(np.abs(change) / most, 1.0)  # of the substep, until the ramp ends
                 rise[j] = change * share * (1.5 - share)
@@ -192,7 +197,7 @@ def _forces_on_substeps(
             every = mean.shape[1] // force.size
             edges = np.interp(np.arange(mean.shape[1] + 1), every * np.arange(force.size), force)
             if np.isfinite(actuator.rate_limit):
-                _, edges = stepping.ramped(np.r_[edges[1:], edges[-1]], actuator.rate_limit * h)
+                _, edges = _ramped(np.r_[edges[1:], edges[-1]], actuator.rate_limit * h)
             start = edges[:-1]
             mean[j], rise[j] = 0.5 * (start + edges[1:]), 0.5 * np.diff(edges)
         if actuator.delay or actuator.time_constant:
@@ -204,7 +209,13 @@ def _forces_on_substeps(
                 nonlinear.append((j, course, size))
         mean[j] += actuator.bias
         at_samples[j] = start[::substeps] + actuator.bias
-    return (mean - rise, mean + rise), at_samples, nonlinear
+    starts, ends = mean - rise, mean + rise
+    least = ROUND_OFF * max(np.abs(starts).max(initial=0.0), np.abs(ends).max(initial=0.0))
+    acting = [each for each in nonlinear if np.abs(each[2]).max(initial=0.0) * h ** each[1][0].power > least]
+    sizes = np.array([size for *_, size in acting]).reshape(len(acting), mean.shape[1])
+    driven = np.logical_or(starts.any(axis=1), ends.any(axis=1))
+    of_acting = tuple((j, course) for j, course, _ in acting)
+    return Drives(driven, starts[driven], ends[driven], at_samples, of_acting, sizes)
 
 
 def _delayed_and_lagged(
@@ -250,7 +261,7 @@ def _delayed_and_lagged(
 
 
 def sinusoid_on_substeps(
-    element: elements.PeriodicForce, n_samples: int, sample_time: float, substeps: int
+    element: PeriodicForce, n_samples: int, sample_time: float, substeps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A sinusoid's linear replacement over each substep, of the same mean and first moment, and its values at samples.
 

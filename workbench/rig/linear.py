@@ -312,3 +312,39 @@ def shifted(values: np.ndarray, samples: int) -> np.ndarray:
     if samples < values.shape[-1]:
         later[..., samples:] = values[..., : values.shape[-1] - samples]
     return later
+
+
+@njit(cache=True, nogil=True)
+def propagators(omega: Floats, c: Floats, h: float, out: Floats) -> None:
+    """Fill out (2, 4, n_modes): q and q' after h from (q, q', force at start, force at end), force linear between."""
+    for r in range(omega.size):
+        w = omega[r]
+        half = 0.5 * c[r]
+        root = np.sqrt(complex(half * half - w * w, 0.0))
+        if abs(root) * h < 1e-7:
+            root = complex(1e-7 / h, 0.0)
+        l1, l2 = -half + root, -half - root
+        spread = l1 - l2
+        e1, e2 = np.exp(l1 * h), np.exp(l2 * h)
+        out[0, 0, r] = ((l1 * e2 - l2 * e1) / spread).real
+        out[0, 1, r] = ((e1 - e2) / spread).real
+        out[1, 0, r] = (l1 * l2 * (e2 - e1) / spread).real
+        out[1, 1, r] = ((l1 * e1 - l2 * e2) / spread).real
+        # p_k = ∫ e^{λ(h-s)} ds and m_k = ∫ e^{λ(h-s)} s/h ds
+        p1, m1 = _moments(l1, h, e1)
+        p2, m2 = _moments(l2, h, e2)
+        out[0, 2, r] = ((p1 - m1 - p2 + m2) / spread).real
+        out[0, 3, r] = ((m1 - m2) / spread).real
+        out[1, 2, r] = ((l1 * (p1 - m1) - l2 * (p2 - m2)) / spread).real
+        out[1, 3, r] = ((l1 * m1 - l2 * m2) / spread).real
+
+
+@njit(cache=True, nogil=True)
+def _moments(pole: complex, h: float, e: complex) -> tuple[complex, complex]:
+    z = pole * h
+    if abs(z) < 0.05:
+        p = h * (1 + z / 2 * (1 + z / 3 * (1 + z / 4 * (1 + z / 5 * (1 + z / 6 * (1 + z / 7))))))
+        m = h * (0.5 + z / 6 * (1 + z / 4 * (1 + z / 5 * (1 + z / 6 * (1 + z / 7 * (1 + z / 8))))))
+        return p, m
+    p = (e - 1.0) / pole
+    return p, (p / h - 1.0) / pole

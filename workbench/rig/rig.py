@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -10,11 +11,13 @@ from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import Element
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.structure.domain import PlaceError, check_place
+from workbench.structure.domain import Between, Patch, PlaceError, check_place
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
 from workbench.structure.printed import Printed, counted, place_text
+
+KEPT = 8  # rigs in a cache of arrays that all records share
 
 
 def derivative_of(port: Actuator | Sensor) -> int:
@@ -32,15 +35,31 @@ def shape_of(modes: Modes, port: Actuator | Sensor) -> Floats:
         shape = modes.phi_at(port.at, derivative_of(port), direction=port.direction)
     except PlaceError as error:
         raise _misplaced(port, error) from None
-    return shape + shape_error_of(port, modes.n_modes) if port.shape_error else shape
+    return shape + _shape_error(port, modes.n_modes) if port.shape_error else shape
 
 
-def shape_error_of(port: Actuator | Sensor, n_modes: int) -> Floats:
+def shapes_at(modes: Modes, ports: Sequence[Actuator | Sensor]) -> Floats:
+    """Mode shapes (n_ports, n_modes) at the ports of a rig, as of `shape_of`, those of one kind computed at once."""
+    shapes = np.empty((len(ports), modes.n_modes))
+    at_points: dict[tuple[str, str | None], list[int]] = {}
+    for j, port in enumerate(ports):
+        if isinstance(port.at, Between | Patch):
+            shapes[j] = modes.phi_at(port.at, derivative_of(port), direction=port.direction)
+        else:
+            kind = port.kind if isinstance(port, Actuator) else port.quantity
+            at_points.setdefault((kind, port.direction), []).append(j)
+    for (_, direction), here in at_points.items():
+        shapes[here] = modes.phi([ports[j].at for j in here], derivative_of(ports[here[0]]), direction=direction)
+    for j, port in enumerate(ports):
+        if port.shape_error:
+            shapes[j] += _shape_error(port, modes.n_modes)
+    return shapes
+
+
+def _shape_error(port: Actuator | Sensor, n_modes: int) -> Floats:
     """Errors (n_modes,) of the mode shapes at a port; zero for modes beyond those of its `shape_error`."""
-    error = np.zeros(n_modes)
     known = port.shape_error[:n_modes]
-    error[: len(known)] = known
-    return error
+    return np.pad(known, (0, n_modes - len(known)))
 
 
 def _misplaced(port: Actuator | Sensor, error: PlaceError) -> PlaceError:
@@ -115,6 +134,11 @@ class Rig(Printed):
             name=name,
         )
 
+    @property
+    def is_rate_limited(self) -> bool:
+        """Whether an actuator limits the rate of change of its force."""
+        return any(np.isfinite(actuator.rate_limit) for actuator in self.actuators)
+
     def in_record(self, name: str) -> "Rig":
         """The rig with the changes that apply to the record of that name."""
         if not self.by_record:
@@ -130,3 +154,12 @@ class Rig(Printed):
         parts = ((self.actuators, "actuator"), (self.sensors, "sensor"), (self.elements, "element"))
         line = ", ".join([counted(self.modes.n_modes, "mode"), *(counted(len(each), word) for each, word in parts)])
         return line, ("name", "", "quantity", "at"), rows, ()
+
+
+@lru_cache(maxsize=KEPT)
+def participation_of(rig: Rig) -> Floats:
+    """Participation factors (n_modes, n_actuators) without the actuators' gains, which belong to the drive.
+
+    The array is cached and must not be changed.
+    """
+    return np.ascontiguousarray(shapes_at(rig.modes, rig.actuators).T)

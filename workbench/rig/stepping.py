@@ -7,285 +7,104 @@ substep in which friction reverses is divided.
 """
 
 import math
-from collections.abc import Callable
-from functools import cache
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
-from llvmlite import ir
-from numba import carray, cfunc, njit, types  # type: ignore[attr-defined]
-from numba.extending import intrinsic
+from numba import njit
 
 from workbench.arrays import Floats, Integers
+from workbench.rig.elements import AirDrag, MidplaneStretching, PointElement, UserLaw
+from workbench.rig.force_laws import BOUC_WEN, FRICTION, LAWS, N_PARAMETERS, compiled_law, solve_laws, yield_update
+from workbench.rig.linear import propagators
+from workbench.rig.rig import KEPT, Rig
 
-LINEAR_SPRING, LINEAR_DAMPER, CUBIC, POWER_SPRING, EVEN_SPRING, POWER_DAMPER = range(6)
-CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, USER = range(6, 11)
-N_PARAMETERS = 3  # of a law, at most
-SETTLED = 1e-10  # relative tolerance of a force
 FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
+LANES = 8  # modes per SIMD operation; the number of modes is padded to a multiple, with modes at rest
 # Parts of a substep in which friction reverses, since its force is far from linear there. On a frame, at four substeps
 # per sample, this reduces the power of the error to a thirteenth. Stops, whose force has a corner only, do not gain:
 # errors at the corner and in contact nearly cancel as long as the substeps are equal.
 PARTS = 8
-# Arguments of `advance`, described there.
+# Described in `structure_arrays` and `law_arrays`.
+Structure = tuple[Floats, Floats, Floats, float, float, Floats, Floats, Floats]
+Elements = tuple[Integers, Floats, Floats]
+# Described in `step_record`.
+Forces = tuple[Floats, Floats, Floats, Floats, Floats]
+Observer = tuple[Floats, Integers, Floats, Floats]
+Out = tuple[Floats, Floats, Floats, Floats]
+# Described in `advance`.
 Linear = tuple[Floats, Floats, Floats]
 Drives = tuple[Floats, Floats, Floats, Floats]
-Elements = tuple[Integers, Floats, Floats]
 Along = tuple[float, Floats, Floats, Floats, Floats, Floats]
 Moving = tuple[Floats, Floats, Floats]
 Points = tuple[Floats, Floats, Floats, Floats]
 Work = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
 Kept = tuple[Floats, Floats, Floats, Floats]
-LANES = 8  # modes per SIMD operation; the number of modes is padded to a multiple, with modes at rest
 
 
-@intrinsic
-def _call(typing: Any, address: Any, w: Any, v: Any, p: Any) -> Any:
-    """Call the law(w, v, pointer to parameters) at an address."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        data = context.make_array(signature.args[3])(context, builder, values[3]).data
-        law = ir.FunctionType(ir.DoubleType(), [ir.DoubleType(), ir.DoubleType(), data.type])
-        return builder.call(builder.inttoptr(values[0], law.as_pointer()), [values[1], values[2], data])
-
-    return types.float64(types.int64, types.float64, types.float64, p), generate
+def on_lanes(values: Floats, axes: int = 1) -> Floats:
+    """An array (..., n_modes), or with several last axes of modes, with zeros for modes at rest up to whole lanes."""
+    n_modes = values.shape[-1]
+    padded = np.zeros((*values.shape[: values.ndim - axes], *(n_modes + -n_modes % LANES,) * axes))
+    padded[tuple(slice(size) for size in values.shape)] = values
+    return padded
 
 
-@njit(cache=True, nogil=True)
-def user_law(w: float, v: float, p: Floats) -> float:
-    """The force of a user-defined law, whose address follows its parameters in `p`."""
-    force: float = _call(int(p[p.size - 1]), w, v, p)  # type: ignore[call-arg]
-    return force
+@lru_cache(maxsize=KEPT)
+def structure_arrays(rig: Rig) -> Structure:
+    """The structure and its distributed elements as arrays for the compiled steppers, n a multiple of LANES.
+
+    All have one type and memory layout, since numba compiles a stepper again for any other; absent parts are empty
+    arrays. The arrays are cached and must not be changed.
+
+    Returns:
+        Frequencies (n,), damping (n,), its coupling (n, n), relative change of the stiffness per time, 1/s; and of the
+        distributed elements: coefficient of stretching, ∫ φ_r' φ_s' dx (n, n), shapes (n, n_points) at quadrature
+        points for drag, and its coefficient times the weights (n_points,).
+    """
+    modes, nothing = rig.modes, np.zeros((0, 0))
+    own = np.diag(modes.damping)
+    coupling = modes.damping - np.diag(own)
+    stretch, drag = (
+        float(sum(e.coefficient for e in rig.elements if isinstance(e, kind))) for kind in (MidplaneStretching, AirDrag)
+    )
+    shapes, weights = _along(rig, 0) if drag else (np.zeros((0, modes.n_modes)), np.zeros(0))
+    stretching = nothing
+    if stretch:
+        slopes, widths = _along(rig, 1)
+        stretching = on_lanes(slopes.T @ (widths[:, None] * slopes), 2)
+    return (
+        on_lanes(modes.omega),
+        on_lanes(own),
+        on_lanes(coupling, 2) if coupling.any() else nothing,
+        float(rig.stiffness_rate),
+        stretch,
+        stretching,
+        np.ascontiguousarray(on_lanes(shapes).T),
+        drag * weights,
+    )
 
 
-@njit(cache=True, nogil=True)
-def propagators(omega: Floats, c: Floats, h: float, out: Floats) -> None:
-    """Fill out (2, 4, n_modes): q and q' after h from (q, q', force at start, force at end), force linear between."""
-    for r in range(omega.size):
-        w = omega[r]
-        half = 0.5 * c[r]
-        root = np.sqrt(complex(half * half - w * w, 0.0))
-        if abs(root) * h < 1e-7:
-            root = complex(1e-7 / h, 0.0)
-        l1, l2 = -half + root, -half - root
-        spread = l1 - l2
-        e1, e2 = np.exp(l1 * h), np.exp(l2 * h)
-        out[0, 0, r] = ((l1 * e2 - l2 * e1) / spread).real
-        out[0, 1, r] = ((e1 - e2) / spread).real
-        out[1, 0, r] = (l1 * l2 * (e2 - e1) / spread).real
-        out[1, 1, r] = ((l1 * e1 - l2 * e2) / spread).real
-        # p_k = ∫ e^{λ(h-s)} ds and m_k = ∫ e^{λ(h-s)} s/h ds
-        p1, m1 = _moments(l1, h, e1)
-        p2, m2 = _moments(l2, h, e2)
-        out[0, 2, r] = ((p1 - m1 - p2 + m2) / spread).real
-        out[0, 3, r] = ((m1 - m2) / spread).real
-        out[1, 2, r] = ((l1 * (p1 - m1) - l2 * (p2 - m2)) / spread).real
-        out[1, 3, r] = ((l1 * m1 - l2 * m2) / spread).real
+def _along(rig: Rig, derivative: int) -> tuple[Floats, Floats]:
+    """Shapes and quadrature weights at Gauss points along the structure, for products of up to four shapes."""
+    points, weights = rig.modes.domain.quadrature(max(3 * rig.modes.n_modes + 12, 30))
+    return rig.modes.phi(points, derivative), weights
 
 
-@njit(cache=True, nogil=True)
-def _moments(pole: complex, h: float, e: complex) -> tuple[complex, complex]:
-    z = pole * h
-    if abs(z) < 0.05:
-        p = h * (1 + z / 2 * (1 + z / 3 * (1 + z / 4 * (1 + z / 5 * (1 + z / 6 * (1 + z / 7))))))
-        m = h * (0.5 + z / 6 * (1 + z / 4 * (1 + z / 5 * (1 + z / 6 * (1 + z / 7 * (1 + z / 8))))))
-        return p, m
-    p = (e - 1.0) / pole
-    return p, (p / h - 1.0) / pole
+@lru_cache(maxsize=KEPT)
+def law_arrays(rig: Rig) -> Elements:
+    """Kinds (n_elements,), shapes (n_elements, n) and parameters (n_elements, n_parameters) of the elements at points.
 
-
-@njit(cache=True, nogil=True)
-def yield_update(z: float, dw: float, limit: float) -> tuple[float, float]:
-    """Bouc-Wen z after a monotone travel dw, and dz/d(dw): exact, since the law does not depend on the speed."""
-    s = 1.0 if dw >= 0 else -1.0
-    left = abs(dw)
-    z = s * z
-    if z < 0.0:
-        if left <= -z:
-            return s * (z + left), 1.0
-        left += z
-        z = 0.0
-    remaining = (limit - z) * math.exp(-left / limit)
-    return s * (limit - remaining), remaining / limit
-
-
-@njit(cache=True, nogil=True)
-def hysteresis(path: Floats, limit: float) -> Floats:
-    """Bouc-Wen z (n_samples,) along a path (n_samples,) that is monotone between its samples, from 0."""
-    z = np.zeros_like(path)
-    for k in range(1, path.size):
-        z[k], _ = yield_update(z[k - 1], path[k] - path[k - 1], limit)
-    return z
-
-
-@njit(cache=True, nogil=True)
-def ramped(targets: Floats, most: float) -> tuple[Floats, Floats]:
-    """Mean over each step, and value at its start, of a signal that follows targets by at most `most` per step."""
-    mean, start = np.empty_like(targets), np.empty_like(targets)
-    value = 0.0
-    for k in range(targets.size):
-        start[k] = value
-        away = targets[k] - value
-        if abs(away) >= most:
-            value += math.copysign(most, away)
-            mean[k] = 0.5 * (start[k] + value)
-        else:
-            value = targets[k]
-            mean[k] = value - 0.5 * away * abs(away) / most
-    return mean, start
-
-
-@njit(cache=True, nogil=True)
-def _power(w: float, p: Floats) -> tuple[float, float]:
-    """-F |w / w_r|^e in the direction of w, with (F, w_r, e) = p, and its derivative."""
-    level = abs(w) / p[1]
-    less = p[0] * level ** (p[2] - 1.0) / p[1]
-    return -less * w, -p[2] * less
-
-
-@njit(cache=True, nogil=True)
-def element_force(
-    kind: int, parameters: Floats, i: int, w: float, v: float, z: float, w_old: float
-) -> tuple[float, float, float]:
-    """The force of element i, and its derivatives with respect to w and v."""
-    a, b = parameters[i, 0], parameters[i, 1]
-    if kind == LINEAR_SPRING:
-        return -a * w, -a, 0.0
-    if kind == LINEAR_DAMPER:
-        return -a * v, 0.0, -a
-    if kind == CUBIC:
-        return -a * w * w * w, -3.0 * a * w * w, 0.0
-    if kind == CLEARANCE:
-        if w > b:
-            return -a * (w - b), -a, 0.0
-        if w < -b:
-            return -a * (w + b), -a, 0.0
-        return 0.0, 0.0, 0.0
-    if kind == ONE_SIDED:
-        return (-a * (w - b), -a, 0.0) if w > b else (0.0, 0.0, 0.0)
-    if kind == FRICTION:
-        level = math.tanh(v / b)
-        return -a * level - parameters[i, 2], 0.0, -a / b * (1.0 - level * level)
-    if kind == BOUC_WEN:
-        pulled, slope = yield_update(z, w - w_old, b)
-        return -a * pulled, -a * slope, 0.0
-    p = parameters[i]
-    if kind == POWER_SPRING:
-        force, slope = _power(w, p)
-        return force, slope, 0.0
-    if kind == EVEN_SPRING:
-        force, slope = _power(w, p)
-        return (force, slope, 0.0) if w > 0 else (-force, -slope, 0.0)
-    if kind == POWER_DAMPER:
-        force, slope = _power(v, p)
-        return force, 0.0, slope
-    force = user_law(w, v, p)
-    dw, dv = 1e-6 * abs(w) + 1e-12, 1e-6 * abs(v) + 1e-12
-    return force, (user_law(w + dw, v, p) - force) / dw, (user_law(w, v + dv, p) - force) / dv
-
-
-@njit(cache=True, nogil=True)
-def solve_element(
-    kind: int,
-    parameters: Floats,
-    i: int,
-    w0: float,
-    v0: float,
-    aw: float,
-    av: float,
-    z: float,
-    w_old: float,
-    start: float,
-) -> float:
-    """The force f of element i with f = law(w0 + aw f, v0 + av f): Newton, safeguarded by bisection."""
-    f = start
-    low, high = -math.inf, math.inf
-    for _ in range(40):
-        value, by_w, by_v = element_force(kind, parameters, i, w0 + aw * f, v0 + av * f, z, w_old)
-        g = f - value
-        if abs(g) <= _close(f, value):
-            break
-        if g > 0:
-            high = f
-        else:
-            low = f
-        slope = 1.0 - by_w * aw - by_v * av
-        f_new = f - g / slope if slope > 0.1 else value
-        if not (low < f_new < high):
-            if low > -math.inf and high < math.inf:
-                f_new = 0.5 * (low + high)
-            else:
-                f_new = value
-        if f_new == f:
-            break
-        f = f_new
-    return f
-
-
-@njit(cache=True, nogil=True)
-def solve_pair(
-    kinds: Integers,
-    parameters: Floats,
-    w_free: Floats,
-    v_free: Floats,
-    aw: Floats,
-    av: Floats,
-    z: Floats,
-    w_old: Floats,
-    f: float,
-    g: float,
-) -> tuple[float, float, bool]:
-    """The forces of two elements by Newton's method from f and g, and whether it converged."""
-    for _ in range(6):
-        w, v = w_free[0] + aw[0, 0] * f + aw[0, 1] * g, v_free[0] + av[0, 0] * f + av[0, 1] * g
-        law_f, f_w, f_v = element_force(kinds[0], parameters, 0, w, v, z[0], w_old[0])
-        w, v = w_free[1] + aw[1, 0] * f + aw[1, 1] * g, v_free[1] + av[1, 0] * f + av[1, 1] * g
-        law_g, g_w, g_v = element_force(kinds[1], parameters, 1, w, v, z[1], w_old[1])
-        off_f, off_g = law_f - f, law_g - g
-        if abs(off_f) <= _close(law_f, f) and abs(off_g) <= _close(law_g, g):
-            return f, g, True
-        ff, fg = 1.0 - f_w * aw[0, 0] - f_v * av[0, 0], -f_w * aw[0, 1] - f_v * av[0, 1]
-        gf, gg = -g_w * aw[1, 0] - g_v * av[1, 0], 1.0 - g_w * aw[1, 1] - g_v * av[1, 1]
-        determinant = ff * gg - fg * gf
-        # ff and gg are at least 1 for laws that resist the motion; others may have several solutions
-        if not (ff > 0.1 and gg > 0.1 and determinant > 0.01):
-            break
-        f += (gg * off_f - fg * off_g) / determinant
-        g += (ff * off_g - gf * off_f) / determinant
-    return f, g, False
-
-
-@njit(cache=True, nogil=True)
-def _close(one: float, other: float) -> float:
-    return SETTLED * (abs(one) + abs(other)) + 1e-300
-
-
-@njit(cache=True, nogil=True)
-def solve_in_turn(
-    kinds: Integers,
-    parameters: Floats,
-    w_free: Floats,
-    v_free: Floats,
-    aw: Floats,
-    av: Floats,
-    z: Floats,
-    w_old: Floats,
-    force: Floats,
-) -> None:
-    """Solve the forces of all elements in place, one after the other until none changes (Gauss-Seidel)."""
-    for _ in range(12):
-        largest = 0.0
-        for i in range(kinds.size):
-            w0, v0 = w_free[i], v_free[i]
-            for j in range(kinds.size):
-                if j != i:
-                    w0 += aw[i, j] * force[j]
-                    v0 += av[i, j] * force[j]
-            f = solve_element(kinds[i], parameters, i, w0, v0, aw[i, i], av[i, i], z[i], w_old[i], force[i])
-            largest = max(largest, abs(f - force[i]) / (abs(f) + 1e-30))
-            force[i] = f
-        if largest < SETTLED:
-            break
+    The arrays are cached and must not be changed.
+    """
+    points = [e for e in rig.elements if isinstance(e, PointElement)]
+    user_defined = any(isinstance(e, UserLaw) for e in points)
+    parameters = np.zeros((len(points), N_PARAMETERS + user_defined))
+    for row, element in zip(parameters, points, strict=True):
+        row[: len(element.parameters)] = element.parameters
+        if isinstance(element, UserLaw):
+            row[-1] = compiled_law(element.law).address  # exact, as addresses are below 2**53
+    shapes = np.array([rig.modes.phi_at(e.at) for e in points]).reshape(len(points), rig.modes.n_modes)
+    return np.array([LAWS[type(e)] for e in points], np.int64), on_lanes(shapes), parameters
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -400,18 +219,8 @@ def _advance_once(
                 w += shapes[i, r] * (base_q[r] + e[0, 3, r] * spread[r])
                 u += shapes[i, r] * (base_v[r] + e[1, 3, r] * spread[r])
             w_free[i], v_free[i] = w, u
-        settled = False
-        if n_elements == 1:
-            point[0] = solve_element(
-                kinds[0], parameters, 0, w_free[0], v_free[0], aw[0, 0], av[0, 0], z[0], w_old[0], point[0]
-            )
-            settled = True
-        elif n_elements == 2:
-            f, g, settled = solve_pair(kinds, parameters, w_free, v_free, aw, av, z, w_old, point[0], point[1])
-            if settled:
-                point[0], point[1] = f, g
-        if n_elements > 1 and not settled:
-            solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z, w_old, point)
+        if n_elements > 0:
+            solve_laws(kinds, parameters, w_free, v_free, aw, av, z, w_old, point)
         for r in range(n):
             new[r] = spread[r]
         for i in range(n_elements):
@@ -551,96 +360,38 @@ def at_rest(n: int, n_elements: int) -> tuple[Linear, Linear, Drives, Moving, Po
     return linear, finely, drives, motion, points, work, kept
 
 
-@njit(cache=True, nogil=True)
-def whole_lanes(
-    omega: Floats, c: Floats, coupling: Floats, stretching: Floats, drag_shapes: Floats, shapes: Floats
-) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """The arrays padded with modes at rest to a multiple of LANES modes."""
-    n = LANES * ((omega.size + LANES - 1) // LANES)
-    wide, damping, elements = np.ones(n), np.zeros(n), np.zeros((shapes.shape[0], n))
-    for r in range(omega.size):
-        wide[r], damping[r] = omega[r], c[r]
-        for i in range(shapes.shape[0]):
-            elements[i, r] = shapes[i, r]
-    return (
-        wide,
-        damping,
-        _widened(coupling, n, n if coupling.size > 0 else 0),
-        _widened(stretching, n, n if stretching.size > 0 else 0),
-        _widened(drag_shapes, n, drag_shapes.shape[1]),
-        elements,
-    )
-
-
-@njit(cache=True, nogil=True)
-def _widened(values: Floats, n: int, columns: int) -> Floats:
-    wide = np.zeros((n, columns))
-    for r in range(values.shape[0]):
-        for s in range(values.shape[1]):
-            wide[r, s] = values[r, s]
-    return wide
-
-
 @njit(cache=True, nogil=True, fastmath=FAST)
 def step_record(
-    omega: Floats,
-    c: Floats,
-    coupling: Floats,
+    structure: Structure,
+    elements: Elements,
+    forces: Forces,
     dt: float,
     n_sub: int,
-    rate: float,
-    starts: Floats,
-    ends: Floats,
-    participation: Floats,
-    sizes: Floats,
-    added: Floats,
-    stretch: float,
-    stretching: Floats,
-    drag_shapes: Floats,
-    drag_weights: Floats,
-    kinds: Integers,
-    shapes: Floats,
-    parameters: Floats,
-    measured: Floats,
-    orders: Integers,
-    reading: Floats,
-    gain: Floats,
-    q_out: Floats,
-    v_out: Floats,
-    f_out: Floats,
-    error_out: Floats,
+    observer: Observer,
+    out: Out,
 ) -> None:
-    """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest; or innovations error_out.
+    """Fill the motion of a rig from rest, or the innovations of an observer, which correct the motion.
 
     Args:
-        omega, c, coupling: frequencies and damping (n_modes,), and coupling by damping (n_modes, n_modes).
-        dt, n_sub, rate: sample time, s; substeps; relative change of stiffness per time, 1/s.
-        starts, ends: (n_inputs, n_samples * n_sub) forces at the start and the end of each substep.
-        participation: (n_modes, n_inputs).
-        sizes, added: forces that are not linear: sizes (n_added, n_samples * n_sub), and the correction (n_added, 2,
-            n_modes) of q and q' at the end of a substep per unit size.
-        stretch, stretching, drag_shapes, drag_weights: distributed elements, see `structure_arrays` of `simulate`.
-        kinds, shapes, parameters: point elements.
-        measured: (n_sensors, n_samples); if given, the innovations are computed instead of the motion, and correct it.
-        orders, reading: order of the time derivative (n_sensors,) and output matrix (n_sensors, n_modes).
-        gain: (2, n_modes, n_sensors) of the observer.
+        structure, elements: see `structure_arrays` and `law_arrays`; n is the number of modes with those at rest.
+        forces: participation (n_inputs, n), and forces (n_inputs, n_samples * n_sub) at the start and the end of each
+            substep; of forces that are not linear, the correction (n_added, 2, n) of q and q' at the end of a substep
+            per unit size, and sizes (n_added, n_samples * n_sub).
+        dt: sample time, s.
+        n_sub: substeps of a sample.
+        observer: outputs (n_sensors, n_samples), order of their time derivative (n_sensors,), output matrix
+            (n_sensors, n) and gain (2, n_sensors, n); empty arrays for none.
+        out: displacements, velocities and element forces of the modes, (n_modes, n_samples), without an observer;
+            innovations (n_sensors, n_samples) with one.
     """
-    n_modes, n_elements, n_inputs = omega.size, kinds.size, starts.shape[0]
+    participation, starts, ends, added, sizes = forces
+    measured, orders, reading, gain = observer
+    q_out, v_out, f_out, error_out = out
+    omega, c, coupling, rate, stretch, stretching, drag_shapes, drag_weights = structure
+    kinds, shapes, _ = elements
     n_samples = measured.shape[1] if measured.size > 0 else q_out.shape[1]
-    omega, c, coupling, stretching, drag_shapes, shapes = whole_lanes(
-        omega, c, coupling, stretching, drag_shapes, shapes
-    )
     n = LANES * (omega.size // LANES)  # tells the compiler that n is a multiple of LANES
-    into, n_sensors = np.zeros((n_inputs, n)), measured.shape[0]
-    more = np.zeros((added.shape[0], 2, n))
-    seen, held = np.zeros((n_sensors, n)), np.zeros((2, n_sensors, n))
-    for r in range(n_modes):
-        for j in range(n_inputs):
-            into[j, r] = participation[r, j]
-        for j in range(added.shape[0]):
-            more[j, 0, r], more[j, 1, r] = added[j, 0, r], added[j, 1, r]
-        for j in range(n_sensors):
-            seen[j, r], held[0, j, r], held[1, j, r] = reading[j, r], gain[0, r, j], gain[1, r, j]
+    n_elements, n_inputs, n_sensors = kinds.size, starts.shape[0], measured.shape[0]
     accelerations = False
     for j in range(n_sensors):
         accelerations |= orders[j] == 2
@@ -648,13 +399,12 @@ def step_record(
     linear, finely, drives, motion, points, work, kept = at_rest(n, n_elements)
     (drive, drive_end, more_q, more_v), (q, v, old), w_old = drives, motion, points[2]
     accelerated = np.zeros(n)
-    elements = kinds, shapes, parameters
     along = stretch, stretching, drag_shapes, drag_weights, np.empty(drag_weights.size), coupling
     for k in range(n_samples):
         if k == 0 or rate != 0.0:
             drifted_propagators(omega, c, h, 1.0 + rate * (k + 0.5) * dt, elements, linear, finely)
         if measured.size == 0:
-            for r in range(n_modes):
+            for r in range(q_out.shape[0]):
                 q_out[r, k] = q[r]
                 v_out[r, k] = v[r]
                 f_out[r, k] = old[r]
@@ -667,13 +417,13 @@ def step_record(
                 moved = q if orders[j] == 0 else v if orders[j] == 1 else accelerated
                 read = 0.0
                 for r in range(n):
-                    read += seen[j, r] * moved[r]
+                    read += reading[j, r] * moved[r]
                 error_out[j, k] = measured[j, k] - read
             for j in range(n_sensors):
                 error = error_out[j, k]
                 for r in range(n):
-                    q[r] += held[0, j, r] * error
-                    v[r] += held[1, j, r] * error
+                    q[r] += gain[0, j, r] * error
+                    v[r] += gain[1, j, r] * error
             for i in range(n_elements):
                 w_old[i] = 0.0
                 for r in range(n):
@@ -687,31 +437,14 @@ def step_record(
             for j in range(n_inputs):
                 first, last = starts[j, k * n_sub + sub], ends[j, k * n_sub + sub]
                 for r in range(n):
-                    drive[r] += into[j, r] * first
-                    drive_end[r] += into[j, r] * last
-            for r in range(n if more.shape[0] > 0 else 0):
+                    drive[r] += participation[j, r] * first
+                    drive_end[r] += participation[j, r] * last
+            for r in range(n if added.shape[0] > 0 else 0):
                 more_q[r] = 0.0
                 more_v[r] = 0.0
-            for j in range(more.shape[0]):
+            for j in range(added.shape[0]):
                 size = sizes[j, k * n_sub + sub]
                 for r in range(n):
-                    more_q[r] += more[j, 0, r] * size
-                    more_v[r] += more[j, 1, r] * size
+                    more_q[r] += added[j, 0, r] * size
+                    more_v[r] += added[j, 1, r] * size
             advance(linear, finely, drives, elements, along, motion, points, work, kept)
-
-
-@cache
-def address_of(law: Callable[[float, float, Floats], float]) -> float:
-    """Address of the compiled force(w, v, parameters) = `law` in the memory of this process."""
-    compiled = njit(nogil=True)(law)
-
-    def call(w: float, v: float, parameters: Any) -> float:
-        force: float = compiled(w, v, carray(parameters, (N_PARAMETERS,)))
-        return force
-
-    signature = types.float64(types.float64, types.float64, types.CPointer(types.float64))  # type: ignore[no-untyped-call]
-    _KEPT.append(cfunc(signature)(call))
-    return float(_KEPT[-1].address)  # exact, as addresses are below 2**53
-
-
-_KEPT: list[Any] = []  # user-defined laws, kept alive as long as this process

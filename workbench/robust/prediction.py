@@ -15,9 +15,11 @@ from workbench.records.record import Channel, Record
 from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import RandomForce
+from workbench.rig.motion import Motion
+from workbench.rig.readings import read
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import Motion, read, simulate
+from workbench.rig.simulate import simulate
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.verification import LEVEL, QUANTILES, check_loop_kinds, drawn_with_errors
 from workbench.structure.modes import Modes, freeze
@@ -255,9 +257,9 @@ def _loop_truth(rig: Rig, run: LoopRun, controller: DigitalController, sample_ti
     n = rig.modes.n_modes
     forces = run.into @ run.response.forces
     stiffness = np.asarray(rig.modes.omega[:, None] ** 2, float)
-    motion = Motion(run.response.modal[:n], run.response.modal[n:], forces, stiffness, rig.modes.damping, held=True)
+    motion = Motion(run.response.modal[:n], run.response.modal[n:], forces, stiffness, rig.modes.damping, sample_time)
     plain = replace(rig, sensors=tuple(replace(s, limit=np.inf, step=0.0) for s in rig.sensors))
-    return np.asarray(read(plain, motion, sample_time=sample_time)[rows], float)
+    return np.asarray(read(plain, motion)[rows], float)
 
 
 def _banded(

@@ -14,10 +14,10 @@ from workbench.gap.effects.ports import clipped_level, exchanged_last
 from workbench.gap.report.verdict import _described, effect_json
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
+from workbench.rig.force_laws import LAWS, USER, element_force
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import LAWS, simulate
-from workbench.rig.stepping import USER, element_force
+from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.finite_elements import FiniteElements

@@ -8,14 +8,12 @@ import math
 import numpy as np
 from numba import njit
 
-from workbench.arrays import Floats, Integers
+from workbench.arrays import Floats
 from workbench.design.estimation.digital import ONSET
-from workbench.rig.stepping import FAST, LANES, advance, at_rest, drifted_propagators, whole_lanes, yield_update
+from workbench.rig.force_laws import yield_update
+from workbench.rig.stepping import FAST, LANES, Elements, Structure, advance, at_rest, drifted_propagators
 
-# Described in `loop_record` and `_commands`.
-StructureArrays = tuple[Floats, Floats, Floats, float, float, Floats, Floats, Floats]
-LawArrays = tuple[Integers, Floats, Floats]
-ControllerArrays = tuple[tuple[Floats, ...], ...]
+ControllerArrays = tuple[tuple[Floats, ...], ...]  # described in `_commands`
 
 RUN_AWAY = 1e100  # modal displacement, in any unit, above which the loop has diverged
 
@@ -83,8 +81,8 @@ def _commands(
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def loop_record(
-    structure: StructureArrays,
-    laws: LawArrays,
+    structure: Structure,
+    elements: Elements,
     drive: Floats,
     into: Floats,
     sense: Floats,
@@ -101,9 +99,7 @@ def loop_record(
     """Fill the motion of a closed loop from an initial state; False where it diverges.
 
     Args:
-        structure: omega (n,), damping (n,), coupling (n, n) or empty, stiffness rate, stretch, stretching, drag shapes
-            (n, n_points), drag weights.
-        laws: kinds, shapes (n_elements, n), parameters (n_elements, 3).
+        structure, elements: see `structure_arrays` and `law_arrays`.
         drive: (n_actuators, 9) gain, dead zone, limit, delay, time constant, bias, rate limit, share and width of
             hysteresis.
         into: (n, n_actuators) participation factors.
@@ -118,19 +114,15 @@ def loop_record(
             rate and force of each element (n_elements, n_samples).
     """
     omega, damping, coupling, stiffening, stretch, stretching, drag_shapes, drag_weights = structure
-    kinds, shapes, parameters = laws
+    kinds, shapes, _ = elements
     q_out, v_out, f_out, u_out, ew, ev, ef = out
-    n_modes, n_el, nu, ny = omega.size, kinds.size, drive.shape[0], sense.shape[0]
+    n_modes, n_el, nu, ny = into.shape[0], kinds.size, drive.shape[0], sense.shape[0]
     n_samples, h = noise.shape[1], dt / n_sub
     n_dis = disturbance.shape[0]
-    omega, damping, coupling, stretching, drag_shapes, shapes = whole_lanes(
-        omega, damping, coupling, stretching, drag_shapes, shapes
-    )
     linear, finely, drives, motion, points, work, kept = at_rest(LANES * (omega.size // LANES), n_el)
     (modal, _, none, _), (q, v, _), (point, _, w_old, _) = drives, motion, points
     for r in range(n_modes):
         q[r], v[r] = start[0, r], start[1, r]
-    elements = kinds, shapes, parameters
     along = stretch, stretching, drag_shapes, drag_weights, np.empty(drag_weights.size), coupling
     fine = n_samples * n_sub
     held = np.zeros((nu, fine))

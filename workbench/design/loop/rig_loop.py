@@ -12,11 +12,11 @@ from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.loop_steps import ControllerArrays, loop_record
 from workbench.rig.actuators import Actuator
-from workbench.rig.elements import PeriodicForce, PointElement, RandomForce
-from workbench.rig.rig import Rig
+from workbench.rig.elements import PeriodicForce, RandomForce
+from workbench.rig.rig import Rig, participation_of
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.simulate import law_arrays, participation_of, structure_arrays
 from workbench.rig.statespace import output_matrix
+from workbench.rig.stepping import law_arrays, structure_arrays
 from workbench.structure.domain import Where
 from workbench.structure.modes import freeze
 from workbench.threads import cores
@@ -133,13 +133,12 @@ def run_loop(
     start = np.zeros((2, n))
     if test.impulse_at is not None:
         start[1] = test.impulse * modes.phi_at(test.impulse_at)
-    points = [e for e in rig.elements if isinstance(e, PointElement)]
-    rows = (n, n, len(actuators), len(actuators), *[len(points)] * 3)
+    laws = law_arrays(rig)
+    rows = (n, n, len(actuators), len(actuators), *[laws[0].size] * 3)
     out = tuple(np.zeros((size, n_samples)) for size in rows)
-    damping, coupling, spread = structure_arrays(rig)
     bounded = loop_record(
-        (np.array(modes.omega), damping, coupling, float(rig.stiffness_rate), *spread),
-        law_arrays(rig, points),
+        structure_arrays(rig),
+        laws,
         np.array([_drive(a) for a in actuators]).reshape(-1, 9),
         np.ascontiguousarray(into),
         np.array([_sense(s, test.n_samples) for s in sensors]).reshape(-1, 7),

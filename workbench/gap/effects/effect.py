@@ -12,8 +12,8 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.records.record import Record
 from workbench.renamed import Renamed, former_arguments
+from workbench.rig.motion import Motion
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import Motion
 from workbench.structure.domain import Between, Domain, NamedPoints, Rectangle, Where
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes

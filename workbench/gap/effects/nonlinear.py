@@ -34,8 +34,8 @@ from workbench.rig.elements import (
     PowerDamper,
     PowerSpring,
 )
+from workbench.rig.force_laws import hysteresis
 from workbench.rig.rig import Rig
-from workbench.rig.stepping import hysteresis
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.member import Structure
 

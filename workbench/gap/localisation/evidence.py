@@ -20,8 +20,8 @@ from workbench.gap.prediction.unmodelled_force import (
     wandering_force_filter,
 )
 from workbench.gap.prediction.workers import ALONE, Workers
+from workbench.rig.motion import Motion
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import Motion
 from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Rectangle, Where
 
 

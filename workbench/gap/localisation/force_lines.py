@@ -25,8 +25,8 @@ import numpy as np
 
 from workbench.arrays import Complexes, Floats
 from workbench.gap.prediction.unmodelled_force import SampledModel
+from workbench.rig.readings import reading_of
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import reading_of
 
 
 @dataclass(frozen=True)

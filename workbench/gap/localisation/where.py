@@ -15,8 +15,7 @@ from workbench.identification.signal.distortion import distortion_of, period_of
 from workbench.records.record import Record
 from workbench.renamed import Renamed
 from workbench.rig.linear import held_response, modal_motion, modal_poles, straight_response
-from workbench.rig.rig import Rig
-from workbench.rig.simulate import participation_of
+from workbench.rig.rig import Rig, participation_of
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
 from workbench.threads import one_blas_thread
 

@@ -10,9 +10,11 @@ from scipy.linalg import expm
 from workbench.arrays import Floats
 from workbench.gap.prediction.unmodelled_force import driven, force_filter, sampled_model
 from workbench.records.record import Record
-from workbench.rig.rig import Rig
+from workbench.rig.motion import Motion
+from workbench.rig.readings import read, reading_of
+from workbench.rig.rig import KEPT, Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import KEPT, Motion, move, prediction_errors, read, reading_of
+from workbench.rig.simulate import move, prediction_errors
 from workbench.structure.domain import Interval, Where
 from workbench.structure.modes import Modes
 
@@ -110,7 +112,7 @@ class Observer:
                 moved = move(rig, record.inputs, sample_time=dt, substeps=substeps, input_hold=record.input_hold)
             else:
                 moved = motion()
-            measured = measured + read(instantaneous, moved, sample_time=dt) - read(unrounded, moved, sample_time=dt)
+            measured = measured + read(instantaneous, moved) - read(unrounded, moved)
         gain = self._gain_for(rig, dt)
         hold = record.input_hold
         return prediction_errors(

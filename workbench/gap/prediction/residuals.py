@@ -14,8 +14,10 @@ from workbench.deadline import NEVER, Deadline
 from workbench.gap.prediction.innovations import LOOSE, Observer
 from workbench.gap.prediction.unmodelled_force import ForceFilter, whiten
 from workbench.records.record import Record
+from workbench.rig.motion import Motion
+from workbench.rig.readings import read
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import Motion, is_stepped, move, read, steps_exactly
+from workbench.rig.simulate import is_stepped, move, steps_exactly
 from workbench.structure.modes import Modes
 
 REMEMBERED = 2  # cached motions a record: of 45,000 requests in searches, 4,400 are of the last two, 140 of older ones
@@ -163,7 +165,7 @@ class FitData:
     def predictions(self, rig: Rig) -> tuple[np.ndarray, ...]:
         """Predicted outputs (n_outputs, n_samples) of each record."""
         return tuple(
-            read(rig.in_record(record.name), motion, sample_time=record.sample_time)
+            read(rig.in_record(record.name), motion)
             for record, motion in zip(self.counted, self.motions(rig), strict=True)
         )
 

@@ -1,13 +1,13 @@
-"""Modal motion between the samples, by exact propagation of each mode, for the readings of delayed sensors."""
+"""Modal motion of a rig at the samples and, for the readings of delayed sensors, between them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.rig.stepping import propagators
+from workbench.rig.linear import propagators
 
 SETTLED = 1e-6  # of the trace: regularisation of forces that hardly move a mode over a sample
 
@@ -42,6 +42,72 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
+class Motion:
+    """Modal motion of a rig at the sample instants.
+
+    Attributes:
+        displacement, velocity: (n_modes, n_samples) of the modal coordinates.
+        forces: (n_modes, n_samples) modal forces without those of stiffness and damping.
+        stiffness: (n_modes, 1) of each mode, or (n_modes, n_samples) where it changes.
+        damping: (n_modes, n_modes).
+        sample_time: s.
+        steps: of the forces within each interval.
+        held: (n_modes, n_samples) the part of the forces that is constant over each interval but for the steps.
+        finer: function that recomputes the motion with more samples, where forces change within an interval in another
+            way; None where not needed.
+        delayed: function of a delay, s, that recomputes the motion so much later, at the same instants; None where
+            there is none.
+    """
+
+    displacement: Floats
+    velocity: Floats
+    forces: Floats
+    stiffness: Floats
+    damping: Floats
+    sample_time: float
+    steps: tuple[Step, ...] = ()
+    held: Floats | float = 0.0
+    finer: "Callable[[], Motion] | None" = None
+    delayed: "Callable[[float], Motion] | None" = None
+
+    @cached_property
+    def acceleration(self) -> Floats:
+        """Modal accelerations (n_modes, n_samples)."""
+        return self.forces - self.stiffness * self.displacement - self.damping @ self.velocity
+
+    @cached_property
+    def finely(self) -> "Motion":
+        """The motion with more samples, by `finer`; itself where that is None."""
+        return self if self.finer is None else self.finer()
+
+    @cached_property
+    def between_samples(self) -> "BetweenSamples":
+        """The motion at any time; cached, as `finely`, since sensors of many delays may read one motion."""
+        return BetweenSamples(self)
+
+    def after(self, lead: int) -> "Motion":
+        """The motion without its first `lead` samples."""
+        if lead == 0:
+            return self
+        delayed = self.delayed
+        return replace(
+            self,
+            displacement=self.displacement[:, lead:],
+            velocity=self.velocity[:, lead:],
+            forces=self.forces[:, lead:],
+            stiffness=self.stiffness[:, lead:] if self.stiffness.shape[1] > 1 else self.stiffness,
+            steps=tuple(replace(step, forces=step.forces[:, lead:]) for step in self.steps),
+            held=self.held[:, lead:] if isinstance(self.held, np.ndarray) else self.held,
+            finer=None if self.finer is None else lambda: self.finely.after(self.times_finer * lead),
+            delayed=None if delayed is None else lambda delay: delayed(delay).after(lead),
+        )
+
+    @property
+    def times_finer(self) -> int:
+        """How many times as many samples `finely` has."""
+        return round(self.sample_time / self.finely.sample_time)
+
+
 class BetweenSamples:
     """Modal motion at any time, by exact propagation of each mode within a sample interval under a linear force.
 
@@ -51,76 +117,34 @@ class BetweenSamples:
     reading at any time is a weighted sum of the motion. For accelerations the given forces at both ends are
     interpolated instead, since p_0 and p_1 give the mean force alone. With nonlinear laws an accelerometer therefore
     reads a motion of more samples (`Motion.finely`).
-
-    Attributes:
-        omega, damping: (n_modes,) uncoupled frequencies, rad/s, and damping, 1/s.
-        series: (3 n_modes, n_samples) displacements, velocities, and modal forces without stiffness and damping.
-        arrivals: (2 n_modes, n_samples - 1) displacements and velocities at the end of each interval, without the
-            response to the steps of force within it.
-        changes: (n_modes, n_samples) change of the forces over each interval, without held ones; None where all are
-            held.
-        steps: of the forces within each interval.
-        ends: (2, 5, n_modes) p_0 and p_1 as functions of displacement, velocity and force at the start of an interval,
-            and of displacement and velocity at its end.
-        sample_time: s.
-        rests: whether the motion begins at rest.
     """
 
-    omega: Floats
-    damping: Floats
-    series: Floats
-    arrivals: Floats
-    changes: Floats | None
-    steps: tuple[Step, ...]
-    ends: Floats
-    sample_time: float
-    rests: bool
-
-    @classmethod
-    def of(
-        cls,
-        displacement: Floats,
-        velocity: Floats,
-        forces: Floats,
-        stiffness: Floats,
-        damping: Floats,
-        sample_time: float,
-        *,
-        steps: tuple[Step, ...] = (),
-        held: Floats | float = 0.0,
-    ) -> "BetweenSamples":
-        """From displacements, velocities and forces (n_modes, n_samples) at the samples.
-
-        Args:
-            displacement, velocity, forces: of the modes, forces without those of stiffness and damping.
-            stiffness: (n_modes, 1) or (n_modes, n_samples).
-            damping: (n_modes, n_modes).
-            sample_time: s.
-            steps: of the forces within each interval.
-            held: (n_modes, n_samples) the part of the forces that is constant over each interval but for the steps.
-        """
-        omega, own = np.sqrt(stiffness.mean(axis=1)), np.diag(damping).copy()
+    def __init__(self, motion: Motion) -> None:
+        q, v, residual = motion.displacement, motion.velocity, motion.forces
+        self.sample_time, self.steps = motion.sample_time, motion.steps
+        self.omega, self.damping = np.sqrt(motion.stiffness.mean(axis=1)), np.diag(motion.damping).copy()
+        self.rests = not (q[:, 0].any() or v[:, 0].any())  # begins at rest
         # coupling by damping and changes of stiffness count as forces
-        residual, coupled = forces, damping - np.diag(own)
-        if stiffness.shape[1] > 1:
-            residual = residual - (stiffness - omega[:, None] ** 2) * displacement
+        coupled = motion.damping - np.diag(self.damping)
+        if motion.stiffness.shape[1] > 1:
+            residual = residual - (motion.stiffness - self.omega[:, None] ** 2) * q
         if coupled.any():
-            residual = residual - coupled @ velocity
-        changes: Floats | None = None
-        if residual is not held:
-            changes = np.diff(residual - held, axis=1, append=0.0)
+            residual = residual - coupled @ v
+        # change of the forces over each interval, (n_modes, n_samples), without held ones; None where all are held
+        self.changes: Floats | None = None
+        if residual is not motion.held:
+            changes = np.diff(residual - motion.held, axis=1, append=0.0)
             changes[:, -1] = 0.0  # the force is held after the last sample
-        if changes is None or not changes.any():
-            changes, ends = None, _held(omega.size)
-        else:
-            ends = _ends(omega, own, sample_time)
-        rests = not (displacement[:, 0].any() or velocity[:, 0].any())
-        series = np.concatenate([displacement, velocity, residual])
-        arrivals = series[: 2 * omega.size, 1:]
-        for step in steps:
-            added = step.response(omega, own, sample_time)
-            arrivals = arrivals - np.concatenate([row[:, None] * step.forces[:, :-1] for row in added[:2]])
-        return cls(omega, own, series, arrivals, changes, steps, ends, sample_time, rests)
+            self.changes = changes if changes.any() else None
+        # (2, 5, n_modes) p_0 and p_1 by q, q' and force at the start of an interval, and q and q' at its end
+        held = self.changes is None
+        self.ends = _held(self.omega.size) if held else _ends(self.omega, self.damping, self.sample_time)
+        self.series = np.concatenate([q, v, residual])  # (3 n_modes, n_samples)
+        # (2 n_modes, n_samples - 1) q and q' at the end of each interval, without the response to steps within it
+        self.arrivals = self.series[: 2 * self.omega.size, 1:]
+        for step in self.steps:
+            added = step.response(self.omega, self.damping, self.sample_time)
+            self.arrivals = self.arrivals - np.concatenate([row[:, None] * step.forces[:, :-1] for row in added[:2]])
 
     def delayed(self, order: int, shapes: Floats, delays: Floats) -> Floats:
         """Readings (n_sensors, n_samples) of delayed sensors; zero before a start at rest.
@@ -130,7 +154,10 @@ class BetweenSamples:
             shapes: (n_sensors, n_modes) at the sensors.
             delays: (n_sensors,) s; negative for a sensor ahead of the samples.
         """
-        whole, within = _intervals(tuple(delays.tolist()), self.sample_time)
+        in_samples = [delay / self.sample_time for delay in delays]
+        # samples back to the start of each one's interval, and time within it, rounded: a tiny one would be a divisor
+        whole = [int(np.ceil(round(samples, 9))) for samples in in_samples]
+        within = [self.sample_time * round(n - samples, 9) for n, samples in zip(whole, in_samples, strict=True)]
         read = self._read(order, shapes, within)
         for step in self.steps:
             for j in (j for j, time in enumerate(within) if time > step.late):
@@ -152,7 +179,8 @@ class BetweenSamples:
     def _read(self, order: int, shapes: Floats, times: Sequence[float], samples: slice = slice(None)) -> Floats:
         """Readings (n_sensors, n_samples), each sensor at its own time after the start of each interval."""
         n_modes, series, arrivals = self.omega.size, self.series[:, samples], self.arrivals[:, samples]
-        rows = np.array([self._rows(order, time) for time in times])
+        by_time = {time: self._rows(order, time) for time in set(times)}
+        rows = np.array([by_time[time] for time in times])
 
         def weights(ends: Floats) -> Floats:
             by_motion = np.einsum("jfm,fsm->jsm", rows[:, 2:], ends)
@@ -182,30 +210,15 @@ class BetweenSamples:
         return np.asarray(motion[order] if order < 2 else -(self.omega**2) * motion[0] - self.damping * motion[1])
 
 
-@lru_cache(maxsize=64)
-def _intervals(delays: tuple[float, ...], sample_time: float) -> tuple[list[int], list[float]]:
-    """Of each delay: the number of samples back to the start of its interval, and the time within the interval, s."""
-    in_samples = [delay / sample_time for delay in delays]
-    whole = [int(np.ceil(round(samples, 9))) for samples in in_samples]
-    # rounded, because a tiny time would be a divisor
-    return whole, [sample_time * round(n - samples, 9) for n, samples in zip(whole, in_samples, strict=True)]
-
-
 def _held(n_modes: int) -> Floats:
-    """`ends` of forces held from the start of the interval."""
+    """`BetweenSamples.ends` of forces held from the start of the interval."""
     ends = np.zeros((2, 5, n_modes))
     ends[:, 2] = 1.0
     return ends
 
 
 def _ends(omega: Floats, damping: Floats, sample_time: float) -> Floats:
-    """`ends` of the forces nearest to that at the start of the interval that give the motion at its end."""
-    return _cached_ends(omega.tobytes(), damping.tobytes(), sample_time)
-
-
-@lru_cache(maxsize=64)
-def _cached_ends(frequencies: bytes, dampings: bytes, sample_time: float) -> Floats:
-    omega, damping = np.frombuffer(frequencies), np.frombuffer(dampings)
+    """`BetweenSamples.ends` of the forces nearest to that at the start that give the motion at the end."""
     step = _propagators(omega, damping, sample_time)
     weight = np.array([1.0, sample_time])[:, None, None]
     by_force = np.moveaxis(weight * step[:, 2:], 2, 0)  # (n_modes, 2 motions, 2 forces)
@@ -217,18 +230,12 @@ def _cached_ends(frequencies: bytes, dampings: bytes, sample_time: float) -> Flo
     missing[0, 3] = missing[1, 4] = 1.0
     ends: Floats = np.einsum("mfd,dsm->fsm", change, missing)
     ends[:, 2] += 1.0
-    ends.flags.writeable = False
     return ends
 
 
 def _propagators(omega: Floats, damping: Floats, span: float, time: float | None = None) -> Floats:
     """(2, 4, n_modes): q and q' at `time` from q, q', p_0 and p_1, with a force linear over the span."""
-    return _cached_propagators(omega.tobytes(), damping.tobytes(), span, span if time is None else time)
-
-
-@lru_cache(maxsize=256)  # the same for all records of a rig and for sensors of equal delay
-def _cached_propagators(frequencies: bytes, dampings: bytes, span: float, time: float) -> Floats:
-    omega, damping = np.frombuffer(frequencies).copy(), np.frombuffer(dampings).copy()
+    time = span if time is None else time
     out = np.zeros((2, 4, omega.size))
     if time == 0:
         out[0, 0] = out[1, 1] = 1.0
@@ -238,5 +245,4 @@ def _cached_propagators(frequencies: bytes, dampings: bytes, span: float, time: 
         share = time / span
         out[:, 2] += (1.0 - share) * out[:, 3]
         out[:, 3] *= share
-    out.flags.writeable = False
     return out
