@@ -10,6 +10,7 @@ import pytest
 from workbench.design.estimation.digital import sampled
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.imsc import imsc
+from workbench.design.laws.law import DesignError
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.rig.elements import CubicSpring, LinearDamper, LinearSpring
 from workbench.rig.statespace import state_space
@@ -39,6 +40,15 @@ def test_the_slowest_pole_is_that_of_the_simulated_motion(rig, controller):
 def test_poles_without_control_are_those_of_the_modes(rig, controller):
     silent = replace(controller, c=0.0 * controller.c, e=0.0 * controller.e)
     assert loop_poles(rig, silent).damping == pytest.approx(rig.modes.zeta, rel=1e-6)
+
+
+def test_a_delay_that_a_predictor_makes_up_for_has_loop_poles_too(rig, controller):
+    """One limit for both: compensation took 500 samples, the poles of its loop 400."""
+    first, *others = rig.actuators
+    late = replace(rig, actuators=(replace(first, delay=450 * DT), *others))
+    assert loop_poles(late, controller).poles.size == 2 * rig.modes.n_modes + len(controller.a) + 450
+    with pytest.raises(DesignError, match="501 samples, more than 500"):
+        loop_poles(replace(rig, actuators=(replace(first, delay=501 * DT), *others)), controller)
 
 
 def test_an_element_is_worth_the_spring_and_damper_that_it_is(rig, controller):

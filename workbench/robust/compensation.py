@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
 
 from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
@@ -26,6 +25,7 @@ from workbench.design.estimation.digital import (
     zero_order_hold,
 )
 from workbench.design.estimation.observers import observed_plant
+from workbench.design.export.sampled_loop import MOST_PAST, held, held_over, past_commands
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.rig_loop import named
@@ -38,7 +38,6 @@ from workbench.structure.modes import Modes
 
 STEPS = ("sensors", "delay", "dead zone", "saturation", "friction")  # compensations, in this order
 SLOWEST = 4.0  # least samples per period of a controlled mode
-LONGEST = 500  # longest delay of a predictor, samples
 
 
 class Loop(NamedTuple):
@@ -74,33 +73,6 @@ class _Model:
     lags: np.ndarray
     hold: float
     sample_time: float
-
-    @property
-    def late(self) -> np.ndarray:
-        """(n_actuators,) number of past commands in the state, the delay in samples rounded up.
-
-        A prediction by the delay and half a sample needs no earlier command.
-        """
-        return np.ceil(np.round(self.delays / self.sample_time, 9)).astype(int)
-
-    def moved(self, a: np.ndarray, horizon: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """e^{a h}, and the effect on X over h of the commands.
-
-        Those to be sent are (n_x, n_actuators); the past ones (n_x, n_past), actuator by actuator, newest first.
-        """
-        whole, step = self.late, self.sample_time
-        now, past, starts = np.zeros_like(self.b), np.zeros((len(a), whole.sum())), np.cumsum(whole) - whole
-        for j, delay in enumerate(self.delays):
-            changes = (delay + k * step for k in range(-whole[j], 2))
-            times = sorted({0.0, horizon, *(t for t in changes if 0.0 < t < horizon)})
-            for start, end in zip(times, times[1:]):
-                age = -int(np.floor(round((0.5 * (start + end) - delay) / step, 9)))
-                effect = expm(a * (horizon - end)) @ zero_order_hold(a, self.b[:, [j]], end - start)[1][:, 0]
-                if age > 0:
-                    past[:, starts[j] + age - 1] += effect
-                else:
-                    now[:, j] += effect
-        return expm(a * horizon), now, past
 
 
 def check_rate(modes: Modes, controlled: Sequence[int], sample_time: float) -> None:
@@ -180,8 +152,8 @@ def _states(model: _Model, loop: Loop, actuators: Sequence[str]) -> tuple[str, .
     lagging = [f"command of {actuators[int(j)]} after its lag" for j in np.flatnonzero(model.lags)]
     past = [
         f"command of {name}, {k + 1} {'sample' if k == 0 else 'samples'} ago"
-        for name, late in zip(actuators, model.late, strict=True)
-        for k in range(late)
+        for name, count in zip(actuators, past_commands(model.delays, model.sample_time), strict=True)
+        for k in range(count)
     ]
     return (*own, *lagging, *past)
 
@@ -189,12 +161,12 @@ def _states(model: _Model, loop: Loop, actuators: Sequence[str]) -> tuple[str, .
 def _model(a: Floats, b: Floats, actuators: Sequence[Actuator], sample_time: float, compensate: bool) -> _Model:
     """The model of the controlled modes, with delays and lags of the actuators where these are compensated."""
     delays, lags = (compensate * _values(actuators, name) for name in ("delay", "time_constant"))
-    if (delays > LONGEST * sample_time).any():
+    if (delays > MOST_PAST * sample_time).any():
         latest = max(actuators, key=lambda x: x.delay)
         raise DesignError(
             f"the delay of {latest.name}, {1e3 * latest.delay:.3g} ms, is {latest.delay / sample_time:,.0f} samples at"
-            f" {1 / sample_time:g} Hz, more than the {LONGEST} of a predictor: sample at {LONGEST / latest.delay:.4g}"
-            " Hz or slower"
+            f" {1 / sample_time:g} Hz, more than the {MOST_PAST} of a predictor: sample at"
+            f" {MOST_PAST / latest.delay:.4g} Hz or slower"
         )
     lagging = np.flatnonzero(lags)
     n, n_x = len(a), len(a) + lagging.size
@@ -214,30 +186,25 @@ def _matrices(model: _Model, loop: Loop, estimator: Floats, output: Floats) -> t
         estimator: of the loop's controller.
         output: of `_output`.
     """
-    static, late, n = loop.controller.static, model.late, model.n
-    (n_x, n_u), n_y = model.b.shape, estimator.shape[1]
-    size = n_x + int(late.sum())
-    a, b, e = np.zeros((size, size)), np.zeros((size, n_y)), np.zeros((size, n_u))
+    static, n, (n_x, n_u), n_y = loop.controller.static, model.n, model.b.shape, estimator.shape[1]
+    observer = model.a.copy()
+    if not static:
+        observer[:n, :n] -= estimator @ output
+    a, e = held(observer, model.b, model.sample_time, model.delays)
+    size = len(a)
+    b = np.zeros((size, n_y))
     # X at a sample from the states, and of a modal filter from the readings
     by_state, by_reading = np.eye(n_x, size), np.zeros((n_x, n_y))
-    observer = model.a.copy()
     if static:
         by_state[:n], by_reading[:n] = 0.0, output
+        a[:n], e[:n] = 0.0, 0.0
     else:
-        observer[:n, :n] -= estimator @ output
         correction = np.vstack([estimator, np.zeros((n_x - n, n_y))])
         b[:n_x] = zero_order_hold(observer, correction, model.sample_time)[1]
-    step, now, past = model.moved(observer, model.sample_time)
-    own = slice(n if static else 0, n_x)
-    a[own, :n_x], a[own, n_x:], e[own] = step[own], past[own], now[own]
-    for j, (count, end) in enumerate(zip(late, n_x + np.cumsum(late), strict=True)):
-        if count:
-            sent = slice(end - count, end)
-            e[end - count, j], a[sent, sent] = 1.0, np.eye(count, k=-1)
 
     def predicted(horizon: float) -> tuple[Floats, Floats, Floats]:
         """X̂ at a horizon from X̂ now (n_x, n_x), from the states, and from the commands to be sent."""
-        step, now, past = model.moved(model.a, horizon)
+        step, past, now = held_over(model.a, model.b, model.sample_time, model.delays, horizon)
         rows = step @ by_state
         rows[:, n_x:] += past
         return step, rows, now

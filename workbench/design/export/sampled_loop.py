@@ -13,15 +13,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import expm
 
-from workbench.design.estimation.digital import DigitalController
+from workbench.arrays import Floats, Integers
+from workbench.design.estimation.digital import DigitalController, zero_order_hold
 from workbench.design.laws.law import DesignError
 from workbench.rig.actuators import Actuator
-from workbench.rig.linear import whole_samples
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
 from workbench.structure.modes import Modes
 
-MOST_PAST = 400  # delayed commands, in samples
+MOST_PAST = 500  # longest delay of a command, samples
 
 
 def sampled_loop(
@@ -58,8 +58,8 @@ def sampled_loop(
     return closed_by(stepped, into, reads, controller)[0]
 
 
-def held(a: np.ndarray, b: np.ndarray, period: float, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A and B of the plant in discrete time; the states are x, then each actuator's delayed commands, newest first.
+def held(a: Floats, b: Floats, period: float, delays: Floats) -> tuple[Floats, Floats]:
+    """A and B of the plant in discrete time; the states are x, then each actuator's past commands, newest first.
 
     Args:
         a: (n, n) of x' = A x + B u.
@@ -70,27 +70,44 @@ def held(a: np.ndarray, b: np.ndarray, period: float, delays: np.ndarray) -> tup
     Raises:
         DesignError: delays of too many samples.
     """
-    parts = [whole_samples(float(delay), period) for delay in delays]
-    past = [whole + (rest > 0) for whole, rest in parts]
-    if max(past, default=0) > MOST_PAST:
+    past = past_commands(delays, period)
+    if past.max(initial=0) > MOST_PAST:
         raise DesignError(
-            f"the delay of a command is {max(past)} samples, more than {MOST_PAST}; sample slower, or shorten the delay"
+            f"the delay of a command is {past.max()} samples, more than {MOST_PAST}; sample slower, or shorten the"
+            " delay"
         )
-    n, starts = len(a), len(a) + np.r_[0, np.cumsum(past)].astype(int)
-    stepped, into = np.zeros((starts[-1],) * 2), np.zeros((starts[-1], len(parts)))
-    stepped[:n, :n] = expm(period * a)
-    for j, (whole, rest) in enumerate(parts):
-        newer = _integral(a, period - rest) @ b[:, j]
-        older = expm((period - rest) * a) @ (_integral(a, rest) @ b[:, j]) if rest > 0 else None
-        for age, effect in ((whole, newer), (whole + 1, older)):
-            if effect is not None and age == 0:
-                into[:n, j] += effect
-            elif effect is not None:
-                stepped[:n, starts[j] + age - 1] += effect
-        if past[j]:
-            into[starts[j], j] = 1.0
-            stepped[starts[j] + 1 : starts[j + 1], starts[j] : starts[j + 1] - 1] = np.eye(past[j] - 1)
-    return stepped, into
+    transition, by_past, by_new = held_over(a, b, period, delays, period)
+    newest, late = np.cumsum(past) - past, np.flatnonzero(past)
+    ageing, entering = np.eye(past.sum(), k=-1), np.zeros((past.sum(), len(past)))
+    ageing[newest[late]], entering[newest[late], late] = 0.0, 1.0
+    older = np.zeros((past.sum(), len(a)))
+    return np.block([[transition, by_past], [older, ageing]]), np.vstack([by_new, entering])
+
+
+def past_commands(delays: Floats, period: float) -> Integers:
+    """Number of past commands (n_actuators,) that still act at a sample: the delay in samples, rounded up."""
+    return np.asarray(np.ceil(np.round(delays / period, 9)), np.int64)
+
+
+def held_over(a: Floats, b: Floats, period: float, delays: Floats, horizon: float) -> tuple[Floats, Floats, Floats]:
+    """e^{A h}, and the effect on x over a horizon h (s) of the commands, held over each sample and delayed.
+
+    Past commands (n, n_past) are in the order of `held`; of those to be sent (n, n_actuators) the first is kept to the
+    horizon. Arguments as of `held`.
+    """
+    past = past_commands(delays, period)
+    by_past, by_new = np.zeros((len(a), past.sum())), np.zeros_like(b)
+    for j, (delay, newest) in enumerate(zip(delays, np.cumsum(past) - past, strict=True)):
+        changes = (delay + k * period for k in range(-past[j], 2))
+        times = sorted({0.0, horizon, *(t for t in changes if 0.0 < t < horizon)})
+        for start, end in zip(times, times[1:]):
+            age = -int(np.floor(round((0.5 * (start + end) - delay) / period, 9)))
+            effect = expm(a * (horizon - end)) @ zero_order_hold(a, b[:, [j]], end - start)[1][:, 0]
+            if age > 0:
+                by_past[:, newest + age - 1] += effect
+            else:
+                by_new[:, j] += effect
+    return expm(a * horizon), by_past, by_new
 
 
 def closed_by(
@@ -118,9 +135,3 @@ def linear_plant(
     linear_sensors = [replace(s, bias=0.0, drift=0.0, limit=np.inf, step=0.0) for s in sensors]
     plant = state_space(modes, linear_actuators, linear_sensors)
     return np.asarray(plant.A), np.asarray(plant.B), np.asarray(plant.C)
-
-
-def _integral(a: np.ndarray, span: float) -> np.ndarray:
-    """∫_0^span e^{At} dt; A may be singular."""
-    n = a.shape[0]
-    return np.asarray(expm(span * np.block([[a, np.eye(n)], [np.zeros((n, 2 * n))]]))[:n, n:])
