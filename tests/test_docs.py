@@ -12,7 +12,8 @@ import pytest
 from typer.main import get_command
 
 import workbench
-from workbench.cases.case import EDGES, INPUT, MEMBER, MODAL, OUTPUT, PLATE, RECORD, SINGLE, STRUCTURES, TABLES
+from workbench.cases.case import RECORD
+from workbench.cases.nominal import EDGES, INPUT, MEMBER, MODAL, OUTPUT, PLATE, SINGLE, STRUCTURES, TABLES
 from workbench.cli.app import app
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.rig.actuators import Actuator

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from workbench.cases.case import read_case, read_rig
+from workbench.cases.case import read_case
+from workbench.cases.nominal import read_rig
 from workbench.rig.simulate import simulate
 
 

@@ -14,7 +14,8 @@ from scipy.linalg import eigh
 from threadpoolctl import threadpool_info, threadpool_limits
 from typer.testing import CliRunner
 
-from workbench.cases.case import Case, CaseError, read_case, read_rig
+from workbench.cases.case import Case, CaseError, read_case
+from workbench.cases.nominal import read_rig
 from workbench.cases.writing import write_case
 from workbench.cli.app import app
 from workbench.rig.actuators import Actuator

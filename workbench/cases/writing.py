@@ -23,7 +23,7 @@ from workbench.structure.profile import Profile
 from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
 
 POINTS = "points.csv"
-EDGES = ("simply supported", "clamped", "guided", "free")
+EDGE_NAMES = ("simply supported", "clamped", "guided", "free")
 Support = TypeVar("Support", End, Edge)
 Port = Actuator | Sensor
 
@@ -103,7 +103,7 @@ def _plate(plate: Plate, n_modes: int) -> str:
         length=list(plate.length),
         **{name: float(quantity(0.0, 0.0)) for name, quantity in constants.items()},
         poisson_ratio=plate.poisson_ratio,
-        edges={side: _named(edge, EDGES, NAMED_EDGES) for side, edge in plate.edges.items()},
+        edges={side: _named(edge, EDGE_NAMES, NAMED_EDGES) for side, edge in plate.edges.items()},
         damping_ratio=_damping_ratio(plate),
         modes=n_modes,
     )
@@ -172,54 +172,31 @@ def _check_ports(rig: Rig) -> None:
     moments = isinstance(rig.structure, Beam | Plate) or isinstance(rig.modes.domain, NamedPoints)
     ports: tuple[Port, ...] = (*rig.actuators, *rig.sensors)
     for port in ports:
-        patch = isinstance(port, Actuator) and _is_patch(port, rig)
+        moment = isinstance(port, Actuator) and port.kind == "moment"
         plain = Sensor(port.name, port.at) if isinstance(port, Sensor) else Actuator(port.name, port.at, port.kind)
         kept = ["direct"] if isinstance(port, Actuator) else ["quantity", "noise_std"]
         kept += ["direction"] * (not isinstance(rig.structure, Structure))
         other = [f.name for f in fields(port) if f.name not in kept and getattr(port, f.name) != getattr(plain, f.name)]
-        other += ["a moment"] * (isinstance(port, Actuator) and port.kind == "moment" and not moments)
-        if other or (isinstance(port.at, Between) and not patch):
+        other += ["a moment"] * (moment and not moments)
+        if other or (isinstance(port.at, Between) and not (moment and isinstance(rig.structure, Beam))):
             raise ValueError(
                 f"{port.name!r} has {other[0] if other else 'two places'}; the case format describes only ideal point"
                 " forces, moments, piezo patches and sensors at one place"
             )
 
 
-def _is_patch(actuator: Actuator, rig: Rig) -> bool:
-    on_beam = isinstance(rig.structure, Beam) and isinstance(actuator.at, Between) and actuator.kind == "moment"
-    return isinstance(actuator.at, Patch) or on_beam
-
-
 def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
     """Tables of the inputs and outputs; `at` returns the keys and values of a place."""
-    inputs = [
-        _table(
-            "[[input]]",
-            name=a.name,
-            kind="hammer" if a.direct else "actuator",
-            **_quantity(a),
-            **at(a),
-            **_direction(a),
-        )
-        for a in rig.actuators
-    ]
-    outputs = [
-        _table(
-            "[[output]]",
-            name=s.name,
-            quantity=s.quantity,
-            **at(s),
-            **_direction(s),
-            **({"noise_std": s.noise_std} if s.noise_std else {}),
-        )
-        for s in rig.sensors
-    ]
-    return [*inputs, *outputs]
-
-
-def _quantity(actuator: Actuator) -> dict[str, str]:
-    at_point = not isinstance(actuator.at, Patch | Between)
-    return {"quantity": "moment"} if actuator.kind == "moment" and at_point else {}
+    blocks = []
+    for a in rig.actuators:
+        kind = "hammer" if a.direct else "actuator"
+        at_point = not isinstance(a.at, Patch | Between)
+        quantity = {"quantity": "moment"} if a.kind == "moment" and at_point else {}
+        blocks.append(_table("[[input]]", name=a.name, kind=kind, **quantity, **at(a), **_direction(a)))
+    for s in rig.sensors:
+        noise = {"noise_std": s.noise_std} if s.noise_std else {}
+        blocks.append(_table("[[output]]", name=s.name, quantity=s.quantity, **at(s), **_direction(s), **noise))
+    return blocks
 
 
 def _direction(port: Port) -> dict[str, str]:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 def read_rig_and_units(path: Path) -> "tuple[Rig, Units]":
     """The rig and the units of a TOML file, or of case.toml in a case folder."""
-    from workbench.cases.case import read_rig, read_units
+    from workbench.cases.case import read_units
+    from workbench.cases.nominal import read_rig
 
     file = path / "case.toml" if path.is_dir() else path
     return read_rig(file), read_units(file)

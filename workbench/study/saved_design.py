@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from workbench.cases.case import read_rig
+from workbench.cases.nominal import read_rig
 {imports}
 from workbench.study.trying import Design, try_out
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import simpson
 
-from workbench.cases.case import read_rig
+from workbench.cases.nominal import read_rig
 from workbench.design.estimation.modal_filter import filter_on
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
