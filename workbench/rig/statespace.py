@@ -90,16 +90,14 @@ def modal_plant(
         for what, (pa, pb, pc) in lateness(actuator, modes):
             size = len(pa)
             a = np.block([[a, b[:, [j]] * pc], [np.zeros((size, len(a))), pa]])
-            c = np.hstack([c, d[:, [j]] * pc])
-            b, d = np.vstack([b, np.zeros((size, m))]), d.copy()
+            b, c = np.vstack([b, np.zeros((size, m))]), np.hstack([c, d[:, [j]] * pc])
             b[:, j], d[:, j] = np.r_[np.zeros(len(a) - size), pb], 0.0
             states += _named(f"{actuator.name}_{what}", size)
     for j, sensor in enumerate(sensors):
         for what, (pa, pb, pc) in lateness(sensor, modes):
             size = len(pa)
             a = np.block([[a, np.zeros((len(a), size))], [np.outer(pb, c[j]), pa]])
-            b = np.vstack([b, np.outer(pb, d[j])])
-            c, d = np.hstack([c, np.zeros((len(c), size))]), d.copy()
+            b, c = np.vstack([b, np.outer(pb, d[j])]), np.hstack([c, np.zeros((len(c), size))])
             c[j], d[j] = np.r_[np.zeros(len(a) - size), pc], 0.0
             states += _named(f"{sensor.name}_{what}", size)
     return a, b, c, d, states

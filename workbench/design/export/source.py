@@ -1,6 +1,6 @@
 """A controller as C or Python source, from templates: one function that is called once per sample."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 
+from workbench.arrays import Floats
 from workbench.design.estimation.digital import DigitalController
 from workbench.records.record import QUANTITIES
 from workbench.records.units import SI, Units
@@ -38,88 +39,83 @@ def source(
         readings, commands: what each is, in words; by default the names.
     """
     infinite = "INFINITY" if language == "c" else "inf"
-    given = _Numbers(controller, infinite)
+    matrices, vectors = _numbers(controller)
+    n_states, n_readings, n_commands = len(controller.a), len(controller.sensors), len(controller.actuators)
     words = {
         "name": name,
         "title": fill(f"{_plain(controller.name)}, at {1 / controller.sample_time:.6g} Hz", WIDTH),
         "period": f"{controller.sample_time:.10g}",
         "rate": f"{1 / controller.sample_time:.6g}",
-        "equations": "\n".join(_equations(given)),
+        "equations": "\n".join(_equations(matrices, vectors)),
         "signals": "\n".join(
             [
                 *_listed("reading", readings or controller.sensors),
                 *_listed("command", commands or controller.actuators),
-                *_listed("z", controller.states or ["state of the controller"] * given.sizes["n_states"]),
+                *_listed("z", controller.states or ["state of the controller"] * n_states),
             ]
         ),
-        "matrices": given.matrices,
-        "vectors": given.vectors,
-        "uses_math": bool(given.vectors.keys() - {"SCALE", "OFFSET", "BIAS"}),
-        **given.sizes,
+        "matrices": {key: _literals(values, infinite) for key, values in matrices.items()},
+        "vectors": {key: _literals(values, infinite) for key, values in vectors.items()},
+        "uses_math": bool(vectors.keys() - {"SCALE", "OFFSET", "BIAS"}),
+        "n_states": n_states,
+        "n_readings": n_readings,
+        "n_commands": n_commands,
+        "n_outputs": len(controller.d),
     }
     environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True)
     texts = {end: (HERE / f"step.{end}.jinja").read_text(encoding="utf-8") for end in TEMPLATES[language]}
     return {f"{name}.{end}": environment.from_string(text).render(words) for end, text in texts.items()}
 
 
-class _Numbers:
-    """The matrices and vectors of a controller as text; those without effect are left out."""
-
-    def __init__(self, controller: DigitalController, infinite: str) -> None:
-        def text(value: Any) -> Any:
-            if np.ndim(value):
-                return [text(each) for each in value]
-            return repr(float(value)) if np.isfinite(value) else infinite if value > 0 else f"-{infinite}"
-
-        one, relays, friction = controller, controller.relays, controller.friction
-        n_states = one.a.shape[0]
-        self.sizes = {"n_states": n_states, "n_readings": len(one.sensors), "n_outputs": one.d.shape[0]}
-        self.sizes["n_commands"] = len(one.actuators)
-        self.matrices: dict[str, Any] = {"D": text(one.d)}
-        self.vectors: dict[str, Any] = {}
-        if n_states:
-            self.matrices |= {"A": text(one.a), "B": text(one.b), "C": text(one.c)}
-            if one.e.any():
-                self.matrices["E"] = text(one.e)
-        if one.offset.any() or (one.scale != 1).any():
-            self.vectors |= {"SCALE": text(one.scale), "OFFSET": text(one.offset)}
-        if relays is not None:
-            self.matrices["SPREAD"] = text(relays.spread)
-            self.vectors |= {"FORCE": text(relays.force), "DEAD_BAND": text(relays.dead_band)}
-        if friction is not None:
-            self.matrices |= {"PUSH": text(friction.push), "SPEED_Y": text(friction.of_reading)}
-            if n_states:
-                self.matrices["SPEED_Z"] = text(friction.of_state)
-            self.vectors |= {"FRICTION": text(friction.force), "SMOOTHING": text(friction.smoothing)}
-        for name, values in (("LIMIT", one.limit), ("RATE", one.rate)):
-            if np.isfinite(values).any():
-                self.vectors[name] = text(values)
-        if one.dead_zone.any():
-            self.vectors |= {"DEAD_ZONE": text(one.dead_zone), "ONSET": text(one.onset)}
-        if one.bias.any():
-            self.vectors["BIAS"] = text(one.bias)
+def _numbers(controller: DigitalController) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """The matrices and the vectors of a controller, without those that have no effect."""
+    one, relays, friction = controller, controller.relays, controller.friction
+    matrices, vectors = {"D": one.d}, {}
+    if len(one.a):
+        matrices |= {"A": one.a, "B": one.b, "C": one.c}
+        if one.e.any():
+            matrices["E"] = one.e
+    if one.offset.any() or (one.scale != 1).any():
+        vectors |= {"SCALE": one.scale, "OFFSET": one.offset}
+    if relays is not None:
+        matrices["SPREAD"] = relays.spread
+        vectors |= {"FORCE": relays.force, "DEAD_BAND": relays.dead_band}
+    if friction is not None:
+        matrices |= {"PUSH": friction.push, "SPEED_Y": friction.of_reading}
+        if len(one.a):
+            matrices["SPEED_Z"] = friction.of_state
+        vectors |= {"FRICTION": friction.force, "SMOOTHING": friction.smoothing}
+    vectors |= {name: limit for name, limit in (("LIMIT", one.limit), ("RATE", one.rate)) if np.isfinite(limit).any()}
+    if one.dead_zone.any():
+        vectors |= {"DEAD_ZONE": one.dead_zone, "ONSET": one.onset}
+    if one.bias.any():
+        vectors["BIAS"] = one.bias
+    return matrices, vectors
 
 
-def _equations(given: _Numbers) -> list[str]:
+def _literals(values: Any, infinite: str) -> Any:
+    """Numbers as text that is read back to the last digit."""
+    if np.ndim(values):
+        return [_literals(each, infinite) for each in values]
+    return repr(float(values)) if np.isfinite(values) else infinite if values > 0 else f"-{infinite}"
+
+
+def _equations(matrices: Collection[str], vectors: Collection[str]) -> list[str]:
     """The equations of one step, line by line."""
-    there, states = given.vectors, "z" if given.sizes["n_states"] else ""
-    lines = ["y = SCALE (reading - OFFSET)" if "SCALE" in there else "y = reading"]
-    lines.append("w = C z + D y" if states else "w = D y")
-    if "FORCE" in there:
+    lines = ["y = SCALE (reading - OFFSET)" if "SCALE" in vectors else "y = reading"]
+    lines.append("w = C z + D y" if "C" in matrices else "w = D y")
+    if "FORCE" in vectors:
         lines.append("w <- -SPREAD (FORCE sgn w outside the DEAD_BAND)")
-    if "FRICTION" in there:
+    if "FRICTION" in vectors:
         lines.append("w <- w + PUSH (FRICTION tanh(speed / SMOOTHING)), speed = SPEED_Z z + SPEED_Y y")
-    if "LIMIT" in there or "RATE" in there:
-        bounds = [text for name, text in (("LIMIT", "+-LIMIT"), ("RATE", "+-RATE of the previous v")) if name in there]
-        lines.append(f"v = w within {' and '.join(bounds)}")
-    else:
-        lines.append("v = w")
+    bounds = [text for name, text in (("LIMIT", "+-LIMIT"), ("RATE", "+-RATE of the previous v")) if name in vectors]
+    lines.append(f"v = w within {' and '.join(bounds)}" if bounds else "v = w")
     command = "command = v"
-    if "DEAD_ZONE" in there:
+    if "DEAD_ZONE" in vectors:
         command += " + DEAD_ZONE (v / ONSET within +-1)"
-    lines.append(command + (" - BIAS" if "BIAS" in there else ""))
-    if states:
-        lines.append("z <- A z + B y" + (" + E v" if "E" in given.matrices else ""))
+    lines.append(command + (" - BIAS" if "BIAS" in vectors else ""))
+    if "A" in matrices:
+        lines.append("z <- A z + B y" + (" + E v" if "E" in matrices else ""))
     return lines
 
 
