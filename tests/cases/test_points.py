@@ -298,6 +298,11 @@ def test_what_is_wrong_is_refused_by_name(tmp_path, case, points, words):
         read_case(written(tmp_path, case, points))
 
 
+def test_a_faulty_name_in_the_table_of_points_is_refused_with_its_place_once(tmp_path):
+    with pytest.raises(CaseError, match=r"^(?!.*points\.csv.*points\.csv).*points\.csv, line 3, column 'name'"):
+        read_case(written(tmp_path, FRAME, POINTS.replace("a.y,1", ",1")))
+
+
 def test_rigid_modes_have_damping_of_their_own(tmp_path):
     table = FRAME.replace("[3.0, 7.0]", "[0.0, 7.0]").replace("points =", "rigid_damping = [2.5]\npoints =")
     modes = read_case(written(tmp_path, table)).rig.modes

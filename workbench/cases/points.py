@@ -42,13 +42,12 @@ def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
     known = any(row[c] for _, row in rows for c in "xyz")
     numeric = [*("xyz" if known else ""), *columns[len(COLUMNS) :]]
     values = np.array([[_number(path, i, row, c) for c in numeric] for i, row in rows])
+    names, directions, nodes = (
+        tuple(_text(path, i, row, column, may_be_empty=column == "direction") for i, row in rows)
+        for column in ("name", "direction", "node")
+    )
     try:
-        points = NamedPoints(
-            names=tuple(_text(path, i, row, "name") for i, row in rows),
-            positions=values[:, :3] if known else None,
-            directions=tuple(_text(path, i, row, "direction", may_be_empty=True) for i, row in rows),
-            nodes=tuple(_text(path, i, row, "node") for i, row in rows),
-        )
+        points = NamedPoints(names, values[:, :3] if known else None, directions, nodes)
     except ValueError as error:
         raise CaseError(f"{path}: {error}") from error
     return points, values[:, -n_modes:]
