@@ -144,40 +144,8 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
         raise CaseError(f"{where}: sample_time must be positive; got {sample_time:g}")
     file = inside(folder, text(entry, "file", where), where)
     arrays, stated = _arrays(file, where, units)
-    names = {a.name for a in rig.actuators} | {s.name for s in rig.sensors}
-    missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
-    if missing:
-        unknown = [name for name in extra if name.startswith((f"{missing[0]} [", f"{missing[0]} ("))]
-        unit = f", where the unit of {shown(unknown[0])} is not known" if unknown else ""
-        raise CaseError(
-            f"{file}: channel {missing[0]!r} of case.toml is missing; the file has {shown(sorted(arrays))}{unit}"
-        )
-    if extra:
-        raise CaseError(f"{file}: channel {shown(extra[0])} is not named in case.toml; name it there or leave it out")
-    if "t" not in arrays:
-        raise CaseError(f"{file}: the array t of sample instants is missing")
-    n_samples = arrays["t"].size
-    for channel, values in arrays.items():
-        if values.shape != (n_samples,):
-            raise CaseError(f"{file}: channel {channel!r} has shape {values.shape}; t has {n_samples} samples")
-        bad = ~np.isfinite(values)
-        if bad.any():
-            raise CaseError(f"{file}: channel {channel!r}, sample {int(np.argmax(bad))} is {values[bad][0]}")
-    steps = np.diff(arrays["t"])
-    if n_samples < LEAST_SAMPLES or np.abs(steps - sample_time).max() > 0.01 * sample_time:
-        is_in_ms = steps.size and np.abs(1e-3 * steps - sample_time).max() < 0.01 * sample_time
-        in_ms = "; if it is in ms, name it 't [ms]'" if is_in_ms else ""
-        raise CaseError(
-            f"{file}: t must rise by sample_time = {sample_time:g} over at least {LEAST_SAMPLES} samples;"
-            f" it has {n_samples} and steps from {steps.min() if steps.size else np.nan:g} to"
-            f" {steps.max() if steps.size else np.nan:g}{in_ms}"
-        )
-    elastic = rig.modes.omega[rig.modes.omega > 0]
-    if elastic.size and n_samples * sample_time < 2.0 * np.pi / elastic[0]:
-        raise CaseError(
-            f"{file} lasts {n_samples * sample_time:g} s, less than a period of the first mode"
-            f" ({2.0 * np.pi / elastic[0]:g} s); take a longer record"
-        )
+    _check_channels(file, arrays, rig)
+    _check_instants(file, arrays["t"], sample_time, rig)
     for sensor in rig.sensors:
         if np.ptp(arrays[sensor.name]) == 0:
             level = arrays[sensor.name][0]
@@ -199,6 +167,48 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
                 f" {known.unit} by case.toml: correct one of them"
             )
     return record
+
+
+def _check_channels(file: Path, arrays: dict[str, np.ndarray], rig: Rig) -> None:
+    """Refuse channels that are missing, unknown, of unequal length, or not finite."""
+    names = {a.name for a in rig.actuators} | {s.name for s in rig.sensors}
+    missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
+    if missing:
+        unknown = [name for name in extra if name.startswith((f"{missing[0]} [", f"{missing[0]} ("))]
+        unit = f", where the unit of {shown(unknown[0])} is not known" if unknown else ""
+        raise CaseError(
+            f"{file}: channel {missing[0]!r} of case.toml is missing; the file has {shown(sorted(arrays))}{unit}"
+        )
+    if extra:
+        raise CaseError(f"{file}: channel {shown(extra[0])} is not named in case.toml; name it there or leave it out")
+    if "t" not in arrays:
+        raise CaseError(f"{file}: the array t of sample instants is missing")
+    n_samples = arrays["t"].size
+    for channel, values in arrays.items():
+        if values.shape != (n_samples,):
+            raise CaseError(f"{file}: channel {channel!r} has shape {values.shape}; t has {n_samples} samples")
+        bad = ~np.isfinite(values)
+        if bad.any():
+            raise CaseError(f"{file}: channel {channel!r}, sample {int(np.argmax(bad))} is {values[bad][0]}")
+
+
+def _check_instants(file: Path, t: np.ndarray, sample_time: float, rig: Rig) -> None:
+    """Refuse sample instants that are not a sample time apart, or span less than a period of the first mode."""
+    steps = np.diff(t)
+    if t.size < LEAST_SAMPLES or np.abs(steps - sample_time).max() > 0.01 * sample_time:
+        is_in_ms = steps.size and np.abs(1e-3 * steps - sample_time).max() < 0.01 * sample_time
+        in_ms = "; if it is in ms, name it 't [ms]'" if is_in_ms else ""
+        raise CaseError(
+            f"{file}: t must rise by sample_time = {sample_time:g} over at least {LEAST_SAMPLES} samples;"
+            f" it has {t.size} and steps from {steps.min() if steps.size else np.nan:g} to"
+            f" {steps.max() if steps.size else np.nan:g}{in_ms}"
+        )
+    elastic = rig.modes.omega[rig.modes.omega > 0]
+    if elastic.size and t.size * sample_time < 2.0 * np.pi / elastic[0]:
+        raise CaseError(
+            f"{file} lasts {t.size * sample_time:g} s, less than a period of the first mode"
+            f" ({2.0 * np.pi / elastic[0]:g} s); take a longer record"
+        )
 
 
 def signals_of(record: Record) -> dict[str, np.ndarray]:

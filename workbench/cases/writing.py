@@ -68,7 +68,7 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
             " no structure"
         )
     write_points(folder / POINTS, points, rig.modes.phi(points.names))
-    return [_modal(rig.modes, POINTS), *_ports(rig, at=lambda port: {"point": port.at})]
+    return [_modal(rig.modes), *_ports(rig, at=lambda port: {"point": port.at})]
 
 
 def _member(member: Structure, n_modes: int) -> str:
@@ -109,7 +109,7 @@ def _plate(plate: Plate, n_modes: int) -> str:
     )
 
 
-def _modal(modes: Modes, points: str) -> str:
+def _modal(modes: Modes) -> str:
     if not modes.proportional:
         raise ValueError("the case format has no damping that couples modes; keep the diagonal of Modes.damping")
     rigid = modes.omega == 0
@@ -120,7 +120,7 @@ def _modal(modes: Modes, points: str) -> str:
         natural_frequencies_hz=modes.frequencies_hz.tolist(),
         damping_ratios=modes.zeta.tolist(),
         **({"rigid_damping": rates} if any(rates) else {}),
-        points=points,
+        points=POINTS,
     )
 
 
