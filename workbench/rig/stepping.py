@@ -130,16 +130,16 @@ def spread_forces(
             tension += q[r] * out[r]
         for r in range(n):
             out[r] *= -stretch * tension
-    for g in range(push.size):
-        push[g] = 0.0
-    for r in range(n if push.size > 0 else 0):
+    if push.size > 0:
+        push[:] = 0.0
+        for r in range(n):
+            for g in range(push.size):
+                push[g] += drag_shapes[r, g] * v[r]
         for g in range(push.size):
-            push[g] += drag_shapes[r, g] * v[r]
-    for g in range(push.size):
-        push[g] *= -drag_weights[g] * abs(push[g])
-    for r in range(n if push.size > 0 else 0):
-        for g in range(push.size):
-            out[r] += drag_shapes[r, g] * push[g]
+            push[g] *= -drag_weights[g] * abs(push[g])
+        for r in range(n):
+            for g in range(push.size):
+                out[r] += drag_shapes[r, g] * push[g]
     if coupling.size > 0:
         for r in range(n):
             for s in range(n):
@@ -245,12 +245,13 @@ def _advance_once(
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
-def _rate(shapes: Floats, i: int, v: Floats) -> float:
-    """Velocity at element i."""
-    rate = 0.0
-    for r in range(shapes.shape[1]):
-        rate += shapes[i, r] * v[r]
-    return rate
+def _fill_rates(shapes: Floats, v: Floats, rates: Floats, row: int) -> None:
+    """Fill a row of `rates` with the velocities at the elements."""
+    for i in range(shapes.shape[0]):
+        rate = 0.0
+        for r in range(shapes.shape[1]):
+            rate += shapes[i, r] * v[r]
+        rates[row, i] = rate
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
@@ -315,8 +316,7 @@ def advance(
     if friction:
         _keep(modes_kept, q, v, old, spread)
         _keep(points_kept, point, earlier, w, z)
-        for i in range(kinds.size):
-            rates[0, i] = _rate(shapes, i, v)
+        _fill_rates(shapes, v, rates, 0)
     parts, part = 1, 0
     while part < parts:
         # one call for both cases, because every inlined call is compiled again
@@ -332,8 +332,7 @@ def advance(
         )
         part += 1
         if friction and whole:
-            for i in range(kinds.size):
-                rates[1, i] = _rate(shapes, i, v)
+            _fill_rates(shapes, v, rates, 1)
             if _friction_reverses(kinds, parameters, rates):
                 _put_back(modes_kept, q, v, old, spread)
                 _put_back(points_kept, point, earlier, w, z)
@@ -431,17 +430,15 @@ def step_record(
         if k == n_samples - 1:
             break
         for sub in range(n_sub):
-            for r in range(n):
-                drive[r] = 0.0
-                drive_end[r] = 0.0
+            drive[:] = 0.0
+            drive_end[:] = 0.0
             for j in range(n_inputs):
                 first, last = starts[j, k * n_sub + sub], ends[j, k * n_sub + sub]
                 for r in range(n):
                     drive[r] += participation[j, r] * first
                     drive_end[r] += participation[j, r] * last
-            for r in range(n if added.shape[0] > 0 else 0):
-                more_q[r] = 0.0
-                more_v[r] = 0.0
+            more_q[:] = 0.0
+            more_v[:] = 0.0
             for j in range(added.shape[0]):
                 size = sizes[j, k * n_sub + sub]
                 for r in range(n):

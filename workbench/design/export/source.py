@@ -70,7 +70,8 @@ def source(
 def _numbers(controller: DigitalController) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """The matrices and the vectors of a controller, without those that have no effect."""
     one, relays, friction = controller, controller.relays, controller.friction
-    matrices, vectors = {"D": one.d}, {}
+    matrices: dict[str, Floats] = {"D": one.d}
+    vectors: dict[str, Floats] = {}
     if len(one.a):
         matrices |= {"A": one.a, "B": one.b, "C": one.c}
         if one.e.any():
