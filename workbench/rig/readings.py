@@ -19,20 +19,18 @@ def reading_of(rig: Rig) -> tuple[Floats, Integers]:
 
     The arrays are cached and must not be changed.
     """
-    shapes, orders = _shapes_and_orders(rig)
-    return np.array([sensor.gain for sensor in rig.sensors])[:, None] * shapes, orders
+    orders = np.array([MEASURED[sensor.quantity][1] for sensor in rig.sensors], np.int64)
+    return np.array([sensor.gain for sensor in rig.sensors])[:, None] * _shapes(rig), orders
 
 
 @lru_cache(maxsize=KEPT)
-def _shapes_and_orders(rig: Rig) -> tuple[Floats, Integers]:
-    """As `reading_of`, without gains."""
-    orders = np.array([MEASURED[sensor.quantity][1] for sensor in rig.sensors], np.int64)
-    return shapes_at(rig.modes, rig.sensors), orders
+def _shapes(rig: Rig) -> Floats:
+    return shapes_at(rig.modes, rig.sensors)
 
 
 def read(rig: Rig, motion: Motion) -> Floats:
     """Noise-free readings (n_sensors, n_samples) of a motion, clipped, and with the mean effect of rounding."""
-    shapes, _ = _shapes_and_orders(rig)
+    shapes = _shapes(rig)
     delays = np.array([0.0 if sensor.interpolated else sensor.delay for sensor in rig.sensors])
     outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
     for quantity in {sensor.quantity for sensor in rig.sensors}:
