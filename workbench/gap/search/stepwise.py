@@ -753,7 +753,8 @@ class Stepwise:
         kind = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}[side]
         effect = Effect(kind, port, {"gain": float(np.exp(gains[name]))})
         found = fit_from_zero(self.search, (*step.effects, effect))  # other nominal errors have absorbed part of it
-        error = abs(float(np.log(found.effects[-1].values["gain"])))
+        gain = found.effects[-1].values["gain"]
+        error = abs(float(np.log(gain))) if gain > 0.0 else 0.0  # a gain that passed zero: the fit has gone astray
         is_wrong = error >= max(PLAIN.most_gain, PLAIN.outlying * size_of(found.errors, "gain"))
         if not (is_wrong and self._are_noticeable(found.effects, found.fit.effects)):
             return step
