@@ -41,7 +41,7 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int, units: Units 
     shifts, width = grouped_bars(len(works))
     for shift, (name, work) in zip(shifts, works.items(), strict=True):
         numbers = first + 1 + np.arange(work.size)
-        ax.bar(numbers + shift, work, width, label=units.named(f"{name}: W_R = {work.sum():.3g} J"))
+        ax.bar(numbers + shift, work, width, label=f"{name}: W_R = {work.sum():.3g} {units.named('J')}")
     label = units.named("spillover work in the mode, W_r [J]")
     ax.set(xticks=few_ticks(numbers), xlabel="residual mode", ylabel=label)
     ax.set_title("spillover work by residual mode")
