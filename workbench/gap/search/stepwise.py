@@ -295,7 +295,12 @@ class Stepwise:
             if self.search.is_over:
                 break
             before = self.last
-            step = self._at_another_place(before) or self._with_an_absorbed(before) or self._with_one_more(before)
+            step = (
+                self._with_another_law(before)
+                or self._at_another_place(before)
+                or self._with_an_absorbed(before)
+                or self._with_one_more(before)
+            )
             if step is None:
                 break
             self.steps.append(step)
@@ -495,6 +500,32 @@ class Stepwise:
             return None
         found = fitted_to_all(self.search, best)
         return found if loss(self.search, found) < loss(self.search, step) else None
+
+    def _with_another_law(self, step: Step) -> Step | None:
+        """The step with its one nonlinear law replaced by another at the same place, if that removes enough.
+
+        The first effect is searched beside nominal errors that have absorbed part of it, and where those are far off, a
+        wrong law at the right place may be the best. Now that the errors are nearly known, the laws compare.
+        """
+        if len(step.effects) != 1 or not step.effects[0].kind.nonlinear or step.effects[0].at is None or step.explains:
+            return None
+        (effect,), domain = step.effects, self.search.rig.modes.domain
+        self.search.report("another law at the same place", 0.6)
+        with_errors = self.search.with_nominal_errors(step.errors)
+        laws = [kind for kind in self.search.catalogue if kind.nonlinear and kind is not effect.kind]
+        with_errors = replace(with_errors, catalogue=tuple(laws))
+        rig = apply_all(self.search.rig, (step.errors,))
+        evidence = Evidence.of(rig, self.search.data, workers=self.search.workers, absorbed=True)
+        ahead = one_more(with_errors, (), evidence.of_force_at(effect.at))
+        there = [f for f in ahead if f.effects[0].at is not None and not apart(f.effects[0], effect, domain)]
+        present = fitted_ahead(with_errors, [step.effects])
+        cost_limit = min((f.cost for f in present), default=np.inf)
+        likeliest = [f for f in best_of_each_kind(there) if f.cost < cost_limit][: STEPWISE.finalists]
+        others = self.search.workers.map(
+            lambda f: fit_jointly(self.search, f.effects, step.errors, rounds=2), likeliest
+        )
+        best = min(others, key=partial(loss, self.search), default=None)
+        return best if best is not None and self._is_accepted(best, step) else None
 
     def _with_an_absorbed(self, step: Step) -> Step | None:
         """The step with one linear effect more that makes its implausible nominal errors much smaller, or None.
