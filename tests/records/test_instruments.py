@@ -178,6 +178,15 @@ def test_labview_text_that_is_no_record(tmp_path, over, start, words):
         read(tmp_path, text, ending=".lvm")
 
 
+def test_labview_text_of_several_segments(tmp_path):
+    """One record is read, not several with a pause between them: the message says how LabVIEW writes one."""
+    segment = LABVIEW.partition("***End_of_Header***\t\n\t\n")[2]
+    table = "X_Value\tA\tB\tComment\n0.50\t1\t3\n0.75\t2\t4\n\n"
+    text = LABVIEW.format("One", "Time", "Time", 0.5) + table + segment.format("Time", "Time", 1.0) + table
+    with pytest.raises(RecordFileError, match="row 17: the header of a further segment; .*'One header only'"):
+        read(tmp_path, text, ending=".lvm")
+
+
 def test_what_was_changed_is_remarked(tmp_path):
     record = read(tmp_path, "t [s],a [g],b [m],c [counts],d (left)\n0,1,1,1,1\n1,2,2,2,2\n")
     assert record.remarks[0] == "a: g taken as 9.80665 m/s^2"

@@ -101,6 +101,22 @@ def test_a_placement_shows_where_and_how_surely(tmp_path):
     assert places["x"] == [2.0, 6.0]
 
 
+@pytest.mark.parametrize(
+    ("positions", "where", "n_figures"),
+    [([[30.0, 20.0], [80.0, 60.0]], "30, 20; 80, 60 mm", 2), (["N4", "J"], "N4, J", 1)],
+)
+def test_a_placement_on_a_plate_and_at_named_points_in_other_units(tmp_path, positions, where, n_figures):
+    units = {"length": "mm", "mass": "t", "time": "s", "force": "N"}
+    placements = [{**PLACED["placements"][0], "positions": positions}]
+    placed = {**PLACED, "placements": placements, "length": [100.0, 80.0], "units": units}
+    shown = page_content_in(written(tmp_path, placed))
+    assert shown.lead.startswith(f"Actuators at {where} leave spillover work W_R = 0.25 N mm.")
+    assert len(shown.blocks) == n_figures and "W_R [N mm]" in shown.tables[0][1]
+    if n_figures == 2:
+        axes = shown.blocks[0]["figure"]["panels"][0]
+        assert "x [mm]" in str(axes) and "y [mm]" in str(axes)
+
+
 def test_one_sensor_has_no_shape_and_remarks_are_kept(tmp_path):
     one = {**IDENTIFIED, "positions": [None], "shapes_real": [[1.0]], "shapes_imag": [[0.0]]}
     shown = page_content_in(written(tmp_path, {**one, "heading": "1 sensor", "lines": ["mode 1: mains hum?"]}))

@@ -1,5 +1,6 @@
 """`workbench design`: a comparison of control laws."""
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -90,6 +91,7 @@ def design(
             "impulse_at": at,
             "weight": weight,
             "command_unit": unit,
+            "units": asdict(units),
             "final_time": end,
             "controlled": list(range(1, n + 1)),
             "laws": [

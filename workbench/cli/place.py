@@ -1,7 +1,7 @@
 """`workbench place`: actuator placement."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -87,7 +87,7 @@ def place(
         say("damping couples the modes: placements are compared without its coupling terms")
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
     domain = modes.domain
-    candidates = _candidates(domain, at, grid)
+    candidates = _candidates(domain, at, grid, units)
     if certified_gap is not None and isinstance(domain, Rectangle) and candidates is None:
         raise ValueError("--certify on a plate needs candidate places; give their spacing by --grid M, or --at PLACES")
     with reporting("placing actuators") as report:
@@ -99,7 +99,7 @@ def place(
             spacing=least if spacing is None else spacing,
             peak_force=peak_force,
             condition=condition,
-            forbidden=tuple(_zone(domain, text) for text in forbid or ()),
+            forbidden=tuple(_zone(domain, text, units) for text in forbid or ()),
             candidates=candidates,
         )
         try:
@@ -148,6 +148,7 @@ def place(
             "impulse_at": impulse_point,
             "weight": weight,
             "command_unit": unit,
+            "units": asdict(units),
             "controlled": list(range(1, control + 1)),
             "placements": [{key: getattr(row, key) for key in WRITTEN} for row in rows],
             "lower_bound": None if certificate is None else certificate.lower_bound,
@@ -175,14 +176,16 @@ def _reference(task: "PlacementTask", rig: "Rig") -> "Placement":
     return found
 
 
-def _candidates(domain: Domain, at: str | None, grid: float | None) -> tuple[Place, ...] | None:
+def _candidates(domain: Domain, at: str | None, grid: float | None, units: "Units") -> tuple[Place, ...] | None:
     """The places of --grid, or of --at, separated by semicolons on a plate, else by commas; None without both."""
     if grid is not None:
         if at is not None or not isinstance(domain, Rectangle):
             raise ValueError("--grid is for a plate, instead of --at; leave one of them out")
         widest = 0.5 * min(domain.length)
         if not 0.0 < grid <= widest:
-            raise ValueError(f"--grid must be between 0 and half the shorter side, {widest:g} m; got {grid:g}")
+            raise ValueError(
+                f"--grid must be between 0 and half the shorter side, {widest:g} {units.length}; got {grid:g}"
+            )
         return domain.grid(round(max(domain.length) / grid))
     if at is None:
         return None
@@ -195,10 +198,11 @@ def _candidates(domain: Domain, at: str | None, grid: float | None) -> tuple[Pla
     return tuple(dict.fromkeys(place_in(domain, part, "--at") for part in parts))
 
 
-def _zone(domain: Domain, text: str) -> tuple[Place, Place]:
+def _zone(domain: Domain, text: str, units: "Units") -> tuple[Place, Place]:
     ends = text.split(":")
     if len(ends) != 2:
-        raise ValueError(f"--forbid takes FROM:TO in m, such as 0.2:0.3, or 0.1,0.2:0.3,0.4 on a plate; got {text!r}")
+        example = "0.1,0.2:0.3,0.4" if isinstance(domain, Rectangle) else "0.2:0.3"
+        raise ValueError(f"--forbid takes FROM:TO in {units.length}, such as {example}; got {text!r}")
     low, high = (typed_place(domain, end, "--forbid") for end in ends)
     return low, high
 

@@ -10,6 +10,7 @@ from workbench.design.placement.controlled_modes import ControlledModeCount
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, grouped_bars, new_figure
+from workbench.records.units import SI, Units
 from workbench.structure.printed import place_text
 
 SHOWN_SHARE = 1e-5
@@ -34,14 +35,15 @@ def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
     return figure
 
 
-def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
+def plot_two_works(works: Mapping[str, np.ndarray], *, first: int, units: Units = SI) -> Figure:
     """Work put into each residual mode, a group of bars per mode; `first` is the zero-based index of the first one."""
     figure, ax = new_figure(width=9, height=4)
     shifts, width = grouped_bars(len(works))
     for shift, (name, work) in zip(shifts, works.items(), strict=True):
         numbers = first + 1 + np.arange(work.size)
-        ax.bar(numbers + shift, work, width, label=f"{name}: W_R = {work.sum():.3g} J")
-    ax.set(xticks=few_ticks(numbers), xlabel="residual mode", ylabel="spillover work in the mode, W_r [J]")
+        ax.bar(numbers + shift, work, width, label=f"{name}: W_R = {work.sum():.3g} {units.named('J')}")
+    label = units.named("spillover work in the mode, W_r [J]")
+    ax.set(xticks=few_ticks(numbers), xlabel="residual mode", ylabel=label)
     ax.set_title("spillover work by residual mode")
     ax.legend()
     return figure

@@ -1,6 +1,6 @@
 """Figures of placements: actuators and sensors on the structure, with the contribution of each mode."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -58,15 +58,33 @@ def plot_placement(placement: Placement, *, units: Units = SI) -> Figure:
     return figure
 
 
-def plot_places(places: Mapping[str, np.ndarray], length: float | None = None) -> Figure:
-    """Places (m) of each placement along a structure."""
+def plot_places(
+    places: Mapping[str, np.ndarray], length: float | Sequence[float] | None = None, *, units: Units = SI
+) -> Figure:
+    """Places of each placement along a structure, (n_actuators,), or on a plate, (n_actuators, 2).
+
+    Args:
+        places: by the name of the placement, m.
+        length: of the structure, or both sides of the plate, m; None leaves the outline out.
+        units: of the axes.
+    """
+    if next(iter(places.values())).ndim == 2:
+        figure, ax = new_figure(width=6, height=5)
+        for (name, positions), marker in zip(places.items(), "osD^v"):
+            ax.plot(*positions.T, marker, label=name, markersize=9, clip_on=False, zorder=3)
+        if length is not None:
+            ax.fill(*(0.5 * (1.0 + CORNERS) * np.array(length)).T, facecolor="none", edgecolor=GREY)
+        ax.set(xlabel=units.named("x [m]"), ylabel=units.named("y [m]"), title="places of the actuators")
+        ax.set_aspect("equal")
+        ax.legend(**BELOW)
+        return figure
     figure, ax = new_figure(width=9, height=1.4 + 0.5 * len(places))
     for row, (positions, colour) in enumerate(zip(places.values(), COLOURS)):
         ax.plot(positions, np.full(len(positions), row), "^", color=colour, markersize=9)
     if length is not None:
-        ax.set_xlim(-0.02 * length, 1.02 * length)
+        ax.set_xlim(np.array((-0.02, 1.02)) * length)
     ax.set_yticks(range(len(places)), list(places))
-    ax.set(xlabel="x [m]", ylim=(len(places) - 0.5, -0.5), title="places of the actuators")
+    ax.set(xlabel=units.named("x [m]"), ylim=(len(places) - 0.5, -0.5), title="places of the actuators")
     return figure
 
 

@@ -36,6 +36,7 @@ MARKS = re.compile("[.,]")
 COMMENTS = re.compile(r'[\t;,] *"?comment"?\s*', re.IGNORECASE)  # at the end of a line of names, as in LabVIEW files
 NO_UNIT = ("", "-", "–")
 LABVIEW_END = "***End_of_Header***"
+LABVIEW_SEGMENT = re.compile(r"Channels\W+\d+\W*")  # the first line of the header of a segment
 LABVIEW_WITHOUT_X = re.compile(r"X_Columns\W+No\W*", re.IGNORECASE)  # the line that says that no instants are written
 
 
@@ -191,6 +192,11 @@ def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]
     Raises:
         RecordFileError: too many or too few fields, or a field that is not a number.
     """
+    if LABVIEW_SEGMENT.fullmatch(line):
+        raise RecordFileError(
+            f"{path}, row {number}: the header of a further segment; write the LabVIEW file with 'One header only', or"
+            " each segment into a file of its own"
+        )
     fields = layout.fields(line)
     if len(fields) != len(layout.names):
         raise RecordFileError(f"{path}, row {number} has {len(fields)} fields; the header has {len(layout.names)}")

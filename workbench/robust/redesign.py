@@ -119,11 +119,26 @@ def redesign(
     progress("placement of actuators", 0.9)
     moved = relocated(search.loop, test, units) if placement else None
     progress("done", 1.0)
-    notes = _notes(uncertain, corrected, search.criterion == wanted)
     return Redesign(
-        uncertain, present, search.controller, search.loop, controlled, tuple(search.steps), test, before, after, old,
-        new, search.weight, search.criterion, more_cost, more_work, moved, notes, units,
-    )  # fmt: skip
+        uncertain_rig=uncertain,
+        present=present,
+        redesigned=search.controller,
+        loop=search.loop,
+        controlled=controlled,
+        steps=tuple(search.steps),
+        test=test,
+        before=before,
+        after=after,
+        present_verification=old,
+        verification=new,
+        weight=search.weight,
+        criterion=search.criterion,
+        more_cost=more_cost,
+        more_work=more_work,
+        relocation=moved,
+        notes=_notes(uncertain, corrected, search.criterion == wanted),
+        units=units,
+    )
 
 
 def _check_wanted(criterion: str | None, more_cost: float, more_work: float) -> None:

@@ -19,9 +19,10 @@ from workbench.draw.signals import plot_frf, plot_spectra, plot_transfer
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
-from workbench.structure.domain import place_array, same_place
+from workbench.records.units import Units
+from workbench.structure.domain import listed, place_array, same_place
 from workbench.structure.modes import SampledModes, mac
-from workbench.structure.printed import command_headings
+from workbench.structure.printed import command_headings, place_text
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
 from workbench.study.pages.page import (
@@ -191,7 +192,7 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
 
 def _designed(content: dict[str, Any]) -> dict[str, Any]:
     """A comparison of control laws."""
-    laws = content["laws"]
+    laws, units = content["laws"], _units_of(content)
     controlled = content.get("controlled", ())
     first = 0 if 0 in controlled else 1  # files of earlier versions count modes from zero
     works = {
@@ -225,15 +226,16 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}
     unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if row[2] == "unstable"]
     loops = [row[0] for row in (*rows, *sensed)]
+    work = plot_two_works(works, first=len(controlled), units=units)
     blocks = [
-        block(plot_two_works(works, first=len(controlled)), "Spillover work of each law in each residual mode."),
+        block(work, "Spillover work of each law in each residual mode."),
         block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
     ]
     if seen:
         caption = "Closed-loop poles with sensors, including those of the estimators."
         blocks.append(block(plot_poles(seen), caption))
-    headings = command_headings(str(content.get("command_unit", "N")))
-    tables: list[Table] = [("Laws", ("law", "cost", *headings, "W_R [J]", "loop"), rows)]
+    headings = map(units.named, (*command_headings(str(content.get("command_unit", "N"))), "W_R [J]"))
+    tables: list[Table] = [("Laws", ("law", "cost", *headings, "loop"), rows)]
     if sensed:
         tables.append(("With sensors", tuple(heads[i] for i in filled), sensed))
     return {
@@ -261,34 +263,43 @@ def _stability(loops: list[str], unstable: list[str]) -> str:
 
 def _placed(content: dict[str, Any]) -> dict[str, Any]:
     """Actuator placements."""
-    placements = content["placements"]
+    placements, units = content["placements"], _units_of(content)
     names = ["optimum", *(str(one["status"]) for one in placements[1:])]
-    places = [np.array(one["positions"], float) for one in placements]
+    places = {name: np.array(one["positions"]) for name, one in zip(names, placements, strict=True)}
+    are_points = next(iter(places.values())).dtype.kind == "U"
+    texts = [_between(at) for at in places.values()]
     works = {n: np.array(one["by_mode"], float) for n, one in zip(names, placements, strict=True)}
     rows = [
-        [name, *(short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), _between(at)]
-        for name, one, at in zip(names, placements, places, strict=True)
+        [name, *(short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), text]
+        for name, one, text in zip(names, placements, texts, strict=True)
     ]
     first, bound = placements[0]["residual_work"], content.get("lower_bound")
-    proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g} J."
-    n, headings = len(content.get("controlled", ())), command_headings(str(content.get("command_unit", "N")))
+    length, energy = "" if are_points else f" {units.length}", units.named("J")
+    proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g} {energy}."
+    lead = f"Actuators at {texts[0]}{length} leave spillover work W_R = {float(first):.4g} {energy}.{proof}"
+    work = plot_two_works(works, first=len(content.get("controlled", ())), units=units)
+    blocks = [block(work, "Spillover work of each placement in each residual mode.")]
+    if not are_points:
+        where = plot_places(places, content.get("length"), units=units)
+        blocks.insert(0, block(where, "Positions of the actuators."))
+    numbers = ("W_R [J]", *command_headings(str(content.get("command_unit", "N"))), "condition number of B")
+    headings = ("placement", *map(units.named, (*numbers, "points" if are_points else "places [m]")))
     return {
         "title": "Actuator placement",
-        "lead": f"Actuators at {_between(places[0])} m leave spillover work W_R = {float(first):.4g} J.{proof}",
+        "lead": lead,
         "standing": "good" if bound is not None else "",
         "lines": [f"The search: {placements[0]['status']}."],
-        "blocks": [
-            block(
-                plot_places(dict(zip(names, places, strict=True)), content.get("length")), "Positions of the actuators."
-            ),
-            block(plot_two_works(works, first=n), "Spillover work of each placement in each residual mode."),
-        ],
-        "tables": [("Placements", ("placement", "W_R [J]", *headings, "condition number of B", "places [m]"), rows)],
+        "blocks": blocks,
+        "tables": [("Placements", headings, rows)],
     }
 
 
 def _between(places: np.ndarray) -> str:
-    return ", ".join(f"{x:.4g}" for x in places)
+    return ("; " if places.ndim == 2 else ", ").join(map(place_text, listed(places)))
+
+
+def _units_of(content: Mapping[str, Any]) -> Units:
+    return Units(**content.get("units", {}))
 
 
 def _studied(content: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.report.budget import RUNAWAY, residual_power
+from workbench.gap.search.candidates import fit_from_zero
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.pairs import Pairs, _evidence_with
 from workbench.gap.search.screening import Screening, _starts, fitted_ahead, one_more
@@ -61,7 +62,7 @@ def test_a_load_that_only_a_stiffer_beam_bears_ends_no_search(rig, search):
     assert _starts(replace(search, held=(errors,)), (load,), Evidence.of(rig, search.data))
     assert residual_power(rig, (load,), search.data.records[0], 0.0) == RUNAWAY
     linear = replace(search, data=search.first.stepped(1), quick=search.first.stepped(1), by_mode=True)
-    assert np.isfinite(Stepwise(linear, 0.0).fit_from_zero((load,)).fit.cost)
+    assert np.isfinite(fit_from_zero(Stepwise(linear, 0.0).search, (load,)).fit.cost)
 
 
 def screened(n_starts: int, seed: int) -> Screening:

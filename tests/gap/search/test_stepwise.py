@@ -14,6 +14,7 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_
 from workbench.gap.prediction.noise import are_coloured, noise_found
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
+from workbench.gap.search.candidates import fit_from_zero
 from workbench.gap.search.fit import cost_of, fit, sensitivity
 from workbench.gap.search.search import Search
 from workbench.gap.search.stepwise import Stepwise
@@ -274,11 +275,11 @@ def test_sensors_are_late_as_the_records_show(rig, measured, interpolated):
     data = FitData((measured(real, "low", 0.3, 0), measured(real, "high", 3.0, 1)), np.full(4, NOISE))
     nominal = data.by_channel(data.residual(rig))
     beside = Stepwise(Search(rig, data, data, data, CATALOGUE, lambda *_: None, ALONE, nominal))
-    found = beside.fit_from_zero((spring,))
+    found = fit_from_zero(beside.search, (spring,))
     delays = [found.errors.values[f"delay_{sensor.name}"] for sensor in rig.sensors]
     assert found.errors.target.interpolated is interpolated
     np.testing.assert_allclose(delays, late, atol=0.01)
-    assert beside.explains(found)
+    assert found.explains
 
 
 def test_a_comparison_that_time_cut_short_names_nothing(rig, measured):
@@ -308,10 +309,10 @@ def test_one_sensor_is_late_by_straight_lines_too(rig, measured):
     data = FitData((measured(real, "low", 0.3, 0), measured(real, "high", 3.0, 1)), np.full(4, NOISE))
     nominal = data.by_channel(data.residual(rig))
     beside = Stepwise(Search(rig, data, data, data, CATALOGUE, lambda *_: None, ALONE, nominal))
-    found = beside.fit_from_zero((replace(late, values={"delay": 1.2 * DT}),))
+    found = fit_from_zero(beside.search, (replace(late, values={"delay": 1.2 * DT}),))
     assert found.errors.target.interpolated
     assert found.effects[0].values["delay"] == pytest.approx(1.4 * DT, rel=1e-3)
-    assert beside.explains(found)
+    assert found.explains
 
 
 @pytest.mark.slow

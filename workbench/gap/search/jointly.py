@@ -19,7 +19,7 @@ from workbench.gap.prediction.noise import (
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Chord, Fit, fit, parameters_of
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import FIT, INPUTS, JOINT, SELECTION
+from workbench.gap.search.settings import FIT, INPUTS, JOINT, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
 
@@ -79,6 +79,11 @@ class Step:
     def is_plausible(self) -> bool:
         """Whether the nominal errors are as small as in a careful laboratory."""
         return are_plausible(self.errors)
+
+    @property
+    def explains(self) -> bool:
+        """Whether the residual is at the noise floor of the sensors."""
+        return self.excess(self.sensor_noise) < STEPWISE.no_gap * float(self.sensor_noise.mean())
 
     def description(self, noise_power: np.ndarray, *, of_errors_alone: bool = False) -> float:
         """Description length, nats, of the residual above a noise power (n_records, n_outputs) and the nominal errors.

@@ -8,6 +8,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import differing, figures_of
+from workbench.gap.search.candidates import fit_from_zero
 from workbench.gap.search.fit import finite_residual
 from workbench.gap.search.jointly import Step, too_large
 from workbench.gap.search.plain import PORT_GROUPS
@@ -168,7 +169,7 @@ def with_mode_errors(before: Stepwise) -> Stepwise | None:
             return with_modes
         with_modes.singles = [step.effects for step in before.fitted_singles]
     else:
-        refitted = with_modes.fit_from_zero(nearest.effects)
+        refitted = fit_from_zero(with_modes.search, nearest.effects)
         excess = nearest.excess(nearest.noise_power)
         if before.has_plausible_errors and refitted.excess(refitted.noise_power) > STEPWISE.halved * excess:
             return None

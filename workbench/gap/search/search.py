@@ -62,6 +62,11 @@ class Search:
         """Whether the deadline is past: no further step starts, and fits end with the best that they have."""
         return self.data.deadline.is_past
 
+    @property
+    def nats_per_parameter(self) -> float:
+        """Description length, nats, of one parameter: half the logarithm of the number of values."""
+        return 0.5 * float(np.log(self.data.n_values))
+
     def explains(self, candidate: Fit) -> bool:
         """Whether the residual of a fit is at the noise floor in every record, up to the integration error.
 

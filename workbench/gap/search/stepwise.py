@@ -1,42 +1,38 @@
 """Stepwise selection of effects, each fitted jointly with small errors of the nominal model."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from workbench.gap.effects.effect import (
     Effect,
-    Kind,
     apply_all,
-    can_be,
     contained,
     each_left_out,
     key_of,
     merged_sets,
     more_general_sets,
-    nearest_possible,
     simpler_sets,
     with_one_simpler,
 )
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
-from workbench.gap.effects.ports import ACTUATOR_GAIN, SENSOR_DELAY, SENSOR_GAIN, SENSOR_LAG
+from workbench.gap.effects.ports import ACTUATOR_GAIN, SENSOR_GAIN
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.noise import LEAST_LOGGED
+from workbench.gap.search.candidates import TIMING, fit_from_zero, fitted_to_all, fitted_to_quick
 from workbench.gap.search.finish import other_places
-from workbench.gap.search.fit import Chord, Fit, cost_of, fit, parameters_of, slopes
+from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of
 from workbench.gap.search.jointly import (
     Step,
     are_plausible,
     evaluated,
     fit_jointly,
-    likeliest_loss,
     size_of,
     with_all_groups,
     with_input_noise,
-    with_reading_sides,
 )
 from workbench.gap.search.plain import (
     NO_UNIFORM_ERROR,
@@ -46,17 +42,22 @@ from workbench.gap.search.plain import (
     few_with_uniform_errors,
     in_place_of_nominal_errors,
     is_linear_structural,
-    is_plausible_delay,
-    is_plausible_gain_or_place,
     other_delay_causes,
     with_common_delay,
 )
+from workbench.gap.search.preference import (
+    is_likelier,
+    is_timing,
+    loss,
+    may_be_port_errors,
+    noticeable,
+    size_of_set,
+    surely_prefers,
+)
 from workbench.gap.search.screening import fitted_ahead, one_more
 from workbench.gap.search.search import Decision, Search, apart, best_of_each_kind, most_informative
-from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
+from workbench.gap.search.settings import FINISH, PLAIN, SEARCH, STEPWISE
 from workbench.rig.simulate import is_stepped
-
-TIMING = (SENSOR_DELAY, SENSOR_LAG)  # kinds that delay the readings of a sensor
 
 
 class Stepwise:
@@ -93,7 +94,7 @@ class Stepwise:
         self.shows_unknown_law = False
         search.report("small errors of the nominal model", 0.4)
         self.steps: list[Step] = []
-        self.steps.append(self.fit_from_zero(()))
+        self.steps.append(fit_from_zero(self.search, ()))
         self._with_input_noise(self.last)
 
     @property
@@ -111,21 +112,19 @@ class Stepwise:
         """Single effects, each fitted jointly with nominal errors that start from zero, best first."""
         sets = [f.effects for f in self._likeliest_singles()] if self.singles is None else self.singles
         keys = {key_of(step.effects) for step in self.known}
-        fresh = self.search.workers.map(
-            self.fit_from_zero, [effects for effects in sets if key_of(effects) not in keys]
-        )
-        found = [s for s in (*self.known, *fresh) if not self._may_be_port_errors(s)]
+        fresh = self._from_zero([effects for effects in sets if key_of(effects) not in keys])
+        found = [s for s in (*self.known, *fresh) if not may_be_port_errors(self.search, s)]
         best = sorted(found, key=lambda s: s.fit.cost)
         if not best or (self.has_plausible_errors and not self.search.by_mode):
             return best
         # nominal errors of each mode, or implausibly large ones, absorb the residual of any linear effect: of effects
         # that leave as little, the one that needs the smallest nominal errors is preferred
-        noise, nats_per_parameter = best[0].noise_power, 0.0 if self.search.by_mode else self._nats_per_parameter
+        noise, nats_per_parameter = best[0].noise_power, 0.0 if self.search.by_mode else self.search.nats_per_parameter
         little = best[0].excess(noise) + STEPWISE.no_gap * float(noise.mean())
-        as_good = found if self.explains(best[0]) else [s for s in best if s.excess(noise) < little]
+        as_good = found if best[0].explains else [s for s in best if s.excess(noise) < little]
         others = [s for s in best if s not in as_good]
         return [
-            *sorted(as_good, key=lambda s: s.description(noise) + nats_per_parameter * self._size(s)[0]),
+            *sorted(as_good, key=lambda s: s.description(noise) + nats_per_parameter * size_of_set(self.search, s)[0]),
             *others,
         ]
 
@@ -175,7 +174,7 @@ class Stepwise:
         stiffness, damping = (float(np.log(effect.values["factor"])) for effect in uniform.effects)
         sizes = {name: damping for name in errors.values if group_of(name) == "damping"} | {"stiffness_0": stiffness}
         found = fit_jointly(search, (), nominal_errors(search.rig, search.prior, errors.values | sizes))
-        if self.explains(found) and are_plausible(found.errors, damping=False):
+        if found.explains and are_plausible(found.errors, damping=False):
             self.steps.append(found)
 
     def by_singles(self) -> bool:
@@ -183,12 +182,12 @@ class Stepwise:
         if not self.fitted_singles or self.search.is_over:  # the order of unfinished fits means nothing
             return False
         best = self.fitted_singles[0]
-        with_noise = None if self.explains(best) else self._with_input_noise(best)
+        with_noise = None if best.explains else self._with_input_noise(best)
         if with_noise is not None:  # the residual of the nominal errors alone may be that input noise
             best = with_noise
             self.steps[-1] = fit_jointly(self.search, self.last.effects, self.last.errors)
         excess = best.excess(best.noise_power)
-        if not self.explains(best) and excess > STEPWISE.further * float(self.search.nominal.mean()):
+        if not best.explains and excess > STEPWISE.further * float(self.search.nominal.mean()):
             return False
         best = replace(self._simplest(best, self.fitted_singles[1:]), others=tuple(self.fitted_singles))
         # quiet noise of the inputs excites weak modes in the prediction alone, which large damping makes up for
@@ -216,13 +215,9 @@ class Stepwise:
         if length_limit < 0.0:
             return
         sets = [f.effects for f in self._linear_singles[: STEPWISE.finalists]]
-        tried = [
-            s
-            for s in self.search.workers.map(self.fit_from_zero, sets)
-            if s.is_plausible and not self._may_be_port_errors(s)
-        ]
+        tried = [s for s in self._from_zero(sets) if s.is_plausible and not may_be_port_errors(self.search, s)]
         shorter = [s for s in tried if s.description(noise) < length_limit]
-        found = [s for s in shorter if self._is_likelier(s, errors_only, least=SEARCH.trifle)]
+        found = [s for s in shorter if is_likelier(self.search, s, errors_only, least=SEARCH.trifle)]
         if found:
             best = min(found, key=lambda s: s.description(noise))
             if self._are_noticeable(best.effects, best.fit.effects):
@@ -258,8 +253,8 @@ class Stepwise:
         if not search.near(best, STEPWISE.almost) or any(effect.kind in UNIFORM for effect in best.effects):
             return False
         found = fit_jointly(search, best.effects, nominal_errors(search.rig, search.prior), until_convergence=True)
-        if self._may_be_port_errors(found) or not (
-            self.explains(found) and self._are_noticeable(found.effects, found.fit.effects)
+        if may_be_port_errors(self.search, found) or not (
+            found.explains and self._are_noticeable(found.effects, found.fit.effects)
         ):
             return False
         self.steps.append(found)
@@ -300,7 +295,12 @@ class Stepwise:
             if self.search.is_over:
                 break
             before = self.last
-            step = self._at_another_place(before) or self._with_an_absorbed(before) or self._with_one_more(before)
+            step = (
+                self._with_another_law(before)
+                or self._at_another_place(before)
+                or self._with_an_absorbed(before)
+                or self._with_one_more(before)
+            )
             if step is None:
                 break
             self.steps.append(step)
@@ -315,7 +315,7 @@ class Stepwise:
     @property
     def is_sufficient(self) -> bool:
         """Whether the residual of the last set is too small to search for another effect."""
-        left = self.explains(self.last) or (self.last.effects and self.unexplained < STEPWISE.further)
+        left = self.last.explains or (self.last.effects and self.unexplained < STEPWISE.further)
         return bool(left and self.last.is_plausible and (self.tried_beside_input_noise or not self.search.logged))
 
     @property
@@ -330,7 +330,7 @@ class Stepwise:
         """
         rig, noise = apply_all(self.search.rig, step.fit.effects), step.noise_power
         is_near_noise = step.excess(noise) < STEPWISE.further * self._gap
-        if not (step.effects and is_near_noise and is_stepped(rig)) or self.explains(step):
+        if not (step.effects and is_near_noise and is_stepped(rig)) or step.explains:
             return step
         data, substeps = self.search.data, self.search.data.substeps
         residual = data.residual(rig)
@@ -387,14 +387,18 @@ class Stepwise:
         self.steps = [fitted if s is step else replace(evaluated(search, s.fit), others=s.others) for s in self.steps]
         return fitted
 
-    def explains(self, step: Step) -> bool:
-        """Whether the residual of a step is at the noise floor of the sensors."""
-        return step.excess(step.sensor_noise) < STEPWISE.no_gap * float(step.sensor_noise.mean())
-
     @property
     def unexplained(self) -> float:
         """Residual power of the last set above the noise, as a share of that of the nominal rig."""
         return float(self.last.excess(self.last.noise_power) / self._gap)
+
+    def _from_zero(self, sets: Sequence[tuple[Effect, ...]]) -> list[Step]:
+        """Sets of effects, each with nominal errors that start from zero, fitted to all records side by side."""
+        return self.search.workers.map(partial(fit_from_zero, self.search), sets)
+
+    def _to_all(self, steps: Sequence[Step]) -> list[Step]:
+        """Steps fitted to all records side by side."""
+        return self.search.workers.map(partial(fitted_to_all, self.search), steps)
 
     @property
     def _gap(self) -> float:
@@ -456,7 +460,7 @@ class Stepwise:
         if chosen is None:
             return []
         others = [s for s in chosen.others if key_of(s.effects) != key]
-        return [chosen, *(s for s in others if self.explains(s) or self._is_as_good(s, chosen))]
+        return [chosen, *(s for s in others if s.explains or self._is_as_good(s, chosen))]
 
     def _rivals(self) -> tuple[tuple[Fit, float], ...]:
         """Other sets that fit as well, with their probabilities by description length.
@@ -469,19 +473,14 @@ class Stepwise:
             return ()
         key, rig = key_of(sets[0].effects), self.search.rig
         sets = [s for s in sets if key not in contained(s.effects, rig)]
-        noise, none_explains = sets[0].sensor_noise, not self.explains(sets[0])
+        noise, none_explains = sets[0].sensor_noise, not sets[0].explains
         length = [
-            s.description(noise, of_errors_alone=none_explains) + self._nats_per_parameter * s.fit.n_parameters
+            s.description(noise, of_errors_alone=none_explains) + self.search.nats_per_parameter * s.fit.n_parameters
             for s in sets
         ]
         odds = np.exp(min(length) - np.array(length))
         likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
         return tuple((s.fit, float(p)) for s, p in likely if p > STEPWISE.excluded)
-
-    @property
-    def _nats_per_parameter(self) -> float:
-        """Description length, nats, of one parameter: half the logarithm of the number of values."""
-        return 0.5 * float(np.log(self.search.data.n_values))
 
     def _at_another_place(self, step: Step) -> Step | None:
         """The step with its one linear structural effect moved to another place, if that has a smaller loss.
@@ -494,13 +493,39 @@ class Stepwise:
         (effect,), domain = step.effects, self.search.rig.modes.domain
         self.search.report("the same effect at other places", 0.6)
         places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
-        here, *others = self._fitted_to_quick([(effect,), *places], step, self._slopes(step))
+        here, *others = fitted_to_quick(self.search, [(effect,), *places], step)
         near = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
         best = min(near, key=lambda s: s.fit.cost, default=None)
         if best is None or best.fit.cost > STEPWISE.near * here.fit.cost:
             return None
-        found = self._fitted_to_all(best)
-        return found if self._loss(found) < self._loss(step) else None
+        found = fitted_to_all(self.search, best)
+        return found if loss(self.search, found) < loss(self.search, step) else None
+
+    def _with_another_law(self, step: Step) -> Step | None:
+        """The step with its one nonlinear law replaced by another at the same place, if that removes enough.
+
+        The first effect is searched beside nominal errors that have absorbed part of it, and where those are far off, a
+        wrong law at the right place may be the best. Now that the errors are nearly known, the laws compare.
+        """
+        if len(step.effects) != 1 or not step.effects[0].kind.nonlinear or step.effects[0].at is None or step.explains:
+            return None
+        (effect,), domain = step.effects, self.search.rig.modes.domain
+        self.search.report("another law at the same place", 0.6)
+        with_errors = self.search.with_nominal_errors(step.errors)
+        laws = [kind for kind in self.search.catalogue if kind.nonlinear and kind is not effect.kind]
+        with_errors = replace(with_errors, catalogue=tuple(laws))
+        rig = apply_all(self.search.rig, (step.errors,))
+        evidence = Evidence.of(rig, self.search.data, workers=self.search.workers, absorbed=True)
+        ahead = one_more(with_errors, (), evidence.of_force_at(effect.at))
+        there = [f for f in ahead if f.effects[0].at is not None and not apart(f.effects[0], effect, domain)]
+        present = fitted_ahead(with_errors, [step.effects])
+        cost_limit = min((f.cost for f in present), default=np.inf)
+        likeliest = [f for f in best_of_each_kind(there) if f.cost < cost_limit][: STEPWISE.finalists]
+        others = self.search.workers.map(
+            lambda f: fit_jointly(self.search, f.effects, step.errors, rounds=2), likeliest
+        )
+        best = min(others, key=partial(loss, self.search), default=None)
+        return best if best is not None and self._is_accepted(best, step) else None
 
     def _with_an_absorbed(self, step: Step) -> Step | None:
         """The step with one linear effect more that makes its implausible nominal errors much smaller, or None.
@@ -513,7 +538,7 @@ class Stepwise:
         self.search.report("effects that errors of the model have absorbed", 0.6)
         named = {effect.kind for effect in step.effects}
         singles = [f.effects for f in self._linear_singles if f.effects[0].kind not in named][: STEPWISE.finalists]
-        tried = self.search.workers.map(self.fit_from_zero, [(*step.effects, *each) for each in singles])
+        tried = self._from_zero([(*step.effects, *each) for each in singles])
         noise = step.noise_power
         longest = step.description(noise) - STEPWISE.shorter
         found = [s for s in tried if s.description(noise) < longest and self._are_noticeable(s.effects, s.fit.effects)]
@@ -556,18 +581,18 @@ class Stepwise:
             if candidate.cost <= promising and same_kind < (2 if candidate.cost <= as_good else 1):
                 chosen.append(candidate.effects)
         chosen = [*chosen[: STEPWISE.candidates], *more_general_sets(step.effects)]
-        return self._fitted_to_quick(chosen, step, self._slopes(step))
+        return fitted_to_quick(self.search, chosen, step)
 
     def _in_place_of_inputs(self, step: Step) -> Step | None:
         """The step with one more effect that explains the records without input noise, or None."""
         near = [
             s
             for s in self._candidates_with_one_more(step)
-            if s.fit.cost < PLAIN.near and not self._may_be_port_errors(s)
+            if s.fit.cost < PLAIN.near and not may_be_port_errors(self.search, s)
         ]
         near = sorted(near, key=lambda s: s.fit.cost)[: STEPWISE.finalists]
-        whole = self.search.workers.map(self._fitted_to_all, near)
-        found = [s for s in whole if self.explains(s) and s.is_plausible and self._is_accepted(s, step)]
+        whole = self._to_all(near)
+        found = [s for s in whole if s.explains and s.is_plausible and self._is_accepted(s, step)]
         return self._simplest_of_sets(sorted(found, key=lambda s: s.fit.cost)) if found else None
 
     def _with_late_accelerometer(self, step: Step, tried: Sequence[Step]) -> Step | None:
@@ -577,7 +602,7 @@ class Stepwise:
         """
         best = min(tried, key=lambda s: s.fit.cost)
         prior, late = step.errors.target, best.effects[-1]
-        if late.kind not in TIMING or prior.interpolated or not self._is_timing(best, TIMING):
+        if late.kind not in TIMING or prior.interpolated or not is_timing(self.search, best, TIMING):
             return None
         accelerometers = {sensor.name for sensor in self.search.rig.sensors if sensor.quantity == "acceleration"}
         if late.target not in accelerometers.difference(prior.late):
@@ -594,11 +619,12 @@ class Stepwise:
         """The best set on all records, of candidates fitted to the most informative ones."""
         # the single effects fitted before nominal errors could absorb them compete too
         singles = [] if step.effects else self.fitted_singles
-        tried = sorted((s for s in tried if not self._may_be_port_errors(s)), key=self._loss)
+        tried = sorted((s for s in tried if not may_be_port_errors(self.search, s)), key=partial(loss, self.search))
         close = [s for s in tried if s.fit.cost < STEPWISE.near * tried[0].fit.cost][: STEPWISE.finalists]
-        whole = self.search.workers.map(lambda s: self._without_inactive(self._fitted_to_all(s)), close)
-        whole = [s for s in whole if not self._may_be_port_errors(s)]  # the most informative records overstate some
-        whole = sorted((*whole, *singles), key=self._loss)
+        whole = self.search.workers.map(lambda s: self._without_inactive(fitted_to_all(self.search, s)), close)
+        # the most informative records overstate some
+        whole = [s for s in whole if not may_be_port_errors(self.search, s)]
+        whole = sorted((*whole, *singles), key=partial(loss, self.search))
         return self._simplest_of_sets(whole) if whole else step
 
     def _simplest_of_sets(self, sets: Sequence[Step]) -> Step:
@@ -608,198 +634,68 @@ class Stepwise:
     def _reselected(self, step: Step) -> Step:
         """The best of a step and its competitors (`others`), refitted in the current search."""
         others = [s for s in step.others if key_of(s.effects) != key_of(step.effects)]
-        others = self.search.workers.map(self._fitted_to_all, others)
-        return self._simplest_of_sets(sorted((step, *others), key=self._loss))
+        others = self._to_all(others)
+        return self._simplest_of_sets(sorted((step, *others), key=partial(loss, self.search)))
 
-    def _loss(self, step: Step) -> float:
-        """The loss of a step: its cost, or minus the log-likelihood where input noise is modelled."""
-        if not self.search.logged:
-            return step.fit.cost
-        return likeliest_loss(self.search, apply_all(self.search.rig, step.fit.effects))
+    def _are_noticeable(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> bool:
+        """Whether each of these effects alters the readings noticeably, `beside` being the whole set."""
+        return len(noticeable(self.search, effects, beside, self.tolerance)) == len(effects)
 
     def _is_accepted(self, best: Step, step: Step) -> bool:
         """Whether a set removes enough of the residual of a smaller one, or makes its nominal errors plausible."""
         if not self._are_noticeable(best.effects, best.fit.effects):
             return False
         # if nominal errors, sensor delays among them, explain the records, another small delay is no effect
-        by_likelihood = self.explains(step) and not self._is_timing(best, TIMING)
-        if (self.search.logged or by_likelihood) and self._is_likelier(best, step):
+        by_likelihood = step.explains and not is_timing(self.search, best, TIMING)
+        if (self.search.logged or by_likelihood) and is_likelier(self.search, best, step):
             return True
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
         is_negligible = bool(step.effects) and before - after < STEPWISE.least * self._gap
         share = STEPWISE.further_excess if step.effects and not is_negligible else STEPWISE.excess
-        if not self.explains(step) and before - after > share * before:
+        if not step.explains and before - after > share * before:
             return True
         saved = step.description(noise, of_errors_alone=is_negligible) - best.description(
             noise, of_errors_alone=is_negligible
         )
         return not step.is_plausible and saved > STEPWISE.shorter
 
-    def _is_likelier(self, best: Step, step: Step, least: float = SEARCH.significant) -> bool:
-        """Whether the likelihood surely prefers a set to a smaller one, beyond the imperfection of any model."""
-        extra, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), self._gain(best, step)
-        return gain > least and self.search.pays(gain, extra)
-
-    def _gain(self, best: Step, step: Step) -> float:
-        """Twice the log-likelihood ratio of one step over another, per measured value."""
-        if not self.search.logged:
-            return float(np.log(step.fit.cost / best.fit.cost))
-        # each step has the input noise that fits its own residual, which is loud where it masks an effect
-        losses = [likeliest_loss(self.search, apply_all(self.search.rig, s.fit.effects)) for s in (best, step)]
-        return 2.0 * (losses[1] - losses[0]) / self.search.data.n_values
-
     def _without_inactive(self, step: Step) -> Step:
         """The step without effects that no longer alter the readings, because another has replaced them."""
-        kept = self._noticeable(step.effects, step.fit.effects)
+        kept = noticeable(self.search, step.effects, step.fit.effects, self.tolerance)
         if len(kept) in (0, len(step.effects)):
             return step
         return self._without_inactive(fit_jointly(self.search, kept, step.errors, rounds=2))
 
-    def _are_noticeable(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> bool:
-        """Whether each of these effects alters the readings noticeably, `beside` being the whole set."""
-        return len(self._noticeable(effects, beside)) == len(effects)
-
-    def _noticeable(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> tuple[Effect, ...]:
-        """Those of the effects that alter the readings by more than the tolerance in some record."""
-        data, rig = self.search.data, self.search.rig
-        scales = [record.outputs.std(axis=1, keepdims=True) for record in data.counted]
-        whole = data.predictions(apply_all(rig, beside))
-
-        def altered(effect: Effect) -> float:
-            others = [e for e in beside if e is not effect]
-            if not can_be(rig, others):  # the others cannot exist without this effect
-                return np.inf
-            without = data.predictions(apply_all(rig, others))
-            each = zip(whole, without, scales, strict=True)
-            return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
-
-        return tuple(effect for effect in effects if altered(effect) > self.tolerance)
-
-    def _may_be_port_errors(self, step: Step) -> bool:
-        """Whether an effect of a step may be a plausible error of a port, which the nominal errors include already."""
-        return self._is_timing(step) or any(
-            is_plausible_gain_or_place(effect, self.search.rig) for effect in step.effects
-        )
-
-    def _is_timing(self, step: Step, kinds: Collection[Kind] = (SENSOR_DELAY,)) -> bool:
-        """Whether an effect of these kinds is a plausible error of a sensor's timing: a small delay."""
-        return any(is_plausible_delay(effect, self.search) for effect in step.effects if effect.kind in kinds)
-
-    def _slopes(self, step: Step) -> np.ndarray:
-        """Sensitivities (n_values, n_errors) to the nominal errors of a step, on the two most informative records."""
-        search = self.search
-        return slopes(search.rig, (step.errors,), search.quick, step.effects, search.workers)[1]
-
-    def _fitted_to_quick(self, sets: Sequence[tuple[Effect, ...]], step: Step, known: np.ndarray) -> list[Step]:
-        """Physically possible sets fitted to the two most informative records, nominal errors starting as a step's.
-
-        Args:
-            sets: of effects.
-            step: with the start values of the nominal errors.
-            known: (n_values, n_errors) sensitivities to these errors, of `_slopes`.
-        """
-        return self.search.workers.map(
-            lambda effects: fit_jointly(self.search, effects, step.errors, rounds=2, known=known),
-            [effects for effects in sets if can_be(self.search.rig, (*effects, step.errors))],
-        )
-
-    def fit_from_zero(self, effects: tuple[Effect, ...]) -> Step:
-        """The effects and nominal errors that start from zero, fitted jointly to all records.
-
-        With wrong frequencies, a simulation drifts out of phase over a record, so one-step-ahead predictions are
-        fitted first.
-        """
-        search = self.search
-        zero_errors = nominal_errors(search.rig, search.prior)
-        effects = nearest_possible(search.rig, effects, (zero_errors,))  # with nominal errors they could be larger
-        zero_errors = with_reading_sides(search, zero_errors, effects)
-        ahead = self._fitted_ahead(effects, zero_errors)
-        *others, errors = ahead.effects
-        # with corrected frequencies, the sides of the accelerometers are clearer
-        reassigned = with_reading_sides(
-            search, replace(errors, target=replace(errors.target, late=(), early=())), others
-        )
-        if reassigned.target.late != zero_errors.target.late:
-            ahead = min(ahead, self._fitted_ahead(others, reassigned), key=lambda each: each.cost)
-        interpolated = self._interpolated(ahead)
-        if interpolated is not ahead:
-            ahead, zero_errors = interpolated, nominal_errors(search.rig, replace(search.prior, interpolated=True))
-        found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
-        if search.by_mode or found.excess(found.noise_power) < STEPWISE.astray * float(search.nominal.mean()):
-            return found
-        return min(found, fit_jointly(search, effects, zero_errors), key=lambda s: s.fit.cost)
-
-    def _interpolated(self, ahead: Fit) -> Fit:
-        """The one-step-ahead fit, or one with delays by linear interpolation of the readings if its cost is lower."""
-        *effects, errors = ahead.effects
-        delays = {name: value for name, value in errors.values.items() if group_of(name) == "delay"}
-        is_late = any(effect.kind in TIMING for effect in effects)
-        may_be_late = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.surely_late
-        if not may_be_late and (effects or ahead.cost < JOINT.straight):
-            return ahead
-        prior = replace(self.search.prior, interpolated=True)
-        interpolated = self._fitted_ahead(effects, nominal_errors(self.search.rig, prior, delays))
-        return min(ahead, interpolated, key=lambda each: each.cost)
-
-    def _fitted_ahead(self, effects: Sequence[Effect], errors: Effect) -> Fit:
-        """Effects and nominal errors fitted to one-step-ahead predictions.
-
-        The sensitivities are kept during a fit, and taken anew as long as the cost falls.
-        """
-        search = self.search
-
-        def on(sets: Sequence[Effect]) -> Fit:
-            return fit(
-                search.rig, sets, search.ahead, iterations=JOINT.iterations, workers=search.workers, chord=Chord()
-            )
-
-        found = on((*effects, errors))
-        for _ in range(JOINT.anew - 1):
-            if found.falling < JOINT.still:
-                break
-            found = on(found.effects)
-        return found
-
-    def _fitted_to_all(self, step: Step) -> Step:
-        """The step fitted to all records.
-
-        Nominal errors fitted without an effect have absorbed part of it and may be in another local minimum, so they
-        start from zero; they also start from their values if that does not explain the records.
-        """
-        fresh = self.fit_from_zero(step.effects)
-        if self.explains(fresh):
-            return fresh
-        return min(fresh, fit_jointly(self.search, step.effects, step.errors, rounds=2), key=lambda s: s.fit.cost)
-
     def _simplest(self, best: Step, tried: Sequence[Step]) -> Step:
         """The best step, or a simpler set (a limiting case, or fewer effects) that fits almost as well."""
-        as_good = [s for s in (best, *tried) if len(s.effects) > 1 and not self._surely_prefers(best, s)]
+        as_good = [s for s in (best, *tried) if len(s.effects) > 1 and not surely_prefers(self.search, best, s)]
         simpler = [
             *simpler_sets(best.effects, self.search.rig),
             *merged_sets(best.effects),
             *(fewer for s in as_good for fewer in each_left_out(s.effects)),
         ]
-        on_quick = self._fitted_to_quick(simpler, best, self._slopes(best) if simpler else np.zeros((0, 0)))
+        on_quick = fitted_to_quick(self.search, simpler, best)
         sets = [*tried, *self._refitted_to_all(on_quick, best), *self._simpler_singles(best)]
         # implausible nominal errors may have absorbed the effect that is left out
         sets = [s for s in sets if s.is_plausible or not best.is_plausible]
+        size = partial(size_of_set, self.search)
         # a set of as many parameters may fit better: friction, for a hysteretic spring that always slides
-        best = min((best, *(s for s in sets if self._size(s) == self._size(best))), key=lambda s: s.fit.cost)
+        best = min((best, *(s for s in sets if size(s) == size(best))), key=lambda s: s.fit.cost)
         excess_limit = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
         limiting_cases = contained(best.effects, self.search.rig)
         fewer = [
             step
             for step in sets
-            if (self._size(step) < self._size(best) or key_of(step.effects) in limiting_cases)
+            if (size(step) < size(best) or key_of(step.effects) in limiting_cases)
             and step.excess(best.sensor_noise) < excess_limit
-            and not self._surely_prefers(best, step)
+            and not surely_prefers(self.search, best, step)
         ]
-        return min(fewer, key=lambda s: (self._size(s), s.fit.cost)) if fewer else best
+        return min(fewer, key=lambda s: (size(s), s.fit.cost)) if fewer else best
 
     def _refitted_to_all(self, on_quick: Sequence[Step], best: Step) -> list[Step]:
         """The steps; those that may be as good as `best`, which was fitted to all records, are refitted to all."""
-        if not self.explains(best):
+        if not best.explains:
             return list(on_quick)
         cost_limit = max(STEPWISE.near * best.fit.cost, STEPWISE.least * self._gap)
         return self.search.workers.map(
@@ -812,11 +708,11 @@ class Stepwise:
 
         Any law fits some of the residual of a measured gap, so a slightly smaller residual justifies no wider law.
         """
-        if self.explains(step):
+        if step.explains:
             return step
         sets = list(with_one_simpler(step.effects, self.search.rig))
-        limits = self._fitted_to_quick(sets, step, self._slopes(step)) if sets else []
-        as_good = [s for s in self.search.workers.map(self._fitted_to_all, limits) if self._is_as_good(s, step)]
+        limits = fitted_to_quick(self.search, sets, step)
+        as_good = [s for s in self._to_all(limits) if self._is_as_good(s, step)]
         return self._limiting_case(min(as_good, key=lambda s: s.fit.cost)) if as_good else step
 
     def _is_as_good(self, step: Step, best: Step) -> bool:
@@ -825,7 +721,7 @@ class Stepwise:
         Implausible nominal errors do not count: they may have absorbed an effect.
         """
         more = step.excess(best.sensor_noise) - best.excess(best.sensor_noise)
-        return step.is_plausible and not self.explains(best) and more < STEPWISE.least * self._gap
+        return step.is_plausible and not best.explains and more < STEPWISE.least * self._gap
 
     def _simpler_singles(self, best: Step) -> list[Step]:
         """Single effects of fewer parameters that fit almost as well as a single effect, fitted to all records."""
@@ -835,24 +731,16 @@ class Stepwise:
         nominal = self.search.nominal_ahead
         good = nominal - STEPWISE.as_good * (nominal - self.ahead[0].cost)
         likely = [f.effects for f in best_of_each_kind(self.ahead) if f.cost <= good and f.n_parameters < size]
-        on_quick = self._fitted_to_quick(likely, best, self._slopes(best)) if likely else []
-        fitted = [self._fitted_to_all(step) for step in on_quick if step.fit.cost < STEPWISE.near * best.fit.cost]
-        return [step for step in fitted if not self._may_be_port_errors(step)]
-
-    def _size(self, step: Step) -> tuple[int, int]:
-        """Number of parameters and of effects: of as many parameters, one effect is simpler than two."""
-        return len(parameters_of(self.search.rig, step.effects)), len(step.effects)
-
-    def _surely_prefers(self, best: Step, simpler: Step) -> bool:
-        """Whether the best step explains the records and its likelihood is surely higher than that of a simpler one."""
-        extra, gain = best.fit.n_parameters - simpler.fit.n_parameters, self._gain(best, simpler)
-        return self.explains(best) and self.search.pays(gain, extra)
+        on_quick = fitted_to_quick(self.search, likely, best)
+        near = [step for step in on_quick if step.fit.cost < STEPWISE.near * best.fit.cost]
+        fitted = [fitted_to_all(self.search, step) for step in near]
+        return [step for step in fitted if not may_be_port_errors(self.search, step)]
 
     def _backward_eliminated(self, step: Step) -> Step:
         """The step after backward elimination: without effects that later ones have made unnecessary."""
         if not step.effects:
             return step
-        fewer = self._fitted_to_quick(list(each_left_out(step.effects)), step, self._slopes(step))
+        fewer = fitted_to_quick(self.search, list(each_left_out(step.effects)), step)
         best = min(fewer, key=lambda s: s.fit.cost)
         excess_limit = (1.0 + STEPWISE.needless) * max(step.excess(step.sensor_noise), STEPWISE.simpler)
         is_needless = best.excess(step.sensor_noise) < excess_limit and (best.is_plausible or not step.is_plausible)
@@ -895,8 +783,9 @@ class Stepwise:
         _, side, port = name.split("_", 2)
         kind = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}[side]
         effect = Effect(kind, port, {"gain": float(np.exp(gains[name]))})
-        found = self.fit_from_zero((*step.effects, effect))  # other nominal errors have absorbed part of it
-        error = abs(float(np.log(found.effects[-1].values["gain"])))
+        found = fit_from_zero(self.search, (*step.effects, effect))  # other nominal errors have absorbed part of it
+        gain = found.effects[-1].values["gain"]
+        error = abs(float(np.log(gain))) if gain > 0.0 else 0.0  # a gain that passed zero: the fit has gone astray
         is_wrong = error >= max(PLAIN.most_gain, PLAIN.outlying * size_of(found.errors, "gain"))
         if not (is_wrong and self._are_noticeable(found.effects, found.fit.effects)):
             return step
@@ -935,7 +824,7 @@ class Stepwise:
         each = [evaluated(search, with_common_delay(s.fit)) for s in each]
         best, *others = sorted(each, key=lambda s: s.fit.cost)
         effect = best.effects[-1]
-        if self._is_likelier(step, best) or not effect.stands_out(search.rig):
+        if is_likelier(self.search, step, best) or not effect.stands_out(search.rig):
             return step
         share = cost_of(search.rig, (*step.effects, errors), search.data) - best.fit.cost
         if share < STEPWISE.explained * self._gap or not self._are_noticeable([effect], best.effects):

@@ -1,0 +1,94 @@
+"""Fits of candidate sets of effects with nominal errors, to the most informative records or to all."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from workbench.gap.effects.effect import Effect, can_be, nearest_possible
+from workbench.gap.effects.nominal import group_of, nominal_errors
+from workbench.gap.effects.ports import SENSOR_DELAY, SENSOR_LAG
+from workbench.gap.search.fit import Chord, Fit, fit, slopes
+from workbench.gap.search.jointly import Step, fit_jointly, with_reading_sides
+from workbench.gap.search.search import Search
+from workbench.gap.search.settings import JOINT, STEPWISE
+
+TIMING = (SENSOR_DELAY, SENSOR_LAG)  # kinds that delay the readings of a sensor
+
+
+def fitted_to_quick(search: Search, sets: Sequence[tuple[Effect, ...]], step: Step) -> list[Step]:
+    """The physically possible ones of some sets, fitted to the two most informative records.
+
+    The nominal errors start as those of a step, with the sensitivities to them.
+    """
+    if not sets:
+        return []
+    known = slopes(search.rig, (step.errors,), search.quick, step.effects, search.workers)[1]
+    return search.workers.map(
+        lambda effects: fit_jointly(search, effects, step.errors, rounds=2, known=known),
+        [effects for effects in sets if can_be(search.rig, (*effects, step.errors))],
+    )
+
+
+def fitted_to_all(search: Search, step: Step) -> Step:
+    """The effects of a step fitted to all records.
+
+    Nominal errors fitted without an effect have absorbed part of it and may be in another local minimum, so they start
+    from zero; they also start from their values if that does not explain the records.
+    """
+    fresh = fit_from_zero(search, step.effects)
+    if fresh.explains:
+        return fresh
+    return min(fresh, fit_jointly(search, step.effects, step.errors, rounds=2), key=lambda s: s.fit.cost)
+
+
+def fit_from_zero(search: Search, effects: Sequence[Effect]) -> Step:
+    """The effects and nominal errors that start from zero, fitted jointly to all records.
+
+    With wrong frequencies, a simulation drifts out of phase over a record, so one-step-ahead predictions are fitted
+    first.
+    """
+    zero_errors = nominal_errors(search.rig, search.prior)
+    effects = nearest_possible(search.rig, effects, (zero_errors,))  # with nominal errors they could be larger
+    zero_errors = with_reading_sides(search, zero_errors, effects)
+    ahead = _fitted_ahead(search, effects, zero_errors)
+    *others, errors = ahead.effects
+    # with corrected frequencies, the sides of the accelerometers are clearer
+    reassigned = with_reading_sides(search, replace(errors, target=replace(errors.target, late=(), early=())), others)
+    if reassigned.target.late != zero_errors.target.late:
+        ahead = min(ahead, _fitted_ahead(search, others, reassigned), key=lambda each: each.cost)
+    interpolated = _interpolated(search, ahead)
+    if interpolated is not ahead:
+        ahead, zero_errors = interpolated, nominal_errors(search.rig, replace(search.prior, interpolated=True))
+    found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
+    if search.by_mode or found.excess(found.noise_power) < STEPWISE.astray * float(search.nominal.mean()):
+        return found
+    return min(found, fit_jointly(search, effects, zero_errors), key=lambda s: s.fit.cost)
+
+
+def _interpolated(search: Search, ahead: Fit) -> Fit:
+    """The one-step-ahead fit, or one with delays by linear interpolation of the readings if its cost is lower."""
+    *effects, errors = ahead.effects
+    delays = {name: value for name, value in errors.values.items() if group_of(name) == "delay"}
+    is_late = any(effect.kind in TIMING for effect in effects)
+    may_be_late = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.surely_late
+    if not may_be_late and (effects or ahead.cost < JOINT.straight):
+        return ahead
+    prior = replace(search.prior, interpolated=True)
+    interpolated = _fitted_ahead(search, effects, nominal_errors(search.rig, prior, delays))
+    return min(ahead, interpolated, key=lambda each: each.cost)
+
+
+def _fitted_ahead(search: Search, effects: Sequence[Effect], errors: Effect) -> Fit:
+    """Effects and nominal errors fitted to one-step-ahead predictions.
+
+    The sensitivities are kept during a fit, and taken anew as long as the cost falls.
+    """
+
+    def on(sets: Sequence[Effect]) -> Fit:
+        return fit(search.rig, sets, search.ahead, iterations=JOINT.iterations, workers=search.workers, chord=Chord())
+
+    found = on((*effects, errors))
+    for _ in range(JOINT.anew - 1):
+        if found.falling < JOINT.still:
+            break
+        found = on(found.effects)
+    return found
