@@ -343,7 +343,7 @@ def test_a_grid_over_a_plate_is_proven(plate, tmp_path):
     assert written["lower_bound"] >= 0.95 * best["residual_work"]
     for more, words in (
         (("--grid", 0.9), "--grid must be between 0 and half the shorter side, 0.4 m; got 0.9"),
-        (("--grid", 0.1, "--at", "0.3,0.2"), "--grid is for a plate, instead of --at; leave one of them out"),
+        (("--grid", 0.1, "--at", "0.3,0.2"), "--grid and --at both name candidate places; leave one of them out"),
         ((), "--certify on a plate needs candidate places; give their spacing by --grid M, or --at PLACES"),
     ):
         refused = run("place", plate, *given, *more)
@@ -403,9 +403,10 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         (("identify", "{rig}"), "names no format"),
         (("design", "nowhere.toml"), "no such file"),
         (("design", "{rig}", "--damping", 1), "damping ratio wanted must lie between 0 and 1"),
-        (("design", "{rig}", "--errors", 0), "relative error of the models must be positive"),
+        (("design", "{rig}", "--errors", 0), "a share between 0 and 1, 0.05 for 5 %; got 0"),
+        (("design", "{rig}", "--errors", 5), "a share between 0 and 1, 0.05 for 5 %; got 5"),
         (("design", "{rig}", "--weight", -1), "positive"),
-        (("design", "{rig}", "--control", -1), "-1 modes cannot be controlled of 9"),
+        (("design", "{rig}", "--control", -1), "controlled modes is 1 to 9, those of the model; got -1"),
         (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),
         (("design", "{rig}", "--final-time", 0), "final time must be positive and finite; got 0"),
         (("design", "{rig}", "--json", "nowhere/found.json"), "there is no folder nowhere"),
@@ -415,6 +416,7 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
             "only 2 find room on the allowed intervals, 0 to 0.5 m:",
         ),
         (("place", "{rig}", "--control", 9), "residual"),
+        (("place", "{rig}", "--control", 4, "--grid", 0.1), "--grid is for a plate; name candidate places by --at"),
         (("place", "{rig}", "--control", 1, "--effort", 0.01), "--effort is a multiple of"),
         (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
         (("place", "{rig}", "--control", 4, "--at", "1,2,3,11"), "outside the structure"),
@@ -434,6 +436,17 @@ def test_bad_input_ends_in_one_line_and_code_2(rig, arguments, words):
     assert result.exit_code == 2, result.output
     assert words in result.output and "Traceback" not in result.output
     assert len(result.output.strip().splitlines()) <= 2
+
+
+@pytest.mark.parametrize("command", ["design", "place"])
+def test_damping_in_per_cent_is_no_design(rig, tmp_path, command):
+    """Of modes that are damped critically nothing is left to control."""
+    text = rig.read_text()
+    (written,) = {line for line in text.splitlines() if line.startswith("damping_ratio")}
+    (tmp_path / "percent.toml").write_text(text.replace(written, "damping_ratio = 3"))
+    refused = run(command, tmp_path / "percent.toml", "--control", 4)
+    assert refused.exit_code == 2
+    assert "a share of critical damping, below 1, such as 0.02 for 2 %; got 3" in refused.output
 
 
 def test_a_study_that_does_not_hold_ends_in_code_1(tmp_path, monkeypatch):

@@ -67,6 +67,17 @@ def test_a_prediction_is_told_in_the_units_of_the_case(run, case):
     assert rms[0] == rms[1] and rms[0][0] == "mm"
 
 
+@pytest.mark.parametrize(("header", "channel"), [("t,F1 [mm]", "F1"), ("t,F1,d0 [N]", "d0")])
+@pytest.mark.parametrize("command", ["predict", "check"])
+def test_a_column_of_another_quantity_is_refused(run, case, command, header, channel):
+    rows = np.ones((200, header.count(",") + 1))
+    rows[:, 0] = 0.01 * np.arange(200)
+    np.savetxt(case / "odd.csv", rows, delimiter=",", header=header, comments="")
+    done = run(command, "late", "odd.csv", "--verdict", "verdict.json", "--draws", 40)
+    assert done.exit_code == 2 and not (case / "late" / "tests.csv").exists()
+    assert f"odd.csv: channel '{channel}' is in " in done.stderr and "by case.toml: correct one of them" in done.stderr
+
+
 @pytest.mark.slow
 def test_tests_are_checked_and_logged_beside_the_case(run, case):
     for name, holds in (("friday", True), ("monday", False)):

@@ -1,6 +1,7 @@
 """`workbench redesign`: from a case and its verdict to a controller, a page and JSON."""
 
 import json
+import re
 from runpy import run_path
 
 import numpy as np
@@ -39,6 +40,8 @@ def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
     done = run("redesign", folder, *options)
     assert done.exit_code == 0, done.output
     assert "stable on 6 of 6 Monte Carlo samples" in done.output and "F1: delay 40 ms" in done.output
+    assert "the range of 6 draws, not of 95 %, which need 40 draws or more" in " ".join(done.output.split())
+    assert re.search(r"test: an impulse of \S+ N s at x = \S+, which moves the structure as far", done.output)
     found = json.loads(told.read_text())
     assert found["safe"] and found["redesigned"]["stable"] == 6
     assert found["steps"][-1]["loss"] < 0.5 * found["steps"][0]["loss"]
@@ -124,7 +127,7 @@ def test_a_damaged_verdict_is_named(run, case, tmp_path, change, said):
         ("--impulse-at", 9.0, "lies outside the structure"),
         ("--impulse-at", "F9", "or name an input: F1, F2"),
         ("--impulse-at", 0, "moves none of the controlled modes"),
-        ("--control", 7, "7 modes cannot be controlled of 5"),
+        ("--control", 7, "controlled modes is 1 to 5, those of the model; got 7"),
         ("--to", "anew.m", ".c, .py or .mat"),
         ("--to", "no/anew.c", "make it first"),
         ("--page", ".", "is a folder; name a file in it"),

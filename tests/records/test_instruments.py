@@ -183,7 +183,7 @@ def test_labview_text_of_several_segments(tmp_path):
     segment = LABVIEW.partition("***End_of_Header***\t\n\t\n")[2]
     table = "X_Value\tA\tB\tComment\n0.50\t1\t3\n0.75\t2\t4\n\n"
     text = LABVIEW.format("One", "Time", "Time", 0.5) + table + segment.format("Time", "Time", 1.0) + table
-    with pytest.raises(RecordFileError, match="row 17: the header of a further segment; .*'One header only'"):
+    with pytest.raises(RecordFileError, match=r"row 17: the header of a further segment; .*'One header only'"):
         read(tmp_path, text, ending=".lvm")
 
 

@@ -1,6 +1,6 @@
 """A case folder: a nominal model, and records measured on the real structure."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -159,14 +159,28 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
         input_channels=in_units(record.input_channels, units),
         output_channels=in_units(record.output_channels, units),
     )
-    for _, known, _ in record.signals():
+    check_units(file, [known for _, known, _ in record.signals()], stated)
+    return record
+
+
+def check_units(file: Path, channels: Sequence[Channel], stated: Mapping[str, str]) -> None:
+    """Refuse a file whose header states a unit of another quantity than case.toml.
+
+    Args:
+        file: of the record.
+        channels: of the case, in its units.
+        stated: units by the name of the channel; empty where the header states none.
+
+    Raises:
+        CaseError: for the first such channel.
+    """
+    for known in channels:
         unit = stated.get(known.name, "")
         if unit not in ("", known.unit):
             raise CaseError(
                 f"{file}: channel {known.name!r} is in {unit} by its header, in the units of the case, and in"
                 f" {known.unit} by case.toml: correct one of them"
             )
-    return record
 
 
 def _check_channels(file: Path, arrays: dict[str, np.ndarray], rig: Rig) -> None:

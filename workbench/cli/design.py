@@ -71,6 +71,8 @@ def design(
         say(f"  {why}")
     headings = map(units.named, (*command_headings(unit), "W_C [J]", "W_R [J]"))
     show_table(("law", "cost", *headings, "largest W_r", "loop"), shown)
+    say(f"  the impulse moves the controlled modes alone; W_C and W_R count until {end:.4g} {units.time},")
+    say("  cost and effort over all time")
     if {row.law.name for row in rows} >= {"IMSC", "coupled LQR"}:
         say("  R weights FᵀF in the cost and coupled LQR, but fᵀf of modal forces in IMSC: the ranking depends on")
         say("  masses and units; --damping compares the laws at equal poles")

@@ -29,9 +29,16 @@ def read_structure_rig(path: Path) -> "tuple[Rig, Units]":
     """As `read_rig_and_units`, with an actuator at a node moved to the point of its direction.
 
     Raises:
-        ValueError: modal data without a table of points, whose shapes are known only at the inputs and outputs.
+        ValueError: modal data without a table of points, whose shapes are known only at the inputs and outputs; or a
+            damping ratio of 1 or more.
     """
     found, units = read_rig_and_units(path)
+    elastic = found.modes.zeta[found.modes.omega > 0]
+    if (elastic >= 1.0).any():
+        raise ValueError(
+            f"{path}: a damping ratio is a share of critical damping, below 1, such as 0.02 for 2 %; got"
+            f" {elastic.max():g}"
+        )
     domain = found.modes.domain
     if not isinstance(domain, NamedPoints):
         return found, units

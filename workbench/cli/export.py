@@ -20,7 +20,7 @@ def export(
             metavar="FILE", help="File to write: NAME.c (with NAME.h), NAME.py or NAME.mat; NAME of letters, digits, _."
         ),
     ],
-    law: options.LawName = "imsc",
+    law: options.LinearLawName = "imsc",
     control: options.Control = None,
     weight: options.LawWeight = None,
     damping: options.Damping = None,

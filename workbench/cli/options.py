@@ -40,6 +40,7 @@ Weight = Annotated[
     float, typer.Option(help="Control weight R: of forces in the cost and coupled LQR, of modal forces in IMSC.")
 ]
 LawName = Annotated[str, typer.Option(help="Control law: imsc, coupled, poles or on-off.")]
+LinearLawName = Annotated[str, typer.Option("--law", help="Control law: imsc, coupled or poles.")]
 Control = Annotated[
     int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
 ]
@@ -64,5 +65,7 @@ Disturbance = Annotated[
 RecordName = Annotated[
     str, typer.Argument(metavar="RECORD", help="File with a column for each input, or a record of the case by name.")
 ]
-Draws = Annotated[int, typer.Option(min=1, help="Samples of the uncertain model from which the bands are computed.")]
+Draws = Annotated[
+    int, typer.Option(help="Samples of the uncertain model from which the bands are computed, 40 or more.")
+]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the samples and of the noise.")]

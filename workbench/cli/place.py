@@ -134,6 +134,7 @@ def place(
     unit = command_unit([task.actuator])
     headings = map(units.named, (where, "W_R [J]", *command_headings(unit)))
     show_table((*headings, "condition number of B", ""), shown)
+    say("  the impulse moves the controlled modes alone; W_R is that of undamped residual modes over all time")
     if best.overlapping:
         size = float(np.linalg.norm(2.0 * reach(domain, task.actuator.at)[0]))  # type: ignore[arg-type]
         say(f"  patches overlap; {SPREAD}: --spacing {size:.3g}")
@@ -179,8 +180,10 @@ def _reference(task: "PlacementTask", rig: "Rig") -> "Placement":
 def _candidates(domain: Domain, at: str | None, grid: float | None, units: "Units") -> tuple[Place, ...] | None:
     """The places of --grid, or of --at, separated by semicolons on a plate, else by commas; None without both."""
     if grid is not None:
-        if at is not None or not isinstance(domain, Rectangle):
-            raise ValueError("--grid is for a plate, instead of --at; leave one of them out")
+        if not isinstance(domain, Rectangle):
+            raise ValueError("--grid is for a plate; name candidate places by --at, or leave --grid out")
+        if at is not None:
+            raise ValueError("--grid and --at both name candidate places; leave one of them out")
         widest = 0.5 * min(domain.length)
         if not 0.0 < grid <= widest:
             raise ValueError(

@@ -81,7 +81,12 @@ def predicted(
 
 
 def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
-    """A record of the case by name, or a file with columns named as the case's inputs and outputs."""
+    """A record of the case by name, or a file with columns named as the case's inputs and outputs.
+
+    Raises:
+        ValueError: neither of these, or a column whose header states a unit of another quantity than the case's.
+    """
+    from workbench.cases.case import check_units
     from workbench.records.files import read_record
 
     own = {record.name: record for record in (*case.fit, *case.validation)}
@@ -90,6 +95,8 @@ def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
     if not Path(name).is_file():
         raise ValueError(f"{name!r} is neither a file nor a record of the case, which are {', '.join(own)}")
     read = read_record(name, sample_rate_hz=sample_rate_hz, units=case.units)
+    known = [channel for _, channel, _ in case.fit[0].signals()]
+    check_units(Path(name), known, {channel.name: channel.unit for _, channel, _ in read.signals()})
     return _with_inputs(read, tuple(actuator.name for actuator in case.rig.actuators))
 
 

@@ -122,6 +122,9 @@ def redesign(
     say(f"{result.advice} {result.guarantee}".rstrip(), bold=True)
     say(result.comparison)
     say(f"  in use: {damping_by(rig.modes, own)}")
+    if test.impulse_at is not None:
+        size, where = f"{test.impulse:.3g} {found.units.named('N s')}", rig.modes.domain.text(test.impulse_at, 4)
+        say(f"  test: an impulse of {size} at {where}, which moves the structure as far as the records did")
     steps = [(step.name, step.what, step.lost, "yes" if step.kept else "no") for step in result.steps]
     show_table(("step", "what", "loss", "kept"), steps)
     if result.relocation is not None:

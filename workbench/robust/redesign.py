@@ -18,6 +18,7 @@ from workbench.robust.compensation import Loop, check_rate, compensated
 from workbench.robust.impulse import impulse_test
 from workbench.robust.on_rig import Design, controlled_by, loop_on_rig, redesigned_for
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
+from workbench.robust.prediction import LEAST_DRAWS
 from workbench.robust.relocation import relocated
 from workbench.robust.small_motion import modes_in_motion
 from workbench.robust.steps import Search, Step, force_weight, weighted
@@ -136,7 +137,7 @@ def redesign(
         more_cost=more_cost,
         more_work=more_work,
         relocation=moved,
-        notes=_notes(uncertain, corrected, search.criterion == wanted),
+        notes=_notes(uncertain, corrected, draws, as_wanted=search.criterion == wanted),
         units=units,
     )
 
@@ -166,9 +167,13 @@ def _silent(controller: DigitalController) -> DigitalController:
     return DigitalController(controller.sample_time, controller.sensors, controller.actuators, a, b, c, d, e)
 
 
-def _notes(uncertain: UncertainRig, rig: Rig, as_wanted: bool) -> tuple[str, ...]:
-    """Remarks on the criterion, where it is not the wanted one, on hysteresis, and on alternative sets of effects."""
+def _notes(uncertain: UncertainRig, rig: Rig, draws: int, *, as_wanted: bool) -> tuple[str, ...]:
+    """Remarks on few draws, the criterion, where it is not the wanted one, hysteresis, and alternative sets."""
     notes = []
+    if draws < LEAST_DRAWS:
+        notes.append(
+            f"The intervals are the range of {draws} draws, not of 95 %, which need {LEAST_DRAWS} draws or more."
+        )
     if not as_wanted:
         notes.append(
             "Even with perfect actuators and sensors the controlled modes do not settle within the test, so the"

@@ -119,7 +119,7 @@ def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[i
         controlled = int(controlled)
     if isinstance(controlled, int) and not 1 <= controlled <= modes.n_modes:
         raise DesignError(
-            f"{controlled} modes cannot be controlled of {modes.n_modes} at hand: control 1 or more of these"
+            f"the number of controlled modes is 1 to {modes.n_modes}, those of the model; got {controlled}"
         )
     index = tuple(int(r) for r in (range(controlled) if isinstance(controlled, int) else controlled))
     if not index or len(set(index)) != len(index) or min(index) < 0 or max(index) >= modes.n_modes:

@@ -116,10 +116,10 @@ def perturbed_modes(modes: Modes, error: float, *, count: int = 100, seed: int =
     The error is that of each frequency and damping ratio, and the root mean square of all modes mixed into a shape.
 
     Raises:
-        DesignError: an error that is not positive.
+        DesignError: an error that is no share between 0 and 1.
     """
-    if not 0 < error < np.inf:
-        raise DesignError(f"the relative error of the models must be positive; got {error:g}")
+    if not 0 < error <= 1:
+        raise DesignError(f"the relative error of the models is a share between 0 and 1, 0.05 for 5 %; got {error:g}")
     rng, n = np.random.default_rng(seed), modes.n_modes
     centre = np.r_[modes.omega, modes.zeta]
     drawn = centre * (1.0 + error * rng.standard_normal((count, 2 * n)))

@@ -36,8 +36,13 @@ def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, fol
         made_by: the command that makes the page again.
     """
     blocks = _replayed(found, record)
+    test = found.test
+    excitation = "the test"
+    if test.impulse_at is not None:
+        at = found.uncertain_rig.rig.modes.domain.text(test.impulse_at, 4)
+        excitation = f"an impulse of {test.impulse:.3g} {found.units.named('N s')} at {at}"
     compared = (
-        "Both controllers after the impulse of the test, on the same samples of the uncertain model, including all"
+        f"Both controllers after {excitation}, on the same samples of the uncertain model, including all"
         " dead zones, delays, friction and noise. The controller with the lower curve is better; a wide band means"
         " that the records leave much uncertain."
     )
