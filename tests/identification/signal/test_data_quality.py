@@ -94,6 +94,13 @@ def test_an_output_of_no_quantity_among_accelerations(sound):
         check_data_quality(replace(sound, output_channels=channels))
 
 
+def test_an_output_of_an_unknown_unit_among_accelerations(sound):
+    channels = (*sound.output_channels[:3], Channel("y4 [furlong/s^2]"))
+    found = only(replace(sound, output_channels=channels))
+    assert found.kind == "unstated" and "states the unit furlong/s^2, which is not known" in found.message
+    assert "known unit, one of m/s^2, " in found.message and "[m/s^2]'" not in found.message
+
+
 def driven(sound, force):
     return replace(sound, inputs=force[None], input_channels=(Channel("F", "force"),))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.records.record import Record, as_records
+from workbench.records.units import LIKELY, unknown_unit
 from workbench.rig.sensors import MEASURED
 
 
@@ -348,10 +349,16 @@ def _unstated(record: Record, alive: list[int]) -> Iterator[DataFault]:
     moving = [channel for channel in channels if channel.quantity in MEASURED]
     for channel in channels:
         if moving and not channel.quantity:
+            unit = unknown_unit(channel.name)
+            stated = f"states the unit {unit}, which is not known" if unit else "states no quantity"
+            remedy = (
+                f"write its numbers in a known unit, one of {LIKELY}"
+                if unit
+                else f"state its unit in the file, as in '{channel.name} [m/s^2]'"
+            )
             yield DataFault(
                 "unstated",
                 (channel.name,),
-                f"output {channel.name!r} states no quantity, and {moving[0].name!r} measures {moving[0].quantity}: it"
-                f" would be taken for a displacement; state its unit in the file, as in '{channel.name} [m/s^2]', or"
-                " leave it out",
+                f"output {channel.name!r} {stated}, and {moving[0].name!r} measures {moving[0].quantity}: it would be"
+                f" taken for a displacement; {remedy}, or leave it out",
             )
