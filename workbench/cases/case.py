@@ -15,6 +15,7 @@ from workbench.cases.tables import (
     inside,
     number,
     numbers,
+    one_of,
     profile,
     shown,
     table_of,
@@ -48,6 +49,8 @@ STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
 PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio", "edges", "damping_ratio", "modes")
 EDGES = ("left", "right", "bottom", "top")
+ENDS = {"beam": ("hinged", "clamped", "free", "sliding"), "rod": ("fixed", "free")}
+EDGE = ("simply supported", "clamped", "guided", "free")
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
 # Further keys of an input and of an output, for moments, patches and directions, by the kind of structure.
@@ -132,6 +135,10 @@ def _units(table: dict[str, Any], path: Path) -> Units:
     if missing:
         raise CaseError(f"{where}: {missing[0]} is missing; name all of {', '.join(UNITS)}")
     found = Units(**{name: text(units, name, where) for name in UNITS})
+    try:
+        found.check_known()
+    except ValueError as error:
+        raise CaseError(f"{where}: {error}") from None
     ratio = found.consistency
     if ratio is not None and abs(ratio - 1.0) > 1e-3:
         product = f"{found.mass} {found.length}/{found.time}^2"
@@ -210,8 +217,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     common: dict[str, Any] = {
         "length": number(table, "length", "[structure]"),
         "mass_per_length": profile(table, "mass_per_length"),
-        "left": text(table, "left", "[structure]"),
-        "right": text(table, "right", "[structure]"),
+        **{side: one_of(table, side, ENDS[kind], "[structure]") for side in ("left", "right")},
         "damping": ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     }
     structure: Structure
@@ -240,7 +246,7 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
         mass_per_area=number(table, "mass_per_area", "[structure]", low=0.0),
         bending_stiffness=number(table, "bending_stiffness", "[structure]", low=0.0),
         poisson_ratio=number(table, "poisson_ratio", "[structure]"),
-        edges={side: text(edges, side, "[structure] edges") for side in EDGES},
+        edges={side: one_of(edges, side, EDGE, "[structure] edges") for side in EDGES},
         damping=ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     )
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=PLATE_TOLERANCE)
@@ -443,7 +449,8 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
             raise CaseError(f"{file}: channel {channel!r} has shape {values.shape}; t has {n_samples} samples")
         bad = ~np.isfinite(values)
         if bad.any():
-            raise CaseError(f"{file}: channel {channel!r}, sample {int(np.argmax(bad))} is {values[bad][0]}")
+            at = int(np.argmax(bad))
+            raise CaseError(f"{file}: channel {channel!r}, sample {at} is {values[at]}; fill it, or cut the record")
     steps = np.diff(arrays["t"])
     if n_samples < LEAST_SAMPLES or np.abs(steps - sample_time).max() > 0.01 * sample_time:
         is_in_ms = steps.size and np.abs(1e-3 * steps - sample_time).max() < 0.01 * sample_time

@@ -51,7 +51,9 @@ BY_QUANTITY: dict[str, tuple[str, dict[str, float]]] = {
     "pressure": ("Pa", {"Pa": 1, "kPa": 1e3, "MPa": 1e6, "bar": 1e5}),
     "": ("counts", {"counts": 1, "count": 1, "Counts": 1, "cts": 1, "ADC": 1}),
 }  # fmt: skip
-MASSES = {"kg": 1.0, "g": 1e-3, "t": 1e3, "lb": 0.45359237, "slug": POUND_FORCE / 0.3048}  # kg
+# kg
+MASSES = {"kg": 1.0, "g": 1e-3, "mg": 1e-6, "ug": 1e-9, "ng": 1e-12, "pg": 1e-15, "t": 1e3, "Mg": 1e3,
+          "lb": 0.45359237, "lbm": 0.45359237, "slug": POUND_FORCE / FOOT, "slinch": POUND_FORCE / INCH}  # fmt: skip
 UNITS = {
     name: Unit(float(factor), si, quantity)
     for quantity, (si, names) in BY_QUANTITY.items()
@@ -89,9 +91,13 @@ NUMBERED = re.compile(r"(\S\D*?\S)\s+\d+\b.*")  # one time of several, as catman
 
 def unit_named(text: str) -> Unit | None:
     """The unit with a name, in any usual spelling; None for an unknown one."""
+    return UNITS.get(_our_spelling(text))
+
+
+def _our_spelling(text: str) -> str:
     for spelling, ours in SPELLINGS:
         text = text.replace(spelling, ours)
-    return UNITS.get(" ".join(text.split()))
+    return " ".join(text.split())
 
 
 def split_unit(name: str) -> tuple[str, str]:
@@ -166,6 +172,9 @@ def time_base(name: str) -> str:
     return base if base in TIME or base in TIME_AS_UNIT else ""
 
 
+NAMED_BY = {"length": "displacement", "time": "time", "force": "force"}  # names of `Units` but mass, by quantity
+
+
 @dataclass(frozen=True)
 class Units:
     """Names of a consistent set of units, for input and results.
@@ -200,10 +209,23 @@ class Units:
     def consistency(self) -> float | None:
         """A force of mass · length / time² in the unit of force; None where a name's factor to SI is not known."""
         units = [unit_named(name) for name in (self.length, self.time, self.force)]
-        if self.mass not in MASSES or not all(units):
+        mass = MASSES.get(_our_spelling(self.mass))
+        if mass is None or not all(units):
             return None
         length, time, force = (unit.factor for unit in units if unit)
-        return MASSES[self.mass] * length / time**2 / force
+        return mass * length / time**2 / force
+
+    def check_known(self) -> None:
+        """Refuse a name whose factor to SI is not known, or that is of another quantity.
+
+        Raises:
+            ValueError: naming what it is of, the name, and the known ones.
+        """
+        names = {what: BY_QUANTITY[quantity][1] for what, quantity in NAMED_BY.items()}
+        for what, known in (*names.items(), ("mass", MASSES)):
+            name = getattr(self, what)
+            if _our_spelling(name) not in known:
+                raise ValueError(f"{what} = {name!r:.60} is not known; name one of {', '.join(known)}")
 
     def _by_si(self) -> dict[str, str]:
         hertz = "Hz" if self.time == "s" else f"1/{self.time}"
