@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workbench.cases.case import Case, CaseError, files_of, read_case
+from workbench.cases.case import Case, CaseError, files_of, read_case, read_rig, read_units
 from workbench.cases.writing import write_case
 from workbench.records.files import read_record
 from workbench.records.limits import RecordFileError
@@ -106,7 +106,9 @@ def test_what_the_format_cannot_say_is_refused(case, tmp_path):
     [
         ('kind = "beam"', 'kind = "shell"', "beam, rod, plate or modal; got 'shell'"),
         ("length = 2.0", "length = -2.0", "length"),
-        ('left = "clamped"', 'left = "glued"', "glued"),
+        ('left = "clamped"', 'left = "pinned"', "left is one of hinged, clamped, free, sliding; got 'pinned'$"),
+        ('right = "hinged"', 'right = "pinned"', r"\[structure\]: right is one of hinged"),
+        ("[[input]]", "[input]", r"write \[\[input\]\], with two brackets, for each input"),
         ("modes = 5", "modes = 5.5", "whole number"),
         ("at = 0.7", "at = 7.0", "outside the structure"),
         ('quantity = "acceleration"', 'quantity = "volts"', "quantity is one of"),
@@ -333,6 +335,30 @@ def test_inputs_are_held_or_run_straight_as_the_case_says(case, tmp_path):
     (folder / "case.toml").write_text('input_hold = "second"\n' + text)
     with pytest.raises(CaseError, match=r"zero \(constant between samples\), first"):
         read_case(folder)
+
+
+@pytest.mark.parametrize(
+    ("units", "words"),
+    [
+        (("milimeter", "kg", "s", "N"), r"\[units\]: length = 'milimeter' is not known; name one of m, cm, mm, "),
+        (("m", "stone", "s", "N"), "mass = 'stone' is not known; name one of kg, g, "),
+        (("m", "kg", "N", "N"), "time = 'N' is not known; name one of s, "),
+        (("m", "kg", "s", "Newton"), "force = 'Newton' is not known; name one of N, mN, "),
+    ],
+)
+def test_names_of_units_that_are_not_known_are_refused(tmp_path, units, words):
+    """By whatever reads a case.toml: a misspelt name would otherwise leave the set unchecked."""
+    text = "".join(f"{key} = {name!r}\n" for key, name in zip(("length", "mass", "time", "force"), units))
+    (tmp_path / "case.toml").write_text("[units]\n" + text)
+    with pytest.raises(CaseError, match=words):
+        read_units(tmp_path / "case.toml")
+
+
+def test_one_bracket_in_place_of_two_is_told(tmp_path):
+    for text in ("[input]\nname = 'F'\n", "[input]\nname = 'F'\n[input]\nname = 'G'\n"):
+        (tmp_path / "rig.toml").write_text(text)
+        with pytest.raises(CaseError, match=r"write \[\[input\]\], with two brackets, for each input"):
+            read_rig(tmp_path / "rig.toml")
 
 
 def test_units_are_named_all_four_or_none(case, tmp_path):

@@ -78,6 +78,19 @@ def test_identify_finds_the_modes_and_their_number(tmp_path):
     assert (np.abs(modes["frequencies_hz"] - exact) < 5 * np.array(modes["frequencies_std_hz"])).all()
 
 
+def test_identify_says_which_modes_and_options_go_nowhere(tmp_path):
+    beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged",
+                damping=ModalDamping(0.01))  # fmt: skip
+    decay = impulse_response_modes(beam.modes(2), at=7.3, positions=[1.0, 3.0])
+    record = free_decay(decay, sample_time=1.0, n_samples=200, quantity="velocity", noise_std=0.003, seed=1)
+    path = write_record(record, tmp_path / "ring.csv")
+    many = run("identify", path, "--modes", 15)
+    assert many.exit_code == 0 and "14 of the 15 modes asked for are found" in many.output, many.output
+    assert "asked for" not in run("identify", path, "--modes", 2).output
+    held = run("identify", path, "--input-hold", "first")
+    assert held.exit_code == 2 and "--input-hold is for records with inputs: name them by --inputs" in held.output
+
+
 def test_identify_reads_records_with_inputs_and_ambient_ones(tmp_path):
     rng, dt, n = np.random.default_rng(2), 0.02, 6000
     pole = -0.3 + 9.0j

@@ -1,9 +1,11 @@
 """`workbench new`: templates that are read and run as they are."""
 
 import numpy as np
+import pytest
 
-from workbench.cases.case import read_case
-from workbench.cases.nominal import read_rig
+from workbench.cases.case import UNITS, read_case, read_units
+from workbench.cases.nominal import ACTING, EDGE, ENDS, MODAL, PLATE, STRUCTURES, read_rig
+from workbench.rig.sensors import MEASURED
 from workbench.rig.simulate import simulate
 
 
@@ -39,3 +41,25 @@ def test_a_new_study_runs_and_holds(run, tmp_path, monkeypatch):
     assert (tmp_path / "figures" / "tip-modes.png").is_file()
     assert "exists already" in run("new", "study", "tip").output
     assert "the name of a study" in run("new", "study", "../tip").output
+
+
+def test_a_new_case_names_what_the_format_has(run, tmp_path):
+    run("new", "case", tmp_path / "arm")
+    text = (tmp_path / "arm" / "case.toml").read_text(encoding="utf-8")
+    words = (*STRUCTURES, "plate", "modal", *ENDS["beam"], *ENDS["rod"], *EDGE, *MEASURED, *ACTING[1:])
+    assert [word for word in words if f'"{word}"' not in text] == []
+    assert all(f"{key} = " in text for key in (*UNITS, *PLATE, "points", *MODAL[1:3])) and "# [units]" in text
+    plain = text.replace("# [units]", "[units]").replace('# length = "mm"', 'length = "mm"')
+    for key in UNITS[1:]:
+        plain = plain.replace(f'# {key} = "', f'{key} = "')
+    (tmp_path / "arm" / "case.toml").write_text(plain, encoding="utf-8")
+    assert read_units(tmp_path / "arm" / "case.toml").mass == "t"
+
+
+@pytest.mark.parametrize("what", ["case", "study"])
+@pytest.mark.parametrize("name", ["", "  "])
+def test_a_name_is_needed(run, tmp_path, monkeypatch, what, name):
+    monkeypatch.chdir(tmp_path)
+    refused = run("new", what, name)
+    assert refused.exit_code == 2 and f"the name of the {what} is empty; give one" in refused.output
+    assert list(tmp_path.iterdir()) == []

@@ -105,7 +105,7 @@ def test_a_plain_csv_of_another_program(tmp_path):
         ("time,a\n0,1\n1,2,3\n", "row 3 has 3 fields"),
         ("time,a\n0,1\n1,2\n5,3\n", "not uniformly sampled"),
         ("0,1\n1,2\n", "header"),
-        ("a,a\n1,2\n3,4\n", "must differ"),
+        ("a,a\n1,2\n3,4\n", "columns 1 and 2 are both called 'a'"),
         ("a,b\n1,2\n3,4\n", "sample_rate_hz"),
     ],
 )

@@ -125,3 +125,30 @@ def test_an_axis_of_unknown_name_is_no_reason_to_state_a_rate(tmp_path):
     """A rate beside it would make a signal of the clock, or a record of transfer functions."""
     with pytest.raises(RecordFileError, match=r"unless 'Speed', which rises all along, is one: call it time \[s\]"):
         read(tmp_path, [f"{t:.3f}" for t in EVEN], name="Speed")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: rows[::-1], "its instants fall, from 0.059 to 0 s; sort the rows by time"),
+        (
+            lambda rows: [*rows[:30], rows[31], rows[30], *rows[32:]],
+            "row 33 is 0.001 s before the one above; sort the rows",
+        ),
+        (
+            lambda rows: [*rows[1::2], *rows[::2]],
+            "row 32 is 0.059 s before .*; sort the rows by time, or cut the record there",
+        ),
+        (
+            lambda rows: [*rows[:30], rows[29], *rows[30:]],
+            "row 32 has the instant .*, 0.029 s; remove the doubled row$",
+        ),
+        (lambda rows: [rows[7]] * 60, "all its instants are equal, 0.007 s"),
+        (lambda rows: [*rows[:30], *rows[40:]], "row 32 comes 0.011 s after .* fill the gap, or cut the record there"),
+    ],
+)
+def test_instants_that_are_no_time_are_told_with_their_remedy(tmp_path, change, words):
+    rows = change([f"{t:.3f},{k % 7}" for k, t in enumerate(EVEN[:60])])
+    (tmp_path / "x.csv").write_text("t [s],a\n" + "\n".join(rows) + "\n")
+    with pytest.raises(RecordFileError, match="is not uniformly sampled: .*" + words):
+        read_record(tmp_path / "x.csv")

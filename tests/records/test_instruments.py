@@ -12,7 +12,7 @@ from scipy.io import wavfile
 from workbench.records import csv_file, limits
 from workbench.records.files import read_measured, read_record
 from workbench.records.limits import Limits, RecordFileError
-from workbench.records.units import split_unit, unit_named
+from workbench.records.units import LIKELY, split_unit, unit_named
 
 G = 9.80665  # m/s^2, by definition
 
@@ -228,7 +228,8 @@ def test_a_missing_or_doubled_sample_is_not_filled(tmp_path, times):
 @pytest.mark.parametrize(
     ("written", "si"),
     [("g", G), ("m/s²", 1), ("mm/s**2", 1e-3), ("µm", 1e-6), ("lbf", 4.4482216152605), ("in/s", 0.0254),
-     ("deg", np.pi / 180), ("N·m", 1), ("m s^-2", 1), ("kHz", 1e3)],
+     ("deg", np.pi / 180), ("N·m", 1), ("m s^-2", 1), ("kHz", 1e3), ("ft/s", 0.3048), ("ft/s²", 0.3048),
+     ("mil/s", 2.54e-5), ("km/h", 1 / 3.6)],
 )  # fmt: skip
 def test_units_by_their_definitions(written, si):
     assert unit_named(written).factor == pytest.approx(si, rel=1e-15)
@@ -237,6 +238,71 @@ def test_units_by_their_definitions(written, si):
 def test_brackets_without_a_unit_belong_to_the_name():
     assert split_unit("x (left)") == ("x (left)", "")
     assert split_unit("Acc / g") == ("Acc", "g")
+
+
+def test_a_unit_that_is_not_known_is_said_by_name(tmp_path):
+    record = read(tmp_path, "t [s],a [m/s^2],b [furlong/s^2],c (left),d [1]\n0,1,1,1,1\n1,2,2,2,2\n")
+    [remark] = record.remarks
+    assert remark == "b [furlong/s^2]: as recorded, as furlong/s^2 is no known unit"
+    assert all(unit_named(name) for name in LIKELY.split(", "))
+    known = read(tmp_path, "t [s],b [ft/s^2]\n0,1\n1,2\n")
+    assert known.remarks == ("b: ft/s^2 taken as 0.3048 m/s^2",) and known.outputs[0, 0] == pytest.approx(0.3048)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        (
+            "b [furlong/s^2] [m/s^2]",
+            r"states two units, furlong/s\^2 and m/s\^2: leave the one that its numbers are in",
+        ),
+        ("b [ft/s^2] [m/s^2]", r"states two units, ft/s\^2 and m/s\^2"),
+        ("b (ft/min) [mm/s]", "states two units, ft/min and mm/s"),
+        ("b (mm) [m]", "states two units, mm and m"),
+        ("b (left) [g]", ""),
+        ("b [0] [g]", ""),
+        ("b (N) [g]", ""),
+        ("b (A/D) [g]", ""),
+        ("b (m/s²) [m/s^2]", ""),
+    ],
+)
+def test_a_column_with_two_units_is_refused(tmp_path, name, words):
+    text = f"t [s],a,{name}\n0,1,1\n1,2,2\n"
+    if not words:
+        assert read(tmp_path, text).output_channels[1].quantity == "acceleration"
+        return
+    with pytest.raises(RecordFileError, match=words):
+        read(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("t,m1,m2,m1", "columns 2 and 4 are both called 'm1'; give them names that differ"),
+        ("t,m1,m1 ,m3", "columns 2 and 3 are called 'm1' and 'm1 ', alike but for blanks; give them names that differ"),
+    ],
+)
+def test_sensors_of_one_name_are_named_with_their_columns(tmp_path, header, words):
+    with pytest.raises(RecordFileError, match=words):
+        read(tmp_path, f"{header}\n0,1,1,1\n1,2,2,2\n")
+
+
+def test_samples_that_are_not_there_matter_where_their_channel_is_asked_for(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("t [s],F,a,b,c\n" + "".join(f"{k},{k % 3},{k % 5},nan,{k % 7}\n" for k in range(20)))
+    with pytest.raises(
+        RecordFileError, match="'b', row 2: nan is not a number; delete the column, or fill the samples"
+    ):
+        read_record(path)
+    kept = read_measured(path, inputs=("F",), outputs=("c", "a"))
+    assert (kept.input_names, kept.output_names) == (("F",), ("c", "a")) and kept.outputs[0].max() == 6.0
+    with pytest.raises(RecordFileError, match="'b', row 2: nan"):
+        read_measured(path, inputs=("F",), outputs=("a", "b"))
+    with pytest.raises(RecordFileError, match="has no output 'd'; it has a, b, c"):
+        read_measured(path, inputs=("F",), outputs=("d",))
+    path.write_text("t [s],a,b\n0,1,\n1,2,1\n2,3,1\n".replace("0,1,", "0,1,3", 1).replace("1,2,1", "1,2,"))
+    with pytest.raises(RecordFileError, match="'b', row 3: '' is not a number; delete the column, or fill the samples"):
+        read_record(path)
 
 
 def test_labview_channels(tmp_path):
@@ -268,7 +334,8 @@ def test_units_beside_hdf5_data(tmp_path):
             file[name] = values
             file[name].attrs["units"] = unit
     record = read_record(tmp_path / "x.h5")
-    assert record.sample_rate_hz == pytest.approx(1000.0) and record.remarks == ("a: g taken as 9.80665 m/s^2",)
+    assert record.sample_rate_hz == pytest.approx(1000.0)
+    assert record.remarks == ("a: g taken as 9.80665 m/s^2", "b [rpm]: as recorded, as rpm is no known unit")
     assert [(c.name, c.unit) for c in record.output_channels] == [("a", "m/s^2"), ("b [rpm]", "")]
     np.testing.assert_allclose(record.outputs, [[G, 2 * G, 3 * G], [1, 2, 3]])
     with h5py.File(tmp_path / "x.h5", "w") as file:

@@ -93,6 +93,10 @@ def _units(table: dict[str, Any], path: Path) -> Units:
     if missing:
         raise CaseError(f"{where}: {missing[0]} is missing; name all of {', '.join(UNITS)}")
     found = Units(**{name: text(units, name, where) for name in UNITS})
+    try:
+        found.check_known()
+    except ValueError as error:
+        raise CaseError(f"{where}: {error}") from None
     ratio = found.consistency
     if ratio is not None and abs(ratio - 1.0) > 1e-3:
         product = f"{found.mass} {found.length}/{found.time}^2"
@@ -203,7 +207,8 @@ def _check_channels(file: Path, arrays: dict[str, np.ndarray], rig: Rig) -> None
             raise CaseError(f"{file}: channel {channel!r} has shape {values.shape}; t has {n_samples} samples")
         bad = ~np.isfinite(values)
         if bad.any():
-            raise CaseError(f"{file}: channel {channel!r}, sample {int(np.argmax(bad))} is {values[bad][0]}")
+            at = int(np.argmax(bad))
+            raise CaseError(f"{file}: channel {channel!r}, sample {at} is {values[at]}; fill it, or cut the record")
 
 
 def _check_instants(file: Path, t: np.ndarray, sample_time: float, rig: Rig) -> None:

@@ -14,6 +14,7 @@ from workbench.cases.tables import (
     inside,
     number,
     numbers,
+    one_of,
     profile,
     shown,
     table_of,
@@ -40,6 +41,8 @@ STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
 PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio", "edges", "damping_ratio", "modes")
 EDGES = ("left", "right", "bottom", "top")
+ENDS = {"beam": ("hinged", "clamped", "free", "sliding"), "rod": ("fixed", "free")}
+EDGE = ("simply supported", "clamped", "guided", "free")
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
 # Further keys of an input and of an output, for moments, patches and directions, by the kind of structure.
@@ -107,8 +110,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     common: dict[str, Any] = {
         "length": number(table, "length", "[structure]"),
         "mass_per_length": profile(table, "mass_per_length"),
-        "left": text(table, "left", "[structure]"),
-        "right": text(table, "right", "[structure]"),
+        **{side: one_of(table, side, ENDS[kind], "[structure]") for side in ("left", "right")},
         "damping": ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     }
     structure: Structure
@@ -137,7 +139,7 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
         mass_per_area=number(table, "mass_per_area", "[structure]", low=0.0),
         bending_stiffness=number(table, "bending_stiffness", "[structure]", low=0.0),
         poisson_ratio=number(table, "poisson_ratio", "[structure]"),
-        edges={side: text(edges, side, "[structure] edges") for side in EDGES},
+        edges={side: one_of(edges, side, EDGE, "[structure] edges") for side in EDGES},
         damping=ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     )
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=PLATE_TOLERANCE)

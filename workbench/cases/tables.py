@@ -2,7 +2,7 @@
 
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from reprlib import Repr
@@ -14,6 +14,8 @@ MOST_BYTES = 2**24
 MOST_ENTRIES = 1000
 
 _DEEP_KEY = re.compile(r"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
+
+_SINGLE = re.compile(r"^[ \t]*\[[ \t]*(input|output|record)[ \t]*\]", re.MULTILINE)
 
 _REPR = Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
@@ -43,8 +45,16 @@ def table_of(path: Path) -> dict[str, Any]:
         raise
     except RecursionError:
         raise CaseError(f"{path} cannot be read as TOML: its brackets are nested too deeply") from None
-    except (ValueError, OSError) as error:
+    except OSError as error:
         raise CaseError(f"{path} cannot be read as TOML: {error}") from error
+    except ValueError as error:
+        single = _SINGLE.search(text) if isinstance(error, tomllib.TOMLDecodeError) else None
+        remedy = f"; {_brackets(single[1])}" if single else ""
+        raise CaseError(f"{path} cannot be read as TOML: {error}{remedy}") from error
+
+
+def _brackets(key: str) -> str:
+    return f"write [[{key}]], with two brackets, for each {key}"
 
 
 def check_keys(entry: dict[str, Any], allowed: Iterable[str], where: str) -> None:
@@ -68,6 +78,8 @@ def tables(table: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
         CaseError: no entries, too many, or two with the same name.
     """
     entries = table.get(key)
+    if isinstance(entries, dict):
+        raise CaseError(f"{path}: [{key}] has one bracket; {_brackets(key)}")
     if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
         raise CaseError(f"{path}: at least one [[{key}]] is needed")
     if len(entries) > MOST_ENTRIES:
@@ -93,6 +105,18 @@ def text(entry: dict[str, Any], key: str, where: str) -> str:
     value = entry.get(key)
     if not isinstance(value, str) or not value or not value.isprintable() or len(value) > 255:
         raise CaseError(f"{where}: {key} must be a text of up to 255 printable characters; {_got(entry, key)}")
+    return value
+
+
+def one_of(entry: dict[str, Any], key: str, allowed: Sequence[str], where: str) -> str:
+    """The text under `key`, which must be one of those allowed.
+
+    Raises:
+        CaseError: the value is anything else.
+    """
+    value = text(entry, key, where)
+    if value not in allowed:
+        raise CaseError(f"{where}: {key} is one of {', '.join(allowed)}; got {shown(value)}")
     return value
 
 

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from workbench.cases.case import Case, signals_of
+from workbench.cases.nominal import EDGE, ENDS
 from workbench.cases.points import write_points
 from workbench.records.npz_file import write_arrays
 from workbench.records.units import SI
@@ -23,7 +24,6 @@ from workbench.structure.profile import Profile
 from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
 
 POINTS = "points.csv"
-EDGE_NAMES = ("simply supported", "clamped", "guided", "free")
 Support = TypeVar("Support", End, Edge)
 Port = Actuator | Sensor
 
@@ -103,7 +103,7 @@ def _plate(plate: Plate, n_modes: int) -> str:
         length=list(plate.length),
         **{name: float(quantity(0.0, 0.0)) for name, quantity in constants.items()},
         poisson_ratio=plate.poisson_ratio,
-        edges={side: _named(edge, EDGE_NAMES, NAMED_EDGES) for side, edge in plate.edges.items()},
+        edges={side: _named(edge, EDGE, NAMED_EDGES) for side, edge in plate.edges.items()},
         damping_ratio=_damping_ratio(plate),
         modes=n_modes,
     )
@@ -149,7 +149,7 @@ def _profile(profile: Profile, length: float, name: str) -> float | dict[str, li
 
 
 def _end(end: End, beam: bool) -> str:
-    return _named(end, ("hinged", "clamped", "free", "sliding") if beam else ("fixed", "free"), NAMED_ENDS)
+    return _named(end, ENDS["beam" if beam else "rod"], NAMED_ENDS)
 
 
 def _named(support: Support, names: tuple[str, ...], known: Mapping[str, Support]) -> str:

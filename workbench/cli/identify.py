@@ -72,12 +72,17 @@ def identify(
     with reporting("reading") as report:
         read = [
             read_measured(
-                path, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), input_hold=input_hold, limits=limits
+                path,
+                sample_rate_hz=sample_rate_hz,
+                inputs=names_in(inputs),
+                outputs=names_in(outputs),
+                input_hold=input_hold,
+                limits=limits,
             )
             for path in records
         ]
-        if outputs:
-            read = [measured.select_outputs(names_in(outputs)) for measured in read]
+        if input_hold is not None and not any(getattr(measured, "n_inputs", 0) for measured in read):
+            raise ValueError("--input-hold is for records with inputs: name them by --inputs, or leave it out")
         found = identification_report(
             read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz, seconds=seconds, progress=report
         )

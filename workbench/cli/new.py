@@ -28,6 +28,8 @@ def new(
     """
     from workbench.study.templates import new_case, new_study
 
+    if not name.strip():
+        raise ValueError(f"the name of the {what.value} is empty; give one, as in: workbench new {what.value} arm")
     typed = shlex.quote(name)
     if what is What.CASE:
         path = new_case(Path(name))

@@ -163,6 +163,7 @@ def ring_down(
         (
             *notes,
             *drift_notes,
+            *_missing_modes(identified.refined, n_modes),
             *budget.remarks,
             *_undecaying(identified.refined, decays),
             *_ambient_excitation(identified.refined, mode_remarks),
@@ -173,6 +174,16 @@ def ring_down(
             *coloured,
         ),
     )
+
+
+def _missing_modes(refined: Refined, n_modes: int | None) -> list[str]:
+    """A note where there are fewer modes than were asked for."""
+    found = refined.modes.n_modes
+    if n_modes is None or found >= n_modes:
+        return []
+    return [
+        f"{found} of the {n_modes} modes asked for are found: no other decaying oscillation can be told in the records"
+    ]
 
 
 def _cut_to_decay(record: Record, start: float | None) -> tuple[Record, list[str]]:

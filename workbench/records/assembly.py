@@ -16,11 +16,12 @@ import numpy as np
 from workbench.records.instants import UNIFORM, Sampling, even_sampling
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
-from workbench.records.units import SI, Unit, Units, split_unit, unit_named
+from workbench.records.units import SI, Unit, Units, contradiction, split_unit, unit_named, unknown_unit
 from workbench.structure.domain import Between, Patch
 
 KINDS = ("input", "output")
 COMPOUND = {"Between": Between, "Patch": Patch}  # places of several numbers or names
+FILL = "delete the column, or fill the samples"  # the remedy of samples that are not there
 KEY = "crc32"  # of the checksum that detects changes of a file written here
 
 
@@ -74,6 +75,7 @@ def record_of(
     *,
     sample_rate_hz: float | None,
     inputs: Sequence[str],
+    outputs: Sequence[str] = (),
     into: Units = SI,
 ) -> Record:
     """The record of a file's contents.
@@ -83,6 +85,7 @@ def record_of(
         contents: of the file.
         sample_rate_hz: where the file has no time.
         inputs: names of the input signals, where the file does not say.
+        outputs: names of the outputs to read, in their order; all unless given. The others may hold anything.
         into: the units into which stated units are converted.
 
     Raises:
@@ -93,12 +96,6 @@ def record_of(
         raise RecordFileError(f"{path} holds no signals")
     described = Description({}) if header is None else _description(path, header, signals)
     _check_lengths(path, time, signals)
-    for key, values in signals.items():
-        bad = ~np.isfinite(values)
-        if bad.any():
-            at = int(np.argmax(bad))
-            raise RecordFileError(f"{path}, channel {_name(key)!r}, row {row_of(at)}: {values[at]} is not a number")
-    sampling = _sampling(path, contents, described, sample_rate_hz)
     units = _units(path, (key for key in signals if key not in described.channels), into)
     names = {key: split_unit(_name(key))[0] if key in units else _name(key) for key in signals}
     for name in inputs:
@@ -109,6 +106,22 @@ def record_of(
     keys = {kind: [key for key in signals if kinds[key] == kind] for kind in KINDS}
     if not keys["output"]:
         raise RecordFileError(f"{path} holds inputs only; at least one output is needed")
+    if outputs:
+        there = {names[key]: key for key in keys["output"]}
+        missing = [name for name in outputs if name not in there]
+        if missing:
+            raise RecordFileError(f"{path} has no output {missing[0]!r}; it has {', '.join(there)}")
+        keys["output"] = [there[name] for name in outputs]
+        kept = {*keys["input"], *keys["output"]}
+        signals = {key: values for key, values in signals.items() if key in kept}
+    for key, values in signals.items():
+        bad = ~np.isfinite(values)
+        if bad.any():
+            at = int(np.argmax(bad))
+            raise RecordFileError(
+                f"{path}, channel {_name(key)!r}, row {row_of(at)}: {values[at]} is not a number; {FILL}"
+            )
+    sampling = _sampling(path, contents._replace(signals=signals), described, sample_rate_hz)
     rows = {kind: _rows([signals[key] for key in keys[kind]], [units.get(key) for key in keys[kind]], sampling)
             for kind in KINDS}  # fmt: skip
     channels = {
@@ -117,8 +130,15 @@ def record_of(
     }
     written: dict[tuple[str, Unit], list[str]] = {}
     for key, unit in units.items():
+        if key not in signals:
+            continue
         written.setdefault((split_unit(_name(key))[1], unit), []).append(names[key])
     remarks = [unit_remark(", ".join(alike), text, unit) for (text, unit), alike in written.items()]
+    unknown: dict[str, list[str]] = {}
+    for key in signals:
+        if key not in units and key not in described.channels and (text := unknown_unit(_name(key))):
+            unknown.setdefault(text, []).append(names[key])
+    remarks += [f"{', '.join(alike)}: as recorded, as {text} is no known unit" for text, alike in unknown.items()]
     try:
         return Record(
             sample_time=sampling.step,
@@ -208,6 +228,14 @@ def _channel(path: Path, name: str, facts: Mapping[str, Any], unit: Unit | None)
 
 def _units(path: Path, keys: Iterable[str], into: Units) -> dict[str, Unit]:
     """The units at the end of signal names; none for names that would be equal without them."""
+    keys = list(keys)
+    for key in keys:
+        both = contradiction(_name(key))
+        if both is not None:
+            raise RecordFileError(
+                f"{path}, channel {_name(key)!r} states two units, {both[0]} and {both[1]}: leave the one that its"
+                " numbers are in"
+            )
     split = {key: split_unit(_name(key)) for key in keys}
     counts = Counter(base for base, _ in split.values())
     units = {key: unit_named(text) for key, (base, text) in split.items() if text and counts[base] == 1}

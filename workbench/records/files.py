@@ -81,6 +81,7 @@ def read_measured(
     *,
     sample_rate_hz: float | None = None,
     inputs: tuple[str, ...] = (),
+    outputs: tuple[str, ...] = (),
     input_hold: str | None = None,
     limits: Limits = DEFAULT,
     units: Units = SI,
@@ -94,6 +95,7 @@ def read_measured(
 
     Args:
         path, inputs, input_hold, limits, units: as for `read_record`; transfer functions are always in SI.
+        outputs: names of the outputs to read, all unless given; what other channels hold does not matter then.
         sample_rate_hz: where the file itself has no time, or no lines, which are then from zero to the Nyquist
             frequency.
 
@@ -118,8 +120,9 @@ def read_measured(
             raise RecordFileError(
                 f"{path} holds transfer functions, which name no inputs; leave them and their hold out"
             )
-        return transfer_of(path, arrays, sample_rate_hz=sample_rate_hz)
-    record = record_of(path, contents, sample_rate_hz=sample_rate_hz, inputs=inputs, into=units)
+        transfer = transfer_of(path, arrays, sample_rate_hz=sample_rate_hz)
+        return transfer.select_outputs(outputs) if outputs else transfer
+    record = record_of(path, contents, sample_rate_hz=sample_rate_hz, inputs=inputs, outputs=outputs, into=units)
     return record if input_hold is None else replace(record, input_hold=input_hold)
 
 

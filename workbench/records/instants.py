@@ -106,9 +106,28 @@ def even_sampling(
     with np.errstate(over="ignore", invalid="ignore"):  # times near the largest number, whose differences are infinite
         relative = np.nan_to_num(steps / median if median else steps, posinf=1e300, neginf=-1e300)
     row = int(np.argmax(np.abs(relative - 1.0)))
-    raise RecordFileError(
-        f"{path} is not uniformly sampled: row {row_of(row + 1)} comes {steps[row]:g} s after the one before, the"
-        f" others {median:g} s; fill the gap, or cut the record there"
+    raise RecordFileError(f"{path} is not uniformly sampled: {_cause_and_remedy(time, steps, row, row_of)}")
+
+
+def _cause_and_remedy(time: np.ndarray, steps: np.ndarray, worst: int, row_of: Callable[[int], int]) -> str:
+    """What is wrong with instants, of which the `worst` step is the oddest, and the way out."""
+    if not steps.any():
+        return f"all its instants are equal, {time[0]:g} s; write the instants of its samples, or leave the column out"
+    if (steps < 0).all():
+        return f"its instants fall, from {time[0]:g} to {time[-1]:g} s; sort the rows by time"
+    if (steps < 0).any():
+        row, count = int(np.argmax(steps < 0)), int((steps < 0).sum())
+        remedy = "sort the rows by time" + (", or cut the record there if another begins" if count == 1 else "")
+        where = f"row {row_of(row + 1)} is {-steps[row]:g} s before the one above"
+        return f"its instants are out of order: {where}; {remedy}"
+    median = float(np.median(steps))
+    if steps[worst] == 0:
+        count = int((steps == 0).sum())
+        remedy = "remove the doubled row" + (f", and {count - 1} more like it" if count > 1 else "")
+        return f"row {row_of(worst + 1)} has the instant of the one before, {time[worst]:g} s; {remedy}"
+    return (
+        f"row {row_of(worst + 1)} comes {steps[worst]:g} s after the one before, the others {median:g} s; fill the gap,"
+        " or cut the record there"
     )
 
 

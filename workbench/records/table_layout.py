@@ -8,12 +8,13 @@ numbers, except the decimal mark, which the first row with one determines.
 import csv
 import re
 from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE, getincrementaldecoder
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from io import TextIOBase
 from pathlib import Path
 
-from workbench.records.assembly import KEY
+from workbench.records.assembly import FILL, KEY
 from workbench.records.limits import RecordFileError
 from workbench.records.time_stamps import MOMENT, n_stamps
 from workbench.records.units import split_unit, time_factor, unit_named
@@ -209,6 +210,7 @@ def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]
             joined = BETWEEN.sub("", field)
             marked = _is_number(joined, None) or THOUSANDS.fullmatch(joined)
             hint = f" with the decimal mark of this table; {ONE_MARK}" if marked else ""
+            hint = hint if text.strip() else f"; {FILL}"
             raise RecordFileError(f"{path}, channel {name!r}, row {number}: {text!r} is not a number{hint}") from None
     return numbers
 
@@ -251,7 +253,9 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
     else:
         by_name = dict(zip((name for name in names if time_factor(name) is None), channel_units))
         column_units = tuple(by_name.get(name, "") for name in names) if channel_units else ()
-    layout = replace(found, names=_names(path, names), units=column_units, sampling=sampling)
+    as_written = _fields(titles[at][1], found.delimiter, found.trailing)[found.n_front :]
+    names_read = _names(path, names, as_written, found.n_front)
+    layout = replace(found, names=names_read, units=column_units, sampling=sampling)
     for row in rows:
         if row[0] > titles[at][0] and row not in titles:
             check_row(path, layout, *row[:2])
@@ -397,11 +401,27 @@ def _fields(line: str, delimiter: str, trailing: bool) -> list[str]:
     return row[:-1] if trailing and row and not row[-1].strip() else row
 
 
-def _names(path: Path, fields: Sequence[str]) -> tuple[str, ...]:
+def _names(path: Path, fields: Sequence[str], as_written: Sequence[str] = (), n_front: int = 0) -> tuple[str, ...]:
+    """The names of columns, without blanks around them, of which all but the first must differ and not be empty.
+
+    Args:
+        path: of the file, for messages.
+        fields: the names.
+        as_written: the fields of the header line, with their blanks, for messages; those of `names` unless given.
+        n_front: number of columns before the first.
+    """
     names = tuple(name.strip() for name in fields)
     if all(_is_number(name, False) for name in names):
         raise RecordFileError(f"{path}: a header line of names is needed before the numbers")
-    if len(set(names)) != len(names) or not all(names[1:]):  # pandas writes its index without a name
+    twice = next((name for name, count in Counter(names).items() if name and count > 1), None)
+    if twice is not None:
+        first, second, *_ = (i for i, name in enumerate(names) if name == twice)
+        one, other = ((as_written or fields)[i] for i in (first, second))
+        both = f"both called {twice!r}" if one == other else f"called {one!r} and {other!r}, alike but for blanks"
+        raise RecordFileError(
+            f"{path}: columns {first + n_front + 1} and {second + n_front + 1} are {both}; give them names that differ"
+        )
+    if not all(names[1:]):  # pandas writes its index without a name
         shown = ", ".join(map(repr, names[:10])) + (", ..." if len(names) > 10 else "")
         raise RecordFileError(f"{path}: the names of the header must differ and not be empty; got {shown}")
     return names

@@ -21,7 +21,7 @@ class Unit:
 
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
-INCH, POUND_FORCE = 0.0254, 4.4482216152605  # m, N
+INCH, FOOT, POUND_FORCE = 0.0254, 0.3048, 4.4482216152605  # m, m, N
 DEGREE = pi / 180
 
 # By quantity: the SI unit, then names and factors of all its units. Small and capital letters differ: mN is not MN.
@@ -31,16 +31,19 @@ BY_QUANTITY: dict[str, tuple[str, dict[str, float]]] = {
                    "seconde": 1, "secondes": 1, "segundos": 1}),
     "frequency": ("Hz", {"Hz": 1, "hz": 1, "HZ": 1, "kHz": 1e3, "MHz": 1e6, "CPM": 1 / 60, "cpm": 1 / 60}),
     "displacement": ("m", {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "micron": 1e-6, "microns": 1e-6, "nm": 1e-9,
-                           "in": INCH, "inch": INCH, "mil": 1e-3 * INCH, "mils": 1e-3 * INCH, "ft": 12 * INCH}),
-    "velocity": ("m/s", {"m/s": 1, "cm/s": 1e-2, "mm/s": 1e-3, "um/s": 1e-6, "nm/s": 1e-9, "in/s": INCH, "ips": INCH}),
-    "acceleration": ("m/s^2", {"m/s^2": 1, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "um/s^2": 1e-6, "in/s^2": INCH, "Gal": 1e-2,
+                           "in": INCH, "inch": INCH, "inches": INCH, "mil": 1e-3 * INCH, "mils": 1e-3 * INCH,
+                           "ft": FOOT, "km": 1e3}),
+    "velocity": ("m/s", {"m/s": 1, "cm/s": 1e-2, "mm/s": 1e-3, "um/s": 1e-6, "nm/s": 1e-9, "in/s": INCH, "ips": INCH,
+                         "inch/s": INCH, "mil/s": 1e-3 * INCH, "mils/s": 1e-3 * INCH, "ft/s": FOOT, "km/h": 1 / 3.6}),
+    "acceleration": ("m/s^2", {"m/s^2": 1, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "um/s^2": 1e-6, "nm/s^2": 1e-9,
+                               "in/s^2": INCH, "inch/s^2": INCH, "ft/s^2": FOOT, "Gal": 1e-2,
                                "g": STANDARD_GRAVITY, "G": STANDARD_GRAVITY, "gn": STANDARD_GRAVITY,
                                "mg": 1e-3 * STANDARD_GRAVITY, "ug": 1e-6 * STANDARD_GRAVITY}),
     "slope": ("rad", {"rad": 1, "mrad": 1e-3, "urad": 1e-6, "deg": DEGREE, "degree": DEGREE, "degrees": DEGREE,
                       "°": DEGREE}),
     "angular velocity": ("rad/s", {"rad/s": 1, "mrad/s": 1e-3, "deg/s": DEGREE, "°/s": DEGREE, "dps": DEGREE}),
-    "force": ("N", {"N": 1, "mN": 1e-3, "uN": 1e-6, "kN": 1e3, "MN": 1e6, "lbf": POUND_FORCE, "lb": POUND_FORCE,
-                    "kgf": STANDARD_GRAVITY}),
+    "force": ("N", {"N": 1, "mN": 1e-3, "uN": 1e-6, "nN": 1e-9, "kN": 1e3, "MN": 1e6, "lbf": POUND_FORCE,
+                    "lb": POUND_FORCE, "kgf": STANDARD_GRAVITY}),
     "moment": ("N m", {"N m": 1, "Nm": 1, "N mm": 1e-3, "Nmm": 1e-3, "mN m": 1e-3, "mNm": 1e-3, "kN m": 1e3,
                        "kNm": 1e3}),
     "voltage": ("V", {"V": 1, "v": 1, "Volt": 1, "Volts": 1, "volt": 1, "volts": 1, "mV": 1e-3, "uV": 1e-6, "kV": 1e3}),
@@ -48,7 +51,9 @@ BY_QUANTITY: dict[str, tuple[str, dict[str, float]]] = {
     "pressure": ("Pa", {"Pa": 1, "kPa": 1e3, "MPa": 1e6, "bar": 1e5}),
     "": ("counts", {"counts": 1, "count": 1, "Counts": 1, "cts": 1, "ADC": 1}),
 }  # fmt: skip
-MASSES = {"kg": 1.0, "g": 1e-3, "t": 1e3, "lb": 0.45359237, "slug": POUND_FORCE / 0.3048}  # kg
+# kg
+MASSES = {"kg": 1.0, "g": 1e-3, "mg": 1e-6, "ug": 1e-9, "ng": 1e-12, "pg": 1e-15, "t": 1e3, "Mg": 1e3,
+          "lb": 0.45359237, "lbm": 0.45359237, "slug": POUND_FORCE / FOOT, "slinch": POUND_FORCE / INCH}  # fmt: skip
 UNITS = {
     name: Unit(float(factor), si, quantity)
     for quantity, (si, names) in BY_QUANTITY.items()
@@ -60,6 +65,12 @@ SPELLINGS = (
     ("µ", "u"), ("μ", "u"), ("²", "^2"), ("**", "^"), ("·", " "), ("*", " "), ("⋅", " "), ("º", "°"),
     ("/sec", "/s"), ("/s/s", "/s^2"), ("/s2", "/s^2"), (" s^-2", "/s^2"), (" s^-1", "/s"), ("/(s^2)", "/s^2"),
 )  # fmt: skip
+# of the motions that are measured most, for messages
+LIKELY = "m/s^2, mm/s^2, in/s^2, ft/s^2, g, m/s, mm/s, in/s, ft/s, m, mm, um, in, ft"
+# Text in brackets that is a unit, if not a known one: with an exponent, as furlong/s^2, or one of these words.
+EXPONENT = re.compile(r"[A-Za-z)](?:\^|\*\*)-?\d|[²³]")
+PER = ("time", "displacement")  # quantities below the stroke of a unit
+FOREIGN = ("rpm", "psi", "ksi", "mph", "kph", "yd", "kip", "dyn", "oz", "mA", "pC", "dB")
 SI_NAME = re.compile(r"\b(m|kg|s|N|Hz|J)(?![^\W²³])")
 POWERS = re.compile(r"(/?)\s*([A-Za-z]+)(?:\^(\d))?")
 BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*((?:[^()]++|\([^()]*+\))*+)\))")
@@ -80,9 +91,13 @@ NUMBERED = re.compile(r"(\S\D*?\S)\s+\d+\b.*")  # one time of several, as catman
 
 def unit_named(text: str) -> Unit | None:
     """The unit with a name, in any usual spelling; None for an unknown one."""
+    return UNITS.get(_our_spelling(text))
+
+
+def _our_spelling(text: str) -> str:
     for spelling, ours in SPELLINGS:
         text = text.replace(spelling, ours)
-    return UNITS.get(" ".join(text.split()))
+    return " ".join(text.split())
 
 
 def split_unit(name: str) -> tuple[str, str]:
@@ -98,6 +113,41 @@ def split_unit(name: str) -> tuple[str, str]:
             if unit_named(text) is not None:
                 return found[1], text
     return name, ""
+
+
+def unknown_unit(name: str) -> str:
+    """What the brackets at the end of a name state as its unit, if that is not a known one; else empty.
+
+    Round brackets may hold any remark, as in `x (left)`: only what looks like a unit is taken for one.
+    """
+    found = BRACKETED.fullmatch(name.strip())
+    if not found or not found[1]:
+        return ""
+    text = (found[2] or found[3] or "").strip()
+    if unit_named(text) is not None or not any(sign.isalpha() for sign in text):
+        return ""
+    return text if found[2] or _is_like_unit(text) else ""
+
+
+def contradiction(name: str) -> tuple[str, str] | None:
+    """Two units at the end of a name that cannot both be right, as in `a [ft/min] [m/s^2]`; None for other names."""
+    base, outer = split_unit(name)
+    found = BRACKETED.fullmatch(base.strip()) if outer else None
+    if found is None:
+        return None
+    inner = (found[2] or found[3] or "").strip()
+    first, second = unit_named(inner), unit_named(outer)
+    if first is None or second is None:
+        return (inner, outer) if _is_like_unit(inner) else None
+    # in round brackets one letter may be a direction or a place: `Acc (N) [g]`
+    alike = found[2] is not None or _is_like_unit(inner) or first.quantity == second.quantity
+    return (inner, outer) if alike and first != second else None
+
+
+def _is_like_unit(text: str) -> bool:
+    _, slash, below = text.rpartition("/")
+    per = unit_named(below.strip(" ()").rstrip("0123456789")) if slash else None
+    return text in FOREIGN or bool(EXPONENT.search(text)) or (per is not None and per.quantity in PER)
 
 
 def time_factor(name: str) -> float | None:
@@ -120,6 +170,9 @@ def time_base(name: str) -> str:
     numbered = NUMBERED.fullmatch(base)
     base = (underscore[1] if underscore else numbered[1] if numbered else base).lower()
     return base if base in TIME or base in TIME_AS_UNIT else ""
+
+
+NAMED_BY = {"length": "displacement", "time": "time", "force": "force"}  # names of `Units` but mass, by quantity
 
 
 @dataclass(frozen=True)
@@ -156,10 +209,23 @@ class Units:
     def consistency(self) -> float | None:
         """A force of mass · length / time² in the unit of force; None where a name's factor to SI is not known."""
         units = [unit_named(name) for name in (self.length, self.time, self.force)]
-        if self.mass not in MASSES or not all(units):
+        mass = MASSES.get(_our_spelling(self.mass))
+        if mass is None or not all(units):
             return None
         length, time, force = (unit.factor for unit in units if unit)
-        return MASSES[self.mass] * length / time**2 / force
+        return mass * length / time**2 / force
+
+    def check_known(self) -> None:
+        """Refuse a name whose factor to SI is not known, or that is of another quantity.
+
+        Raises:
+            ValueError: naming what it is of, the name, and the known ones.
+        """
+        names = {what: BY_QUANTITY[quantity][1] for what, quantity in NAMED_BY.items()}
+        for what, known in (*names.items(), ("mass", MASSES)):
+            name = getattr(self, what)
+            if _our_spelling(name) not in known:
+                raise ValueError(f"{what} = {name!r:.60} is not known; name one of {', '.join(known)}")
 
     def _by_si(self) -> dict[str, str]:
         hertz = "Hz" if self.time == "s" else f"1/{self.time}"

@@ -7,7 +7,7 @@ import pytest
 
 from workbench.identification.free_decay.order import identify
 from workbench.identification.signal import data_quality
-from workbench.identification.signal.data_quality import check_data_quality, data_faults, steps
+from workbench.identification.signal.data_quality import check_data_quality, data_faults, of_same_sensors, steps
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -94,6 +94,13 @@ def test_an_output_of_no_quantity_among_accelerations(sound):
         check_data_quality(replace(sound, output_channels=channels))
 
 
+def test_an_output_of_an_unknown_unit_among_accelerations(sound):
+    channels = (*sound.output_channels[:3], Channel("y4 [furlong/s^2]"))
+    found = only(replace(sound, output_channels=channels))
+    assert found.kind == "unstated" and "states the unit furlong/s^2, which is not known" in found.message
+    assert "known unit, one of m/s^2, " in found.message and "[m/s^2]'" not in found.message
+
+
 def driven(sound, force):
     return replace(sound, inputs=force[None], input_channels=(Channel("F", "force"),))
 
@@ -154,6 +161,16 @@ def test_a_record_given_twice_is_refused(sound):
     """Its errors would be too small by the root of two."""
     with pytest.raises(ValueError, match="'one' and 'again' hold the same measurement"):
         identify([replace(sound, name="one"), replace(sound, name="again")])
+
+
+def test_a_measurement_given_again_in_other_units_or_digits_is_refused(sound):
+    """Read back from six digits, or from numbers in g, it differs in the last ones."""
+    digits = np.vectorize(lambda value: float(f"{value:.6g}"))
+    again = replace(sound, name="again", outputs=digits(sound.outputs / 9.80665) * 9.80665)
+    with pytest.raises(ValueError, match="hold the same measurement, which would count twice: give it once"):
+        of_same_sensors([sound, again])
+    noise = 1e-4 * sound.outputs.std() * np.random.default_rng(0).standard_normal(sound.outputs.shape)
+    assert len(of_same_sensors([sound, replace(sound, outputs=sound.outputs + noise)])) == 2
 
 
 def test_the_step_of_a_rounded_output_is_read_from_it(sound):

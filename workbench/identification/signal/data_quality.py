@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.records.record import Record, as_records
+from workbench.records.units import LIKELY, unknown_unit
 from workbench.rig.sensors import MEASURED
 
 
@@ -34,6 +35,7 @@ class DataSettings:
     about: int = 32  # samples on either side of a dropout, which show the motion there
     straight: float = 1e-9  # rounding deviation of samples from a straight line, relative to the output's range
     moves: float = 100.0  # least motion from sample to sample there, in resolutions of the output
+    same: float = 1e-5  # rms difference of one measurement written twice, to six digits or more, over its rms
     block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
 
 
@@ -151,13 +153,20 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
             )
     for i, record in enumerate(records):
         for other in records[:i]:
-            alike = other.input_names == record.input_names and np.array_equal(other.outputs, record.outputs)
-            if alike and np.array_equal(other.inputs, record.inputs):
+            alike = other.input_names == record.input_names and _are_same(other.outputs, record.outputs)
+            if alike and _are_same(other.inputs, record.inputs):
                 raise ValueError(
                     f"records {other.name!r} and {record.name!r} hold the same measurement, which would count twice:"
                     " give it once"
                 )
     return records
+
+
+def _are_same(rows: np.ndarray, others: np.ndarray) -> bool:
+    """Whether signals (n_signals, n_samples) are the same to the digits that a file may have of them."""
+    if rows.shape != others.shape:
+        return False
+    return all(np.linalg.norm(row - other) <= DATA.same * np.linalg.norm(row) for row, other in zip(rows, others))
 
 
 def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
@@ -348,10 +357,16 @@ def _unstated(record: Record, alive: list[int]) -> Iterator[DataFault]:
     moving = [channel for channel in channels if channel.quantity in MEASURED]
     for channel in channels:
         if moving and not channel.quantity:
+            unit = unknown_unit(channel.name)
+            stated = f"states the unit {unit}, which is not known" if unit else "states no quantity"
+            remedy = (
+                f"write its numbers in a known unit, one of {LIKELY}"
+                if unit
+                else f"state its unit in the file, as in '{channel.name} [m/s^2]'"
+            )
             yield DataFault(
                 "unstated",
                 (channel.name,),
-                f"output {channel.name!r} states no quantity, and {moving[0].name!r} measures {moving[0].quantity}: it"
-                f" would be taken for a displacement; state its unit in the file, as in '{channel.name} [m/s^2]', or"
-                " leave it out",
+                f"output {channel.name!r} {stated}, and {moving[0].name!r} measures {moving[0].quantity}: it would be"
+                f" taken for a displacement; {remedy}, or leave it out",
             )
