@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workbench.cases.case import Case, CaseError, files_of, read_case, read_rig, read_units
+from workbench.cases.case import Case, CaseError, files_of, read_case, read_units
+from workbench.cases.nominal import read_rig
 from workbench.cases.writing import write_case
 from workbench.records.files import read_record
 from workbench.records.limits import RecordFileError
