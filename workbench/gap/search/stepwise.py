@@ -33,6 +33,7 @@ from workbench.gap.search.jointly import (
     size_of,
     with_all_groups,
     with_input_noise,
+    with_reading_sides,
 )
 from workbench.gap.search.plain import (
     NO_UNIFORM_ERROR,
@@ -240,25 +241,28 @@ class Stepwise:
     def by_almost_alone(self, singles: Sequence[Fit]) -> bool:
         """Whether one effect closes nearly all of the gap alone, and the rest with nominal errors; it is then a step.
 
-        Tried only if nominal errors alone explain the records but are implausible. With the effect they may be as
-        large: those of a few modes of an identified rig make up for its missing modes. One effect then replaces errors
-        of all the other modes.
+        Tried only if nominal errors alone are implausible, and explain the records or leave more than the effect alone
+        does. With the effect they may be as large: those of a few modes of an identified rig make up for its missing
+        modes. One effect then replaces errors of all the other modes.
 
         Args:
             singles: fitted to whole records without nominal errors, best first.
         """
-        if self.has_plausible_errors or self.last.effects or not (singles and self.is_noise_only):
+        if self.has_plausible_errors or self.last.effects or not singles:
             return False
         search, best = self.search, singles[0]
+        if not (self.is_noise_only or best.cost < self.last.fit.cost):
+            return False
         if not search.near(best, STEPWISE.almost) or any(effect.kind in UNIFORM for effect in best.effects):
             return False
-        found = fit_jointly(search, best.effects, nominal_errors(search.rig, search.prior), until_convergence=True)
+        errors = with_reading_sides(search, nominal_errors(search.rig, search.prior), best.effects)
+        found = fit_jointly(search, best.effects, errors, until_convergence=True)
         if may_be_port_errors(self.search, found) or not (
             found.explains and self._are_noticeable(found.effects, found.fit.effects)
         ):
             return False
         self.steps.append(found)
-        self.is_run = True  # errors as large as these absorb the effect at any other place too
+        self.is_run = not found.is_plausible  # errors that are large absorb the effect at any other place too
         return True
 
     def run(self, most: int = STEPWISE.most) -> None:
@@ -505,27 +509,32 @@ class Stepwise:
         """The step with its one nonlinear law replaced by another at the same place, if that removes enough.
 
         The first effect is searched beside nominal errors that have absorbed part of it, and where those are far off, a
-        wrong law at the right place may be the best. Now that the errors are nearly known, the laws compare.
+        wrong law at the right place may be the best. Now that the errors are nearly known, the laws compare. More
+        general laws, of which this one is a limiting case, compete with two effects (`_with_one_more`).
         """
         if len(step.effects) != 1 or not step.effects[0].kind.nonlinear or step.effects[0].at is None or step.explains:
             return None
-        (effect,), domain = step.effects, self.search.rig.modes.domain
-        self.search.report("another law at the same place", 0.6)
-        with_errors = self.search.with_nominal_errors(step.errors)
-        laws = [kind for kind in self.search.catalogue if kind.nonlinear and kind is not effect.kind]
-        with_errors = replace(with_errors, catalogue=tuple(laws))
-        rig = apply_all(self.search.rig, (step.errors,))
-        evidence = Evidence.of(rig, self.search.data, workers=self.search.workers, absorbed=True)
-        ahead = one_more(with_errors, (), evidence.of_force_at(effect.at))
-        there = [f for f in ahead if f.effects[0].at is not None and not apart(f.effects[0], effect, domain)]
+        (effect,), search = step.effects, self.search
+        search.report("another law at the same place", 0.6)
+        laws = tuple(kind for kind in search.catalogue if kind.nonlinear and kind is not effect.kind)
+        with_errors = replace(search.with_nominal_errors(step.errors), catalogue=laws)
+        evidence = Evidence.of(
+            apply_all(search.rig, (step.errors,)), search.data, workers=search.workers, absorbed=True
+        ).of_force_at(effect.at)
+        key, domain = key_of(step.effects), search.rig.modes.domain
+        there = [
+            f
+            for f in one_more(with_errors, (), evidence)
+            if f.effects[0].at is not None
+            and not apart(f.effects[0], effect, domain)
+            and key not in contained(f.effects, search.rig)
+        ]
         present = fitted_ahead(with_errors, [step.effects])
         cost_limit = min((f.cost for f in present), default=np.inf)
         likeliest = [f for f in best_of_each_kind(there) if f.cost < cost_limit][: STEPWISE.finalists]
-        others = self.search.workers.map(
-            lambda f: fit_jointly(self.search, f.effects, step.errors, rounds=2), likeliest
-        )
-        best = min(others, key=partial(loss, self.search), default=None)
-        return best if best is not None and self._is_accepted(best, step) else None
+        others = search.workers.map(lambda f: fit_jointly(search, f.effects, step.errors, rounds=2), likeliest)
+        best, *rest = sorted((step, *others), key=partial(loss, search))
+        return replace(best, others=(best, *rest)) if best is not step and self._is_accepted(best, step) else None
 
     def _with_an_absorbed(self, step: Step) -> Step | None:
         """The step with one linear effect more that makes its implausible nominal errors much smaller, or None.
