@@ -163,6 +163,13 @@ def test_a_record_given_twice_is_refused(sound):
         identify([replace(sound, name="one"), replace(sound, name="again")])
 
 
+def test_two_measurements_on_one_large_offset_are_two(sound):
+    """As of accelerometers that measure gravity too: the motion counts, not the offset."""
+    offset = 1e6 * sound.outputs.std()
+    up, down = (replace(sound, name=str(sign), outputs=offset + sign * sound.outputs) for sign in (1, -1))
+    assert of_same_sensors([up, down]) == [up, down]
+
+
 def test_a_measurement_given_again_in_other_units_or_digits_is_refused(sound):
     """Read back from six digits, or from numbers in g, it differs in the last ones."""
     digits = np.vectorize(lambda value: float(f"{value:.6g}"))

@@ -163,10 +163,10 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
 
 
 def _are_same(rows: np.ndarray, others: np.ndarray) -> bool:
-    """Whether signals (n_signals, n_samples) are the same to the digits that a file may have of them."""
+    """Whether signals (n_signals, n_samples) are the same to the digits that a file may have of their motion."""
     if rows.shape != others.shape:
         return False
-    return all(np.linalg.norm(row - other) <= DATA.same * np.linalg.norm(row) for row, other in zip(rows, others))
+    return bool((np.sqrt(((rows - others) ** 2).mean(axis=1)) <= DATA.same * rows.std(axis=1)).all())
 
 
 def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
