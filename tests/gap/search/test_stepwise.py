@@ -224,6 +224,7 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (20270165, "input", 2.0, ("point_mass",)),  # errors common to all did
         (20270117, "offset", 0.5, ("sensor_delay",)),  # told as sensors that are late beside common errors
         (75100003, "shape", 1.0, ("local_stiffness_loss",)),  # errors bent to it, and left a mass the rest
+        (20360306, "gain", 0.5, ("sensor_delay",)),  # beside it errors ended far off, and it was unknown
         (75200003, "mixed", 1.0, ("local_stiffness_loss",)),  # errors that were longer to say stood for it
         (75400014, "mixed", 1.0, ("point_mass",)),  # likewise
         (75400010, "mixed", 1.0, ("local_stiffness_loss",)),  # likewise, beside noise of the inputs
