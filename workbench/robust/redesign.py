@@ -168,12 +168,8 @@ def _silent(controller: DigitalController) -> DigitalController:
 
 
 def _notes(uncertain: UncertainRig, rig: Rig, draws: int, *, as_wanted: bool) -> tuple[str, ...]:
-    """Remarks on few draws, the criterion, where it is not the wanted one, hysteresis, and alternative sets."""
+    """Remarks on the criterion, where it is not the wanted one, hysteresis, alternative sets, and few draws."""
     notes = []
-    if draws < LEAST_DRAWS:
-        notes.append(
-            f"The intervals are the range of {draws} draws, not of 95 %, which need {LEAST_DRAWS} draws or more."
-        )
     if not as_wanted:
         notes.append(
             "Even with perfect actuators and sensors the controlled modes do not settle within the test, so the"
@@ -184,4 +180,8 @@ def _notes(uncertain: UncertainRig, rig: Rig, draws: int, *, as_wanted: bool) ->
     if uncertain.alternatives:
         share = sum(p for _, p in uncertain.alternatives)
         notes.append(f"{100 * share:.0f} % of the draws are of other sets of effects that the records do not exclude.")
+    if draws < LEAST_DRAWS:
+        notes.append(
+            f"The intervals are the range of {draws} draws, not of 95 %, which need {LEAST_DRAWS} draws or more."
+        )
     return tuple(notes)
