@@ -8,7 +8,7 @@ import pytest
 
 from workbench.gap.diagnose import _leaves_unexplained, _note_of_residual, _outcome, diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
-from workbench.gap.effects.effect import Effect, Kind, Parameter, place_parameters
+from workbench.gap.effects.effect import Effect, Kind, Parameter, apply_all, place_parameters
 from workbench.gap.effects.nonlinear import with_element
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.budget import Budget, Shrinkage
@@ -283,6 +283,26 @@ def test_a_fault_of_a_record_held_out_is_not_called_over_fitting(hinged_rig, rec
     verdict = diagnose(rig, [fitted], validation=[crossed], catalogue=(kind_named("actuator_gain"),), workers=1)
     assert verdict.outcome == "part" and "exchanged" in verdict.notes[0]
     assert not any("over-fitting" in note for note in verdict.notes)
+
+
+def test_wires_that_are_surely_exchanged_are_put_right_before_the_search(hinged_rig, record_of):
+    """An effect of a sensor is told of the sensor itself, not of the channel that it was read from."""
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    gain = Effect(kind_named("sensor_gain"), rig.sensors[0].name, {"gain": 1.3})
+    exchange = Effect(kind_named("swapped_outputs"), (rig.sensors[0].name, rig.sensors[2].name), {})
+    real = apply_all(rig, (gain, exchange))
+    commands = [level * np.repeat(rng.normal(size=40), 10)[None] for level in (0.3, 1.0)]
+    fitted, kept = (record_of(real, command, rng, name=f"r{i}") for i, command in enumerate(commands))
+    both = (gain.kind, exchange.kind)
+    verdict = diagnose(rig, fitted, validation=kept, catalogue=both, workers=1)
+    assert verdict.outcome == "explained" and [e.label for e in verdict.effects] == [gain.label, exchange.label]
+    assert verdict.effects[0].values["gain"] == pytest.approx(1.3, rel=1e-3)
+    assert verdict.shrinkage.overall > 0.95 and sum(verdict.budget.effects.values()) > 0.95
+    assert [f.effects[0].kind for f in verdict.attribution.tried] == [gain.kind]  # the exchange was not searched for
+    one = diagnose(rig, fitted, validation=replace(kept, outputs=kept.outputs[[2, 1, 0, 3]]), catalogue=both, workers=1)
+    assert exchange.kind in {f.effects[0].kind for f in one.attribution.tried}  # not in every record, so it is
+    without = diagnose(rig, fitted, validation=kept, catalogue=(gain.kind,), workers=1)
+    assert exchange.kind not in {e.kind for e in without.effects}
 
 
 @pytest.mark.parametrize("settle", [-1.0, 1e6, np.nan])

@@ -14,6 +14,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior, deviations_of
 from workbench.gap.effects.nonlinear import any_beyond
+from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import Where, locate, locate_force
 from workbench.gap.prediction.noise import LOGGED, noise_guessed
 from workbench.gap.prediction.residuals import lead_of
@@ -41,7 +42,7 @@ from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.gap.search.finish import with_equals
 from workbench.gap.search.jointly import too_large
 from workbench.gap.search.settings import JOINT
-from workbench.gap.setup.faults import setup_faults
+from workbench.gap.setup.faults import exchanges, setup_faults
 from workbench.gap.setup.records import check_disjoint, data_faults
 from workbench.records.record import Record, as_records
 from workbench.records.units import SI, Units
@@ -143,16 +144,21 @@ def diagnose(
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
     faults = setup_faults(rig, records, validation, settle=settle)
     progress("locating the unmodelled force", 0.02)
-    seen, nominal, evidence = baseline(
-        rig, records, settle=settle, guessed=without_noise, workers=sharing, deadline=deadline
+    exchanged = tuple(e for e in exchanges(faults, (*records, *validation)) if e.kind in catalogue)
+    wired = apply_all(rig, exchanged)
+    seen, as_wired, evidence = baseline(
+        wired, records, settle=settle, guessed=without_noise, workers=sharing, deadline=deadline
     )
+    nominal, given = as_wired, (*exchanged, *seen)
+    if exchanged:
+        nominal = replace(Evidence.of(rig, as_wired.data, workers=sharing), given_size=evidence.size)
     with (
-        sharing.in_background(lambda: locate_force(nominal.without(_faulty(seen)))) as place,
+        sharing.in_background(lambda: locate_force(nominal.without(_faulty(given)))) as place,
         sharing.in_background(lambda: detectability(nominal, catalogue=catalogue)) as ready,
     ):
         attribution = attribute(
             seen,
-            nominal,
+            as_wired,
             evidence,
             catalogue=catalogue,
             report=progress,
@@ -165,7 +171,9 @@ def diagnose(
             alike, search = ready().indistinguishable, replace(attribution.search, data=attribution.weighed)
             rivals = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
             attribution = replace(attribution, alternatives=rivals)
-        attribution = _validated(rig, attribution, validation, settle)
+        attribution = _validated(wired, attribution, validation, settle)
+        if exchanged:
+            attribution = attribution.with_exchanges(exchanged, nominal)
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)
         accounted = with_held_out(rig, attribution.best.effects, validation, settle=settle)
@@ -178,7 +186,7 @@ def diagnose(
         named = tuple(e for e in accounted if e is not errors)
         effects = named if outcome in ("none", "explained") else ()
         faulty = _faulty(attribution.best.effects)
-        as_seen = faulty == _faulty(seen)
+        as_given = faulty == _faulty(given)
         budget_for = partial(
             budget_of,
             rig,
@@ -196,7 +204,7 @@ def diagnose(
         is_settled = outcome in ("none", "explained")
         in_records = () if is_settled else data_faults(rig, records, settle=settle)
         in_validation = () if is_settled else data_faults(rig, validation, settle=settle)
-        where = locate(nominal, effects, place() if as_seen else locate_force(nominal.without(faulty)))
+        where = locate(nominal, effects, place() if as_given else locate_force(nominal.without(faulty)))
         of_setup = any(record.name in fault.records for fault in faults for record in validation)
         return Verdict(
             case=name,

@@ -98,6 +98,26 @@ class Attribution:
         best = replace(best, effects=(*self.seen, *best.effects))
         return replace(self, best=best, noise=noise_of(search, best))
 
+    def with_exchanges(self, exchanges: tuple[Effect, ...], nominal: Evidence) -> "Attribution":
+        """The attribution to the nominal rig, of one to that rig with channels exchanged.
+
+        Args:
+            exchanges: of two channels each.
+            nominal: evidence of the rig without them.
+        """
+
+        def with_them(found: Fit) -> Fit:
+            return replace(found, effects=exchanged_last((*exchanges, *found.effects)))
+
+        return replace(
+            self,
+            outcome="explained" if self.outcome == "none" else self.outcome,
+            best=with_them(self.best),
+            alternatives=tuple((with_them(found), probability) for found, probability in self.alternatives),
+            nominal_cost=cost_of(nominal.rig, (), nominal.data),
+            evidence=nominal,
+        )
+
     @cached_property
     def singles(self) -> tuple[Fit, ...]:
         """The best effect of each likely kind alone, on whole records, best first; missing ones are fitted now."""

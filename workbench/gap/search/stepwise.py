@@ -498,12 +498,11 @@ class Stepwise:
         self.search.report("the same effect at other places", 0.6)
         places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
         here, *others = fitted_to_quick(self.search, [(effect,), *places], step)
-        near = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
-        best = min(near, key=lambda s: s.fit.cost, default=None)
-        if best is None or best.fit.cost > STEPWISE.near * here.fit.cost:
-            return None
-        found = fitted_to_all(self.search, best)
-        return found if loss(self.search, found) < loss(self.search, step) else None
+        elsewhere = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
+        near = sorted((s for s in elsewhere if s.fit.cost < STEPWISE.near * here.fit.cost), key=lambda s: s.fit.cost)
+        whole = self._to_all(near[: STEPWISE.finalists])
+        best = min(whole, key=partial(loss, self.search), default=step)
+        return best if loss(self.search, best) < loss(self.search, step) else None
 
     def _with_another_law(self, step: Step) -> Step | None:
         """The step with its one nonlinear law replaced by another at the same place, if that removes enough.

@@ -224,7 +224,7 @@ def _fault(gap: Comparison, kind: str, value: Any, at: Sequence[int], certain: b
     """The fault of some channels; kind, value, at: as of `Candidate`."""
     rig = gap.rig
     names = [(rig.actuators if "inputs" in kind else rig.sensors)[c].name for c in at]
-    fault_kind, fault_records = kind, gap.record_names
+    fault_kind, fault_records, pair = kind, gap.record_names, ()
     if kind == "outputs":
         sentence = sentence_of_outputs(rig.sensors, at, value, None if certain else gap.gains[list(at)] / value - 1.0)
         correction = partial(outputs_times, dict.fromkeys(names, 1.0 / value))
@@ -237,15 +237,16 @@ def _fault(gap: Comparison, kind: str, value: Any, at: Sequence[int], certain: b
         sentence = f'{what}: state the quantity "{true}".'
         correction, fault_records = partial(quantity_set, frozenset(names), true), ()
     else:
-        sentence = f"The {kind.split()[1]} {' and '.join(value)} are exchanged: swap them."
-        correction = partial(exchanged, kind.split()[1], *value)
+        pair = value
+        sentence = f"The {kind.split()[1]} {' and '.join(pair)} are exchanged: swap them."
+        correction = partial(exchanged, kind.split()[1], *pair)
     if kind in ("outputs", "inputs"):
         fault_kind = "sign" if value == -1.0 else "unit"
     factor = value if fault_kind == "unit" else 1.0
     outputs = np.flatnonzero(gap.wide) if "inputs" in kind else list(at)
     after, before = (np.maximum(each.before - each.noise, 0.0)[outputs] for each in (gap.corrected(correction), gap))
     closes = float(np.median(1.0 - after / np.maximum(before, 1e-300)))  # of the power beyond the noise
-    return SetupFault(fault_kind, sentence, closes, correction, certain, fault_records, factor)
+    return SetupFault(fault_kind, sentence, closes, correction, certain, fault_records, factor, pair)
 
 
 def scaled_inputs(gap: Comparison) -> list[SetupFault]:

@@ -46,6 +46,7 @@ class SetupFault:
         correction: (rig, records) -> (rig, records) without the fault.
         records: names of the records that have the fault; empty if it is of the rig, or of a channel in every record.
         factor: of units, by which measured and predicted signals differ; 1 for any other fault.
+        pair: names of the two channels that are exchanged; empty for any other fault.
         certain: False for a factor of units if a gain near it explains far more (an error of calibration), or if the
             gain varies between records (an amplifier that saturates). Such a fault is reported and not corrected.
     """
@@ -57,6 +58,7 @@ class SetupFault:
     certain: bool = True
     records: tuple[str, ...] = ()
     factor: float = 1.0
+    pair: tuple[str, ...] = ()
 
 
 def without_faults(faults: Iterable[SetupFault], rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:

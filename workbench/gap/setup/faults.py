@@ -1,11 +1,13 @@
 """Faults of the test set-up, detected before any effect is tried: of wiring, of units and of bookkeeping."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from workbench.gap.effects.effect import Effect
+from workbench.gap.effects.ports import SWAPPED_INPUTS, SWAPPED_OUTPUTS
 from workbench.gap.setup.channels import (
     channel_faults,
     largest_difference,
@@ -81,6 +83,17 @@ def setup_faults(
             if fault.certain and fault.closes >= CLOSED and _is_of_one_record(fault, gap, others)
         ]
     return tuple(found)
+
+
+def exchanges(faults: Iterable[SetupFault], records: Sequence[Record]) -> tuple[Effect, ...]:
+    """The exchanges of two channels that all of these records surely have, as effects."""
+    names = {record.name for record in records}
+    kinds = {"exchanged inputs": SWAPPED_INPUTS, "exchanged outputs": SWAPPED_OUTPUTS}
+    return tuple(
+        Effect(kinds[fault.kind], fault.pair, {})
+        for fault in faults
+        if fault.pair and fault.certain and names <= set(fault.records or names)
+    )
 
 
 def _in_rounds(gap: Comparison, detectors: Sequence[Detector]) -> list[SetupFault]:
