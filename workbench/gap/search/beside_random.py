@@ -13,7 +13,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
 from workbench.gap.search.finish import finished, plainest, ranked, simplest
-from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of
 from workbench.gap.search.jointly import Step, fit_jointly
 from workbench.gap.search.screening import on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, best_of_each_kind
@@ -48,27 +48,36 @@ def _rms_above(frequency: float, force: Floats, sample_time: float) -> float:
 
 
 def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:
-    """The decision for a random disturbance, alone or with one effect, and all fits that were tried.
+    """The decision for a random disturbance, alone or with a few effects, and all fits that were tried.
 
-    The decision is None if the whitened residual is not white, or if an effect explains the records without a random
-    disturbance, which over-fits easily.
+    Effects are added one by one as long as the whitened residual is not white. The decision is None if it never is, or
+    if the effects explain the records without a random disturbance, which over-fits easily.
     """
     search, evidence = _without_clipped(search, (), evidence)
     evidence = _with_laws_on_measured_motion(search, evidence)
     if not looks_random(evidence):
         return None, []
-    alone = fitted_with_random(search, _fit_without_effects(search), evidence)
-    if not search.near(alone[0], RANDOM.near) or alone[1].tonal > TONAL:
+    best = fitted_with_random(search, _fit_without_effects(search), evidence)
+    if not search.near(best[0], RANDOM.near) or best[1].tonal > TONAL:
         return None, []
-    whitened = search.through(
-        model_filter(evidence.model, search.rig, alone[1]), _observer(search, search.rig, alone[1])
-    )
-    search.report("effects with a random disturbance", 0.2)
-    gaining = whitened.side_by_side(simplest, _improving_singles(search, whitened, evidence)[: RANDOM.tried])
-    if any(search.explains(finished(search, single)) for single in gaining):
-        return None, []
-    tried = [alone, *(fitted_with_random(search, single) for single in gaining)]
-    found = _best_decision(search, tried)
+    tried, found = [best], None
+    for _ in range(RANDOM.beside):
+        *given, _force = best[0].effects
+        search.report("effects with a random disturbance", 0.2)
+        whitened = search.through(
+            model_filter(evidence.model, evidence.rig, best[1]), _observer(search, evidence.rig, best[1])
+        )
+        improving = _improving(search, whitened, tuple(given), evidence)
+        gaining = whitened.side_by_side(simplest, improving[: RANDOM.tried])
+        if any(search.explains(finished(search, candidate)) for candidate in gaining):
+            return None, []
+        with_one_more = [fitted_with_random(search, candidate) for candidate in gaining]
+        tried += with_one_more
+        found = _best_decision(search, tried)
+        if found is not None or not with_one_more or search.is_over:
+            break
+        best = min(with_one_more, key=lambda each: each[1].cost)
+        evidence = _evidence_with(search, best[0].effects[:-1])
     return found, [each[0] for each in tried]
 
 
@@ -98,7 +107,7 @@ def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = Tru
         step: effects and nominal errors to start from, fitted without the force.
         surely: require that the force at the start looks random already.
     """
-    evidence = _evidence_with(search, step.fit)
+    evidence = _evidence_with(search, step.fit.effects)
     if surely and not looks_random(evidence):
         return None
     found, random = _random_given(search, step.fit, evidence)
@@ -108,7 +117,7 @@ def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = Tru
             model_filter(evidence.model, evidence.rig, random), _observer(search, search.rig, random)
         )
         step = fit_jointly(whitened, step.effects, step.errors)
-        evidence = _evidence_with(search, step.fit)
+        evidence = _evidence_with(search, step.fit.effects)
         found, random = _random_given(search, step.fit, evidence)
         if random.cost > (1.0 - RANDOM.settled) * before:
             break
@@ -119,38 +128,39 @@ def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = Tru
     return Decision("explained", found, random) if holds else None
 
 
-def _evidence_with(search: Search, given: Fit) -> Evidence:
+def _evidence_with(search: Search, effects: Sequence[Effect]) -> Evidence:
     """Evidence of the rig with the given effects, nonlinear laws acting on the measured motion."""
-    return _with_laws_on_measured_motion(search, search.evidence_of(apply_all(search.rig, given.effects)))
+    return _with_laws_on_measured_motion(search, search.evidence_of(apply_all(search.rig, effects)))
 
 
-def _improving_singles(search: Search, whitened: Search, evidence: Evidence) -> list[Fit]:
-    """Fits of single effects that improve on a random force alone, best first.
+def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[Fit]:
+    """Fits of the given effects and one more that improve on the random force beside the given ones, best first.
 
     The unmodelled force is located where the random one acts, so all laws are tried again at the best effect's place.
 
     Args:
         search: without the whitening filter of the force.
         whitened: the search with it.
-        evidence: of the rig without effects.
+        given: effects.
+        evidence: of the rig with the given effects.
     """
-    cost = cost_of(whitened.rig, (), whitened.data)
+    cost, n_given = cost_of(whitened.rig, given, whitened.data), len(parameters_of(search.rig, given))
 
     def fitted(evidence: Evidence) -> list[Fit]:
-        fits = on_whole_records(whitened, one_more(whitened, (), evidence), RANDOM.finalists)
-        return [f for f in fits if whitened.surely_better(f, cost, f.n_parameters)]
+        fits = on_whole_records(whitened, one_more(whitened, given, evidence), RANDOM.finalists)
+        return [f for f in fits if whitened.surely_better(f, cost, f.n_parameters - n_given)]
 
     found = fitted(evidence)
-    places = [f.effects[0].at for f in found if f.effects[0].at is not None]
+    places = [f.effects[-1].at for f in found if f.effects[-1].at is not None]
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
     rivals = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.rival]
-    return [f for f in rivals if _removes_enough(search, f)]
+    return [f for f in rivals if _removes_enough(search, f, given)]
 
 
-def _removes_enough(search: Search, single: Fit) -> bool:
-    """Whether a single effect removes more of the gap than small errors of gains and places would."""
-    before, after = (cost_of(search.rig, effects, search.data) for effects in ((), single.effects))
+def _removes_enough(search: Search, candidate: Fit, given: Sequence[Effect]) -> bool:
+    """Whether a set removes more of what the given effects leave than small errors of gains and places would."""
+    before, after = (cost_of(search.rig, effects, search.data) for effects in (given, candidate.effects))
     return before - after > STEPWISE.least * before
 
 
@@ -195,17 +205,21 @@ def fitted_with_random(search: Search, given: Fit, evidence: Evidence | None = N
         evidence: of the rig with the given effects, if available.
     """
     if evidence is None:
-        evidence = _evidence_with(search, given)
+        evidence = _evidence_with(search, given.effects)
     found = _random_given(search, given, evidence)
-    if given.effects and not found[1].holds and search.near(found[0], RANDOM.near):
+    for _ in range(RANDOM.turns if given.effects else 0):
+        if found[1].holds or not search.near(found[0], RANDOM.near):
+            break
+        before = found
         observer = _observer(search, evidence.rig, found[1])
         data = search.data.through(model_filter(evidence.model, evidence.rig, found[1]), observer)
         refitted = fit(search.rig, given.effects, data, iterations=8)
         rig = apply_all(search.rig, refitted.effects)
-        again = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
-        evidence = search.evidence_of(rig)
-        evidence = _with_laws_on_measured_motion(search, evidence, observer)
-        found = _random_given(search, again, evidence)
+        given = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
+        evidence = _with_laws_on_measured_motion(search, search.evidence_of(rig), observer)
+        found = _random_given(search, given, evidence)
+        if found[1].cost > (1.0 - RANDOM.settled) * before[1].cost:
+            break
     return found
 
 

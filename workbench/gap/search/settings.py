@@ -109,8 +109,9 @@ class RandomSettings:
     points: int = 4  # named points at which it is tried
     finalists: int = 4  # effects that are fitted to whole records through its whitening filter
     tried: int = 3  # of these, effects that are fitted jointly with it
+    beside: int = 2  # effects that are added one by one beside it, at most
     likeliest_sets: int = 2  # other sets of effects with which a random force is tried
-    turns: int = 4  # alternations between its fit and that of the nominal errors, at most
+    turns: int = 4  # alternations between its fit and that of effects or nominal errors, at most
     settled: float = 0.02  # relative decrease of the cost below which the alternation ends
     # range of the unmodelled force's rms over records, relative: that of forces in the rig follows the input level
     spread: float = 0.5
