@@ -230,6 +230,7 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (75400010, "mixed", 1.0, ("local_stiffness_loss",)),  # likewise, beside noise of the inputs
         (75200007, "offset", 1.0, ("local_stiffness_loss",)),  # a traceback: sensors on the late side of jumps
         (20360210, "triple", 0.5, ("one_sided_stop", "point_damper", "swapped_outputs")),  # two lost to the exchange
+        (20360386, "triple", 1.0, ("axial_load", "clearance", "random_disturbance")),  # two beside a random force
         (881003, "triple", 0.5, ("actuator_dead_zone", "clearance", "ground_spring")),  # told as a cubic spring
         (94290035, "offset", 0.5, ("sensor_lag",)),  # told as a small delay
         (94290030, "place", 2.0, ()),  # told as one sensor that is out of its place, no farther than any other

@@ -43,7 +43,7 @@ class RandomForceSettings:
     # one random force of the surroundings: largest spread of its rms between records, relative; largest deviation of
     # the mean square of the whitened residual from 1; largest share of it that inputs and motion predict
     level_spread: float = 0.15
-    whitened: float = 0.08
+    whitened: float = 0.15
     follows: float = 0.1
 
 

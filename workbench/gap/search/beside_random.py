@@ -50,40 +50,35 @@ def _rms_above(frequency: float, force: Floats, sample_time: float) -> float:
 def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:
     """The decision for a random disturbance, alone or with a few effects, and all fits that were tried.
 
-    Effects are added one by one as long as the whitened residual is not white. The decision is None if it never is, or
-    if the effects explain the records without a random disturbance, which over-fits easily.
+    The decision is None if the whitened residual is never white, or if effects explain the records without a random
+    disturbance, which over-fits easily.
     """
     search, evidence = _without_clipped(search, (), evidence)
     evidence = _with_laws_on_measured_motion(search, evidence)
     if not looks_random(evidence):
         return None, []
-    best = fitted_with_random(search, _fit_without_effects(search), evidence)
-    if not search.near(best[0], RANDOM.near) or best[1].tonal > TONAL:
+    alone = fitted_with_random(search, _fit_without_effects(search), evidence)
+    if not search.near(alone[0], RANDOM.near) or alone[1].tonal > TONAL:
         return None, []
-    tried, found = [best], None
+    tried = [alone]
     for _ in range(RANDOM.beside):
-        *given, _force = best[0].effects
-        search.report("effects with a random disturbance", 0.2)
-        whitened = search.through(
-            model_filter(evidence.model, evidence.rig, best[1]), _observer(search, evidence.rig, best[1])
-        )
-        improving = _improving(search, whitened, tuple(given), evidence)
-        gaining = whitened.side_by_side(simplest, improving[: RANDOM.tried])
-        if any(search.explains(finished(search, candidate)) for candidate in gaining):
+        with_one_more = _with_one_more(search, tried[-1], evidence)
+        if with_one_more is None:
             return None, []
-        with_one_more = [fitted_with_random(search, candidate) for candidate in gaining]
         tried += with_one_more
         found = _best_decision(search, tried)
         if found is not None or not with_one_more or search.is_over:
             break
-        best = min(with_one_more, key=lambda each: each[1].cost)
-        evidence = _evidence_with(search, best[0].effects[:-1])
+        evidence = _evidence_with(search, tried[-1][0].effects[:-1])
     return found, [each[0] for each in tried]
 
 
 def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None:
-    """The decision for a random disturbance with stronger effects, whose residual looks random; None if none holds."""
-    tried = []
+    """The decision for a random disturbance with stronger effects, whose residual looks random; None if none holds.
+
+    If none holds but one is near, a further effect is tried with it.
+    """
+    tried, searches = [], []
     for given in best_of_each_kind(found)[: RANDOM.likeliest_sets]:
         evidence = search.evidence_of(apply_all(search.rig, given.effects))
         unclipped, evidence = _without_clipped(search, given.effects, evidence)
@@ -93,7 +88,37 @@ def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None
                 given, cost_by_channel=unclipped.data.by_channel(unclipped.data.residual(evidence.rig))
             )
             tried.append(fitted_with_random(unclipped, unclipped_fit, evidence))
-    return _best_decision(search, tried)
+            searches.append(unclipped)
+    decision = _best_decision(search, tried)
+    if decision is not None or not tried or search.is_over:
+        return decision
+    best, unclipped = min(zip(tried, searches, strict=True), key=lambda each: each[0][1].cost)
+    if not search.near(best[0], RANDOM.near) or best[1].tonal > TONAL:
+        return None
+    evidence = _evidence_with(unclipped, best[0].effects[:-1])
+    return _best_decision(search, _with_one_more(unclipped, best, evidence) or [])
+
+
+def _with_one_more(
+    search: Search, best: tuple[Fit, RandomForceFit], evidence: Evidence
+) -> list[tuple[Fit, RandomForceFit]] | None:
+    """Fits of one effect more with a random force, highest cost first; None if one explains the records without it.
+
+    Args:
+        search: records and nominal rig.
+        best: effects and a random force, whose whitened residual is not white.
+        evidence: of the rig with these effects.
+    """
+    search.report("effects with a random disturbance", 0.2)
+    (*given, _), random = best[0].effects, best[1]
+    whitened = search.through(
+        model_filter(evidence.model, evidence.rig, random), _observer(search, evidence.rig, random)
+    )
+    gaining = whitened.side_by_side(simplest, _improving(search, whitened, tuple(given), evidence)[: RANDOM.tried])
+    if any(search.explains(finished(search, candidate)) for candidate in gaining):
+        return None
+    found = [fitted_with_random(search, candidate) for candidate in gaining]
+    return sorted(found, key=lambda each: each[1].cost, reverse=True)
 
 
 def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = True) -> Decision | None:
