@@ -82,7 +82,8 @@ class SurfaceSpline:
         domain: the rectangle, m.
         places: (n_places, 2) of the values, m.
         edges: "simply supported", "clamped", "free" or "guided": one for all, or a mapping of left, right, bottom and
-            top. They set the function or its slope to zero; a side that is left out has no condition.
+            top. They set the function or its slope to zero; a side that is left out has no condition. A sensor on an
+            edge that holds the value at zero is not used.
 
     Raises:
         ValueError: fewer values and edge points than the ten of a cubic, two coincident places, a place outside.
@@ -108,7 +109,7 @@ class SurfaceSpline:
             raise ValueError(f"sensors {i + 1} and {j + 1} stand at one place, {self.places[i]} m; keep one of them")
         if np.linalg.matrix_rank(self._polynomials) < len(CUBIC):
             raise ValueError(
-                f"{len(self.places)} sensors and the edges do not determine a cubic over the rectangle, which takes"
+                f"{self._used.sum()} sensors and the edges do not determine a cubic over the rectangle, which takes"
                 f" {len(CUBIC)} values, not on a line: add sensors, or name the edges that hold it"
             )
 
@@ -128,8 +129,19 @@ class SurfaceSpline:
         return conditions
 
     @cached_property
+    def _used(self) -> np.ndarray:
+        """Which places are not on an edge that holds the value at zero, (n_places,)."""
+        assert isinstance(self.edges, Mapping)
+        used = np.ones(len(self.places), bool)
+        for side in (side for side, edge in self.edges.items() if 0 in HELD_BY[edge]):
+            axis, far = divmod(SIDES.index(side), 2)
+            distance = np.abs(self.places[:, axis] - far * self.domain.length[axis])
+            used &= distance > SURFACE.same_place * self.domain.size
+        return used
+
+    @cached_property
     def _functionals(self) -> list[Functional]:
-        return [(self.places, (0, 0)), *self._held]
+        return [(self.places[self._used], (0, 0)), *self._held]
 
     @cached_property
     def _polynomials(self) -> np.ndarray:
@@ -161,7 +173,9 @@ class SurfaceSpline:
         at = np.atleast_2d(at)
         rows = np.hstack([self._covariance(at, derivative), self._cubic(at, derivative)])
         scale = self.domain.size ** -sum(derivative)
-        return np.asarray(scale * (rows @ self._system)[:, : len(self.places)])
+        matrix = np.zeros((len(at), len(self.places)))
+        matrix[:, self._used] = scale * (rows @ self._system)[:, : self._used.sum()]
+        return matrix
 
     def error(self, at: np.ndarray, derivatives: Sequence[tuple[int, int]] = ((0, 0),)) -> np.ndarray:
         """Covariance of the interpolation error for τ² = 1, (n_derivatives n_at, n_derivatives n_at).
@@ -181,7 +195,8 @@ class SurfaceSpline:
 
         By the likelihood of the contrasts orthogonal to all cubics (restricted maximum likelihood).
         """
-        n, size = len(self.places), len(self._polynomials)
+        values, covariance = values[self._used], covariance[np.ix_(self._used, self._used)]
+        n, size = values.size, len(self._polynomials)
         k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
         contrasts = null_space(self._polynomials.T)
         noise = np.zeros((size, size))
