@@ -194,11 +194,19 @@ class SurfaceSpline:
         """Upper confidence limit of τ² of values (n_places,) of known covariance; 0 where they may be noise.
 
         By the likelihood of the contrasts orthogonal to all cubics (restricted maximum likelihood).
+
+        Raises:
+            ValueError: no more values and edge points than the ten of a cubic.
         """
         values, covariance = values[self._used], covariance[np.ix_(self._used, self._used)]
         n, size = values.size, len(self._polynomials)
         k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
         contrasts = null_space(self._polynomials.T)
+        if contrasts.size == 0:
+            raise ValueError(
+                f"{n} sensors determine a cubic over the rectangle and nothing beyond, from which its errors could be"
+                " estimated: add a sensor"
+            )
         noise = np.zeros((size, size))
         noise[:n, :n] = covariance
         scale = float(np.abs(values).max()) ** 2
@@ -289,7 +297,7 @@ def surface_errors(
         length, edges: as `surface_eigenfunctions` takes them.
 
     Raises:
-        ValueError: as `surface_eigenfunctions`.
+        ValueError: as `surface_eigenfunctions` and `SurfaceSpline.roughness`.
     """
     spline, _ = _scaled(found.modes, length, None, edges)
     values = normalised_shapes(found.modes.shapes).real
@@ -324,7 +332,7 @@ def surface_bands(
         seed: of the Monte Carlo samples for the simultaneous band.
 
     Raises:
-        ValueError: a level outside 0..1; as `surface_eigenfunctions`.
+        ValueError: a level outside 0..1; as `surface_eigenfunctions` and `SurfaceSpline.roughness`.
     """
     check_level(level)
     sampled = found.modes
