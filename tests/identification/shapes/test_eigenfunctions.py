@@ -137,6 +137,8 @@ def test_refusals():
         eigenfunctions(SampledModes([1.0], [0.0], [[1.0], [0.5]], [0.5, 0.5]), length=1.0, degree=1)
     with pytest.raises(ValueError, match="has no place"):
         eigenfunctions(SampledModes([1.0], [0.0], [[1.0], [0.5]], [0.5, np.nan]), length=1.0, degree=1)
+    with pytest.raises(ValueError, match="shape of mode 2 is zero at all sensors: leave the mode out"):
+        eigenfunctions(SampledModes([1.0, 2.0], [0.0, 0.0], [[1.0, 0], [0.5, 0]], [0.5, 0.8]), length=1.0, degree=1)
     with pytest.raises(ValueError, match=r"no boundary condition of a .* is called"):
         BoundaryConditions.of("bar", length=1.0, left="clamped")
     hinged = elastic("beam", "hinged", "hinged", 2)

@@ -374,9 +374,12 @@ def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
     """Shapes rotated to be most nearly real, largest entry 1, the first entry of over 0.05 positive.
 
     Raises:
-        ValueError: an entry that is not finite.
+        ValueError: an entry that is not finite, a shape that is zero at all sensors.
     """
     check_finite(shapes)
+    still = ~np.any(shapes, axis=0)
+    if still.any():
+        raise ValueError(f"the shape of mode {int(np.argmax(still)) + 1} is zero at all sensors: leave the mode out")
     rotated = shapes * np.exp(-0.5j * np.angle((shapes**2).sum(axis=0)))
     rotated = rotated / np.abs(rotated).max(axis=0)
     first = np.argmax(np.abs(rotated.real) > 0.05, axis=0)
