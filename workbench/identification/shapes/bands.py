@@ -43,7 +43,7 @@ from workbench.identification.shapes.eigenfunctions import (
     interpolating_spline,
     mass_matrix,
 )
-from workbench.identification.signal.modal_estimates import ShapeEstimates, normalised_shapes
+from workbench.identification.signal.modal_estimates import ShapeEstimates, check_level, normalised_shapes
 from workbench.renamed import Renamed
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed, counted
@@ -264,16 +264,6 @@ class Bands(Printed):
         """Lower and upper limit of the pointwise interval at each place, (n_points, n_modes) each."""
         width = float(ndtri(0.5 * (1.0 + self.level)))
         return self.phi - width * self.std, self.phi + width * self.std
-
-
-def check_level(level: float) -> None:
-    """Refuse a confidence level outside 0..1.
-
-    Raises:
-        ValueError: a level outside 0..1.
-    """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"the level of a confidence band lies between 0 and 1; got {level}")
 
 
 def deviation_and_width(root: np.ndarray, level: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:

@@ -19,8 +19,13 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
 from workbench.arrays import symmetric_root
-from workbench.identification.shapes.bands import BANDS, Bands, check_level, deviation_and_width
-from workbench.identification.signal.modal_estimates import ShapeEstimates, check_placed, normalised_shapes
+from workbench.identification.shapes.bands import BANDS, Bands, deviation_and_width
+from workbench.identification.signal.modal_estimates import (
+    ShapeEstimates,
+    check_level,
+    check_placed,
+    normalised_shapes,
+)
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import FieldLike, as_field

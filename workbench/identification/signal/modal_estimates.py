@@ -62,7 +62,12 @@ class ModalEstimates(Printed):
         return np.sqrt(np.diag(self.covariance)[self.modes.n_modes :])
 
     def interval(self, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-        """Confidence intervals of ω and of ζ, (2, n_modes) each: lower row, upper row."""
+        """Confidence intervals of ω and of ζ, (2, n_modes) each: lower row, upper row.
+
+        Raises:
+            ValueError: a level outside 0..1.
+        """
+        check_level(level)
         width = float(ndtri(0.5 * (1.0 + level)))
         both = ((self.modes.omega, self.omega_std), (self.modes.zeta, self.zeta_std))
         omega, zeta = (np.stack([value - width * std, value + width * std]) for value, std in both)
@@ -347,6 +352,16 @@ def by_poles(poles: np.ndarray) -> np.ndarray:
     return np.block(
         [[np.diag(x / omega), np.diag(y / omega)], [np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)]]
     )
+
+
+def check_level(level: float) -> None:
+    """Refuse a confidence level outside 0..1.
+
+    Raises:
+        ValueError: such a level.
+    """
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"the level of a confidence interval or band lies between 0 and 1; got {level}")
 
 
 def check_placed(sampled: SampledModes) -> None:
