@@ -129,10 +129,17 @@ def test_refusals():
     modes = SampledModes([1.0], [0.0], [[1.0], [0.5], [0.2]], [0.5, 1.0, 1.5])
     with pytest.raises(ValueError, match="odd degree"):
         eigenfunctions(modes, length=2.0, degree=4)
+    with pytest.raises(ValueError, match="odd degree; got 0"):
+        eigenfunctions(modes, length=2.0, degree=0)
     with pytest.raises(ValueError, match="add sensors or take degree 1"):
         eigenfunctions(modes, length=2.0, degree=3)
     with pytest.raises(ValueError, match="lies outside"):
         eigenfunctions(modes, length=1.2, degree=1)
+    with pytest.raises(ValueError, match="x = nan lies outside"):
+        interpolating_spline([0.5, np.nan, 1.5], length=2.0, degree=1)
+    held = BoundaryConditions.of("beam", length=2.0, left="hinged", right="hinged")
+    with pytest.raises(ValueError, match="all sensors stand at ends that hold the value at zero; add one between"):
+        eigenfunctions(SampledModes([1.0], [0.0], [[0.1], [0.5]], [0.0, 2.0]), length=2.0, ends=held)
     with pytest.raises(ValueError, match="two sensors stand at"):
         eigenfunctions(SampledModes([1.0], [0.0], [[1.0], [0.5]], [0.5, 0.5]), length=1.0, degree=1)
     with pytest.raises(ValueError, match="has no place"):

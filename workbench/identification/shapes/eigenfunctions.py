@@ -122,7 +122,7 @@ def interpolating_spline(
     slack = 1e-9 * length
     conditions = _usable(ends.zeros, degree, length)
     held_places = [at for at, derivative in conditions if derivative == 0]
-    used = np.array([all(abs(x - at) > slack for at in held_places) for x in at_sensors])
+    used = np.array([all(abs(x - at) > slack for at in held_places) for x in at_sensors], bool)
     sites = np.union1d(at_sensors[used], np.array(held_places))
     derivatives = [(at, d) for at, d in conditions if d > 0]
     n_functions = sites.size + len(derivatives)
@@ -242,9 +242,12 @@ class Splines:
     ) -> "Splines":
         check_along(sampled)
         options: dict[str, Any] = {"length": length, "ends": ends}
-        degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **options)
+        degrees = best_degrees(sampled, **options) if degree is None else np.full(sampled.n_modes, degree)
         each = [(int(d), np.flatnonzero(degrees == d)) for d in np.unique(degrees)]
-        return cls(tuple((interpolating_spline(sampled.positions, degree=d, **options), modes) for d, modes in each))
+        groups = tuple((interpolating_spline(sampled.positions, degree=d, **options), modes) for d, modes in each)
+        if not any(spline.weights.any() for spline, _ in groups):
+            raise ValueError("all sensors stand at ends that hold the value at zero; add one between the ends")
+        return cls(groups)
 
     def __call__(self, values: np.ndarray, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Splines through values (n_sensors, n_modes), at x: (n_points, n_modes)."""
@@ -311,7 +314,7 @@ def _check_places(positions: np.ndarray, length: float, degree: int) -> None:
     if degree < 1 or degree % 2 == 0:
         raise ValueError(f"a spline through sensors has an odd degree; got {degree}")
     slack = 1e-9 * length
-    outside = (positions < -slack) | (positions > length + slack)
+    outside = ~((positions >= -slack) & (positions <= length + slack))
     if outside.any():
         raise ValueError(f"the sensor at x = {positions[outside][0]:g} lies outside the structure, 0 to {length:g}")
     ordered = np.sort(positions)
