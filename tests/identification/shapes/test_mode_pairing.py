@@ -6,6 +6,7 @@ import pytest
 from workbench.identification.shapes.mode_pairing import pair_modes, subspace_mac
 from workbench.structure.domain import NamedPoints, place_array
 from workbench.structure.finite_elements import FiniteElements
+from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes, mac
 from workbench.structure.plate import Plate
 
@@ -53,6 +54,21 @@ def test_one_of_repeated_modes_is_paired_with_the_one_it_is():
     lost = np.where(np.arange(14)[:, None] == 3, np.nan, measured.shapes)
     with pytest.raises(ValueError, match=r"shapes must be finite; of mode 1 sensor 4 has .*nan"):
         pair_modes(SampledModes(measured.omega, measured.zeta, lost, PLACES), modes)
+
+
+def test_rigid_modes_on_a_suspension_are_paired_by_shape():
+    """Their frequency in the model is zero, and no scale: it used to take the pairs of all other modes with it."""
+    model = Beam(length=1.0, bending_stiffness=10.0, mass_per_length=1.0, left="free", right="free").modes(4)
+    assert (model.omega[:2] == 0.0).all()
+    at = np.linspace(0.0, 1.0, 6)
+    omega = np.r_[3.0, 5.0, 1.02 * model.omega[2:]]
+    for some in ([0, 1, 2], [0, 1, 2, 3]):
+        measured = SampledModes(omega[some], np.zeros(len(some)), model.phi(at)[:, some], at)
+        pairing = pair_modes(measured, model)
+        assert pairing.matched.tolist() == pairing.model.tolist() == some
+        np.testing.assert_allclose(pairing.scaled_hz, [0.0, 0.0, *measured.frequencies_hz[2:]], rtol=1e-9)
+    rigid = pair_modes(measured.select([0, 1]), model)
+    assert rigid.model.tolist() == [0, 1] and rigid.scaled_hz.tolist() == [0.0, 0.0]
 
 
 def test_modes_at_named_points_are_paired_with_those_of_a_model():

@@ -21,7 +21,7 @@ class ModePairing(Printed):
         matched: (n_matched,) indices of the paired measured modes, by increasing mode of the model.
         model: (n_matched,) indices of the model's modes paired with them.
         mac: (n_matched,) MAC of each pair.
-        scaled_hz: (n_matched,) the model's frequencies, scaled to the first pair, Hz.
+        scaled_hz: (n_matched,) the model's frequencies, scaled to the first pair of elastic modes, Hz.
         others: (n_others,) indices of the measured modes without a pair.
     """
 
@@ -100,7 +100,7 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     """Pairs of measured modes and those of a model of unknown frequency scale, by shape, then by frequency.
 
     The shapes are assigned one to one; a pair needs the least MAC, and a frequency ratio near the median of all pairs.
-    Repeated modes of the model are matched as the subspace that they span.
+    Repeated modes of the model are matched as the subspace that they span, its rigid modes, of 0 Hz, by shape alone.
 
     Args:
         measured: shapes at placed sensors, their places those of the model's domain.
@@ -117,12 +117,15 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     rows, columns, agreement = assigned(measured.shapes, model_shapes, cluster, least=shape)
     paired = agreement[rows, columns] >= shape
     rows, columns = rows[paired], columns[paired]
-    ratio = measured.omega[rows] / model.omega[columns]
-    if ratio.size:
-        consistent = np.abs(ratio / np.median(ratio) - 1.0) <= frequency
-        rows, columns = rows[consistent], columns[consistent]
     order = np.argsort(columns)
     rows, columns = rows[order], columns[order]
-    scale = measured.frequencies_hz[rows[0]] / model.frequencies_hz[columns[0]] if rows.size else 1.0
+    elastic = model.omega[columns] > 0.0  # the suspension of a free structure gives its rigid modes a frequency
+    ratio = measured.omega[rows[elastic]] / model.omega[columns[elastic]]
+    consistent = ~elastic
+    if ratio.size:
+        consistent[elastic] = np.abs(ratio / np.median(ratio) - 1.0) <= frequency
+    rows, columns, elastic = rows[consistent], columns[consistent], elastic[consistent]
+    first = np.flatnonzero(elastic)[:1]
+    scale = float(*measured.frequencies_hz[rows[first]] / model.frequencies_hz[columns[first]]) if first.size else 1.0
     others = np.setdiff1d(np.arange(measured.n_modes), rows)
     return ModePairing(rows, columns, agreement[rows, columns], scale * model.frequencies_hz[columns], others)
