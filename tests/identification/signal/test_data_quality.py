@@ -163,6 +163,25 @@ def test_a_record_given_twice_is_refused(sound):
         identify([replace(sound, name="one"), replace(sound, name="again")])
 
 
+def test_records_of_one_name_and_other_sensors_are_refused(sound):
+    """Their outputs have no common shapes: accelerations grow with the square of the frequency."""
+    again = replace(sound, outputs=sound.outputs[:, ::-1])
+    assert len(of_same_sensors([sound, again])) == 2
+    channels = sound.output_channels
+    placed = replace(again, output_channels=tuple(replace(c, at=None if c is channels[3] else c.at) for c in channels))
+    assert len(of_same_sensors([sound, placed])) == 2
+    for change, words in (
+        (
+            {"quantity": "acceleration", "unit": ""},
+            "'y2' measures displacement at 0.3333 in 'free decay' and acceleration",
+        ),
+        ({"at": 0.5}, "'y2' measures displacement at 0.3333 in 'free decay' and displacement at 0.5 in"),
+    ):
+        other = (channels[0], replace(channels[1], **change), *channels[2:])
+        with pytest.raises(ValueError, match=words):
+            of_same_sensors([sound, replace(again, output_channels=other)])
+
+
 def test_two_measurements_on_one_large_offset_are_two(sound):
     """As of accelerometers that measure gravity too: the motion counts, not the offset."""
     offset = 1e6 * sound.outputs.std()

@@ -8,6 +8,7 @@ import numpy as np
 from workbench.records.record import Record, as_records
 from workbench.records.units import LIKELY, unknown_unit
 from workbench.rig.sensors import MEASURED
+from workbench.structure.printed import place_text
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,8 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
     """The records, or the one, as a list.
 
     Raises:
-        ValueError: no records, records that differ in outputs or sample time, and one that is given twice.
+        ValueError: no records; records that differ in sample time or outputs, their quantities and places; one that is
+            given twice.
     """
     records = as_records(records)
     if not records:
@@ -146,6 +148,17 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
                 f"records identified together must have the same outputs; {first.name!r} has"
                 f" {', '.join(first.output_names)} and {other.name!r} has {', '.join(other.output_names)}"
             )
+        for one, another in zip(first.output_channels, other.output_channels, strict=True):
+            places = place_text(one.at), place_text(another.at)
+            if one.quantity != another.quantity or (all(places) and places[0] != places[1]):
+                here, there = (
+                    (channel.quantity or "no quantity") + (f" at {place}" if place else "")
+                    for channel, place in zip((one, another), places, strict=True)
+                )
+                raise ValueError(
+                    f"records identified together must have the same outputs; {one.name!r} measures {here} in"
+                    f" {first.name!r} and {there} in {other.name!r}"
+                )
         if abs(other.sample_time - first.sample_time) > 1e-9 * first.sample_time:
             raise ValueError(
                 f"records {first.name!r} and {other.name!r} are sampled every {first.sample_time:g} s and"
