@@ -358,7 +358,7 @@ def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
                 yield DataFault(
                     "upsampled",
                     (name,),
-                    f"output {name!r} changes at every {every}th sample only: it was sampled at"
+                    f"output {name!r} changes once in {every} samples only: it was sampled at"
                     f" {record.sample_rate_hz / every:g} Hz and {how}, not at {record.sample_rate_hz:g} Hz; leave it"
                     " out, or bring all outputs to that rate",
                 )
