@@ -71,6 +71,26 @@ def test_rigid_modes_on_a_suspension_are_paired_by_shape():
     assert rigid.model.tolist() == [0, 1] and rigid.scaled_hz.tolist() == [0.0, 0.0]
 
 
+def test_modes_with_all_sensors_at_their_nodes_are_not_paired():
+    """Sensors along the middle of a plate see no mode of two half waves across: what rounding leaves of one is like
+    the mode of one half wave across."""
+    plate = Plate(length=(1, 0.6), mass_per_area=1, bending_stiffness=1, poisson_ratio=0.3, edges="simply supported")
+    for model in (plate.modes(6), square()):
+        along = np.column_stack([np.linspace(0.1, 0.9, 7), np.full(7, 0.5 * model.domain.length[1])])
+        seen = np.flatnonzero(np.abs(model.phi(along)).max(axis=0) > 1e-3)
+        assert seen.size < 6
+        measured = SampledModes(model.omega[seen], np.zeros(seen.size), model.phi(along)[:, seen], along)
+        pairing = pair_modes(measured, model)
+        assert pairing.model.tolist() == seen.tolist() and pairing.others.size == 0
+
+
+def test_of_repeated_modes_one_that_no_sensor_sees_adds_nothing_to_their_subspace():
+    model, along = square(), np.column_stack([np.linspace(0.1, 0.9, 7), np.full(7, 0.5)])
+    shapes, other = model.phi(along), np.random.default_rng(0).standard_normal((7, 1))
+    seen = 1 + int(np.argmax(np.abs(shapes[:, 1:3]).max(axis=0)))
+    np.testing.assert_allclose(subspace_mac(other, shapes, model.omega)[0, 1:3], mac(other, shapes[:, [seen]])[0, 0])
+
+
 def test_modes_at_named_points_are_paired_with_those_of_a_model():
     names = ("S1", "S2", "S3")
     points = NamedPoints(names, np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3]]), ("x",) * 3)

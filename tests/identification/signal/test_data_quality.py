@@ -81,7 +81,10 @@ def test_sensor_of_another_rate(sound):
     held = only(with_row(sound, 0, np.repeat(slow, 4)))
     joined = only(with_row(sound, 0, np.interp(time, time[::4], slow)))
     for found in (held, joined):
-        assert (found.kind, found.outputs) == ("upsampled", ("y1",)) and "once in 4 samples only: it was sampled at 25 Hz" in found.message
+        assert (found.kind, found.outputs) == (
+            "upsampled",
+            ("y1",),
+        ) and "once in 4 samples only: it was sampled at 25 Hz" in found.message
     assert "held" in held.message and "straight lines" in joined.message
 
 

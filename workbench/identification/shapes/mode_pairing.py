@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import orth
 from scipy.optimize import linear_sum_assignment
 
 from workbench.identification.signal.modal_estimates import check_finite, check_placed
@@ -11,6 +12,7 @@ from workbench.structure.modes import Modes, SampledModes, mac
 from workbench.structure.printed import Printed, counted
 
 PLAIN_WEIGHT = 1e-3  # of the plain MAC beside that of the subspace: it decides among repeated modes
+HIDDEN = 1e-9  # of the largest shape: one below it is zero at all sensors, and what rounding leaves of it is no shape
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,9 +65,15 @@ def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray) -> np
         omega: (n_second,) frequencies of the second set, not decreasing.
 
     Returns:
-        (n_first, n_second), between 0 and 1.
+        (n_first, n_second), between 0 and 1; 0 for a shape ψ_s that is zero at all points.
     """
-    return _cluster_mac(first, second, repeated_modes(omega))
+    return _cluster_mac(first, _without_rounding(second), repeated_modes(omega))
+
+
+def _without_rounding(shapes: np.ndarray) -> np.ndarray:
+    """Shapes (n_points, n_modes) with zeros for those that all points see at nodes."""
+    size = np.abs(shapes).max(axis=0)
+    return np.where(size > HIDDEN * size.max(), shapes, 0.0)
 
 
 def _cluster_mac(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
@@ -73,7 +81,7 @@ def _cluster_mac(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> 
     for number in np.unique(cluster):
         members = np.flatnonzero(cluster == number)
         if members.size > 1:
-            basis = np.linalg.qr(second[:, members])[0]
+            basis = orth(second[:, members], rcond=HIDDEN)
             share = (np.abs(basis.conj().T @ first) ** 2).sum(axis=0) / (np.abs(first) ** 2).sum(axis=0)
             values[:, members] = share[:, None]
     return values
@@ -91,6 +99,7 @@ def assigned(
         cluster: (n_second,) cluster number of each shape of the second set.
         least: MAC below which a pair is none.
     """
+    second = _without_rounding(second)
     agreement = _cluster_mac(first, second, cluster)
     score = np.where(agreement >= least, agreement + PLAIN_WEIGHT * mac(first, second), 0.0)
     return *linear_sum_assignment(-score), agreement
