@@ -138,6 +138,8 @@ def test_refusals():
     with pytest.raises(ValueError, match="x = nan lies outside"):
         interpolating_spline([0.5, np.nan, 1.5], length=2.0, degree=1)
     held = BoundaryConditions.of("beam", length=2.0, left="hinged", right="hinged")
+    with pytest.raises(ValueError, match="condition holds at x = 2, which is no end of the structure, 0 to 1.6; give"):
+        eigenfunctions(modes, length=1.6, ends=held)
     with pytest.raises(ValueError, match="all sensors stand at ends that hold the value at zero; add one between"):
         eigenfunctions(SampledModes([1.0], [0.0], [[0.1], [0.5]], [0.0, 2.0]), length=2.0, ends=held)
     with pytest.raises(ValueError, match="two sensors stand at"):
@@ -152,6 +154,12 @@ def test_refusals():
     impulse_at_node = impulse_response_modes(hinged, at=1.0, positions=np.linspace(0.1, 1.9, 15))
     with pytest.raises(ValueError, match="hardly excites mode 2"):
         eigenfunctions(impulse_at_node, length=2.0, driven_at=1.0, degree=5)
+
+
+def test_a_shape_that_is_no_number_is_refused_when_scaled_by_an_impulse_too():
+    lost = SampledModes([1.0], [0.0], [[1j], [np.nan], [0.2j]], [0.5, 1.0, 1.5])
+    with pytest.raises(ValueError, match="shapes must be finite; of mode 1 sensor 2"):
+        eigenfunctions(lost, length=2.0, degree=1, driven_at=0.7)
 
 
 def test_the_former_name_of_boundary_conditions_warns():

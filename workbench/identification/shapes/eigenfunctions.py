@@ -13,7 +13,7 @@ from warnings import warn
 import numpy as np
 from scipy.interpolate import BSpline
 
-from workbench.identification.signal.modal_estimates import check_placed, normalised_shapes
+from workbench.identification.signal.modal_estimates import check_finite, check_placed, normalised_shapes
 from workbench.structure.domain import Interval, gauss_between
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
@@ -115,11 +115,18 @@ def interpolating_spline(
         degree: 1, 3, 5, ...
 
     Raises:
-        ValueError: an even degree, too few sensors for it, sensors outside, unplaced or at one place.
+        ValueError: an even degree, too few sensors for it, sensors outside, unplaced or at one place, a boundary
+            condition that is at no end.
     """
     at_sensors = np.asarray(positions, float)
     _check_places(at_sensors, length, degree)
     slack = 1e-9 * length
+    elsewhere = [at for at, _ in ends.zeros if min(abs(at), abs(at - length)) > slack]
+    if elsewhere:
+        raise ValueError(
+            f"a boundary condition holds at x = {elsewhere[0]:g}, which is no end of the structure, 0 to {length:g}; give"
+            " both the same length"
+        )
     conditions = _usable(ends.zeros, degree, length)
     held_places = [at for at, derivative in conditions if derivative == 0]
     used = np.array([all(abs(x - at) > slack for at in held_places) for x in at_sensors], bool)
@@ -348,6 +355,7 @@ def _knots(sites: np.ndarray, derivatives: list[tuple[float, int]], length: floa
 
 
 def _scaled_by_impulse(sampled: SampledModes, splines: Splines, x0: float) -> np.ndarray:
+    check_finite(sampled.shapes)
     omega_d = np.abs(sampled.poles.imag)
     products = (1j * sampled.shapes * omega_d).real
     at_impulse = splines(products, np.array([x0]))[0]
