@@ -353,6 +353,21 @@ def test_a_spring_beside_a_tip_closed_form(distance):
     np.testing.assert_allclose(omega, exact, rtol=1e-8)
 
 
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (PointMass(0.5, 0.1, 0.02), "a bar in axial vibration does not rotate; leave rotary_inertia out"),
+        (PointSpring(0.5, 0.0, 3.0), "does not rotate; leave rotational_stiffness out"),
+        (PointDamper(0.5, 1.0, 3.0), "does not rotate; leave rotational_coefficient out"),
+    ],
+)
+def test_nothing_turns_on_a_bar(part, words):
+    """It acted on the axial strain there, which jumps: no number of functions sufficed."""
+    bar = {"length": 1.0, "mass_per_length": 1.0, "axial_stiffness": 1.0, "left": "fixed", "right": "free"}
+    with pytest.raises(ValueError, match=words):
+        Bar(**bar, attachments=(part,))
+
+
 def test_nothing_stands_on_a_tip():
     with pytest.raises(ValueError, match="stands on a tip"):
         pointed(PointSpring(1.0, 2.0))
