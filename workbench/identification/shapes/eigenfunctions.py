@@ -124,8 +124,8 @@ def interpolating_spline(
     elsewhere = [at for at, _ in ends.zeros if min(abs(at), abs(at - length)) > slack]
     if elsewhere:
         raise ValueError(
-            f"a boundary condition holds at x = {elsewhere[0]:g}, which is no end of the structure, 0 to {length:g}; give"
-            " both the same length"
+            f"a boundary condition holds at x = {elsewhere[0]:g}, which is no end of the structure, 0 to {length:g};"
+            " give both the same length"
         )
     conditions = _usable(ends.zeros, degree, length)
     held_places = [at for at, derivative in conditions if derivative == 0]

@@ -99,11 +99,8 @@ class SurfaceSpline:
     edges: str | Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if isinstance(self.edges, str):
-            object.__setattr__(self, "edges", dict.fromkeys(SIDES, self.edges))
-        assert isinstance(self.edges, Mapping)
         object.__setattr__(self, "places", frozen(self.domain.locate(self.places)))
-        for side, edge in self.edges.items():
+        for side, edge in self._edge_of.items():
             if side not in SIDES or edge not in HELD_BY:
                 raise ValueError(
                     f"edges are given by side, {', '.join(SIDES)}, as {', '.join(HELD_BY)}; got {side} {edge!r}"
@@ -112,33 +109,21 @@ class SurfaceSpline:
         if gaps.min() < SURFACE.same_place * self.domain.size:
             i, j = np.unravel_index(int(gaps.argmin()), gaps.shape)
             raise ValueError(f"sensors {i + 1} and {j + 1} stand at one place, {self.places[i]} m; keep one of them")
-        if np.linalg.matrix_rank(self._polynomials) < len(CUBIC):
+        if np.linalg.matrix_rank(self._equations[:, -len(CUBIC) :]) < len(CUBIC):
             raise ValueError(
                 f"{self._used.sum()} sensors and the edges do not determine a cubic over the rectangle, which takes"
                 f" {len(CUBIC)} values, not on a line: add sensors, or name the edges that hold it"
             )
 
-    @cached_property
-    def _held(self) -> list[Functional]:
-        """Points along the edges, each with the derivative that is zero there."""
-        a, b = self.domain.length
-        conditions: list[Functional] = []
-        assert isinstance(self.edges, Mapping)
-        for side, edge in self.edges.items():
-            i = SIDES.index(side)
-            along = (np.arange(SURFACE.per_edge) + 0.5) / SURFACE.per_edge
-            across = np.full(SURFACE.per_edge, float(i % 2))
-            points = np.column_stack([across, along] if i < 2 else [along, across]) * (a, b)
-            for order in HELD_BY[edge]:
-                conditions.append((points, ((order, 0) if i < 2 else (0, order))))
-        return conditions
+    @property
+    def _edge_of(self) -> Mapping[str, str]:
+        return dict.fromkeys(SIDES, self.edges) if isinstance(self.edges, str) else self.edges
 
     @cached_property
     def _used(self) -> np.ndarray:
         """Which places are not on an edge that holds the value at zero, (n_places,)."""
-        assert isinstance(self.edges, Mapping)
         used = np.ones(len(self.places), bool)
-        for side in (side for side, edge in self.edges.items() if 0 in HELD_BY[edge]):
+        for side in (side for side, edge in self._edge_of.items() if 0 in HELD_BY[edge]):
             axis, far = divmod(SIDES.index(side), 2)
             distance = np.abs(self.places[:, axis] - far * self.domain.length[axis])
             used &= distance > SURFACE.same_place * self.domain.size
@@ -146,38 +131,44 @@ class SurfaceSpline:
 
     @cached_property
     def _functionals(self) -> list[Functional]:
-        return [(self.places[self._used], (0, 0)), *self._held]
+        """The sensors used, and points along the edges, each with a derivative that is zero there."""
+        functionals: list[Functional] = [(self.places[self._used], (0, 0))]
+        share = (np.arange(SURFACE.per_edge) + 0.5) / SURFACE.per_edge
+        for side, edge in self._edge_of.items():
+            axis, far = divmod(SIDES.index(side), 2)
+            points = np.empty((SURFACE.per_edge, 2))
+            points[:, axis], points[:, 1 - axis] = far * self.domain.length[axis], share * self.domain.length[1 - axis]
+            functionals += [(points, (order, 0) if axis == 0 else (0, order)) for order in HELD_BY[edge]]
+        return functionals
 
-    @cached_property
-    def _polynomials(self) -> np.ndarray:
-        """Cubic monomials under all functionals, (n_values, 10), with the diagonal as unit."""
-        return np.vstack([self._cubic(at, derivative) for at, derivative in self._functionals])
+    def _rows(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
+        """Of a derivative at places: covariance with every functional for τ² = 1, and cubics, (n_at, n_values + 10).
 
-    def _cubic(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
-        return _cubics(at / self.domain.size, derivative)
-
-    def _covariance(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
-        """Covariance of a derivative at places with every functional, for τ² = 1: (n_at, n_values)."""
+        The diagonal is the unit of length.
+        """
         columns = []
         for places, order in self._functionals:
             total = (derivative[0] + order[0], derivative[1] + order[1])
             offset = (at[:, None] - places) / self.domain.size
             columns.append((-1.0) ** sum(order) * _kernel(offset, total))
-        return np.hstack(columns)
+        return np.hstack([*columns, _cubics(at / self.domain.size, derivative)])
+
+    @cached_property
+    def _equations(self) -> np.ndarray:
+        """[K, P]: the rows of all functionals, (n_values, n_values + 10)."""
+        return np.vstack([self._rows(at, derivative) for at, derivative in self._functionals])
 
     @cached_property
     def _system(self) -> np.ndarray:
         """The inverse of [[K, P], [Pᵀ, 0]]."""
-        k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
-        p = self._polynomials
-        system = np.block([[k, p], [p.T, np.zeros((p.shape[1],) * 2)]])
-        return np.linalg.inv(system)
+        n = len(self._equations)
+        below = np.hstack([self._equations[:, n:].T, np.zeros((len(CUBIC),) * 2)])
+        return np.linalg.inv(np.vstack([self._equations, below]))
 
     def matrix(self, at: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> np.ndarray:
         """Values (or derivatives) at places (n_at, 2) per value at each sensor, (n_at, n_places)."""
         at = np.atleast_2d(at)
-        rows = np.hstack([self._covariance(at, derivative), self._cubic(at, derivative)])
-        scale = self.domain.size ** -sum(derivative)
+        rows, scale = self._rows(at, derivative), self.domain.size ** -sum(derivative)
         matrix = np.zeros((len(at), len(self.places)))
         matrix[:, self._used] = scale * (rows @ self._system)[:, : self._used.sum()]
         return matrix
@@ -191,7 +182,7 @@ class SurfaceSpline:
         prior_covariance = np.block(
             [[(-1.0) ** (k + m) * _kernel(offset, (i + k, j + m)) for k, m in derivatives] for i, j in derivatives]
         )
-        rows = np.vstack([np.hstack([self._covariance(at, d), self._cubic(at, d)]) for d in derivatives])
+        rows = np.vstack([self._rows(at, d) for d in derivatives])
         scale = np.repeat([self.domain.size ** -sum(d) for d in derivatives], len(at))
         return np.asarray((prior_covariance - rows @ self._system @ rows.T) * np.outer(scale, scale))
 
@@ -204,9 +195,8 @@ class SurfaceSpline:
             ValueError: no more values and edge points than the ten of a cubic.
         """
         values, covariance = values[self._used], covariance[np.ix_(self._used, self._used)]
-        n, size = values.size, len(self._polynomials)
-        k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
-        contrasts = null_space(self._polynomials.T)
+        n, size = values.size, len(self._equations)
+        contrasts = null_space(self._equations[:, size:].T)
         if contrasts.size == 0:
             raise ValueError(
                 f"{n} sensors determine a cubic over the rectangle and nothing beyond, from which its errors could be"
@@ -215,7 +205,7 @@ class SurfaceSpline:
         noise = np.zeros((size, size))
         noise[:n, :n] = covariance
         scale = float(np.abs(values).max()) ** 2
-        unit_covariance = contrasts.T @ k @ contrasts
+        unit_covariance = contrasts.T @ self._equations[:, :size] @ contrasts
         noise_covariance = contrasts.T @ noise @ contrasts + 1e-24 * scale * np.eye(contrasts.shape[1])
         contrast_values = contrasts.T @ np.r_[values, np.zeros(size - n)]
 
