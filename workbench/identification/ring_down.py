@@ -29,8 +29,8 @@ from workbench.identification.signal.data_quality import (
     dropout_remark,
     of_same_sensors,
 )
+from workbench.identification.signal.harmonics import multiple_of
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined, clock_remarks
-from workbench.identification.signal.overtones import multiple_of
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import Record, as_records
