@@ -115,6 +115,16 @@ def test_what_a_spline_misses_by_its_peano_kernel(derivative, right):
     assert np.abs(missed - (sine(x, derivative) - drawn)).max() < 0.02 * np.abs(missed).max()
 
 
+@pytest.mark.parametrize("last", [0.08, 0.12, 0.18])
+def test_the_scale_holds_where_sensors_stand_on_a_small_part_of_the_structure(last):
+    """The curve beyond them is large in each sensor's value, and small in their sum: products of the former cancel."""
+    at, dense = np.linspace(0.02, last, 14), np.linspace(0.0, 1.0, 20001)
+    noise = 1e-9 * np.random.default_rng(3).standard_normal((14, 1))
+    shape = np.sin(np.pi * at)[:, None] + noise
+    drawn = eigenfunctions(SampledModes([1.0], [0.01], shape, at), length=1.0, degree=9)
+    assert np.trapezoid(drawn.phi(dense)[:, 0] ** 2, dense) == pytest.approx(1.0, rel=1e-6)
+
+
 def test_default_degree_follows_the_mode():
     """High degrees for slow shapes; not for those that motion too fast for their sensors."""
     modes = elastic("bar", "fixed", "free", 8)

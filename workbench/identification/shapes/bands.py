@@ -41,7 +41,6 @@ from workbench.identification.shapes.eigenfunctions import (
     check_along,
     inertia_of,
     interpolating_spline,
-    mass_matrix,
 )
 from workbench.identification.signal.modal_estimates import ShapeEstimates, check_level, normalised_shapes
 from workbench.renamed import Renamed
@@ -328,19 +327,20 @@ def eigenfunction_bands(
     width = np.zeros(modes.n_modes)
     for spline, members in splines.groups:
         leave_one_out = LeaveOneOut(modes.positions, degree=spline.degree, **options)
-        rule, mass = spline.matrix(x), mass_matrix(spline, inertia, length)
+        rule, inside = spline.matrix(x), inertia.quadrature(spline, length)
+        kernel, *kernels = (
+            peano_kernel(spline, at, modes.positions, length, derivative) for at, derivative in ((x, 0), *inside.places)
+        )
         for r in members:
             v = values[:, r]
-            q = v @ mass @ v
+            load = inside.weights * (inside.rule @ v)
+            q = load @ (inside.rule @ v)
             phi[:, r] = rule @ v / np.sqrt(q)
-            jacobian = rule / np.sqrt(q) - np.outer(phi[:, r], mass @ v / q)
+            jacobian = rule / np.sqrt(q) - np.outer(phi[:, r], load @ inside.rule / q)
             root = jacobian @ symmetric_root(found.shape_covariance[r])
             roughness = leave_one_out.roughness(v, found.shape_covariance[r])
             if roughness > 0.0:
-                error = peano_kernel(spline, x, modes.positions, length) / np.sqrt(q)
-                for y, weights, derivative in inertia.weighted(spline, length):
-                    kernel = peano_kernel(spline, y, modes.positions, length, derivative)
-                    error -= np.outer(phi[:, r], (weights * (spline.matrix(y, derivative) @ v)) @ kernel / q)
+                error = kernel / np.sqrt(q) - np.outer(phi[:, r], load @ np.vstack(kernels) / q)
                 error *= np.sqrt(roughness)
                 interpolation[:, r] = np.linalg.norm(error, axis=1)
                 root = np.hstack([root, error])

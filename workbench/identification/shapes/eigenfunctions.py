@@ -7,7 +7,7 @@ them; the others are removed by leaving out the knots nearest to that end ("not 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 from warnings import warn
 
 import numpy as np
@@ -191,8 +191,8 @@ def eigenfunctions(
         values = normalised_shapes(sampled.shapes).real
         inertia = inertia_of(mass_per_length, point_masses, length)
         for spline, members in splines.groups:
-            mass = mass_matrix(spline, inertia, length)
-            values[:, members] /= np.sqrt(np.einsum("jr,jk,kr->r", values[:, members], mass, values[:, members]))
+            inside = inertia.quadrature(spline, length)
+            values[:, members] /= np.sqrt(inside.weights @ (inside.rule @ values[:, members]) ** 2)
     else:
         values = _scaled_by_impulse(sampled, splines, driven_at)
     values = frozen(values)
@@ -264,6 +264,20 @@ class Splines:
         return result
 
 
+class Quadrature(NamedTuple):
+    """∫ m φ² dx + Σ (M_k φ² + J_k φ'²) of splines φ = W v as a sum of squares, Σ weights (rule v)², which cannot cancel.
+
+    Attributes:
+        weights: (n_terms,).
+        rule: (n_terms, n_sensors), φ or its derivative per value at each sensor.
+        places: the places of the terms, (n_places,) m, with the order of the derivative, in turn.
+    """
+
+    weights: np.ndarray
+    rule: np.ndarray
+    places: tuple[tuple[np.ndarray, int], ...]
+
+
 @dataclass(frozen=True)
 class Inertia:
     """The mass along the structure and at points, which scales an eigenfunction."""
@@ -271,17 +285,14 @@ class Inertia:
     density: Profile
     point_masses: tuple[PointMass, ...] = ()
 
-    def weighted(self, spline: Spline, length: float) -> list[tuple[np.ndarray, np.ndarray, int]]:
-        """Quadrature of ∫ m φ² dx + Σ (M_k φ² + J_k φ'²): (places, weights, derivative) of each part."""
+    def quadrature(self, spline: Spline, length: float) -> Quadrature:
+        """The quadrature of the mass of a spline, exact for a cubic density between its breaks."""
         breaks = [b for b in self.density.breaks if 0 < b < length]
-        # exact for the product of two splines and a cubic mass
         x, weights = gauss_between(np.unique(np.concatenate([spline.knots, breaks])), spline.degree + 3)
-        at = np.array([point.at for point in self.point_masses])
-        return [
-            (x, weights * self.density(x), 0),
-            (at, np.array([point.mass for point in self.point_masses]), 0),
-            (at, np.array([point.rotary_inertia for point in self.point_masses]), 1),
-        ]
+        at, pairs = np.array([part.at for part in self.point_masses]), [part.pair for part in self.point_masses]
+        places = (x, 0), (at, 0), (at, 1)
+        rule = np.vstack([spline.matrix(where, derivative) for where, derivative in places])
+        return Quadrature(np.concatenate([weights * self.density(x), *np.reshape(pairs, (-1, 2)).T]), rule, places)
 
 
 def inertia_of(mass_per_length: ProfileLike | None, point_masses: Sequence[PointMass], length: float) -> Inertia:
@@ -292,15 +303,6 @@ def inertia_of(mass_per_length: ProfileLike | None, point_masses: Sequence[Point
         if not 0.0 <= cast(float, point.at) <= length:
             raise ValueError(f"the point mass at x = {point.at:g} lies outside the structure, 0 to {length:g}")
     return Inertia(as_profile(1.0 / length if mass_per_length is None else mass_per_length), tuple(point_masses))
-
-
-def mass_matrix(spline: Spline, inertia: Inertia, length: float) -> np.ndarray:
-    """M of v^T M v = ∫ m φ² dx + Σ (M_k φ² + J_k φ'²) for φ through values v at the sensors, (n_sensors, n_sensors)."""
-    mass = np.zeros((spline.weights.shape[1],) * 2)
-    for x, weights, derivative in inertia.weighted(spline, length):
-        rule = spline.matrix(x, derivative)
-        mass += rule.T @ (weights[:, None] * rule)
-    return mass
 
 
 def check_along(sampled: SampledModes) -> None:
