@@ -39,8 +39,8 @@ from workbench.identification.shapes.eigenfunctions import (
     Spline,
     Splines,
     check_along,
-    inertia_of,
     interpolating_spline,
+    mass_quadrature,
 )
 from workbench.identification.signal.modal_estimates import ShapeEstimates, check_level, normalised_shapes
 from workbench.renamed import Renamed
@@ -321,13 +321,12 @@ def eigenfunction_bands(
     modes, rng = found.modes, np.random.default_rng(seed)
     options: dict[str, Any] = {"length": length, "ends": ends or BoundaryConditions()}
     splines = Splines.through(modes, degree=degree, **options)
-    inertia = inertia_of(mass_per_length, point_masses, length)
     values = normalised_shapes(modes.shapes).real
     phi, std, interpolation = (np.zeros((x.size, modes.n_modes)) for _ in range(3))
     width = np.zeros(modes.n_modes)
     for spline, members in splines.groups:
         leave_one_out = LeaveOneOut(modes.positions, degree=spline.degree, **options)
-        rule, inside = spline.matrix(x), inertia.quadrature(spline, length)
+        rule, inside = spline.matrix(x), mass_quadrature(spline, length, mass_per_length, point_masses)
         kernel, *kernels = (
             peano_kernel(spline, at, modes.positions, length, derivative) for at, derivative in ((x, 0), *inside.places)
         )

@@ -16,7 +16,7 @@ from scipy.interpolate import BSpline
 from workbench.identification.signal.modal_estimates import check_finite, check_placed, normalised_shapes
 from workbench.structure.domain import Interval, gauss_between
 from workbench.structure.modes import Modes, SampledModes, frozen
-from workbench.structure.profile import Profile, ProfileLike, as_profile
+from workbench.structure.profile import ProfileLike, as_profile
 from workbench.structure.supports import PointMass
 from workbench.threads import one_blas_thread
 
@@ -189,9 +189,8 @@ def eigenfunctions(
     splines = Splines.through(sampled, length=length, ends=ends, degree=degree)
     if driven_at is None:
         values = normalised_shapes(sampled.shapes).real
-        inertia = inertia_of(mass_per_length, point_masses, length)
         for spline, members in splines.groups:
-            inside = inertia.quadrature(spline, length)
+            inside = mass_quadrature(spline, length, mass_per_length, point_masses)
             values[:, members] /= np.sqrt(inside.weights @ (inside.rule @ values[:, members]) ** 2)
     else:
         values = _scaled_by_impulse(sampled, splines, driven_at)
@@ -265,7 +264,7 @@ class Splines:
 
 
 class Quadrature(NamedTuple):
-    """∫ m φ² dx + Σ (M_k φ² + J_k φ'²) of splines φ = W v as a sum of squares, Σ weights (rule v)², which cannot cancel.
+    """∫ m φ² dx + Σ (M_k φ² + J_k φ'²) of splines φ = W v as Σ weights (rule v)²: a sum of squares does not cancel.
 
     Attributes:
         weights: (n_terms,).
@@ -278,31 +277,24 @@ class Quadrature(NamedTuple):
     places: tuple[tuple[np.ndarray, int], ...]
 
 
-@dataclass(frozen=True)
-class Inertia:
-    """The mass along the structure and at points, which scales an eigenfunction."""
-
-    density: Profile
-    point_masses: tuple[PointMass, ...] = ()
-
-    def quadrature(self, spline: Spline, length: float) -> Quadrature:
-        """The quadrature of the mass of a spline, exact for a cubic density between its breaks."""
-        breaks = [b for b in self.density.breaks if 0 < b < length]
-        x, weights = gauss_between(np.unique(np.concatenate([spline.knots, breaks])), spline.degree + 3)
-        at, pairs = np.array([part.at for part in self.point_masses]), [part.pair for part in self.point_masses]
-        places = (x, 0), (at, 0), (at, 1)
-        rule = np.vstack([spline.matrix(where, derivative) for where, derivative in places])
-        return Quadrature(np.concatenate([weights * self.density(x), *np.reshape(pairs, (-1, 2)).T]), rule, places)
-
-
-def inertia_of(mass_per_length: ProfileLike | None, point_masses: Sequence[PointMass], length: float) -> Inertia:
-    """The mass as `eigenfunctions` takes it; by default one that gives ∫ φ_r² dx = length."""
+def mass_quadrature(
+    spline: Spline, length: float, mass_per_length: ProfileLike | None, point_masses: Sequence[PointMass]
+) -> Quadrature:
+    """The quadrature of the mass as `eigenfunctions` takes it; by default of one that gives ∫ φ_r² dx = length."""
     if mass_per_length is None and len(point_masses):
         raise ValueError("point masses are used beside a mass distribution; give mass_per_length too")
-    for point in point_masses:
-        if not 0.0 <= cast(float, point.at) <= length:
-            raise ValueError(f"the point mass at x = {point.at:g} lies outside the structure, 0 to {length:g}")
-    return Inertia(as_profile(1.0 / length if mass_per_length is None else mass_per_length), tuple(point_masses))
+    at = np.array([cast(float, point.at) for point in point_masses])
+    outside = (at < 0.0) | (at > length)
+    if outside.any():
+        raise ValueError(f"the point mass at x = {at[outside][0]:g} lies outside the structure, 0 to {length:g}")
+    density = as_profile(1.0 / length if mass_per_length is None else mass_per_length)
+    breaks = [b for b in density.breaks if 0 < b < length]
+    # exact for the product of two splines and a cubic mass
+    x, weights = gauss_between(np.unique(np.concatenate([spline.knots, breaks])), spline.degree + 3)
+    places = (x, 0), (at, 0), (at, 1)
+    rule = np.vstack([spline.matrix(where, derivative) for where, derivative in places])
+    masses, inertias = np.reshape([point.pair for point in point_masses], (-1, 2)).T
+    return Quadrature(np.concatenate([weights * density(x), masses, inertias]), rule, places)
 
 
 def check_along(sampled: SampledModes) -> None:
