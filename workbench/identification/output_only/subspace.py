@@ -64,7 +64,7 @@ class StablePole:
         presence: share of the orders at which it was found.
         statistic: twice the log-likelihood ratio, by one-step prediction, of the record with and without the mode.
         orders, poles: model orders at which it was found, and its pole at each.
-        slower: decimation factor of the sampling rate at which it was found.
+        decimation: ratio of the record's sampling rate to the one at which it was found.
         variance: (2, 2) of Re λ and Im λ; nan until estimated.
     """
 

@@ -325,15 +325,11 @@ def _check_places(positions: np.ndarray, length: float, degree: int) -> None:
 
 
 def _usable(zeros: Sequence[tuple[float, int]], degree: int, length: float) -> list[tuple[float, int]]:
-    """Conditions that a spline can take: of each end the value and at most (degree - 1) / 2 derivatives.
-
-    Lowest first, below the degree.
-    """
+    """Conditions that a spline can take: of each end the value and the (degree - 1) / 2 lowest derivatives at most."""
     kept = []
     for end in (0.0, length):
         orders = sorted(d for at, d in zeros if abs(at - end) <= 1e-9 * length and d < degree)
-        values, slopes = [d for d in orders if d == 0], [d for d in orders if d > 0]
-        kept += [(end, d) for d in values + slopes[: (degree - 1) // 2]]
+        kept += [(end, d) for d in orders[: (degree - 1) // 2 + (0 in orders)]]
     return kept
 
 

@@ -4,7 +4,7 @@ A delay τ of sensor j multiplies its entries s_jr of the shapes by e^{-λ_r τ}
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -86,24 +86,20 @@ def _delayed_sensor(modes: SampledModes) -> tuple[int, float] | None:
     A delay agrees with the phases of n modes to within δ by chance with probability (2 δ / π)^n, and up to a time T
     there are T ω / δ distinct delays.
     """
-    omega, poles, n_outputs = modes.poles.imag, modes.poles, modes.n_outputs
-    best: tuple[float, int, float] | None = None
-    for j in range(n_outputs):
-        own, others = modes.shapes[j], np.delete(modes.shapes, j, axis=0)
+    omega, candidates = modes.poles.imag, []
+    for j, own in enumerate(modes.shapes):
         visible = np.abs(own) > CLOCKS.least * np.linalg.norm(modes.shapes, axis=0)
         if np.count_nonzero(visible) < 2:
             continue
-        phases = np.angle(own) - 0.5 * np.angle((others**2).sum(axis=0))
+        phases = np.angle(own) - 0.5 * np.angle((np.delete(modes.shapes, j, axis=0) ** 2).sum(axis=0))
         seconds, chance = _delay_of_phases(phases[visible], omega[visible], omega.max())
-        chance *= n_outputs
-        if best is None or chance < best[0]:
-            best = chance, j, seconds
-    if best is None or best[0] > FALSE_ALARM:
+        candidates.append((chance * modes.n_outputs, j, seconds))
+    chance, j, seconds = min(candidates, default=(1.0, 0, 0.0))
+    if chance > FALSE_ALARM:
         return None
-    _, j, seconds = best
     corrected = modes.shapes.copy()
-    corrected[j] *= np.exp(poles * seconds)
-    if (far_from_real(SampledModes(modes.omega, modes.zeta, corrected, modes.positions)) > CLOCKS.far).any():
+    corrected[j] *= np.exp(modes.poles * seconds)
+    if (far_from_real(replace(modes, shapes=corrected)) > CLOCKS.far).any():
         return None
     return j, seconds
 
