@@ -22,7 +22,7 @@ from workbench.identification.free_decay.preparation import (
     without_spikes,
 )
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
-from workbench.identification.signal.clocks import shape_remarks
+from workbench.identification.signal.clocks import clock_remarks, shape_remarks
 from workbench.identification.signal.data_quality import (
     check_data_quality,
     data_faults,
@@ -30,7 +30,7 @@ from workbench.identification.signal.data_quality import (
     of_same_sensors,
 )
 from workbench.identification.signal.harmonics import multiple_of
-from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined, clock_remarks
+from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import Record, as_records

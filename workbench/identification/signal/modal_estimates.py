@@ -1,4 +1,4 @@
-"""Types of modal estimates with standard errors, how they are printed, and remarks on pairs of modes."""
+"""Types of modal estimates with standard errors, how they are printed, and remarks on neighbouring modes."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -19,7 +19,6 @@ from workbench.structure.printed import Printed, counted
 # between the moduli of their shapes is less than this (noise makes it 0.01); and if that of participation factors is
 # more than this.
 NEAR, APART, ALIKE = 0.05, 0.1, 0.9
-CLOCK_RATIO = 0.01  # largest relative difference of frequencies that is attributed to sample rates
 SURE = 3.0  # number of standard errors that makes a difference significant
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
 
@@ -283,7 +282,7 @@ def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, n
     return np.asarray(~growing & (omega_std < modes.omega) & (modes.omega < nyquist))
 
 
-def repeated_remarks(estimates: "ModalEstimates") -> tuple[str, ...]:
+def repeated_remarks(estimates: ModalEstimates) -> tuple[str, ...]:
     """A remark on neighbours of equal frequency and damping within their errors: a repeated root."""
     modes, pairs = estimates.modes, []
     for r in range(modes.n_modes - 1):
@@ -296,29 +295,6 @@ def repeated_remarks(estimates: "ModalEstimates") -> tuple[str, ...]:
     return (
         f"modes {', '.join(pairs)} may be one repeated root: only the plane of their two shapes is determined; each"
         " shape is one of many in that plane, and need not be real",
-    )
-
-
-def clock_remarks(estimates: "ModalEstimates", only: Sequence[int]) -> tuple[str, ...]:
-    """A remark where all modes form pairs of equal damping and one ratio of frequencies: the sample rates differ.
-
-    Args:
-        estimates: modes of several outputs or records, sorted by frequency.
-        only: the modes to examine, from 0.
-    """
-    if len(only) < 4 or len(only) % 2:
-        return ()
-    omega, zeta = (values[list(only)].reshape(-1, 2).T for values in (estimates.modes.omega, estimates.modes.zeta))
-    omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in (estimates.omega_std, estimates.zeta_std))
-    ratio, error = omega[1] / omega[0] - 1.0, np.hypot(*(omega_std / omega))
-    mean = np.average(ratio, weights=error**-2)
-    separate = (SURE * error < ratio) & (ratio < CLOCK_RATIO)
-    alike = (np.abs(ratio - mean) < SURE * error) & (np.abs(np.diff(zeta, axis=0)[0]) < SURE * np.hypot(*zeta_std))
-    if not (separate & alike).all():
-        return ()
-    return (
-        f"modes come in pairs whose frequencies all differ by {100.0 * mean:.2g} %: does the sample rate of an output"
-        " or a record differ by so much? Resample it to that of the others: each pair is then one mode",
     )
 
 
