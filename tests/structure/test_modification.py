@@ -119,5 +119,10 @@ def test_parts_that_no_structure_has_are_refused():
     for part, figure in ((PointMass, "mass"), (PointSpring, "stiffness"), (PointDamper, "coefficient")):
         with pytest.raises(ValueError, match=f"the {figure} of a {part.__name__} must be finite; got nan"):
             part(0.5, np.nan)
+    for n in (0, 5):
+        with pytest.raises(ValueError, match=f"4 modes give 1 to 4 with attachments; got n_modes={n}"):
+            attach(beam().modes(4), (PointMass(1.3, 0.5),), n_modes=n)
+    with pytest.raises(ValueError, match="damping ratios must be finite and not negative, one at least"):
+        replace(beam(), damping=ModalDamping([])).modes(2)
     with pytest.raises(ValueError, match="a negative mass is too large"):
         attach(beam().modes(4), (PointMass(2.0, -50.0),))

@@ -36,8 +36,13 @@ def attach(
         residual_flexibility: flexibility at a point of all modes that are not given, m/N.
 
     MacNeal, Computers & Structures 1 (1971) 581, on residual flexibility.
+
+    Raises:
+        ValueError: more modes than given, a place outside, or masses or springs so negative that there are no modes.
     """
     if n_modes is not None:
+        if not 1 <= n_modes <= modes.n_modes:
+            raise ValueError(f"{modes.n_modes} modes give 1 to {modes.n_modes} with attachments; got n_modes={n_modes}")
         return _with_residual(modes, attachments, n_modes, residual_flexibility)
     n = modes.n_modes
     mass, stiffness = np.eye(n), np.diag(modes.omega**2)
