@@ -244,6 +244,8 @@ def test_attachments_on_modes_agree_with_the_structure_solved_anew():
     ("change", "words"),
     [
         ({"mass_per_length": -1.0}, "mass_per_length must be positive"),
+        ({"mass_per_length": ([0.0, 4.0], [1.0, 2.0])}, "given at points from x = 0 to 4, and not at .*both ends"),
+        ({"bending_stiffness": ([0.5, 10.0], [1.0, 2.0])}, "given at points from x = 0.5 to 10, and not at"),
         ({"length": 0.0}, "length"),
         ({"left": "glued"}, "hinged, clamped, free, sliding"),
         ({"attachments": (PointMass(11.0, 1.0),)}, "outside"),
