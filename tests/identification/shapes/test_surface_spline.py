@@ -146,6 +146,8 @@ def test_what_cannot_be_drawn_is_refused(plate):
     ):
         with pytest.raises(ValueError, match=words):
             surface_eigenfunctions(SampledModes(found.omega, found.zeta, found.shapes, positions), length=LENGTH)
+    with pytest.raises(ValueError, match=r"mass_per_area is -2 at \(x, y\) = \(.*\); it must be 0 or more"):
+        surface_eigenfunctions(found, length=LENGTH, mass_per_area=-2.0)
     lost = np.where(np.arange(20)[:, None] == 7, np.nan, found.shapes)
     with pytest.raises(ValueError, match=r"shapes must be finite; of mode 1 sensor 8 has .*nan.*: leave it out"):
         surface_eigenfunctions(SampledModes(found.omega, found.zeta, lost, places), length=LENGTH)

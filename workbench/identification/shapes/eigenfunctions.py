@@ -181,7 +181,7 @@ def eigenfunctions(
     large, take the eigenfunctions of `choose_structure(...).structure`, which model springs and masses.
 
     Raises:
-        ValueError: as `interpolating_spline`; both ways of scaling at once; point masses outside, or
+        ValueError: as `interpolating_spline`; both ways of scaling at once; a negative mass; point masses outside, or
             without a mass distribution; an impulse at a node of a mode.
     """
     if mass_per_length is not None and driven_at is not None:
@@ -294,7 +294,11 @@ def mass_quadrature(
     places = (x, 0), (at, 0), (at, 1)
     rule = np.vstack([spline.matrix(where, derivative) for where, derivative in places])
     masses, inertias = np.reshape([point.pair for point in point_masses], (-1, 2)).T
-    return Quadrature(np.concatenate([weights * density(x), masses, inertias]), rule, places)
+    values = density(x)
+    negative = ~(values >= 0.0)
+    if negative.any():
+        raise ValueError(f"mass_per_length is {values[negative][0]:g} at x = {x[negative][0]:g}; it must be 0 or more")
+    return Quadrature(np.concatenate([weights * values, masses, inertias]), rule, places)
 
 
 def check_along(sampled: SampledModes) -> None:

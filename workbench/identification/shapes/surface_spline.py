@@ -244,7 +244,7 @@ def surface_eigenfunctions(
     `surface_bands` gives the error of the shapes between the sensors.
 
     Raises:
-        ValueError: as `SurfaceSpline`; a sensor without a place, or with one of another kind.
+        ValueError: as `SurfaceSpline`; a sensor without a place, or with one of another kind; a negative mass.
     """
     spline, values = _scaled(sampled, length, mass_per_area, edges)
     return Modes(
@@ -372,7 +372,12 @@ def _weighted(domain: Rectangle, mass_per_area: FieldLike | None) -> tuple[np.nd
     """Integration points (n, 2), m, and the mass that each represents."""
     x, weights = domain.quadrature(SURFACE.quadrature)
     density = as_field(1.0 / float(np.prod(domain.length)) if mass_per_area is None else mass_per_area)
-    return x, weights * density(x[:, 0], x[:, 1])
+    values = density(x[:, 0], x[:, 1])
+    negative = ~(values >= 0.0)
+    if negative.any():
+        at = ", ".join(f"{each:g}" for each in x[negative][0])
+        raise ValueError(f"mass_per_area is {values[negative][0]:g} at (x, y) = ({at}); it must be 0 or more")
+    return x, weights * values
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
