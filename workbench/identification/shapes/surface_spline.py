@@ -8,7 +8,7 @@ limit given the values.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import factorial
 
@@ -277,8 +277,13 @@ class SurfaceErrors:
     def select(self, modes: Sequence[int]) -> "SurfaceErrors":
         """The errors of some modes, by zero-based index."""
         index = list(modes)
-        covariances = self.value_covariance[index], self.roughness[index], self.omega_covariance[np.ix_(index, index)]
-        return SurfaceErrors(self.spline, self.values[:, index], *covariances)
+        return replace(
+            self,
+            values=self.values[:, index],
+            value_covariance=self.value_covariance[index],
+            roughness=self.roughness[index],
+            omega_covariance=self.omega_covariance[np.ix_(index, index)],
+        )
 
 
 @one_blas_thread
