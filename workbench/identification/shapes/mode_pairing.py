@@ -109,7 +109,8 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     """Pairs of measured modes and those of a model of unknown frequency scale, by shape, then by frequency.
 
     The shapes are assigned one to one; a pair needs the least MAC, and a frequency ratio near the median of all pairs.
-    Repeated modes of the model are matched as the subspace that they span, its rigid modes, of 0 Hz, by shape alone.
+    Repeated modes of the model are matched as the subspace that they span. Its rigid modes, of 0 Hz, are matched by
+    shape with modes measured below the others.
 
     Args:
         measured: shapes at placed sensors, their places those of the model's domain.
@@ -128,13 +129,15 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     rows, columns = rows[paired], columns[paired]
     order = np.argsort(columns)
     rows, columns = rows[order], columns[order]
-    elastic = model.omega[columns] > 0.0  # the suspension of a free structure gives its rigid modes a frequency
-    ratio = measured.omega[rows[elastic]] / model.omega[columns[elastic]]
-    consistent = ~elastic
-    if ratio.size:
+    elastic, consistent, scale = model.omega[columns] > 0.0, np.zeros(rows.size, bool), 1.0
+    if elastic.any():
+        ratio = measured.omega[rows[elastic]] / model.omega[columns[elastic]]
         consistent[elastic] = np.abs(ratio / np.median(ratio) - 1.0) <= frequency
-    rows, columns, elastic = rows[consistent], columns[consistent], elastic[consistent]
-    first = np.flatnonzero(elastic)[:1]
-    scale = float(*measured.frequencies_hz[rows[first]] / model.frequencies_hz[columns[first]]) if first.size else 1.0
+    if consistent.any():
+        first = np.argmax(consistent)
+        scale = measured.frequencies_hz[rows[first]] / model.frequencies_hz[columns[first]]
+        # the suspension of a free structure gives its rigid modes a frequency
+        consistent |= ~elastic & (measured.omega[rows] < measured.omega[rows[consistent]].min())
+    rows, columns = rows[consistent], columns[consistent]
     others = np.setdiff1d(np.arange(measured.n_modes), rows)
     return ModePairing(rows, columns, agreement[rows, columns], scale * model.frequencies_hz[columns], others)
