@@ -280,6 +280,25 @@ def deviation_and_width(root: np.ndarray, level: float, rng: np.random.Generator
     return std, float(np.quantile(np.abs(samples).max(axis=0), level))
 
 
+def propagated(
+    values: np.ndarray, at: tuple[np.ndarray, ...], inside: tuple[np.ndarray, ...], weights: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """A mass-normalised curve φ = W v (n_points,), and its changes W - φ ∫ m φ W dx by errors of any kind.
+
+    Args:
+        values: v (n_sensors,), such that ∫ m φ² dx = 1.
+        at: W (n_points, n_sensors), and errors of the curve (n_points, n_errors), which change it alike.
+        inside: the same at places inside, (n_places, ...).
+        weights: (n_places,) the mass at each of these.
+
+    Returns:
+        φ, and (n_points, ...) the change for each of `at`.
+    """
+    phi = at[0] @ values
+    load = weights * (inside[0] @ values)
+    return phi, *(here - np.outer(phi, load @ there) for here, there in zip(at, inside, strict=True))
+
+
 @one_blas_thread
 def eigenfunction_bands(
     found: ShapeEstimates,
@@ -326,21 +345,19 @@ def eigenfunction_bands(
     width = np.zeros(modes.n_modes)
     for spline, members in splines.groups:
         leave_one_out = LeaveOneOut(modes.positions, degree=spline.degree, **options)
-        rule, inside = spline.matrix(x), mass_quadrature(spline, length, mass_per_length, point_masses)
+        inside = mass_quadrature(spline, length, mass_per_length, point_masses)
         kernel, *kernels = (
-            peano_kernel(spline, at, modes.positions, length, derivative) for at, derivative in ((x, 0), *inside.places)
+            peano_kernel(spline, y, modes.positions, length, derivative) for y, derivative in ((x, 0), *inside.places)
         )
+        at, within = (spline.matrix(x), kernel), (inside.rule, np.vstack(kernels))
         for r in members:
             v = values[:, r]
-            load = inside.weights * (inside.rule @ v)
-            q = load @ (inside.rule @ v)
-            phi[:, r] = rule @ v / np.sqrt(q)
-            jacobian = rule / np.sqrt(q) - np.outer(phi[:, r], load @ inside.rule / q)
-            root = jacobian @ symmetric_root(found.shape_covariance[r])
+            scale = 1.0 / np.sqrt(inside.weights @ (inside.rule @ v) ** 2)
+            phi[:, r], jacobian, error = propagated(v * scale, at, within, inside.weights)
+            root = scale * jacobian @ symmetric_root(found.shape_covariance[r])
             roughness = leave_one_out.roughness(v, found.shape_covariance[r])
             if roughness > 0.0:
-                error = kernel / np.sqrt(q) - np.outer(phi[:, r], load @ np.vstack(kernels) / q)
-                error *= np.sqrt(roughness)
+                error *= scale * np.sqrt(roughness)
                 interpolation[:, r] = np.linalg.norm(error, axis=1)
                 root = np.hstack([root, error])
             std[:, r], width[r] = deviation_and_width(root, level, rng)

@@ -19,7 +19,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
 from workbench.arrays import symmetric_root
-from workbench.identification.shapes.bands import BANDS, Bands, deviation_and_width
+from workbench.identification.shapes.bands import BANDS, Bands, deviation_and_width, propagated
 from workbench.identification.signal.modal_estimates import (
     ShapeEstimates,
     check_level,
@@ -321,8 +321,7 @@ def surface_bands(
 ) -> Bands:
     """Confidence bands of the eigenfunctions of `surface_eigenfunctions`, at places (n_points, 2), m.
 
-    With values v, φ = W v / √q and q = vᵀ M v, an error dv and the interpolation error e change φ by
-    W dv / √q + e / √q - φ [vᵀ M dv + ∫∫ m W v e dA] / q, as along an interval (`eigenfunction_bands`).
+    Errors of the values and of the interpolation change them as along an interval (`eigenfunction_bands`).
 
     Args:
         found: modes and the covariance of their shapes, such as `identify_driven` gives, at sensors with places (x, y).
@@ -339,21 +338,19 @@ def surface_bands(
     spline, scaled = _scaled(sampled, length, mass_per_area, edges)
     at, rng = spline.domain.locate(at), np.random.default_rng(seed)
     x, weights = _weighted(spline.domain, mass_per_area)
-    rule, rule_inside = spline.matrix(at), spline.matrix(x)
     root = _root(spline.error(np.vstack([at, x])))
+    here, inside = (spline.matrix(at), root[: len(at)]), (spline.matrix(x), root[len(at) :])
     phi, std, interpolation = (np.zeros((len(at), sampled.n_modes)) for _ in range(3))
     width = np.zeros(sampled.n_modes)
     values = normalised_shapes(sampled.shapes).real
     for r in range(sampled.n_modes):
         factor = scaled[:, r] @ values[:, r] / (values[:, r] @ values[:, r])  # 1 / √q
         value_covariance = found.shape_covariance[r] * factor**2
-        phi[:, r] = rule @ scaled[:, r]
-        mass_weights = weights * (rule_inside @ scaled[:, r])
-        noise = (rule - np.outer(phi[:, r], mass_weights @ rule_inside)) @ _root(value_covariance)
-        interpolation_error = root[: len(at)] - np.outer(phi[:, r], mass_weights @ root[len(at) :])
-        interpolation_error = np.sqrt(spline.roughness(scaled[:, r], value_covariance)) * interpolation_error
-        interpolation[:, r] = np.linalg.norm(interpolation_error, axis=1)
-        std[:, r], width[r] = deviation_and_width(np.hstack([noise, interpolation_error]), level, rng)
+        phi[:, r], jacobian, error = propagated(scaled[:, r], here, inside, weights)
+        error *= np.sqrt(spline.roughness(scaled[:, r], value_covariance))
+        interpolation[:, r] = np.linalg.norm(error, axis=1)
+        noise = jacobian @ _root(value_covariance)
+        std[:, r], width[r] = deviation_and_width(np.hstack([noise, error]), level, rng)
     return Bands(frozen(at), frozen(phi), frozen(std), frozen(interpolation), frozen(width), level)
 
 
