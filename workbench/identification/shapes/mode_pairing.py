@@ -71,7 +71,7 @@ def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray) -> np
 
 
 def _without_rounding(shapes: np.ndarray) -> np.ndarray:
-    """Shapes (n_points, n_modes) with zeros for those that all points see at nodes."""
+    """Shapes (n_points, n_modes) with zeros for those of which rounding alone is left: all points are their nodes."""
     size = np.abs(shapes).max(axis=0)
     return np.where(size > HIDDEN * size.max(), shapes, 0.0)
 
