@@ -345,15 +345,14 @@ def eigenfunction_bands(
     width = np.zeros(modes.n_modes)
     for spline, members in splines.groups:
         leave_one_out = LeaveOneOut(modes.positions, degree=spline.degree, **options)
-        inside = mass_quadrature(spline, length, mass_per_length, point_masses)
-        kernel, *kernels = (
-            peano_kernel(spline, y, modes.positions, length, derivative) for y, derivative in ((x, 0), *inside.places)
-        )
-        at, within = (spline.matrix(x), kernel), (inside.rule, np.vstack(kernels))
+        weights, rule, places = mass_quadrature(spline, length, mass_per_length, point_masses)
+        kernels = [peano_kernel(spline, y, modes.positions, length, derivative) for y, derivative in places]
+        at = spline.matrix(x), peano_kernel(spline, x, modes.positions, length)
+        inside = rule, np.vstack(kernels)
         for r in members:
             v = values[:, r]
-            scale = 1.0 / np.sqrt(inside.weights @ (inside.rule @ v) ** 2)
-            phi[:, r], jacobian, error = propagated(v * scale, at, within, inside.weights)
+            scale = 1.0 / np.sqrt(weights @ (rule @ v) ** 2)
+            phi[:, r], jacobian, error = propagated(v * scale, at, inside, weights)
             root = scale * jacobian @ symmetric_root(found.shape_covariance[r])
             roughness = leave_one_out.roughness(v, found.shape_covariance[r])
             if roughness > 0.0:

@@ -7,7 +7,7 @@ them; the others are removed by leaving out the knots nearest to that end ("not 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 from warnings import warn
 
 import numpy as np
@@ -190,8 +190,8 @@ def eigenfunctions(
     if driven_at is None:
         values = normalised_shapes(sampled.shapes).real
         for spline, members in splines.groups:
-            inside = mass_quadrature(spline, length, mass_per_length, point_masses)
-            values[:, members] /= np.sqrt(inside.weights @ (inside.rule @ values[:, members]) ** 2)
+            weights, rule, _ = mass_quadrature(spline, length, mass_per_length, point_masses)
+            values[:, members] /= np.sqrt(weights @ (rule @ values[:, members]) ** 2)
     else:
         values = _scaled_by_impulse(sampled, splines, driven_at)
     values = frozen(values)
@@ -263,24 +263,17 @@ class Splines:
         return result
 
 
-class Quadrature(NamedTuple):
-    """∫ m φ² dx + Σ (M_k φ² + J_k φ'²) of splines φ = W v as Σ weights (rule v)²: a sum of squares does not cancel.
-
-    Attributes:
-        weights: (n_terms,).
-        rule: (n_terms, n_sensors), φ or its derivative per value at each sensor.
-        places: the places of the terms, (n_places,) m, with the order of the derivative, in turn.
-    """
-
-    weights: np.ndarray
-    rule: np.ndarray
-    places: tuple[tuple[np.ndarray, int], ...]
-
-
 def mass_quadrature(
     spline: Spline, length: float, mass_per_length: ProfileLike | None, point_masses: Sequence[PointMass]
-) -> Quadrature:
-    """The quadrature of the mass as `eigenfunctions` takes it; by default of one that gives ∫ φ_r² dx = length."""
+) -> tuple[np.ndarray, np.ndarray, tuple[tuple[np.ndarray, int], ...]]:
+    """∫ m φ² dx + Σ (M_k φ² + J_k φ'²) of splines φ = W v as Σ weights (rule v)²: a sum of squares does not cancel.
+
+    The mass is that of `eigenfunctions`; by default one that gives ∫ φ_r² dx = length.
+
+    Returns:
+        weights (n_terms,); rule (n_terms, n_sensors), φ or φ' per value at each sensor; and the places of the terms,
+        (n_places,) m, with the order of the derivative, in turn.
+    """
     if mass_per_length is None and len(point_masses):
         raise ValueError("point masses are used beside a mass distribution; give mass_per_length too")
     at = np.array([cast(float, point.at) for point in point_masses])
@@ -298,7 +291,7 @@ def mass_quadrature(
     negative = ~(values >= 0.0)
     if negative.any():
         raise ValueError(f"mass_per_length is {values[negative][0]:g} at x = {x[negative][0]:g}; it must be 0 or more")
-    return Quadrature(np.concatenate([weights * values, masses, inertias]), rule, places)
+    return np.concatenate([weights * values, masses, inertias]), rule, places
 
 
 def check_along(sampled: SampledModes) -> None:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from scipy.special import ndtri
@@ -21,27 +20,6 @@ from workbench.structure.printed import Printed, counted
 NEAR, APART, ALIKE = 0.05, 0.1, 0.9
 SURE = 3.0  # number of standard errors that makes a difference significant
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
-
-
-class ShapeEstimates(Protocol):
-    """Modes with a covariance of their shapes, from `refine`, `ring_down`, `identify`, `identify_driven` or
-    `identify_transfer`.
-
-    `shape_covariance` is (n_modes, n_outputs, n_outputs) of the real parts of the shapes, relative to the largest entry
-    of each; `covariance` is (2 n_modes, 2 n_modes) of (ω, ζ).
-    """
-
-    @property
-    def modes(self) -> SampledModes: ...
-
-    @property
-    def covariance(self) -> np.ndarray: ...
-
-    @property
-    def shape_covariance(self) -> np.ndarray: ...
-
-    @property
-    def shape_std(self) -> np.ndarray: ...
 
 
 class ModalEstimates(Printed):
@@ -197,6 +175,9 @@ class OfRefined(ModalEstimates):
     def shape_std(self) -> np.ndarray:
         """Standard error of the real part of each shape (n_outputs, n_modes)."""
         return self.refined.shape_std
+
+
+ShapeEstimates = Refined | OfRefined | ParticipatingModes  # those with a covariance of the shapes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
