@@ -113,6 +113,13 @@ def test_many_modes_that_hardly_decay_are_not_taken_for_driven():
     _check_undriven(free_decay(modes, sample_time=0.02, n_samples=2000, noise_std=0.5))
 
 
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 6])
+def test_a_record_of_few_samples_asks_for_more_without_a_warning(n, recwarn):
+    with pytest.raises(ValueError, match=f"has {n} samples; a mode needs 7: measure longer"):
+        ring_down(decay(n, noise=0.0))
+    assert not recwarn.list
+
+
 def test_number_of_modes_as_asked():
     assert ring_down(decay(), n_modes=1).refined.modes.n_modes == 1
 

@@ -46,6 +46,14 @@ def test_a_free_structure_has_its_rigid_modes_at_zero(beam_elements):
     np.testing.assert_allclose(found.omega[2:], beam(ends="free").modes(5).omega[2:], rtol=1e-6)
 
 
+@pytest.mark.parametrize("n_modes", [1, 2])
+def test_masses_without_any_stiffness_move_as_rigid_bodies(n_modes):
+    modes = FiniteElements(np.diag([2.0, 3.0]), np.zeros((2, 2)), nodes=NamedPoints(("a", "b"))).modes(n_modes)
+    assert (modes.omega == 0.0).all()
+    shapes = modes.phi(["a", "b"])
+    np.testing.assert_allclose(shapes.T @ np.diag([2.0, 3.0]) @ shapes, np.eye(n_modes), atol=1e-12)
+
+
 def test_what_is_attached_stands_in_the_matrices(beam_elements):
     parts = [PointMass(3.0, 2.0, 0.4), PointSpring(7.0, 5.0), PointSpring(5.0, 1.0, 2.0)]
     named = [
@@ -136,6 +144,8 @@ def test_thirty_thousand_degrees_of_freedom_take_no_longer_than_twice_arpack():
         (np.eye(3), np.diag([1.0, -1.0, 1.0]), "stiffness matrix is not positive semidefinite"),
         (np.eye(2), np.eye(3), r"shape \(2, 2\)"),
         (np.eye(3), np.diag([1.0, np.nan, 1.0]), "not finite"),
+        (np.diag([1.0, 0.0, 1.0]), np.diag([1.0, 0.0, 1.0]), "point 'b' has neither mass nor stiffness.*leave it out"),
+        (np.diag([1.0, 0.0, 0.0]), np.kron([[1.0, 0], [0, 0]], np.eye(2))[:3, :3], "point 'c' has neither mass nor"),
         (np.eye(3), (1.0 + 0.02j) * np.eye(3), r"stiffness matrix is complex.*loss factor.*ModalDamping"),
     ],
 )

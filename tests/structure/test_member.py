@@ -244,6 +244,8 @@ def test_attachments_on_modes_agree_with_the_structure_solved_anew():
     ("change", "words"),
     [
         ({"mass_per_length": -1.0}, "mass_per_length must be positive"),
+        ({"mass_per_length": ([0.0, 4.0], [1.0, 2.0])}, "given at points from x = 0 to 4, and not at .*both ends"),
+        ({"bending_stiffness": ([0.5, 10.0], [1.0, 2.0])}, "given at points from x = 0.5 to 10, and not at"),
         ({"length": 0.0}, "length"),
         ({"left": "glued"}, "hinged, clamped, free, sliding"),
         ({"attachments": (PointMass(11.0, 1.0),)}, "outside"),
@@ -351,6 +353,21 @@ def test_a_spring_beside_a_tip_closed_form(distance):
     omega = pointed(PointSpring(1.0 - distance, stiffness)).modes(6, tolerance=1e-8).omega
     exact = [brentq(unbalanced, w * (1 - 1e-3), w * (1 + 1e-3), xtol=1e-13) for w in omega]
     np.testing.assert_allclose(omega, exact, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (PointMass(0.5, 0.1, 0.02), "a bar in axial vibration does not rotate; leave rotary_inertia out"),
+        (PointSpring(0.5, 0.0, 3.0), "does not rotate; leave rotational_stiffness out"),
+        (PointDamper(0.5, 1.0, 3.0), "does not rotate; leave rotational_coefficient out"),
+    ],
+)
+def test_nothing_turns_on_a_bar(part, words):
+    """It acted on the axial strain there, which jumps: no number of functions sufficed."""
+    bar = {"length": 1.0, "mass_per_length": 1.0, "axial_stiffness": 1.0, "left": "fixed", "right": "free"}
+    with pytest.raises(ValueError, match=words):
+        Bar(**bar, attachments=(part,))
 
 
 def test_nothing_stands_on_a_tip():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.structure.damping import ModalDamping
+from workbench.structure.damping import ModalDamping, ProportionalDamping, ViscousDamping
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
@@ -54,6 +54,16 @@ def test_springs_and_inertias_of_rotation_act_on_the_few_modes_kept():
     few = attach(many, parts, n_modes=5)
     np.testing.assert_allclose(few.omega, attach(many, parts).omega[:5], rtol=1e-6)
     assert abs(few.omega[0] / attach(many, (PointMass(0.7, 0.5),)).omega[0] - 1.0) > 0.1
+
+
+@pytest.mark.parametrize("damping", [ProportionalDamping(1e-4, 0.3), ViscousDamping(lambda x: 6.0 * x**2)])
+@pytest.mark.parametrize("parts", [(), (PointMass(1.3, 0.5),)])
+def test_the_damping_of_rigid_modes_and_between_modes_stays_with_the_few_kept(parts, damping):
+    """It was left out there: rigid modes had none, and of a coupled matrix the diagonal remained."""
+    free = replace(beam(), left="free", damping=damping)
+    few, all_of_them = attach(free.modes(60), parts, n_modes=5), attach(free.modes(60), parts)
+    np.testing.assert_allclose(few.damping, all_of_them.damping[:5, :5], atol=1e-4 * np.abs(few.damping).max())
+    assert few.damping[0, 0] > 0.1
 
 
 @pytest.mark.slow
@@ -109,5 +119,10 @@ def test_parts_that_no_structure_has_are_refused():
     for part, figure in ((PointMass, "mass"), (PointSpring, "stiffness"), (PointDamper, "coefficient")):
         with pytest.raises(ValueError, match=f"the {figure} of a {part.__name__} must be finite; got nan"):
             part(0.5, np.nan)
+    for n in (0, 5):
+        with pytest.raises(ValueError, match=f"4 modes give 1 to 4 with attachments; got n_modes={n}"):
+            attach(beam().modes(4), (PointMass(1.3, 0.5),), n_modes=n)
+    with pytest.raises(ValueError, match="damping ratios must be finite and not negative, one at least"):
+        replace(beam(), damping=ModalDamping([])).modes(2)
     with pytest.raises(ValueError, match="a negative mass is too large"):
         attach(beam().modes(4), (PointMass(2.0, -50.0),))

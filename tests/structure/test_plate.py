@@ -274,6 +274,8 @@ def test_compression_beyond_buckling_is_refused():
     with pytest.raises(ValueError, match="buckling"):
         square("clamped", tension=-60.0).modes(2)
     assert square(tension=-1.9 * np.pi**2).modes(2).omega[0] > 0
+    with pytest.raises(ValueError, match="or a spring of negative stiffness is too strong"):
+        square("free", attachments=(PointSpring((0.3, 0.3), -10.0),)).modes(5)
 
 
 def test_a_tolerance_out_of_reach_is_refused_with_what_is_known(monkeypatch):

@@ -23,6 +23,7 @@ from workbench.identification.input_output.model_order import Selected, Selectio
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, relative_noise, window_rate
 from workbench.identification.signal.clocks import CLOCKS, late_outputs
+from workbench.identification.signal.harmonics import overtone_remarks
 from workbench.identification.signal.modal_estimates import (
     SURE,
     ParticipatingModes,
@@ -30,7 +31,6 @@ from workbench.identification.signal.modal_estimates import (
     set_up_remarks,
     time_derivatives,
 )
-from workbench.identification.signal.overtones import overtone_remarks
 from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress, check_count
 from workbench.records.record import Channel

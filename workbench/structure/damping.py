@@ -17,8 +17,8 @@ class ModalDamping:
     def matrix(self, omega: np.ndarray) -> np.ndarray:
         """c_rs = 2 ζ_r ω_r δ_rs, (n_modes, n_modes)."""
         zeta = np.atleast_1d(np.asarray(self.zeta, float))
-        if not np.isfinite(zeta).all() or (zeta < 0).any():
-            raise ValueError(f"damping ratios must be finite and not negative; got {self.zeta}")
+        if zeta.size == 0 or not np.isfinite(zeta).all() or (zeta < 0).any():
+            raise ValueError(f"damping ratios must be finite and not negative, one at least; got {self.zeta}")
         of_mode = zeta[np.minimum(np.arange(omega.size), zeta.size - 1)]
         return np.diag(2.0 * of_mode * omega)
 

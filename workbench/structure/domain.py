@@ -183,6 +183,8 @@ class Rectangle:
         """
         if isinstance(derivative, tuple):
             return places, derivative, 1.0
+        if derivative not in (0, 1):
+            raise PlaceError(f"a derivative on a plate is 0, 1, or a pair of orders along x and y; got {derivative}")
         if derivative == 0 and direction in (None, "w", "z"):
             return places, (0, 0), 1.0
         if derivative == 1 and direction in ("x", "y"):

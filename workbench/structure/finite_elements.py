@@ -214,9 +214,16 @@ class FiniteElements(Printed):
                 return 0.0, factor
         except RuntimeError:  # a pivot of exactly zero
             pass
-        massive = self.mass.diagonal() > 0
-        shift = -SHIFT * float((self.stiffness.diagonal()[massive] / self.mass.diagonal()[massive]).max())
-        return shift, _factor((self.stiffness - shift * self.mass).tocsc())
+        mass, stiffness = self.mass.diagonal(), self.stiffness.diagonal()
+        massive = mass > 0
+        # without any stiffness, all modes are rigid and any shift will do
+        shift = -SHIFT * float((stiffness[massive] / mass[massive]).max(initial=0.0)) or -1.0
+        try:
+            return shift, _factor((self.stiffness - shift * self.mass).tocsc())
+        except RuntimeError as error:
+            loose = np.flatnonzero(~massive & (stiffness == 0))
+            what = f"point {self.nodes.names[loose[0]]!r}" if loose.size else "a motion"
+            raise ValueError(f"{what} has neither mass nor stiffness, so it has no mode; leave it out") from error
 
 
 def _factor(matrix: csc_array) -> SuperLU:

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, ClassVar
@@ -340,8 +340,8 @@ class Bar(_Member):
         frequency_errors: (n_modes,) ln of the ratio of natural frequencies to those computed from the profiles.
 
     Raises:
-        ValueError: a profile that is not positive, an end of unknown name, an attachment outside, a spring or mass on a
-            tip, where the stiffness vanishes.
+        ValueError: a profile that is not positive, an end of unknown name, an attachment outside or against rotation, a
+            spring or mass on a tip, where the stiffness vanishes.
     """
 
     axial_stiffness: Profile
@@ -366,6 +366,8 @@ class Bar(_Member):
     def __post_init__(self) -> None:
         self._prepare(("fixed", "free"))
         for part in self.attachments:
+            if part.pair[1]:
+                raise ValueError(f"{part}: a bar in axial vibration does not rotate; leave {fields(part)[-1].name} out")
             at = position(part.at)
             end = 0.0 if at < 0.5 * self.length else self.length
             on_end = abs(at - end) < NO_SLIVER * self.length and isinstance(part, PointSpring | PointMass)

@@ -36,8 +36,13 @@ def attach(
         residual_flexibility: flexibility at a point of all modes that are not given, m/N.
 
     MacNeal, Computers & Structures 1 (1971) 581, on residual flexibility.
+
+    Raises:
+        ValueError: more modes than given, a place outside, or masses or springs so negative that there are no modes.
     """
     if n_modes is not None:
+        if not 1 <= n_modes <= modes.n_modes:
+            raise ValueError(f"{modes.n_modes} modes give 1 to {modes.n_modes} with attachments; got n_modes={n_modes}")
         return _with_residual(modes, attachments, n_modes, residual_flexibility)
     n = modes.n_modes
     mass, stiffness = np.eye(n), np.diag(modes.omega**2)
@@ -48,11 +53,7 @@ def attach(
         target += value * shapes.T @ shapes
     if conservative:
         omega, vectors = _eigen(stiffness, mass)
-        if modes.proportional:
-            # a rigid mode has no damping ratio: its coefficient c is kept
-            damping = np.diag(np.where(modes.omega > 0, 2.0 * modes.zeta * omega, np.diag(modes.damping)))
-        else:
-            damping = vectors.T @ modes.damping @ vectors
+        damping = _damping(modes, omega, vectors)
     else:
         omega, vectors, damping = modes.omega, np.eye(n), modes.damping
     for part, derivative, value in _coefficients(part for part in attachments if isinstance(part, PointDamper)):
@@ -120,8 +121,19 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
         target = mass if isinstance(part, PointMass) else stiffness
         target += value * shapes.T @ shapes
     omega, vectors = _eigen(stiffness, mass, subset_by_index=[0, kept - 1])
-    changed = _combined(modes, basis @ vectors, omega, modes.zeta[:kept], attachments)
+    vectors = basis @ vectors
+    changed = _combined(modes, vectors, omega, _damping(modes, omega, vectors), attachments)
     return attach(changed, tuple(part for part in attachments if isinstance(part, PointDamper)))
+
+
+def _damping(modes: Modes, omega: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Damping (n_changed, n_changed) of changed modes: combinations (n_modes, n_changed) of the given, of `omega`."""
+    if not modes.proportional:
+        return np.asarray(vectors.T @ modes.damping @ vectors)
+    given = slice(omega.size)
+    # a rigid mode has no damping ratio: its coefficient c is kept
+    of_rigid = np.diag(modes.damping)[given]
+    return np.diag(np.where(modes.omega[given] > 0, 2.0 * modes.zeta[given] * omega, of_rigid))
 
 
 def _coefficients(parts: Iterable[Attachment]) -> list[tuple[Attachment, int, float]]:

@@ -31,7 +31,7 @@ class Profile:
 
     @classmethod
     def points(cls, x: ArrayLike, value: ArrayLike) -> "Profile":
-        """Linear between the points (x_i, value_i); the same x twice in a row is a jump.
+        """Linear between the points (x_i, value_i), and refused beyond them; the same x twice in a row is a jump.
 
         Args:
             x: (n_points,) positions in m, not decreasing.
@@ -55,8 +55,15 @@ class Profile:
             raise ValueError("more than two profile points have the same x; two make a jump")
         pieces = [i for i in range(x.size - 1) if x[i + 1] > x[i]]
         starts = x[pieces]
+        slack = 1e-9 * (x[-1] - x[0])
 
         def piecewise_linear(at: Floats) -> Floats:
+            outside = (at < x[0] - slack) | (at > x[-1] + slack)
+            if outside.any():
+                raise ValueError(
+                    f"a profile is given at points from x = {x[0]:g} to {x[-1]:g}, and not at {at[outside][0]:g}; give"
+                    " its values at both ends of the structure too"
+                )
             piece = np.asarray(pieces)[np.clip(np.searchsorted(starts, at, side="right") - 1, 0, None)]
             share = (at - x[piece]) / (x[piece + 1] - x[piece])
             return np.asarray(value[piece] + share * (value[piece + 1] - value[piece]))

@@ -34,7 +34,10 @@ MOST_FUNCTIONS = 3000  # of the eigenvalue problem, which then takes ten seconds
 MOST_STATIC = 5000  # of a static response, by a Cholesky factor
 RIGID = 1e-12  # of the scale of ω²: a lower value is that of a rigid-body mode
 REPEATED = 1e-9  # relative difference of ω² below which modes count as repeated
-UNSTABLE = "the tension compresses the surface beyond buckling: an eigenvalue ω² is negative; lower its magnitude"
+UNSTABLE = (
+    "an eigenvalue ω² of the surface is negative: a tension compresses it beyond buckling, or a spring of negative"
+    " stiffness is too strong; lower its magnitude"
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,6 +79,17 @@ def test_bands_hold_what_a_spline_misses_of_springs_and_a_mass():
     assert by_noise[3:].max() < 0.3
 
 
+def test_one_sensor_between_hinges_has_a_wide_band(beam):
+    """The ends alone predict it, by zero: its own value is the error by which they miss the curve elsewhere."""
+    one = beam.select([0])
+    decay = impulse_response_modes(one, at=0.63, positions=[0.8])
+    record = free_decay(decay, sample_time=0.05, n_samples=300, noise_std=1e-4)
+    bands = eigenfunction_bands(refine(record, decay), X, length=LENGTH, mass_per_length=1.5, ends=HINGED)
+    low, high = bands.whole
+    truth = np.abs(one.phi(X))
+    assert ((truth >= low - 1e-9) & (truth <= high + 1e-9)).all() and bands.std.max() > 0.1 * truth.max()
+
+
 def test_refusals(beam):
     found = refined(beam, 0)
     with pytest.raises(ValueError, match="between 0 and 1"):

@@ -115,6 +115,16 @@ def test_what_a_spline_misses_by_its_peano_kernel(derivative, right):
     assert np.abs(missed - (sine(x, derivative) - drawn)).max() < 0.02 * np.abs(missed).max()
 
 
+@pytest.mark.parametrize("last", [0.08, 0.12, 0.18])
+def test_the_scale_holds_where_sensors_stand_on_a_small_part_of_the_structure(last):
+    """The curve beyond them is large in each sensor's value, and small in their sum: products of the former cancel."""
+    at, dense = np.linspace(0.02, last, 14), np.linspace(0.0, 1.0, 20001)
+    noise = 1e-9 * np.random.default_rng(3).standard_normal((14, 1))
+    shape = np.sin(np.pi * at)[:, None] + noise
+    drawn = eigenfunctions(SampledModes([1.0], [0.01], shape, at), length=1.0, degree=9)
+    assert np.trapezoid(drawn.phi(dense)[:, 0] ** 2, dense) == pytest.approx(1.0, rel=1e-6)
+
+
 def test_default_degree_follows_the_mode():
     """High degrees for slow shapes; not for those that motion too fast for their sensors."""
     modes = elastic("bar", "fixed", "free", 8)
@@ -129,20 +139,39 @@ def test_refusals():
     modes = SampledModes([1.0], [0.0], [[1.0], [0.5], [0.2]], [0.5, 1.0, 1.5])
     with pytest.raises(ValueError, match="odd degree"):
         eigenfunctions(modes, length=2.0, degree=4)
+    with pytest.raises(ValueError, match="odd degree; got 0"):
+        eigenfunctions(modes, length=2.0, degree=0)
     with pytest.raises(ValueError, match="add sensors or take degree 1"):
         eigenfunctions(modes, length=2.0, degree=3)
     with pytest.raises(ValueError, match="lies outside"):
         eigenfunctions(modes, length=1.2, degree=1)
+    with pytest.raises(ValueError, match="x = nan lies outside"):
+        interpolating_spline([0.5, np.nan, 1.5], length=2.0, degree=1)
+    held = BoundaryConditions.of("beam", length=2.0, left="hinged", right="hinged")
+    with pytest.raises(ValueError, match="condition holds at x = 2, which is no end of the structure, 0 to"):
+        eigenfunctions(modes, length=1.6, ends=held)
+    with pytest.raises(ValueError, match="all sensors stand at ends that hold the value at zero; add one between"):
+        eigenfunctions(SampledModes([1.0], [0.0], [[0.1], [0.5]], [0.0, 2.0]), length=2.0, ends=held)
+    with pytest.raises(ValueError, match=r"mass_per_length is -1 at x = 1\.\d+; it must be 0 or more"):
+        eigenfunctions(modes, length=2.0, degree=1, mass_per_length=lambda x: np.where(x < 1.0, 1.0, -1.0))
     with pytest.raises(ValueError, match="two sensors stand at"):
         eigenfunctions(SampledModes([1.0], [0.0], [[1.0], [0.5]], [0.5, 0.5]), length=1.0, degree=1)
     with pytest.raises(ValueError, match="has no place"):
         eigenfunctions(SampledModes([1.0], [0.0], [[1.0], [0.5]], [0.5, np.nan]), length=1.0, degree=1)
+    with pytest.raises(ValueError, match="shape of mode 2 is zero at all sensors: leave the mode out"):
+        eigenfunctions(SampledModes([1.0, 2.0], [0.0, 0.0], [[1.0, 0], [0.5, 0]], [0.5, 0.8]), length=1.0, degree=1)
     with pytest.raises(ValueError, match=r"no boundary condition of a .* is called"):
         BoundaryConditions.of("bar", length=1.0, left="clamped")
     hinged = elastic("beam", "hinged", "hinged", 2)
     impulse_at_node = impulse_response_modes(hinged, at=1.0, positions=np.linspace(0.1, 1.9, 15))
     with pytest.raises(ValueError, match="hardly excites mode 2"):
         eigenfunctions(impulse_at_node, length=2.0, driven_at=1.0, degree=5)
+
+
+def test_a_shape_that_is_no_number_is_refused_when_scaled_by_an_impulse_too():
+    lost = SampledModes([1.0], [0.0], [[1j], [np.nan], [0.2j]], [0.5, 1.0, 1.5])
+    with pytest.raises(ValueError, match="shapes must be finite; of mode 1 sensor 2"):
+        eigenfunctions(lost, length=2.0, degree=1, driven_at=0.7)
 
 
 def test_the_former_name_of_boundary_conditions_warns():

@@ -6,6 +6,7 @@ import pytest
 from workbench.identification.shapes.mode_pairing import pair_modes, subspace_mac
 from workbench.structure.domain import NamedPoints, place_array
 from workbench.structure.finite_elements import FiniteElements
+from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes, mac
 from workbench.structure.plate import Plate
 
@@ -53,6 +54,41 @@ def test_one_of_repeated_modes_is_paired_with_the_one_it_is():
     lost = np.where(np.arange(14)[:, None] == 3, np.nan, measured.shapes)
     with pytest.raises(ValueError, match=r"shapes must be finite; of mode 1 sensor 4 has .*nan"):
         pair_modes(SampledModes(measured.omega, measured.zeta, lost, PLACES), modes)
+
+
+def test_rigid_modes_on_a_suspension_are_paired_by_shape():
+    """Their frequency in the model is zero, and no scale: it used to take the pairs of all other modes with it."""
+    model = Beam(length=1.0, bending_stiffness=10.0, mass_per_length=1.0, left="free", right="free").modes(4)
+    assert (model.omega[:2] == 0.0).all()
+    at = np.linspace(0.0, 1.0, 6)
+    omega = np.r_[3.0, 5.0, 1.02 * model.omega[2:]]
+    for some in ([0, 1, 2], [0, 1, 2, 3]):
+        measured = SampledModes(omega[some], np.zeros(len(some)), model.phi(at)[:, some], at)
+        pairing = pair_modes(measured, model)
+        assert pairing.matched.tolist() == pairing.model.tolist() == some
+        np.testing.assert_allclose(pairing.scaled_hz, [0.0, 0.0, *measured.frequencies_hz[2:]], rtol=1e-9)
+    above = SampledModes(np.r_[300.0, 500.0, omega[2:]], np.zeros(4), model.phi(at), at)
+    assert pair_modes(above, model).model.tolist() == [2, 3]
+
+
+def test_modes_with_all_sensors_at_their_nodes_are_not_paired():
+    """Sensors along the middle of a plate see no mode of two half waves across: what rounding leaves of one is like
+    the mode of one half wave across."""
+    plate = Plate(length=(1, 0.6), mass_per_area=1, bending_stiffness=1, poisson_ratio=0.3, edges="simply supported")
+    for model in (plate.modes(6), square()):
+        along = np.column_stack([np.linspace(0.1, 0.9, 7), np.full(7, 0.5 * model.domain.length[1])])
+        seen = np.flatnonzero(np.abs(model.phi(along)).max(axis=0) > 1e-3)
+        assert seen.size < 6
+        measured = SampledModes(model.omega[seen], np.zeros(seen.size), model.phi(along)[:, seen], along)
+        pairing = pair_modes(measured, model)
+        assert pairing.model.tolist() == seen.tolist() and pairing.others.size == 0
+
+
+def test_of_repeated_modes_one_that_no_sensor_sees_adds_nothing_to_their_subspace():
+    model, along = square(), np.column_stack([np.linspace(0.1, 0.9, 7), np.full(7, 0.5)])
+    shapes, other = model.phi(along), np.random.default_rng(0).standard_normal((7, 1))
+    seen = 1 + int(np.argmax(np.abs(shapes[:, 1:3]).max(axis=0)))
+    np.testing.assert_allclose(subspace_mac(other, shapes, model.omega)[0, 1:3], mac(other, shapes[:, [seen]])[0, 0])
 
 
 def test_modes_at_named_points_are_paired_with_those_of_a_model():

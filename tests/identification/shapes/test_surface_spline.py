@@ -89,6 +89,21 @@ def test_held_edges_are_held(plate):
     np.testing.assert_allclose(spline.matrix(along, (1, 0)) @ values, 0.0, atol=1e-7)
 
 
+@pytest.mark.parametrize("edges", ["simply supported", "clamped"])
+@pytest.mark.parametrize("at", [(0.0, 0.45), (1.2, 0.5), (0.6, 0.9), (0.0, 0.0)])
+def test_a_sensor_on_an_edge_that_is_held_changes_nothing(edges, at):
+    """Such as one in its middle, where a condition of the edge stands too: the same value twice."""
+    places, values = scattered(24), np.random.default_rng(2).standard_normal(24)
+    inside = SurfaceSpline(Rectangle(LENGTH), places, edges)
+    spline = SurfaceSpline(Rectangle(LENGTH), np.vstack([places, at]), edges)
+    with_noise = np.r_[values, 0.01]
+    np.testing.assert_array_equal(spline.matrix(GRID) @ with_noise, inside.matrix(GRID) @ values)
+    np.testing.assert_array_equal(spline.error(GRID), inside.error(GRID))
+    assert spline.roughness(with_noise, 1e-6 * np.eye(25)) == inside.roughness(values, 1e-6 * np.eye(24))
+    with pytest.raises(ValueError, match="5 sensors and the edges do not determine a cubic"):
+        SurfaceSpline(Rectangle(LENGTH), np.vstack([places[:5], (0.0, 0.45)]), {"left": "simply supported"})
+
+
 def test_bands_hold_the_true_shapes(plate):
     """By point and as a whole, nearly all of the true surface."""
     places, rng = scattered(30), np.random.default_rng(8)
@@ -115,6 +130,8 @@ def test_bands_hold_the_true_shapes(plate):
 def test_what_cannot_be_drawn_is_refused(plate):
     with pytest.raises(ValueError, match="do not determine a cubic"):
         SurfaceSpline(Rectangle(LENGTH), scattered(8))
+    with pytest.raises(ValueError, match="10 sensors determine a cubic over the rectangle and nothing beyond"):
+        SurfaceSpline(Rectangle(LENGTH), scattered(10)).roughness(np.ones(10), np.eye(10))
     places = scattered(20)
     with pytest.raises(ValueError, match="sensors 1 and 20 stand at one place"):
         SurfaceSpline(Rectangle(LENGTH), np.vstack([places[:19], places[:1]]))
@@ -129,6 +146,8 @@ def test_what_cannot_be_drawn_is_refused(plate):
     ):
         with pytest.raises(ValueError, match=words):
             surface_eigenfunctions(SampledModes(found.omega, found.zeta, found.shapes, positions), length=LENGTH)
+    with pytest.raises(ValueError, match=r"mass_per_area is -2 at \(x, y\) = \(.*\); it must be 0 or more"):
+        surface_eigenfunctions(found, length=LENGTH, mass_per_area=-2.0)
     lost = np.where(np.arange(20)[:, None] == 7, np.nan, found.shapes)
     with pytest.raises(ValueError, match=r"shapes must be finite; of mode 1 sensor 8 has .*nan.*: leave it out"):
         surface_eigenfunctions(SampledModes(found.omega, found.zeta, lost, places), length=LENGTH)

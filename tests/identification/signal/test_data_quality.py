@@ -81,7 +81,10 @@ def test_sensor_of_another_rate(sound):
     held = only(with_row(sound, 0, np.repeat(slow, 4)))
     joined = only(with_row(sound, 0, np.interp(time, time[::4], slow)))
     for found in (held, joined):
-        assert (found.kind, found.outputs) == ("upsampled", ("y1",)) and "sampled at 25 Hz" in found.message
+        assert (found.kind, found.outputs) == (
+            "upsampled",
+            ("y1",),
+        ) and "once in 4 samples only: it was sampled at 25 Hz" in found.message
     assert "held" in held.message and "straight lines" in joined.message
 
 
@@ -161,6 +164,25 @@ def test_a_record_given_twice_is_refused(sound):
     """Its errors would be too small by the root of two."""
     with pytest.raises(ValueError, match="'one' and 'again' hold the same measurement"):
         identify([replace(sound, name="one"), replace(sound, name="again")])
+
+
+def test_records_of_one_name_and_other_sensors_are_refused(sound):
+    """Their outputs have no common shapes: accelerations grow with the square of the frequency."""
+    again = replace(sound, outputs=sound.outputs[:, ::-1])
+    assert len(of_same_sensors([sound, again])) == 2
+    channels = sound.output_channels
+    placed = replace(again, output_channels=tuple(replace(c, at=None if c is channels[3] else c.at) for c in channels))
+    assert len(of_same_sensors([sound, placed])) == 2
+    for change, words in (
+        (
+            {"quantity": "acceleration", "unit": ""},
+            "'y2' measures displacement at 0.3333 in 'free decay' and acceleration",
+        ),
+        ({"at": 0.5}, "'y2' measures displacement at 0.3333 in 'free decay' and displacement at 0.5 in"),
+    ):
+        other = (channels[0], replace(channels[1], **change), *channels[2:])
+        with pytest.raises(ValueError, match=words):
+            of_same_sensors([sound, replace(again, output_channels=other)])
 
 
 def test_two_measurements_on_one_large_offset_are_two(sound):

@@ -52,7 +52,20 @@ def test_a_repeated_sequence_has_its_period(period, noise):
     assert abs(period_of(inputs + noise * inputs.std() * RNG.normal(size=inputs.shape)) - period) <= 1
 
 
+def test_a_sequence_about_a_constant_has_its_period():
+    """A preload of a shaker, or a pulse train, beside an input that is at rest."""
+    one = np.cos(2 * np.pi * np.arange(100) * 3 / 100) + np.cos(2 * np.pi * np.arange(100) * 7 / 100)
+    assert period_of(np.stack([np.tile(one, 4) + 5.0, np.full(400, 7.0)])) == 100
+    assert period_of(np.tile(one > 1.0, 4)[None]) == 100
+    assert period_of(np.tile(one, 2)[None]) == 100
+
+
+def test_a_sine_of_less_than_two_periods_has_none():
+    assert period_of(np.sin(2 * np.pi * np.arange(400) / 205)[None]) is None
+
+
 def test_noise_a_drift_rest_and_one_period_have_none():
+    assert period_of(np.full((1, 300), 0.1)) is None
     assert period_of(RNG.normal(size=(1, 4000))) is None
     assert period_of(np.linspace(0.0, 1.0, 500)[None]) is None
     assert period_of(np.zeros((2, 300))) is None

@@ -14,8 +14,8 @@ from workbench.arrays import Complexes, Floats
 from workbench.identification.free_decay.assumptions import AmplitudeDependence, amplitude_dependence
 from workbench.identification.free_decay.order import identify_within
 from workbench.identification.input_output.time_variance import IS_MEAN
+from workbench.identification.signal.harmonics import overtone_remarks
 from workbench.identification.signal.modal_estimates import Refined
-from workbench.identification.signal.overtones import overtone_remarks
 from workbench.identification.signal.searches import Budget
 from workbench.records.record import Record
 

@@ -64,7 +64,7 @@ class StablePole:
         presence: share of the orders at which it was found.
         statistic: twice the log-likelihood ratio, by one-step prediction, of the record with and without the mode.
         orders, poles: model orders at which it was found, and its pole at each.
-        slower: decimation factor of the sampling rate at which it was found.
+        decimation: ratio of the record's sampling rate to the one at which it was found.
         variance: (2, 2) of Re λ and Im λ; nan until estimated.
     """
 
@@ -92,9 +92,7 @@ class Subspace:
 
     def stable(self) -> list[StablePole]:
         """The poles that are stable over the orders, each from the sampling rate of its largest presence."""
-        candidates: list[StablePole] = []
-        for decimation in self._outputs:
-            candidates += self._at_one_rate(decimation)
+        candidates = [mode for decimation in self._outputs for mode in self._at_one_rate(decimation)]
         distinct: list[StablePole] = []
         for mode in sorted(candidates, key=lambda mode: -mode.presence):
             if not any(_same(mode, other) for other in distinct):
@@ -162,10 +160,10 @@ class Subspace:
                 gain *= self.n_samples / decimation
                 own = (order,), (complex(pole),)
                 mode = StablePole(complex(pole), shape, 0.0, gain, *own, decimation, np.full((2, 2), np.nan))
-                near = [(_distance(mode, group[-1]), group) for group in groups if group[-1].orders[0] != order]
-                near = [pair for pair in near if pair[0] < SUBSPACE.near]
-                if near:
-                    min(near, key=lambda pair: pair[0])[1].append(mode)
+                others = [group for group in groups if group[-1].orders[0] != order]
+                distances = [_distance(mode, group[-1]) for group in others]
+                if min(distances, default=np.inf) < SUBSPACE.near:
+                    others[int(np.argmin(distances))].append(mode)
                 else:
                     groups.append([mode])
         return [_median_mode(group, orders) for group in groups if _is_stable(group, orders)]

@@ -39,11 +39,10 @@ from workbench.identification.shapes.eigenfunctions import (
     Spline,
     Splines,
     check_along,
-    inertia_of,
     interpolating_spline,
-    mass_matrix,
+    mass_quadrature,
 )
-from workbench.identification.signal.modal_estimates import ShapeEstimates, normalised_shapes
+from workbench.identification.signal.modal_estimates import ShapeEstimates, check_level, normalised_shapes
 from workbench.renamed import Renamed
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed, counted
@@ -266,16 +265,6 @@ class Bands(Printed):
         return self.phi - width * self.std, self.phi + width * self.std
 
 
-def check_level(level: float) -> None:
-    """Refuse a confidence level outside 0..1.
-
-    Raises:
-        ValueError: a level outside 0..1.
-    """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"the level of a confidence band lies between 0 and 1; got {level}")
-
-
 def deviation_and_width(root: np.ndarray, level: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
     """Standard errors (n_points,) of a curve of error covariance R Rᵀ, and the width of its simultaneous band.
 
@@ -289,6 +278,25 @@ def deviation_and_width(root: np.ndarray, level: float, rng: np.random.Generator
         return std, 0.0
     samples = (root[uncertain] / std[uncertain, None]) @ rng.standard_normal((root.shape[1], BANDS.draws))
     return std, float(np.quantile(np.abs(samples).max(axis=0), level))
+
+
+def propagated(
+    values: np.ndarray, at: tuple[np.ndarray, ...], inside: tuple[np.ndarray, ...], weights: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """A mass-normalised curve φ = W v (n_points,), and its changes W - φ ∫ m φ W dx by errors of any kind.
+
+    Args:
+        values: v (n_sensors,), such that ∫ m φ² dx = 1.
+        at: W (n_points, n_sensors), and errors of the curve (n_points, n_errors), which change it alike.
+        inside: the same at places inside, (n_places, ...).
+        weights: (n_places,) the mass at each of these.
+
+    Returns:
+        φ, and (n_points, ...) the change for each of `at`.
+    """
+    phi = at[0] @ values
+    load = weights * (inside[0] @ values)
+    return phi, *(here - np.outer(phi, load @ there) for here, there in zip(at, inside, strict=True))
 
 
 @one_blas_thread
@@ -332,26 +340,23 @@ def eigenfunction_bands(
     modes, rng = found.modes, np.random.default_rng(seed)
     options: dict[str, Any] = {"length": length, "ends": ends or BoundaryConditions()}
     splines = Splines.through(modes, degree=degree, **options)
-    inertia = inertia_of(mass_per_length, point_masses, length)
     values = normalised_shapes(modes.shapes).real
     phi, std, interpolation = (np.zeros((x.size, modes.n_modes)) for _ in range(3))
     width = np.zeros(modes.n_modes)
     for spline, members in splines.groups:
         leave_one_out = LeaveOneOut(modes.positions, degree=spline.degree, **options)
-        rule, mass = spline.matrix(x), mass_matrix(spline, inertia, length)
+        weights, rule, places = mass_quadrature(spline, length, mass_per_length, point_masses)
+        kernels = [peano_kernel(spline, y, modes.positions, length, derivative) for y, derivative in places]
+        at = spline.matrix(x), peano_kernel(spline, x, modes.positions, length)
+        inside = rule, np.vstack(kernels)
         for r in members:
             v = values[:, r]
-            q = v @ mass @ v
-            phi[:, r] = rule @ v / np.sqrt(q)
-            jacobian = rule / np.sqrt(q) - np.outer(phi[:, r], mass @ v / q)
-            root = jacobian @ symmetric_root(found.shape_covariance[r])
+            scale = 1.0 / np.sqrt(weights @ (rule @ v) ** 2)
+            phi[:, r], jacobian, error = propagated(v * scale, at, inside, weights)
+            root = scale * jacobian @ symmetric_root(found.shape_covariance[r])
             roughness = leave_one_out.roughness(v, found.shape_covariance[r])
             if roughness > 0.0:
-                error = peano_kernel(spline, x, modes.positions, length) / np.sqrt(q)
-                for y, weights, derivative in inertia.weighted(spline, length):
-                    kernel = peano_kernel(spline, y, modes.positions, length, derivative)
-                    error -= np.outer(phi[:, r], (weights * (spline.matrix(y, derivative) @ v)) @ kernel / q)
-                error *= np.sqrt(roughness)
+                error *= scale * np.sqrt(roughness)
                 interpolation[:, r] = np.linalg.norm(error, axis=1)
                 root = np.hstack([root, error])
             std[:, r], width[r] = deviation_and_width(root, level, rng)

@@ -13,10 +13,10 @@ from warnings import warn
 import numpy as np
 from scipy.interpolate import BSpline
 
-from workbench.identification.signal.modal_estimates import check_placed, normalised_shapes
+from workbench.identification.signal.modal_estimates import check_finite, check_placed, normalised_shapes
 from workbench.structure.domain import Interval, gauss_between
 from workbench.structure.modes import Modes, SampledModes, frozen
-from workbench.structure.profile import Profile, ProfileLike, as_profile
+from workbench.structure.profile import ProfileLike, as_profile
 from workbench.structure.supports import PointMass
 from workbench.threads import one_blas_thread
 
@@ -115,14 +115,21 @@ def interpolating_spline(
         degree: 1, 3, 5, ...
 
     Raises:
-        ValueError: an even degree, too few sensors for it, sensors outside, unplaced or at one place.
+        ValueError: an even degree, too few sensors for it, sensors outside, unplaced or at one place, a boundary
+            condition that is at no end.
     """
     at_sensors = np.asarray(positions, float)
     _check_places(at_sensors, length, degree)
     slack = 1e-9 * length
+    elsewhere = [at for at, _ in ends.zeros if min(abs(at), abs(at - length)) > slack]
+    if elsewhere:
+        raise ValueError(
+            f"a boundary condition holds at x = {elsewhere[0]:g}, which is no end of the structure, 0 to {length:g};"
+            " give both the same length"
+        )
     conditions = _usable(ends.zeros, degree, length)
     held_places = [at for at, derivative in conditions if derivative == 0]
-    used = np.array([all(abs(x - at) > slack for at in held_places) for x in at_sensors])
+    used = np.array([all(abs(x - at) > slack for at in held_places) for x in at_sensors], bool)
     sites = np.union1d(at_sensors[used], np.array(held_places))
     derivatives = [(at, d) for at, d in conditions if d > 0]
     n_functions = sites.size + len(derivatives)
@@ -174,7 +181,7 @@ def eigenfunctions(
     large, take the eigenfunctions of `choose_structure(...).structure`, which model springs and masses.
 
     Raises:
-        ValueError: as `interpolating_spline`; both ways of scaling at once; point masses outside, or
+        ValueError: as `interpolating_spline`; both ways of scaling at once; a negative mass; point masses outside, or
             without a mass distribution; an impulse at a node of a mode.
     """
     if mass_per_length is not None and driven_at is not None:
@@ -182,10 +189,9 @@ def eigenfunctions(
     splines = Splines.through(sampled, length=length, ends=ends, degree=degree)
     if driven_at is None:
         values = normalised_shapes(sampled.shapes).real
-        inertia = inertia_of(mass_per_length, point_masses, length)
         for spline, members in splines.groups:
-            mass = mass_matrix(spline, inertia, length)
-            values[:, members] /= np.sqrt(np.einsum("jr,jk,kr->r", values[:, members], mass, values[:, members]))
+            weights, rule, _ = mass_quadrature(spline, length, mass_per_length, point_masses)
+            values[:, members] /= np.sqrt(weights @ (rule @ values[:, members]) ** 2)
     else:
         values = _scaled_by_impulse(sampled, splines, driven_at)
     values = frozen(values)
@@ -242,9 +248,12 @@ class Splines:
     ) -> "Splines":
         check_along(sampled)
         options: dict[str, Any] = {"length": length, "ends": ends}
-        degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **options)
+        degrees = best_degrees(sampled, **options) if degree is None else np.full(sampled.n_modes, degree)
         each = [(int(d), np.flatnonzero(degrees == d)) for d in np.unique(degrees)]
-        return cls(tuple((interpolating_spline(sampled.positions, degree=d, **options), modes) for d, modes in each))
+        groups = tuple((interpolating_spline(sampled.positions, degree=d, **options), modes) for d, modes in each)
+        if not any(spline.weights.any() for spline, _ in groups):
+            raise ValueError("all sensors stand at ends that hold the value at zero; add one between the ends")
+        return cls(groups)
 
     def __call__(self, values: np.ndarray, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Splines through values (n_sensors, n_modes), at x: (n_points, n_modes)."""
@@ -254,43 +263,35 @@ class Splines:
         return result
 
 
-@dataclass(frozen=True)
-class Inertia:
-    """The mass along the structure and at points, which scales an eigenfunction."""
+def mass_quadrature(
+    spline: Spline, length: float, mass_per_length: ProfileLike | None, point_masses: Sequence[PointMass]
+) -> tuple[np.ndarray, np.ndarray, tuple[tuple[np.ndarray, int], ...]]:
+    """∫ m φ² dx + Σ (M_k φ² + J_k φ'²) of splines φ = W v as Σ weights (rule v)²: a sum of squares does not cancel.
 
-    density: Profile
-    point_masses: tuple[PointMass, ...] = ()
+    The mass is that of `eigenfunctions`; by default one that gives ∫ φ_r² dx = length.
 
-    def weighted(self, spline: Spline, length: float) -> list[tuple[np.ndarray, np.ndarray, int]]:
-        """Quadrature of ∫ m φ² dx + Σ (M_k φ² + J_k φ'²): (places, weights, derivative) of each part."""
-        breaks = [b for b in self.density.breaks if 0 < b < length]
-        # exact for the product of two splines and a cubic mass
-        x, weights = gauss_between(np.unique(np.concatenate([spline.knots, breaks])), spline.degree + 3)
-        at = np.array([point.at for point in self.point_masses])
-        return [
-            (x, weights * self.density(x), 0),
-            (at, np.array([point.mass for point in self.point_masses]), 0),
-            (at, np.array([point.rotary_inertia for point in self.point_masses]), 1),
-        ]
-
-
-def inertia_of(mass_per_length: ProfileLike | None, point_masses: Sequence[PointMass], length: float) -> Inertia:
-    """The mass as `eigenfunctions` takes it; by default one that gives ∫ φ_r² dx = length."""
+    Returns:
+        weights (n_terms,); rule (n_terms, n_sensors), φ or φ' per value at each sensor; and the places of the terms,
+        (n_places,) m, with the order of the derivative, in turn.
+    """
     if mass_per_length is None and len(point_masses):
         raise ValueError("point masses are used beside a mass distribution; give mass_per_length too")
-    for point in point_masses:
-        if not 0.0 <= cast(float, point.at) <= length:
-            raise ValueError(f"the point mass at x = {point.at:g} lies outside the structure, 0 to {length:g}")
-    return Inertia(as_profile(1.0 / length if mass_per_length is None else mass_per_length), tuple(point_masses))
-
-
-def mass_matrix(spline: Spline, inertia: Inertia, length: float) -> np.ndarray:
-    """M of v^T M v = ∫ m φ² dx + Σ (M_k φ² + J_k φ'²) for φ through values v at the sensors, (n_sensors, n_sensors)."""
-    mass = np.zeros((spline.weights.shape[1],) * 2)
-    for x, weights, derivative in inertia.weighted(spline, length):
-        rule = spline.matrix(x, derivative)
-        mass += rule.T @ (weights[:, None] * rule)
-    return mass
+    at = np.array([cast(float, point.at) for point in point_masses])
+    outside = (at < 0.0) | (at > length)
+    if outside.any():
+        raise ValueError(f"the point mass at x = {at[outside][0]:g} lies outside the structure, 0 to {length:g}")
+    density = as_profile(1.0 / length if mass_per_length is None else mass_per_length)
+    breaks = [b for b in density.breaks if 0 < b < length]
+    # exact for the product of two splines and a cubic mass
+    x, weights = gauss_between(np.unique(np.concatenate([spline.knots, breaks])), spline.degree + 3)
+    places = (x, 0), (at, 0), (at, 1)
+    rule = np.vstack([spline.matrix(where, derivative) for where, derivative in places])
+    masses, inertias = np.reshape([point.pair for point in point_masses], (-1, 2)).T
+    values = density(x)
+    negative = ~(values >= 0.0)
+    if negative.any():
+        raise ValueError(f"mass_per_length is {values[negative][0]:g} at x = {x[negative][0]:g}; it must be 0 or more")
+    return np.concatenate([weights * values, masses, inertias]), rule, places
 
 
 def check_along(sampled: SampledModes) -> None:
@@ -311,7 +312,7 @@ def _check_places(positions: np.ndarray, length: float, degree: int) -> None:
     if degree < 1 or degree % 2 == 0:
         raise ValueError(f"a spline through sensors has an odd degree; got {degree}")
     slack = 1e-9 * length
-    outside = (positions < -slack) | (positions > length + slack)
+    outside = ~((positions >= -slack) & (positions <= length + slack))
     if outside.any():
         raise ValueError(f"the sensor at x = {positions[outside][0]:g} lies outside the structure, 0 to {length:g}")
     ordered = np.sort(positions)
@@ -321,15 +322,11 @@ def _check_places(positions: np.ndarray, length: float, degree: int) -> None:
 
 
 def _usable(zeros: Sequence[tuple[float, int]], degree: int, length: float) -> list[tuple[float, int]]:
-    """Conditions that a spline can take: of each end the value and at most (degree - 1) / 2 derivatives.
-
-    Lowest first, below the degree.
-    """
+    """Conditions that a spline can take: of each end the value and the (degree - 1) / 2 lowest derivatives at most."""
     kept = []
     for end in (0.0, length):
         orders = sorted(d for at, d in zeros if abs(at - end) <= 1e-9 * length and d < degree)
-        values, slopes = [d for d in orders if d == 0], [d for d in orders if d > 0]
-        kept += [(end, d) for d in values + slopes[: (degree - 1) // 2]]
+        kept += [(end, d) for d in orders[: (degree - 1) // 2 + (0 in orders)]]
     return kept
 
 
@@ -345,6 +342,7 @@ def _knots(sites: np.ndarray, derivatives: list[tuple[float, int]], length: floa
 
 
 def _scaled_by_impulse(sampled: SampledModes, splines: Splines, x0: float) -> np.ndarray:
+    check_finite(sampled.shapes)
     omega_d = np.abs(sampled.poles.imag)
     products = (1j * sampled.shapes * omega_d).real
     at_impulse = splines(products, np.array([x0]))[0]

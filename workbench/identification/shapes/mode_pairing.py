@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import orth
 from scipy.optimize import linear_sum_assignment
 
 from workbench.identification.signal.modal_estimates import check_finite, check_placed
@@ -11,6 +12,7 @@ from workbench.structure.modes import Modes, SampledModes, mac
 from workbench.structure.printed import Printed, counted
 
 PLAIN_WEIGHT = 1e-3  # of the plain MAC beside that of the subspace: it decides among repeated modes
+HIDDEN = 1e-9  # of the largest shape: one below it is zero at all sensors, and what rounding leaves of it is no shape
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -21,7 +23,7 @@ class ModePairing(Printed):
         matched: (n_matched,) indices of the paired measured modes, by increasing mode of the model.
         model: (n_matched,) indices of the model's modes paired with them.
         mac: (n_matched,) MAC of each pair.
-        scaled_hz: (n_matched,) the model's frequencies, scaled to the first pair, Hz.
+        scaled_hz: (n_matched,) the model's frequencies, scaled to the first pair of elastic modes, Hz.
         others: (n_others,) indices of the measured modes without a pair.
     """
 
@@ -63,9 +65,15 @@ def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray) -> np
         omega: (n_second,) frequencies of the second set, not decreasing.
 
     Returns:
-        (n_first, n_second), between 0 and 1.
+        (n_first, n_second), between 0 and 1; 0 for a shape ψ_s that is zero at all points.
     """
-    return _cluster_mac(first, second, repeated_modes(omega))
+    return _cluster_mac(first, _without_rounding(second), repeated_modes(omega))
+
+
+def _without_rounding(shapes: np.ndarray) -> np.ndarray:
+    """Shapes (n_points, n_modes) with zeros for those of which rounding alone is left: all points are their nodes."""
+    size = np.abs(shapes).max(axis=0)
+    return np.where(size > HIDDEN * size.max(), shapes, 0.0)
 
 
 def _cluster_mac(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
@@ -73,7 +81,7 @@ def _cluster_mac(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> 
     for number in np.unique(cluster):
         members = np.flatnonzero(cluster == number)
         if members.size > 1:
-            basis = np.linalg.qr(second[:, members])[0]
+            basis = orth(second[:, members], rcond=HIDDEN)
             share = (np.abs(basis.conj().T @ first) ** 2).sum(axis=0) / (np.abs(first) ** 2).sum(axis=0)
             values[:, members] = share[:, None]
     return values
@@ -91,6 +99,7 @@ def assigned(
         cluster: (n_second,) cluster number of each shape of the second set.
         least: MAC below which a pair is none.
     """
+    second = _without_rounding(second)
     agreement = _cluster_mac(first, second, cluster)
     score = np.where(agreement >= least, agreement + PLAIN_WEIGHT * mac(first, second), 0.0)
     return *linear_sum_assignment(-score), agreement
@@ -100,7 +109,8 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     """Pairs of measured modes and those of a model of unknown frequency scale, by shape, then by frequency.
 
     The shapes are assigned one to one; a pair needs the least MAC, and a frequency ratio near the median of all pairs.
-    Repeated modes of the model are matched as the subspace that they span.
+    Repeated modes of the model are matched as the subspace that they span. Its rigid modes, of 0 Hz, are matched by
+    shape with modes measured below the others.
 
     Args:
         measured: shapes at placed sensors, their places those of the model's domain.
@@ -117,12 +127,17 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     rows, columns, agreement = assigned(measured.shapes, model_shapes, cluster, least=shape)
     paired = agreement[rows, columns] >= shape
     rows, columns = rows[paired], columns[paired]
-    ratio = measured.omega[rows] / model.omega[columns]
-    if ratio.size:
-        consistent = np.abs(ratio / np.median(ratio) - 1.0) <= frequency
-        rows, columns = rows[consistent], columns[consistent]
     order = np.argsort(columns)
     rows, columns = rows[order], columns[order]
-    scale = measured.frequencies_hz[rows[0]] / model.frequencies_hz[columns[0]] if rows.size else 1.0
+    elastic, consistent, scale = model.omega[columns] > 0.0, np.zeros(rows.size, bool), 1.0
+    if elastic.any():
+        ratio = measured.omega[rows[elastic]] / model.omega[columns[elastic]]
+        consistent[elastic] = np.abs(ratio / np.median(ratio) - 1.0) <= frequency
+    if consistent.any():
+        first = np.argmax(consistent)
+        scale = measured.frequencies_hz[rows[first]] / model.frequencies_hz[columns[first]]
+        # the suspension of a free structure gives its rigid modes a frequency
+        consistent |= ~elastic & (measured.omega[rows] < measured.omega[rows[consistent]].min())
+    rows, columns = rows[consistent], columns[consistent]
     others = np.setdiff1d(np.arange(measured.n_modes), rows)
     return ModePairing(rows, columns, agreement[rows, columns], scale * model.frequencies_hz[columns], others)

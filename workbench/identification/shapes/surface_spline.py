@@ -8,7 +8,7 @@ limit given the values.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import factorial
 
@@ -19,8 +19,13 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
 from workbench.arrays import symmetric_root
-from workbench.identification.shapes.bands import BANDS, Bands, check_level, deviation_and_width
-from workbench.identification.signal.modal_estimates import ShapeEstimates, check_placed, normalised_shapes
+from workbench.identification.shapes.bands import BANDS, Bands, deviation_and_width, propagated
+from workbench.identification.signal.modal_estimates import (
+    ShapeEstimates,
+    check_level,
+    check_placed,
+    normalised_shapes,
+)
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import FieldLike, as_field
@@ -82,7 +87,8 @@ class SurfaceSpline:
         domain: the rectangle, m.
         places: (n_places, 2) of the values, m.
         edges: "simply supported", "clamped", "free" or "guided": one for all, or a mapping of left, right, bottom and
-            top. They set the function or its slope to zero; a side that is left out has no condition.
+            top. They set the function or its slope to zero; a side that is left out has no condition. A sensor on an
+            edge that holds the value at zero is not used.
 
     Raises:
         ValueError: fewer values and edge points than the ten of a cubic, two coincident places, a place outside.
@@ -93,11 +99,8 @@ class SurfaceSpline:
     edges: str | Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if isinstance(self.edges, str):
-            object.__setattr__(self, "edges", dict.fromkeys(SIDES, self.edges))
-        assert isinstance(self.edges, Mapping)
         object.__setattr__(self, "places", frozen(self.domain.locate(self.places)))
-        for side, edge in self.edges.items():
+        for side, edge in self._edge_of.items():
             if side not in SIDES or edge not in HELD_BY:
                 raise ValueError(
                     f"edges are given by side, {', '.join(SIDES)}, as {', '.join(HELD_BY)}; got {side} {edge!r}"
@@ -106,62 +109,69 @@ class SurfaceSpline:
         if gaps.min() < SURFACE.same_place * self.domain.size:
             i, j = np.unravel_index(int(gaps.argmin()), gaps.shape)
             raise ValueError(f"sensors {i + 1} and {j + 1} stand at one place, {self.places[i]} m; keep one of them")
-        if np.linalg.matrix_rank(self._polynomials) < len(CUBIC):
+        if np.linalg.matrix_rank(self._equations[:, -len(CUBIC) :]) < len(CUBIC):
             raise ValueError(
-                f"{len(self.places)} sensors and the edges do not determine a cubic over the rectangle, which takes"
+                f"{self._used.sum()} sensors and the edges do not determine a cubic over the rectangle, which takes"
                 f" {len(CUBIC)} values, not on a line: add sensors, or name the edges that hold it"
             )
 
+    @property
+    def _edge_of(self) -> Mapping[str, str]:
+        return dict.fromkeys(SIDES, self.edges) if isinstance(self.edges, str) else self.edges
+
     @cached_property
-    def _held(self) -> list[Functional]:
-        """Points along the edges, each with the derivative that is zero there."""
-        a, b = self.domain.length
-        conditions: list[Functional] = []
-        assert isinstance(self.edges, Mapping)
-        for side, edge in self.edges.items():
-            i = SIDES.index(side)
-            along = (np.arange(SURFACE.per_edge) + 0.5) / SURFACE.per_edge
-            across = np.full(SURFACE.per_edge, float(i % 2))
-            points = np.column_stack([across, along] if i < 2 else [along, across]) * (a, b)
-            for order in HELD_BY[edge]:
-                conditions.append((points, ((order, 0) if i < 2 else (0, order))))
-        return conditions
+    def _used(self) -> np.ndarray:
+        """Which places are not on an edge that holds the value at zero, (n_places,)."""
+        used = np.ones(len(self.places), bool)
+        for side in (side for side, edge in self._edge_of.items() if 0 in HELD_BY[edge]):
+            axis, far = divmod(SIDES.index(side), 2)
+            distance = np.abs(self.places[:, axis] - far * self.domain.length[axis])
+            used &= distance > SURFACE.same_place * self.domain.size
+        return used
 
     @cached_property
     def _functionals(self) -> list[Functional]:
-        return [(self.places, (0, 0)), *self._held]
+        """The sensors used, and points along the edges, each with a derivative that is zero there."""
+        functionals: list[Functional] = [(self.places[self._used], (0, 0))]
+        share = (np.arange(SURFACE.per_edge) + 0.5) / SURFACE.per_edge
+        for side, edge in self._edge_of.items():
+            axis, far = divmod(SIDES.index(side), 2)
+            points = np.empty((SURFACE.per_edge, 2))
+            points[:, axis], points[:, 1 - axis] = far * self.domain.length[axis], share * self.domain.length[1 - axis]
+            functionals += [(points, (order, 0) if axis == 0 else (0, order)) for order in HELD_BY[edge]]
+        return functionals
 
-    @cached_property
-    def _polynomials(self) -> np.ndarray:
-        """Cubic monomials under all functionals, (n_values, 10), with the diagonal as unit."""
-        return np.vstack([self._cubic(at, derivative) for at, derivative in self._functionals])
+    def _rows(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
+        """Of a derivative at places: covariance with every functional for τ² = 1, and cubics, (n_at, n_values + 10).
 
-    def _cubic(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
-        return _cubics(at / self.domain.size, derivative)
-
-    def _covariance(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
-        """Covariance of a derivative at places with every functional, for τ² = 1: (n_at, n_values)."""
+        The diagonal is the unit of length.
+        """
         columns = []
         for places, order in self._functionals:
             total = (derivative[0] + order[0], derivative[1] + order[1])
             offset = (at[:, None] - places) / self.domain.size
             columns.append((-1.0) ** sum(order) * _kernel(offset, total))
-        return np.hstack(columns)
+        return np.hstack([*columns, _cubics(at / self.domain.size, derivative)])
+
+    @cached_property
+    def _equations(self) -> np.ndarray:
+        """[K, P]: the rows of all functionals, (n_values, n_values + 10)."""
+        return np.vstack([self._rows(at, derivative) for at, derivative in self._functionals])
 
     @cached_property
     def _system(self) -> np.ndarray:
         """The inverse of [[K, P], [Pᵀ, 0]]."""
-        k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
-        p = self._polynomials
-        system = np.block([[k, p], [p.T, np.zeros((p.shape[1],) * 2)]])
-        return np.linalg.inv(system)
+        n = len(self._equations)
+        below = np.hstack([self._equations[:, n:].T, np.zeros((len(CUBIC),) * 2)])
+        return np.linalg.inv(np.vstack([self._equations, below]))
 
     def matrix(self, at: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> np.ndarray:
         """Values (or derivatives) at places (n_at, 2) per value at each sensor, (n_at, n_places)."""
         at = np.atleast_2d(at)
-        rows = np.hstack([self._covariance(at, derivative), self._cubic(at, derivative)])
-        scale = self.domain.size ** -sum(derivative)
-        return np.asarray(scale * (rows @ self._system)[:, : len(self.places)])
+        rows, scale = self._rows(at, derivative), self.domain.size ** -sum(derivative)
+        matrix = np.zeros((len(at), len(self.places)))
+        matrix[:, self._used] = scale * (rows @ self._system)[:, : self._used.sum()]
+        return matrix
 
     def error(self, at: np.ndarray, derivatives: Sequence[tuple[int, int]] = ((0, 0),)) -> np.ndarray:
         """Covariance of the interpolation error for τ² = 1, (n_derivatives n_at, n_derivatives n_at).
@@ -172,7 +182,7 @@ class SurfaceSpline:
         prior_covariance = np.block(
             [[(-1.0) ** (k + m) * _kernel(offset, (i + k, j + m)) for k, m in derivatives] for i, j in derivatives]
         )
-        rows = np.vstack([np.hstack([self._covariance(at, d), self._cubic(at, d)]) for d in derivatives])
+        rows = np.vstack([self._rows(at, d) for d in derivatives])
         scale = np.repeat([self.domain.size ** -sum(d) for d in derivatives], len(at))
         return np.asarray((prior_covariance - rows @ self._system @ rows.T) * np.outer(scale, scale))
 
@@ -180,14 +190,22 @@ class SurfaceSpline:
         """Upper confidence limit of τ² of values (n_places,) of known covariance; 0 where they may be noise.
 
         By the likelihood of the contrasts orthogonal to all cubics (restricted maximum likelihood).
+
+        Raises:
+            ValueError: no more values and edge points than the ten of a cubic.
         """
-        n, size = len(self.places), len(self._polynomials)
-        k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
-        contrasts = null_space(self._polynomials.T)
+        values, covariance = values[self._used], covariance[np.ix_(self._used, self._used)]
+        n, size = values.size, len(self._equations)
+        contrasts = null_space(self._equations[:, size:].T)
+        if contrasts.size == 0:
+            raise ValueError(
+                f"{n} sensors determine a cubic over the rectangle and nothing beyond, from which its errors could be"
+                " estimated: add a sensor"
+            )
         noise = np.zeros((size, size))
         noise[:n, :n] = covariance
         scale = float(np.abs(values).max()) ** 2
-        unit_covariance = contrasts.T @ k @ contrasts
+        unit_covariance = contrasts.T @ self._equations[:, :size] @ contrasts
         noise_covariance = contrasts.T @ noise @ contrasts + 1e-24 * scale * np.eye(contrasts.shape[1])
         contrast_values = contrasts.T @ np.r_[values, np.zeros(size - n)]
 
@@ -226,7 +244,7 @@ def surface_eigenfunctions(
     `surface_bands` gives the error of the shapes between the sensors.
 
     Raises:
-        ValueError: as `SurfaceSpline`; a sensor without a place, or with one of another kind.
+        ValueError: as `SurfaceSpline`; a sensor without a place, or with one of another kind; a negative mass.
     """
     spline, values = _scaled(sampled, length, mass_per_area, edges)
     return Modes(
@@ -259,8 +277,13 @@ class SurfaceErrors:
     def select(self, modes: Sequence[int]) -> "SurfaceErrors":
         """The errors of some modes, by zero-based index."""
         index = list(modes)
-        covariances = self.value_covariance[index], self.roughness[index], self.omega_covariance[np.ix_(index, index)]
-        return SurfaceErrors(self.spline, self.values[:, index], *covariances)
+        return replace(
+            self,
+            values=self.values[:, index],
+            value_covariance=self.value_covariance[index],
+            roughness=self.roughness[index],
+            omega_covariance=self.omega_covariance[np.ix_(index, index)],
+        )
 
 
 @one_blas_thread
@@ -274,7 +297,7 @@ def surface_errors(
         length, edges: as `surface_eigenfunctions` takes them.
 
     Raises:
-        ValueError: as `surface_eigenfunctions`.
+        ValueError: as `surface_eigenfunctions` and `SurfaceSpline.roughness`.
     """
     spline, _ = _scaled(found.modes, length, None, edges)
     values = normalised_shapes(found.modes.shapes).real
@@ -298,8 +321,7 @@ def surface_bands(
 ) -> Bands:
     """Confidence bands of the eigenfunctions of `surface_eigenfunctions`, at places (n_points, 2), m.
 
-    With values v, φ = W v / √q and q = vᵀ M v, an error dv and the interpolation error e change φ by
-    W dv / √q + e / √q - φ [vᵀ M dv + ∫∫ m W v e dA] / q, as along an interval (`eigenfunction_bands`).
+    Errors of the values and of the interpolation change them as along an interval (`eigenfunction_bands`).
 
     Args:
         found: modes and the covariance of their shapes, such as `identify_driven` gives, at sensors with places (x, y).
@@ -309,28 +331,26 @@ def surface_bands(
         seed: of the Monte Carlo samples for the simultaneous band.
 
     Raises:
-        ValueError: a level outside 0..1; as `surface_eigenfunctions`.
+        ValueError: a level outside 0..1; as `surface_eigenfunctions` and `SurfaceSpline.roughness`.
     """
     check_level(level)
     sampled = found.modes
     spline, scaled = _scaled(sampled, length, mass_per_area, edges)
     at, rng = spline.domain.locate(at), np.random.default_rng(seed)
     x, weights = _weighted(spline.domain, mass_per_area)
-    rule, rule_inside = spline.matrix(at), spline.matrix(x)
     root = _root(spline.error(np.vstack([at, x])))
+    here, inside = (spline.matrix(at), root[: len(at)]), (spline.matrix(x), root[len(at) :])
     phi, std, interpolation = (np.zeros((len(at), sampled.n_modes)) for _ in range(3))
     width = np.zeros(sampled.n_modes)
     values = normalised_shapes(sampled.shapes).real
     for r in range(sampled.n_modes):
         factor = scaled[:, r] @ values[:, r] / (values[:, r] @ values[:, r])  # 1 / √q
         value_covariance = found.shape_covariance[r] * factor**2
-        phi[:, r] = rule @ scaled[:, r]
-        mass_weights = weights * (rule_inside @ scaled[:, r])
-        noise = (rule - np.outer(phi[:, r], mass_weights @ rule_inside)) @ _root(value_covariance)
-        interpolation_error = root[: len(at)] - np.outer(phi[:, r], mass_weights @ root[len(at) :])
-        interpolation_error = np.sqrt(spline.roughness(scaled[:, r], value_covariance)) * interpolation_error
-        interpolation[:, r] = np.linalg.norm(interpolation_error, axis=1)
-        std[:, r], width[r] = deviation_and_width(np.hstack([noise, interpolation_error]), level, rng)
+        phi[:, r], jacobian, error = propagated(scaled[:, r], here, inside, weights)
+        error *= np.sqrt(spline.roughness(scaled[:, r], value_covariance))
+        interpolation[:, r] = np.linalg.norm(error, axis=1)
+        noise = jacobian @ _root(value_covariance)
+        std[:, r], width[r] = deviation_and_width(np.hstack([noise, error]), level, rng)
     return Bands(frozen(at), frozen(phi), frozen(std), frozen(interpolation), frozen(width), level)
 
 
@@ -354,7 +374,12 @@ def _weighted(domain: Rectangle, mass_per_area: FieldLike | None) -> tuple[np.nd
     """Integration points (n, 2), m, and the mass that each represents."""
     x, weights = domain.quadrature(SURFACE.quadrature)
     density = as_field(1.0 / float(np.prod(domain.length)) if mass_per_area is None else mass_per_area)
-    return x, weights * density(x[:, 0], x[:, 1])
+    values = density(x[:, 0], x[:, 1])
+    negative = ~(values >= 0.0)
+    if negative.any():
+        at = ", ".join(f"{each:g}" for each in x[negative][0])
+        raise ValueError(f"mass_per_area is {values[negative][0]:g} at (x, y) = ({at}); it must be 0 or more")
+    return x, weights * values
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

@@ -1,15 +1,16 @@
-"""Complexity of mode shapes, and detection of outputs whose time delay causes it.
+"""Signs of clocks that differ: shapes that the delay of an output makes complex, and modes that come in pairs.
 
-A delay τ of sensor j multiplies its entries s_jr of the shapes by e^{-λ_r τ}: their phase grows with frequency.
+A delay τ of sensor j multiplies its entries s_jr of the shapes by e^{-λ_r τ}: their phase grows with frequency. An
+output or record of another sample rate has all frequencies in one ratio to those of the others.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.identification.signal.modal_estimates import SURE, ShapeEstimates
+from workbench.identification.signal.modal_estimates import SURE, ModalEstimates, ShapeEstimates
 from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.structure.modes import SampledModes
 
@@ -24,6 +25,7 @@ class ClocksSettings:
     least: float = 0.1  # least entry of a shape whose phase counts, relative to the norm of the shape
     phase: float = 0.1  # rad rms; least phase of complex residues
     refined: float = 0.01  # rad rms; likewise, once a delay was found
+    ratio: float = 0.01  # largest relative difference of frequencies that is attributed to sample rates
     small: float = 0.01  # probability that a delay by chance reduces the small phases of damped modes so far
 
 
@@ -86,26 +88,45 @@ def _delayed_sensor(modes: SampledModes) -> tuple[int, float] | None:
     A delay agrees with the phases of n modes to within δ by chance with probability (2 δ / π)^n, and up to a time T
     there are T ω / δ distinct delays.
     """
-    omega, poles, n_outputs = modes.poles.imag, modes.poles, modes.n_outputs
-    best: tuple[float, int, float] | None = None
-    for j in range(n_outputs):
-        own, others = modes.shapes[j], np.delete(modes.shapes, j, axis=0)
+    omega, candidates = modes.poles.imag, []
+    for j, own in enumerate(modes.shapes):
         visible = np.abs(own) > CLOCKS.least * np.linalg.norm(modes.shapes, axis=0)
         if np.count_nonzero(visible) < 2:
             continue
-        phases = np.angle(own) - 0.5 * np.angle((others**2).sum(axis=0))
+        phases = np.angle(own) - 0.5 * np.angle((np.delete(modes.shapes, j, axis=0) ** 2).sum(axis=0))
         seconds, chance = _delay_of_phases(phases[visible], omega[visible], omega.max())
-        chance *= n_outputs
-        if best is None or chance < best[0]:
-            best = chance, j, seconds
-    if best is None or best[0] > FALSE_ALARM:
+        candidates.append((chance * modes.n_outputs, j, seconds))
+    chance, j, seconds = min(candidates, default=(1.0, 0, 0.0))
+    if chance > FALSE_ALARM:
         return None
-    _, j, seconds = best
     corrected = modes.shapes.copy()
-    corrected[j] *= np.exp(poles * seconds)
-    if (far_from_real(SampledModes(modes.omega, modes.zeta, corrected, modes.positions)) > CLOCKS.far).any():
+    corrected[j] *= np.exp(modes.poles * seconds)
+    if (far_from_real(replace(modes, shapes=corrected)) > CLOCKS.far).any():
         return None
     return j, seconds
+
+
+def clock_remarks(estimates: ModalEstimates, only: Sequence[int]) -> tuple[str, ...]:
+    """A remark where all modes form pairs of equal damping and one ratio of frequencies: the sample rates differ.
+
+    Args:
+        estimates: modes of several outputs or records, sorted by frequency.
+        only: the modes to examine, from 0.
+    """
+    if len(only) < 4 or len(only) % 2:
+        return ()
+    omega, zeta = (values[list(only)].reshape(-1, 2).T for values in (estimates.modes.omega, estimates.modes.zeta))
+    omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in (estimates.omega_std, estimates.zeta_std))
+    ratio, error = omega[1] / omega[0] - 1.0, np.hypot(*(omega_std / omega))
+    mean = np.average(ratio, weights=error**-2)
+    separate = (SURE * error < ratio) & (ratio < CLOCKS.ratio)
+    alike = (np.abs(ratio - mean) < SURE * error) & (np.abs(np.diff(zeta, axis=0)[0]) < SURE * np.hypot(*zeta_std))
+    if not (separate & alike).all():
+        return ()
+    return (
+        f"modes come in pairs whose frequencies all differ by {100.0 * mean:.2g} %: does the sample rate of an output"
+        " or a record differ by so much? Resample it to that of the others: each pair is then one mode",
+    )
 
 
 def late_outputs(residues: np.ndarray, poles: np.ndarray, least: float = CLOCKS.phase) -> Floats:

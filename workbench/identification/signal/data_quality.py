@@ -8,6 +8,7 @@ import numpy as np
 from workbench.records.record import Record, as_records
 from workbench.records.units import LIKELY, unknown_unit
 from workbench.rig.sensors import MEASURED
+from workbench.structure.printed import place_text
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,14 @@ def data_faults(record: Record) -> tuple[DataFault, ...]:
     dead = list(_dead(record))
     names = {fault.outputs[0] for fault in dead}
     alive = [j for j, name in enumerate(record.output_names) if name not in names]
-    others = _copied(record, alive), _clipped(record, alive), _upsampled(record, alive), _unstated(record, alive)
-    return (*dead, *(fault for faults in others for fault in faults), *input_faults(record))
+    return (
+        *dead,
+        *_copied(record, alive),
+        *_clipped(record, alive),
+        *_upsampled(record, alive),
+        *_unstated(record, alive),
+        *input_faults(record),
+    )
 
 
 def input_faults(record: Record) -> tuple[DataFault, ...]:
@@ -134,7 +141,8 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
     """The records, or the one, as a list.
 
     Raises:
-        ValueError: no records, records that differ in outputs or sample time, and one that is given twice.
+        ValueError: no records; records that differ in sample time or outputs, their quantities and places; one that is
+            given twice.
     """
     records = as_records(records)
     if not records:
@@ -146,6 +154,17 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
                 f"records identified together must have the same outputs; {first.name!r} has"
                 f" {', '.join(first.output_names)} and {other.name!r} has {', '.join(other.output_names)}"
             )
+        for one, another in zip(first.output_channels, other.output_channels, strict=True):
+            places = place_text(one.at), place_text(another.at)
+            if one.quantity != another.quantity or (all(places) and places[0] != places[1]):
+                here, there = (
+                    (channel.quantity or "no quantity") + (f" at {place}" if place else "")
+                    for channel, place in zip((one, another), places, strict=True)
+                )
+                raise ValueError(
+                    f"records identified together must have the same outputs; {one.name!r} measures {here} in"
+                    f" {first.name!r} and {there} in {other.name!r}"
+                )
         if abs(other.sample_time - first.sample_time) > 1e-9 * first.sample_time:
             raise ValueError(
                 f"records {first.name!r} and {other.name!r} are sampled every {first.sample_time:g} s and"
@@ -236,17 +255,17 @@ def steps(record: Record) -> np.ndarray:
 
 def _dead(record: Record) -> Iterator[DataFault]:
     for name, row in zip(record.output_names, record.outputs, strict=True):
-        # Most signals move within their first samples; the rest is then not searched.
-        few = np.unique(row[:64]).size < DATA.fewest_values and np.unique(row).size
-        if few and few < DATA.fewest_values <= record.n_samples:
-            what = f"stays at {row[0]:g}" if few == 1 else f"takes {few} values only, {row.min():g} to {row.max():g}"
+        n_values = np.unique(row[:64]).size
+        if n_values < DATA.fewest_values:  # most signals move within their first samples; the rest is not searched then
+            n_values = np.unique(row).size
+        if n_values >= DATA.fewest_values:
+            if np.abs(row - np.linspace(row[0], row[-1], row.size)).max() < 1e-6 * abs(row[-1] - row[0]):
+                message = f"output {name!r} is a straight line, a clock or a counter; leave it out"
+                yield DataFault("dead", (name,), message)
+        elif row.size >= DATA.fewest_values:
+            several = f"takes {n_values} values only, {row.min():g} to {row.max():g}"
+            what = several if n_values > 1 else f"stays at {row[0]:g}"
             yield DataFault("dead", (name,), f"output {name!r} {what}: the sensor is dead or too coarse; leave it out")
-        elif (
-            few is False
-            and record.n_samples > 2
-            and (np.abs(row - np.linspace(row[0], row[-1], row.size)).max() < 1e-6 * abs(row[-1] - row[0]))
-        ):
-            yield DataFault("dead", (name,), f"output {name!r} is a straight line, a clock or a counter; leave it out")
 
 
 def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
@@ -316,8 +335,12 @@ def _piled(row: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _piles_up(row: np.ndarray, at: np.ndarray, least: int, ratio: float) -> bool:
-    """Whether the samples `at` an end of a signal's range are many enough for clipping."""
-    return least <= at.size < row.size and at.size > ratio * _count_next(row, at)
+    """Whether the samples `at` an end of a signal's range are many enough for clipping, and for those at the next."""
+    if not least <= at.size < row.size:
+        return False
+    others = row[row != row[at[0]]]
+    nearest = others[np.argmin(np.abs(others - row[at[0]]))]
+    return bool(at.size > ratio * np.count_nonzero(others == nearest))
 
 
 def _has_levels(row: np.ndarray, at: np.ndarray) -> bool:
@@ -325,12 +348,6 @@ def _has_levels(row: np.ndarray, at: np.ndarray) -> bool:
     outer = row[1:] / row[at[0]] > 0.5
     outer &= row[1:] != row[at[0]]
     return not outer.any() or float(np.mean(np.diff(row)[outer] == 0)) > DATA.held
-
-
-def _count_next(row: np.ndarray, at: np.ndarray) -> int:
-    """Number of samples at the value next to that of the samples `at`."""
-    others = row[row != row[at[0]]]
-    return int(np.count_nonzero(others == others[np.argmin(np.abs(others - row[at[0]]))]))
 
 
 def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
@@ -345,7 +362,7 @@ def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
                 yield DataFault(
                     "upsampled",
                     (name,),
-                    f"output {name!r} changes at every {every}th sample only: it was sampled at"
+                    f"output {name!r} changes once in {every} samples only: it was sampled at"
                     f" {record.sample_rate_hz / every:g} Hz and {how}, not at {record.sample_rate_hz:g} Hz; leave it"
                     " out, or bring all outputs to that rate",
                 )

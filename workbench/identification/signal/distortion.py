@@ -119,7 +119,7 @@ def distortion_of(record: Record) -> Distortion:
 def period_of(inputs: np.ndarray) -> int | None:
     """Period of the inputs in samples: the lag L of the first peak of their autocorrelation above 0.9.
 
-        ρ(L) = Σ_k u(k)·u(k + L) / √(Σ_k |u(k)|² Σ_k |u(k + L)|²)      over k = 0 ... n - L - 1
+        ρ(L) = Σ_k u(k)·u(k + L) / √(Σ_k |u(k)|² Σ_k |u(k + L)|²)      over k = 0 ... n - L - 1, u less its mean
 
     Args:
         inputs: (n_inputs, n_samples); at least two periods long.
@@ -127,25 +127,24 @@ def period_of(inputs: np.ndarray) -> int | None:
     Returns:
         The period, or None where the inputs do not repeat.
     """
-    u = np.asarray(inputs, float)
-    n = u.shape[1]
+    n = np.shape(inputs)[1]
     most = n // 2
-    if most < 2 * PERIODIC.least or not np.any(u):
+    if most < 2 * PERIODIC.least:
+        return None
+    u = np.asarray(inputs, float)
+    u = (u - u.mean(axis=1, keepdims=True))[np.ptp(u, axis=1) > 0]
+    if not len(u):
         return None
     spectrum = np.fft.rfft(u, 2 * n, axis=1)
-    product = np.fft.irfft((np.abs(spectrum) ** 2).sum(axis=0))[: most + 1]
+    product = np.fft.irfft((np.abs(spectrum) ** 2).sum(axis=0))[: most + 2]
     sums = np.r_[0.0, np.cumsum((u**2).sum(axis=0))]
-    lags = np.arange(most + 1)
+    lags = np.arange(most + 2)
     scale = np.sqrt(sums[n - lags] * (sums[n] - sums[lags]))
     autocorrelation = product / np.where(scale > 0, scale, np.inf)
     low = np.flatnonzero(autocorrelation[:most] < PERIODIC.low)
     if low.size == 0:
         return None
     start = max(int(low[0]), PERIODIC.least)
-    padded = np.r_[autocorrelation, -np.inf]
-    peaks = start + np.flatnonzero(
-        (padded[start:-1] > PERIODIC.high)
-        & (padded[start:-1] >= padded[start - 1 : -2])
-        & (padded[start:-1] >= padded[start + 1 :])
-    )
+    before, at, after = (autocorrelation[start + shift : most + 1 + shift] for shift in (-1, 0, 1))
+    peaks = start + np.flatnonzero((at > PERIODIC.high) & (at >= before) & (at >= after))
     return int(peaks[0]) if peaks.size else None

@@ -1,10 +1,9 @@
-"""Types of modal estimates with standard errors, how they are printed, and remarks on pairs of modes."""
+"""Types of modal estimates with standard errors, how they are printed, and remarks on neighbouring modes."""
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from scipy.special import ndtri
@@ -19,30 +18,8 @@ from workbench.structure.printed import Printed, counted
 # between the moduli of their shapes is less than this (noise makes it 0.01); and if that of participation factors is
 # more than this.
 NEAR, APART, ALIKE = 0.05, 0.1, 0.9
-CLOCK_RATIO = 0.01  # largest relative difference of frequencies that is attributed to sample rates
 SURE = 3.0  # number of standard errors that makes a difference significant
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
-
-
-class ShapeEstimates(Protocol):
-    """Modes with a covariance of their shapes, from `refine`, `ring_down`, `identify`, `identify_driven` or
-    `identify_transfer`.
-
-    `shape_covariance` is (n_modes, n_outputs, n_outputs) of the real parts of the shapes, relative to the largest entry
-    of each; `covariance` is (2 n_modes, 2 n_modes) of (ω, ζ).
-    """
-
-    @property
-    def modes(self) -> SampledModes: ...
-
-    @property
-    def covariance(self) -> np.ndarray: ...
-
-    @property
-    def shape_covariance(self) -> np.ndarray: ...
-
-    @property
-    def shape_std(self) -> np.ndarray: ...
 
 
 class ModalEstimates(Printed):
@@ -62,7 +39,12 @@ class ModalEstimates(Printed):
         return np.sqrt(np.diag(self.covariance)[self.modes.n_modes :])
 
     def interval(self, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-        """Confidence intervals of ω and of ζ, (2, n_modes) each: lower row, upper row."""
+        """Confidence intervals of ω and of ζ, (2, n_modes) each: lower row, upper row.
+
+        Raises:
+            ValueError: a level outside 0..1.
+        """
+        check_level(level)
         width = float(ndtri(0.5 * (1.0 + level)))
         both = ((self.modes.omega, self.omega_std), (self.modes.zeta, self.zeta_std))
         omega, zeta = (np.stack([value - width * std, value + width * std]) for value, std in both)
@@ -195,6 +177,9 @@ class OfRefined(ModalEstimates):
         return self.refined.shape_std
 
 
+ShapeEstimates = Refined | OfRefined | ParticipatingModes  # those with a covariance of the shapes
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Identified(OfRefined):
     """The modes of a record, and the candidates rejected as noise.
@@ -278,7 +263,7 @@ def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, n
     return np.asarray(~growing & (omega_std < modes.omega) & (modes.omega < nyquist))
 
 
-def repeated_remarks(estimates: "ModalEstimates") -> tuple[str, ...]:
+def repeated_remarks(estimates: ModalEstimates) -> tuple[str, ...]:
     """A remark on neighbours of equal frequency and damping within their errors: a repeated root."""
     modes, pairs = estimates.modes, []
     for r in range(modes.n_modes - 1):
@@ -291,29 +276,6 @@ def repeated_remarks(estimates: "ModalEstimates") -> tuple[str, ...]:
     return (
         f"modes {', '.join(pairs)} may be one repeated root: only the plane of their two shapes is determined; each"
         " shape is one of many in that plane, and need not be real",
-    )
-
-
-def clock_remarks(estimates: "ModalEstimates", only: Sequence[int]) -> tuple[str, ...]:
-    """A remark where all modes form pairs of equal damping and one ratio of frequencies: the sample rates differ.
-
-    Args:
-        estimates: modes of several outputs or records, sorted by frequency.
-        only: the modes to examine, from 0.
-    """
-    if len(only) < 4 or len(only) % 2:
-        return ()
-    omega, zeta = (values[list(only)].reshape(-1, 2).T for values in (estimates.modes.omega, estimates.modes.zeta))
-    omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in (estimates.omega_std, estimates.zeta_std))
-    ratio, error = omega[1] / omega[0] - 1.0, np.hypot(*(omega_std / omega))
-    mean = np.average(ratio, weights=error**-2)
-    separate = (SURE * error < ratio) & (ratio < CLOCK_RATIO)
-    alike = (np.abs(ratio - mean) < SURE * error) & (np.abs(np.diff(zeta, axis=0)[0]) < SURE * np.hypot(*zeta_std))
-    if not (separate & alike).all():
-        return ()
-    return (
-        f"modes come in pairs whose frequencies all differ by {100.0 * mean:.2g} %: does the sample rate of an output"
-        " or a record differ by so much? Resample it to that of the others: each pair is then one mode",
     )
 
 
@@ -349,6 +311,16 @@ def by_poles(poles: np.ndarray) -> np.ndarray:
     )
 
 
+def check_level(level: float) -> None:
+    """Refuse a confidence level outside 0..1.
+
+    Raises:
+        ValueError: such a level.
+    """
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"the level of a confidence interval or band lies between 0 and 1; got {level}")
+
+
 def check_placed(sampled: SampledModes) -> None:
     """Refuse a sensor without a place.
 
@@ -374,9 +346,12 @@ def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
     """Shapes rotated to be most nearly real, largest entry 1, the first entry of over 0.05 positive.
 
     Raises:
-        ValueError: an entry that is not finite.
+        ValueError: an entry that is not finite, a shape that is zero at all sensors.
     """
     check_finite(shapes)
+    still = ~np.any(shapes, axis=0)
+    if still.any():
+        raise ValueError(f"the shape of mode {int(np.argmax(still)) + 1} is zero at all sensors: leave the mode out")
     rotated = shapes * np.exp(-0.5j * np.angle((shapes**2).sum(axis=0)))
     rotated = rotated / np.abs(rotated).max(axis=0)
     first = np.argmax(np.abs(rotated.real) > 0.05, axis=0)

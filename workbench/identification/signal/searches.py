@@ -137,24 +137,15 @@ class DampingSettings:
     """How the damping μ, relative to the diagonal of N, is adapted from step to step.
 
     The minimum does not depend on these numbers, only the number of steps does; they follow Marquardt.
-
-    Attributes:
-        first: initial value.
-        raised: factor after a step that raised the cost.
-        lowered: factor after a step that lowered it.
-        least: lower limit.
-        most: value above which no step is tried: s has shrunk to a gradient step of 1e-8 standard errors.
-        stuck: value above which the search ends after a step.
-        indefinite: lower limit where N is not positive definite.
     """
 
     first: float = 1e-3
-    raised: float = 8.0
-    lowered: float = 0.1
+    raised: float = 8.0  # factor after a step that raised the cost
+    lowered: float = 0.1  # factor after a step that lowered it
     least: float = 1e-12
-    most: float = 1e8
-    stuck: float = 1e6
-    indefinite: float = 1e-9
+    most: float = 1e8  # above it no step is tried: s has shrunk to a gradient step of 1e-8 standard errors
+    stuck: float = 1e6  # above it the search ends after a step
+    indefinite: float = 1e-9  # least where N is not positive definite
 
 
 DAMPING = DampingSettings()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.identification.signal.overtones import overtone_remarks
+from workbench.identification.signal.harmonics import overtone_remarks
 from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
