@@ -299,6 +299,7 @@ def test_wires_that_are_surely_exchanged_are_put_right_before_the_search(hinged_
     assert verdict.effects[0].values["gain"] == pytest.approx(1.3, rel=1e-3)
     assert verdict.shrinkage.overall > 0.95 and sum(verdict.budget.effects.values()) > 0.95
     assert [f.effects[0].kind for f in verdict.attribution.tried] == [gain.kind]  # the exchange was not searched for
+    assert [f.labels for f in verdict.attribution.singles] == [(exchange.label,), (gain.label, exchange.label)]
     one = diagnose(rig, fitted, validation=replace(kept, outputs=kept.outputs[[2, 1, 0, 3]]), catalogue=both, workers=1)
     assert exchange.kind in {f.effects[0].kind for f in one.attribution.tried}  # not in every record, so it is
     without = diagnose(rig, fitted, validation=kept, catalogue=(gain.kind,), workers=1)

@@ -67,6 +67,7 @@ class Attribution:
         logged: input noise estimated from the residual, as a share of the inputs' rms.
         seen: effects that show in the readings themselves, which no fit alters.
         is_cut: whether the search reached its deadline and ended with the best so far.
+        exchanged: exchanges of channels that were given; `search`, `tried` and `ahead` are of the rig with them.
     """
 
     outcome: str
@@ -83,6 +84,7 @@ class Attribution:
     logged: float
     seen: tuple[Effect, ...] = ()
     is_cut: bool = False
+    exchanged: tuple[Effect, ...] = ()
 
     @property
     def noise_ratio(self) -> float:
@@ -106,21 +108,22 @@ class Attribution:
             nominal: evidence of the rig without them.
         """
 
-        def with_them(found: Fit) -> Fit:
-            return replace(found, effects=exchanged_last((*exchanges, *found.effects)))
-
         return replace(
             self,
             outcome="explained" if self.outcome == "none" else self.outcome,
-            best=with_them(self.best),
-            alternatives=tuple((with_them(found), probability) for found, probability in self.alternatives),
+            best=_with_exchanges(self.best, exchanges),
+            alternatives=tuple((_with_exchanges(found, exchanges), p) for found, p in self.alternatives),
             nominal_cost=cost_of(nominal.rig, (), nominal.data),
             evidence=nominal,
+            exchanged=exchanges,
         )
 
     @cached_property
     def singles(self) -> tuple[Fit, ...]:
-        """The best effect of each likely kind alone, on whole records, best first; missing ones are fitted now."""
+        """The best effect of each likely kind alone, on whole records, best first; missing ones are fitted now.
+
+        Channels that are exchanged come first, and are exchanged with each of the others.
+        """
         kinds = {f.effects[0].kind for f in self.tried if f.effects}
         others = [f for f in best_of_each_kind(self.ahead) if f.effects[0].kind not in kinds][: ATTRIBUTION.shown]
 
@@ -128,7 +131,17 @@ class Attribution:
             return fit(self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ATTRIBUTION.alike)
 
         fitted = one_blas_thread(self.search.workers.map)(on_all, others)
-        return tuple(best_of_each(sorted((*self.tried, *fitted), key=lambda f: f.cost)))
+        alone = best_of_each(sorted((*self.tried, *fitted), key=lambda f: f.cost))
+        if not self.exchanged:
+            return tuple(alone)
+        by_channel = self.search.data.by_channel(self.search.data.residual(self.search.rig))
+        start = Fit((), float(by_channel.mean()), by_channel, 0)
+        return tuple(_with_exchanges(found, self.exchanged) for found in (start, *alone))
+
+
+def _with_exchanges(found: Fit, exchanges: tuple[Effect, ...]) -> Fit:
+    """The fit, of a rig with channels exchanged, as one of the rig without."""
+    return replace(found, effects=exchanged_last((*exchanges, *found.effects)))
 
 
 def baseline(
