@@ -14,8 +14,8 @@ def test_an_undriven_mode_moves_as_its_frequency_goes_evenly_with_time(many):
     n, dt, middle, width = 4001, 1e-3, 0.2, 0.3
     pole, a, b = -1.0 + 100.0j, 0.2 - 0.5j, -0.1 + 2.0j
     start, drive = np.array([2.0 + 0.0j]), np.zeros((n - 1, 1), complex)
-    law = np.array([[a, b]]), np.array([1.0]), True, np.exp(pole * dt)
-    z = _simulated(start, drive, *law, 2.0, 1e-3, 1e3, dt, middle, width, 16.0, 0, many)[:, 0]
+    law = np.array([a, b]), np.array([1.0]), True, np.exp(pole * dt)
+    z = _simulated(start, drive, *law, 2.0, 1e-3, 1e3, dt, middle, width, 16.0, 0, many, False)[:, 0]
     share = np.linspace(0.0, 1.0, n)
     along = share * (n - 1) * dt
     exact = 2.0 * np.exp((pole + a) * along + b * along * (0.5 * share - middle) / width)
@@ -30,9 +30,34 @@ def test_what_drives_a_mode_at_first_is_followed_sample_by_sample():
     step, exact = np.exp(pole * dt), np.zeros(n, complex)
     for k in range(n - 1):
         exact[k + 1] = step * exact[k] + drive[k, 0]
-    law = np.zeros((1, 2), complex), np.array([1.0]), False, step
-    z = _simulated(np.zeros(1, complex), drive, *law, 5.0, 1e-3, 1e3, dt, 0.2, 0.3, 16.0, 30, 40)[:, 0]
+    law = np.zeros(2, complex), np.array([1.0]), False, step
+    z = _simulated(np.zeros(1, complex), drive, *law, 5.0, 1e-3, 1e3, dt, 0.2, 0.3, 16.0, 30, 40, False)[:, 0]
     np.testing.assert_allclose(z, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize(("by_time", "powers"), [(True, (1.0, 2.0)), (False, (0.5, 1.0)), (False, (-1.0, 1.0, 2.0))])
+@pytest.mark.parametrize("driven", [1999, 300])
+def test_the_derivatives_of_a_motion_are_its_differences(by_time, powers, driven):
+    """By each coefficient of the rate, then by the factor of a further drive, real parts first."""
+    rng, n, dt, pole = np.random.default_rng(1), 2000, 1e-3, -2.0 + 200.0j
+    drives, start = np.zeros((n - 1, 2), complex), np.array([1.0 + 0.5j, 0.3])
+    drives[:driven] = rng.standard_normal((driven, 2))
+    change = 2.0 * np.array([0.1 + 0.2j, 0.1 - 0.3j, 0.02 + 0.05j, 0.01j][: 1 + len(powers)])
+
+    def motion(unknowns, slopes=False):
+        drive, at_first = drives.copy(), start.copy()
+        drive[:, 0] += unknowns[-1] * drives[:, 1]
+        at_first[0] += unknowns[-1] * start[1]
+        law = unknowns[:-1], np.array(powers), by_time, np.exp(pole * dt)
+        return _simulated(at_first, drive, *law, 20.0, 1e-3, 1e3, dt, 0.5, 0.3, 16.0, driven, 7, slopes)
+
+    at = np.r_[change, 0.2 + 0.1j]
+    exact, steps = motion(at, slopes=True), 1e-6 * np.eye(at.size)
+    np.testing.assert_array_equal(exact[:, :1], motion(at))
+    each = [motion(at + unit * step) - motion(at - unit * step) for unit in (1.0, 1j) for step in steps]
+    differences = np.hstack(each) / 2e-6
+    error = np.linalg.norm(exact[:, 1:] - differences, axis=0) / np.linalg.norm(differences, axis=0)
+    assert error.max() < 1e-6
 
 
 def test_two_linear_modes_are_no_changing_one_after_a_step_of_each_law(monkeypatch):
@@ -45,9 +70,9 @@ def test_two_linear_modes_are_no_changing_one_after_a_step_of_each_law(monkeypat
     force = rng.standard_normal((1, n))
     outputs = control.forced_response(control.sample_system(plant, dt), inputs=force).outputs.reshape(1, -1)
     outputs = outputs + 1e-3 * outputs.std() * rng.standard_normal(outputs.shape)
-    motions: list[int] = []
+    with_slopes: list[bool] = []
     monkeypatch.setattr(
-        changing_response, "_simulated", lambda *law: (motions.append(law[1].shape[1]), _simulated(*law))[1]
+        changing_response, "_simulated", lambda *law: (with_slopes.append(law[-1]), _simulated(*law))[1]
     )
     record = Record(
         sample_time=dt,
@@ -58,7 +83,6 @@ def test_two_linear_modes_are_no_changing_one_after_a_step_of_each_law(monkeypat
     )
     modes = identify_driven(record).modes
     np.testing.assert_allclose(modes.omega, omega, rtol=1e-3)
-    # four laws of two terms, the start and one step each; twice, as the noise spectrum is estimated again
-    assert 0 < len(motions) <= 16
-    # a law that is given up after its step is not differentiated there
-    assert motions[1::2] == [1] * (len(motions) // 2) and min(motions[::2]) > 6
+    # four laws of two terms, the start with its derivatives and one step without; once, although the noise spectrum is
+    # estimated again
+    assert with_slopes == 4 * [True, False]
