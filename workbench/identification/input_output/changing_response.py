@@ -45,10 +45,7 @@ class ChangingResponseSettings:
     within: int = 3  # evaluations within which the same must fall, by a share of itself or by the least that counts:
     # laws that were right in the end lost all of it within three, wrong ones crept on for 15 to 40
     stalled: float = 0.2
-    # what every law leaves at least, above which another estimate of the noise does not matter. The lines about some
-    # modes have much the same weights, whose share of the squares of both models is alike
-    decided: float = 0.5
-    same: float = 0.1  # decay rates, by which a pole may move meanwhile
+    same: float = 0.1  # decay rates, by which the poles of a cluster that is not tried again may have moved
     settled: float = 1e-3  # the standard error of the logarithm of the squares of some thousand lines is larger
 
 
@@ -77,8 +74,8 @@ def in_place_of(
     """`in_place_of_clusters`, for one cluster: the records beside the changing mode, and its pole.
 
     Args:
-        linear: poles of each cluster that no law came near to, with another estimate of the noise: not tried again, and
-            added to.
+        linear: poles of each cluster that no law replaced with an earlier estimate of the noise, added to. They are not
+            tried again: about a few modes it weights all lines much alike, whichever the model.
     """
     poles = fit.poles[cluster]
     same = -RESPONSE.same * poles.real
@@ -103,8 +100,7 @@ def in_place_of(
         else:
             if changing is not None:
                 return changing
-    if response.least > RESPONSE.decided:
-        linear.append(poles)
+    linear.append(poles)
     return None
 
 
@@ -269,7 +265,6 @@ class _Response:
         (self.basis,) = bases_with_changes(self.regressors, fit, others, [self.weight])
         self.values = self._beyond(self.basis, self._lines(data.values))[:, 0]
         self.linear_motions = list(self._motions_of_linear())
-        self.least = np.inf  # logarithm of the squares beyond the threshold, of all laws
 
     def _coordinates(self, pole: complex) -> list[np.ndarray]:
         """Response of a pole to each excitation at the samples of each record, (n_samples, n_excitations) each."""
@@ -315,7 +310,6 @@ class _Response:
             beyond.append(float(np.log(_squares(residual))) - threshold)
             if beyond[-1] < least:
                 best[:], least = unknowns, beyond[-1]
-                self.least = min(self.least, least)
             hopeless = len(beyond) == 2 and least > RESPONSE.hopeless
             if hopeless or before - least < max(RESPONSE.stalled * least, RESPONSE.settled):
                 raise _GivenUp
