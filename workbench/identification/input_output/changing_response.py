@@ -42,9 +42,10 @@ class ChangingResponseSettings:
     # logarithm of the squares beyond those that the linear modes leave, from which a law is given up after its first
     # step. Of laws that were right in the end it was 1 at most, of two linear modes in place of one it is 4 to 9
     hopeless: float = 2.5
-    within: int = 3  # evaluations within which the same must fall, by a share of itself or by the least that counts:
-    # laws that were right in the end lost all of it within three, wrong ones crept on for 15 to 40
-    stalled: float = 0.2
+    # evaluations within which the same must fall, by a share of what is left or by the least that counts. Laws that were
+    # right in the end halved it by each, until it was none by the third; wrong ones crept on for 15 to 40
+    within: int = 2
+    stalled: float = 0.5
     same: float = 0.1  # decay rates, by which the poles of a cluster that is not tried again may have moved
     settled: float = 1e-3  # the standard error of the logarithm of the squares of some thousand lines is larger
 

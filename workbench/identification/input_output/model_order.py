@@ -217,7 +217,7 @@ class _Modes:
         strength, participation, pole = max(candidates, key=lambda item: item[0])
         return None if strength < ORDER.enter * self.threshold(model, pole) else (pole, participation)
 
-    def _gains(self, model: Fit, poles: np.ndarray, at_once: int = 8) -> Iterator[tuple[float, np.ndarray]]:
+    def _gains(self, model: Fit, poles: np.ndarray, at_once: int = 16) -> Iterator[tuple[float, np.ndarray]]:
         """`_candidate_gains`, so many poles at a time: a basis is read from memory once for them all."""
         bases, scaled = bases_of(self.data, model), model.residual / model.noise
         for first in range(0, len(poles), at_once):
@@ -267,7 +267,7 @@ class _Modes:
             )
             start = projected(left, poles[near], factors[near])
             fit = search(left, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
-            if fit.converged and not np.delete(are_near(fit.poles[-1]), near[:-1]).any():
+            if not _is_overdamped(fit) and not np.delete(are_near(fit.poles[-1]), near[:-1]).any():
                 poles[near], factors[near] = fit.poles, fit.participation
         return projected(data, poles, factors)
 
