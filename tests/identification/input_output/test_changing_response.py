@@ -3,8 +3,11 @@ import numpy as np
 import pytest
 
 from workbench.identification.driven import identify_driven
-from workbench.identification.input_output import changing_response
+from workbench.identification.input_output import changing_response, time_variance
 from workbench.identification.input_output.changing_response import _simulated
+from workbench.identification.input_output.known_inputs import KnownInputs
+from workbench.identification.input_output.modal_fit import projected
+from workbench.identification.signal.searches import Budget
 from workbench.records.record import Channel, Record
 
 
@@ -86,3 +89,17 @@ def test_two_linear_modes_are_no_changing_one_after_a_step_of_each_law(monkeypat
     # four laws of two terms, the start with its derivatives and one step without; once, although the noise spectrum is
     # estimated again
     assert with_slopes == 4 * [True, False]
+
+
+@pytest.mark.parametrize(("apart", "compared"), [(1.1, True), (1.2, False)])
+def test_modes_far_apart_are_not_compared_with_a_changing_one(monkeypatch, apart, compared):
+    """A mode changes by 15 % at most, however wide the two are."""
+    rng, omega = np.random.default_rng(2), 2.0 * np.pi * np.array([9.0, 9.0 * apart])
+    record = Record(0.01, rng.standard_normal((1, 2000)), (Channel("d", "displacement"),),
+                    rng.standard_normal((1, 2000)), (Channel("F"),))  # fmt: skip
+    data = KnownInputs([record], at_rest=True, hold="zero", feedthrough=True)
+    fit = projected(data, (-0.05 + 1j) * omega, np.ones((2, 1), complex))
+    tried: list[np.ndarray] = []
+    monkeypatch.setattr(time_variance, "in_place_of", lambda data, fit, cluster, *options: tried.append(cluster))
+    assert time_variance.beside_changing(data, fit, 20.0, Budget(), []) is None
+    assert bool(tried) == compared

@@ -3,9 +3,9 @@
     z' = (λ + Σ_k c_k g_k) z + l u,      g = t, t², t³,  or  r^p, r = |z| over its maximum,
 
 with a few powers p, those of a free decay (`backbone`). The forcing from sample to sample is that of the constant
-mode; the remaining change of the rate is integrated by Heun's method. The changing mode has no more parameters than the
-linear modes, so the model of the higher likelihood is preferred. All are compared in the lines of the cosine transform
-about the modes.
+mode; the remaining change of the rate is integrated by Heun's method, and its derivatives by the unknowns with it. The
+changing mode has no more parameters than the linear modes, so the model of the higher likelihood is preferred. All are
+compared in the lines of the cosine transform about the modes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,8 +42,8 @@ class ChangingResponseSettings:
     # logarithm of the squares beyond those that the linear modes leave, from which a law is given up after its first
     # step. Of laws that were right in the end it was 1 at most, of two linear modes in place of one it is 4 to 9
     hopeless: float = 2.5
-    # evaluations within which the same must fall, by a share of what is left or by the least that counts. Laws that were
-    # right in the end halved it by each, until it was none by the third; wrong ones crept on for 15 to 40
+    # evaluations within which the same must fall, by a share of what is left or by the least that counts. Laws that
+    # were right in the end halved it by each, until it was none by the third; wrong ones crept on for 15 to 40
     within: int = 2
     stalled: float = 0.5
     same: float = 0.1  # decay rates, by which the poles of a cluster that is not tried again may have moved
