@@ -36,12 +36,14 @@ class ChangingResponseSettings:
     insensitive: float = 1e-4  # of the largest column of the Jacobian: an unknown of a smaller one is held
     faded: float = 16.0  # standard deviations of time about the mean time of the energy, beyond which the rate is held
     least: float = 1e-3  # of the largest amplitude: below it the rate is held
-    undriven: float = 1e-12  # forcing over the largest amplitude, below which the mode is in free decay
+    undriven: float = 1e-12  # forcing over the largest amplitude, below which the mode is in free decay, or at rest
     step: float = 0.005  # time constants: largest step of a free decay
     largest: float = 1e3  # times the amplitude of the constant mode: beyond this a motion diverges
     # logarithm of the squares beyond those that the linear modes leave, from which a law is given up after its first
     # step. Of laws that were right in the end it was 1 at most, of two linear modes in place of one it is 4 to 9
     hopeless: float = 2.5
+    # the same of the law of time, from which no other law is tried. It was 3.5 at most where one of amplitude was right
+    linear: float = 5.0
     # evaluations within which the same must fall, by a share of what is left or by the least that counts. Laws that
     # were right in the end halved it by each, until it was none by the third; wrong ones crept on for 15 to 40
     within: int = 2
@@ -65,8 +67,15 @@ LAWS: tuple[Law, ...] = (
 )
 
 
+@dataclass
 class _GivenUp(Exception):
-    """A law is hopeless after its first step or falls no more, or the time is spent."""
+    """A law is hopeless after its first step or falls no more, or the time is spent.
+
+    Attributes:
+        least: logarithm of the squares beyond the threshold.
+    """
+
+    least: float
 
 
 def in_place_of(
@@ -96,8 +105,10 @@ def in_place_of(
             continue
         try:
             changing = response.fitted(law, threshold, budget)
-        except _GivenUp:
+        except _GivenUp as end:
             given_up.add(law)
+            if by_time and end.least > RESPONSE.linear:
+                break
         else:
             if changing is not None:
                 return changing
@@ -141,7 +152,7 @@ def _exponential(x: complex) -> complex:
 def _simulated(
     start: np.ndarray, drive: np.ndarray, change: np.ndarray, powers: Floats, by_time: bool, step: complex,
     scale: float, least: float, largest: float, dt: float, middle: float, width: float, faded: float,
-    driven: int, many: int, slopes: bool,
+    driven: int, many: int, undriven: float, slopes: bool,
 ) -> np.ndarray:  # fmt: skip
     """z of a mode at the samples, (n, 1), beside its derivatives by the unknowns where these are asked for.
 
@@ -157,6 +168,7 @@ def _simulated(
         middle, width: mean and standard deviation of the time of the energy, as shares of the record.
         driven: number of samples after which there is no forcing.
         many: samples of a step from there on, within which the rate varies linearly.
+        undriven: share of the largest amplitude below which motion and forcing are none.
         slopes: whether derivatives are asked for.
     """
     n, n_rates = drive.shape[0] + 1, change.size
@@ -168,8 +180,11 @@ def _simulated(
         if u % n_unknowns >= n_rates:
             z[0, 1 + u] = units[u] * start[1 + u % n_unknowns - n_rates]
     first_slopes, moved, terms = np.zeros_like(units), np.zeros_like(units), np.ones(n_rates)
-    inverse, k = 1.0 / scale, 0
+    inverse, none, k = 1.0 / scale, (undriven * scale) ** 2, 0
     while k < n - 1:
+        if z[k, 0].real ** 2 + z[k, 0].imag ** 2 < none and drive[k, 0].real ** 2 + drive[k, 0].imag ** 2 < none:
+            k += 1  # at rest until the next impact
+            continue
         n_steps = 1 if k < driven else min(many, n - 1 - k)
         propagated, half_time = step if n_steps == 1 else step**n_steps, 0.5 * n_steps * dt
         constant, force = propagated * z[k, 0], drive[k, 0] if k < driven else 0j
@@ -304,7 +319,7 @@ class _Response:
 
         def residual_of(x: Floats) -> Floats:
             if budget.spent(CHANGE_CHECK):
-                raise _GivenUp
+                raise _GivenUp(min(beyond, default=0.0))
             unknowns[active] = x
             residual = self._residual(unknowns, law)[0] if beyond else at_start[0]
             least, before = min(beyond, default=np.inf), min(beyond[: -RESPONSE.within + 1], default=np.inf)
@@ -313,7 +328,7 @@ class _Response:
                 best[:], least = unknowns, beyond[-1]
             hopeless = len(beyond) == 2 and least > RESPONSE.hopeless
             if hopeless or before - least < max(RESPONSE.stalled * least, RESPONSE.settled):
-                raise _GivenUp
+                raise _GivenUp(least)
             return residual
 
         def jacobian_of(x: Floats) -> Floats:
@@ -380,7 +395,7 @@ class _Response:
                 constant[0], drive, self.rate * coefficients[:size], np.array(powers), by_time, step, self.scale,
                 RESPONSE.least, RESPONSE.largest, dt, self.middle, self.width, RESPONSE.faded,
                 int(driven_samples[-1]) + 1 if driven_samples.size else 0,
-                max(int(RESPONSE.step / (self.rate * dt)), 1), slopes,
+                max(int(RESPONSE.step / (self.rate * dt)), 1), RESPONSE.undriven, slopes,
             )  # fmt: skip
             if slopes:
                 simulated[:, 1 : 1 + size] *= self.rate
