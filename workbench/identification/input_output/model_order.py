@@ -156,9 +156,10 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float) -> Fi
     return projected(data, poles, np.array(participation, complex).reshape(poles.size, size // 2))
 
 
-def sure_modes(data: Measurement, start: Fit, options: SelectionOptions) -> Fit:
-    """The fitted modes of a start that exceed the threshold `SELECTION.weak` times, as coloured noise hardly does."""
-    return _Modes(data, options).started(start, SELECTION.weak)
+def sure_modes(data: Measurement, start: Fit, options: SelectionOptions, times: float = SELECTION.weak) -> Fit:
+    """The fitted modes of a start that exceed the threshold several times, `SELECTION.weak` as coloured noise hardly
+    does."""
+    return _Modes(data, options).started(start, times)
 
 
 def _responses(data: Measurement, poles: np.ndarray, size: int, further: np.ndarray) -> np.ndarray:

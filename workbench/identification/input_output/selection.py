@@ -10,7 +10,6 @@ from workbench.identification.input_output.input_noise import input_noise, with_
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, only, projected, settled
 from workbench.identification.input_output.model_order import (
-    ORDER,
     Selected,
     SelectionOptions,
     fit_of_poles,
@@ -48,7 +47,7 @@ def select(
     """
     budget = options.budget
     start = subspace_start(data, options) if strongest is None else strongest.fit
-    start = settled(data, start, SELECTION.few_steps, budget, ORDER.decided)  # once for all searches from there
+    start = sure_modes(data, start, options, times=1.0)  # once for all searches from there
     sure = sure_modes(data, start, options)
     on_one = on_one_clock(data, sure, lambda other: sure_modes(other, subspace_start(other, options), options), budget)
     if on_one is not None:
