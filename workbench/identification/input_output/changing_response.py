@@ -67,7 +67,7 @@ LAWS: tuple[Law, ...] = (
 )
 
 
-@dataclass
+@dataclass(eq=False)
 class _GivenUp(Exception):
     """A law is hopeless after its first step or falls no more, or the time is spent.
 
