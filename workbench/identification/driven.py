@@ -31,6 +31,7 @@ from workbench.identification.input_output.input_noise import (
 )
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import (
+    MANY_ROWS,
     Fit,
     added_misfit,
     modal_coordinate,
@@ -42,6 +43,7 @@ from workbench.identification.input_output.modal_fit import (
 from workbench.identification.input_output.model_order import Selected, SelectionOptions
 from workbench.identification.input_output.output_clock import clock_remarks, on_inputs_clock
 from workbench.identification.input_output.peak_shape import overlap_remarks
+from workbench.identification.input_output.quiet_start import begin_at_rest
 from workbench.identification.input_output.residual_bursts import burst_remarks
 from workbench.identification.input_output.selection import only_predictive, reweighted, select
 from workbench.identification.input_output.sensor_drift import beside_drift
@@ -203,7 +205,8 @@ def identify_driven(
 
     Args:
         records: with the same inputs and outputs at one rate; each output may hold a constant, another in each record.
-        at_rest: whether all modes are at rest at the first sample; otherwise each record has its own initial state.
+        at_rest: whether all modes are at rest at the first sample; otherwise each record has its own initial state,
+            unless the outputs of long records are as quiet before the first force as anywhere after it.
         input_hold: the inputs between samples: "zero" for a zero-order hold, such as the output of a D/A converter;
             "band-limited" for a signal without content above half the sample rate, such as a force behind an anti-alias
             filter; "first" for a first-order hold, linear from sample to sample, close to a force that is slow against
@@ -242,9 +245,10 @@ def identify_driven(
     logged = records
     records, windowed = force_window(logged)
     by_amplitude = after_impacts(records, budget)
+    n_samples = sum(record.n_samples for record in records)
     data = KnownInputs(
         records,
-        at_rest=at_rest,
+        at_rest=at_rest or (n_samples >= MANY_ROWS and begin_at_rest(records)),
         hold=hold,
         feedthrough=feedthrough,
         delays=_checked_delays(records, 0.0 if delays is None else delays),

@@ -1,8 +1,9 @@
 import numpy as np
 from scipy.signal import lfilter
 
+from workbench.identification.input_output import model_order
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import projected
+from workbench.identification.input_output.modal_fit import projected, search, settled
 from workbench.identification.input_output.model_order import SelectionOptions, _Modes, select_modes
 from workbench.identification.signal.searches import overdamped
 from workbench.records.record import Channel, Record
@@ -34,3 +35,26 @@ def test_a_candidate_that_ceases_to_oscillate_is_fitted_no_further():
     nothing = projected(data, np.zeros(0, complex), np.zeros((0, 1), complex))
     trial = _Modes(data, SelectionOptions(6)).extended(nothing, (omega * (-0.1 + 1j), np.ones(1, complex)))
     assert overdamped(trial.poles).all() and not trial.converged
+
+
+def test_a_candidate_of_a_long_record_is_fitted_with_its_neighbours_before_all_modes(monkeypatch):
+    """The steps of a coarse candidate beside a mode are taken with these two; all four modes are nearly there then."""
+    rng, dt, n, hz = np.random.default_rng(5), 1e-3, 6000, np.array([21.0, 60.0, 130.0, 134.0])
+    u, poles = rng.standard_normal((1, n)), 2.0 * np.pi * hz * (-0.01 + 1j)
+    y = sum(np.imag(lfilter([0.0, 1.0], [1.0, -np.exp(pole * dt)], u.astype(complex))) for pole in poles)
+    record = Record(dt, y + 0.05 * rng.standard_normal(y.shape), (Channel("y"),), u, (Channel("u"),))
+    data = KnownInputs([record], at_rest=True, hold="zero", feedthrough=True)
+    model = settled(data, projected(data, poles[:3], np.ones((3, 1), complex)))
+    fits: list[tuple[int, int]] = []
+
+    def counted(*arguments):
+        fit = search(*arguments)
+        fits.append((fit.poles.size, fit.steps))
+        return fit
+
+    monkeypatch.setattr(model_order, "search", counted)
+    candidate = model.poles[2] + 2.0 * np.pi * 8.0j, np.ones(1, complex)
+    trial = _Modes(data, SelectionOptions(6)).extended(model, candidate)
+    np.testing.assert_allclose(trial.poles.imag, poles.imag, rtol=1e-3)
+    (near, of_near), (every, of_all) = fits
+    assert (near, every) == (2, 4) and of_all < of_near

@@ -21,7 +21,7 @@ from scipy.interpolate import CubicSpline
 
 from workbench.arrays import Floats
 from workbench.identification.free_decay.backbone import POWERS, backbone_integrals
-from workbench.identification.input_output.modal_fit import Fit
+from workbench.identification.input_output.modal_fit import Fit, regressors
 from workbench.identification.input_output.rivals import (
     RIVALS,
     bases_with_changes,
@@ -204,7 +204,8 @@ class _Peak:
         self.noise = fit.noise
         self.weights = (np.ones((1, fit.noise.size)) if lines.weights is None else lines.weights).T[:, :, None]
         others = np.setdiff1d(np.arange(fit.poles.size), cluster)
-        self.bases = bases_with_changes(lines, fit, others, list(self.weights))
+        rows = regressors(lines, fit.poles, fit.participation)
+        self.bases = bases_with_changes(rows, fit, others, list(self.weights))
         self.values = self._beyond_others(lines.values.T)
 
     def fitted(self, law: Law, starts: list[np.ndarray]) -> _Fitted | None:

@@ -3,29 +3,29 @@
     z' = (λ + Σ_k c_k g_k) z + l u,      g = t, t², t³,  or  r^p, r = |z| over its maximum,
 
 with a few powers p, those of a free decay (`backbone`). The forcing from sample to sample is that of the constant
-mode; the remaining change of the rate is integrated by Heun's method. The changing mode has no more parameters than the
-linear modes, so the model of the higher likelihood is preferred. All are compared in the lines of the cosine transform
-about the modes.
+mode; the remaining change of the rate is integrated by Heun's method, and its derivatives by the unknowns with it. The
+changing mode has no more parameters than the linear modes, so the model of the higher likelihood is preferred. All are
+compared in the lines of the cosine transform about the modes.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit
+from workbench.identification.input_output.modal_fit import Fit, regressors
 from workbench.identification.input_output.noise_spectrum import lines_of
 from workbench.identification.input_output.rivals import (
     RIVALS,
     bases_with_changes,
     beyond_linear,
     diverged,
-    projected_residual,
 )
-from workbench.identification.signal.searches import Budget, Once
+from workbench.identification.signal.searches import Budget
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,20 @@ class ChangingResponseSettings:
     insensitive: float = 1e-4  # of the largest column of the Jacobian: an unknown of a smaller one is held
     faded: float = 16.0  # standard deviations of time about the mean time of the energy, beyond which the rate is held
     least: float = 1e-3  # of the largest amplitude: below it the rate is held
-    undriven: float = 1e-12  # forcing over the largest amplitude, below which the mode is in free decay
+    undriven: float = 1e-12  # forcing over the largest amplitude, below which the mode is in free decay, or at rest
     step: float = 0.005  # time constants: largest step of a free decay
     largest: float = 1e3  # times the amplitude of the constant mode: beyond this a motion diverges
     # logarithm of the squares beyond those that the linear modes leave, from which a law is given up after its first
     # step. Of laws that were right in the end it was 1 at most, of two linear modes in place of one it is 4 to 9
     hopeless: float = 2.5
-    # stalled: the same, by which a fit that leaves more than the linear modes must fall within so many evaluations
-    stalled: tuple[float, int] = (0.02, 4)
+    # the same of the law of time, from which no other law is tried. It was 3.5 at most where one of amplitude was right
+    linear: float = 5.0
+    # evaluations within which the same must fall, by a share of what is left or by the least that counts. Laws that
+    # were right in the end halved it by each, until it was none by the third; wrong ones crept on for 15 to 40
+    within: int = 2
+    stalled: float = 0.5
+    same: float = 0.1  # decay rates, by which the poles of a cluster that is not tried again may have moved
+    settled: float = 1e-3  # the standard error of the logarithm of the squares of some thousand lines is larger
 
 
 RESPONSE = ChangingResponseSettings()
@@ -59,22 +65,36 @@ LAWS: tuple[Law, ...] = (
     (False, (0.5, 1.0, 2.0)),
     (False, (-1.0, 1.0, 2.0)),
 )
-INVERSES = (1 / 6, 1 / 5, 1 / 4, 1 / 3, 1 / 2, 1.0)  # of the terms of an exponential series, last first
 
 
+@dataclass(eq=False)
 class _GivenUp(Exception):
-    """A law is hopeless after its first step or stalls, or the time is spent."""
+    """A law is hopeless after its first step or falls no more, or the time is spent.
+
+    Attributes:
+        least: logarithm of the squares beyond the threshold.
+    """
+
+    least: float
 
 
 def in_place_of(
-    data: KnownInputs, fit: Fit, cluster: np.ndarray, limit: float, budget: Budget
+    data: KnownInputs, fit: Fit, cluster: np.ndarray, limit: float, budget: Budget, linear: list[np.ndarray]
 ) -> tuple[KnownInputs, complex] | None:
-    """`in_place_of_clusters`, for one cluster: the records beside the changing mode, and its pole."""
+    """`in_place_of_clusters`, for one cluster: the records beside the changing mode, and its pole.
+
+    Args:
+        linear: poles of each cluster that no law replaced with an earlier estimate of the noise, added to. They are not
+            tried again: about a few modes it weights all lines much alike, whichever the model.
+    """
+    poles = fit.poles[cluster]
+    same = -RESPONSE.same * poles.real
+    if any(each.size == poles.size and (np.abs(each - poles) < same).all() for each in linear):
+        return None
     response = _Response(data, fit, cluster)
-    linear = response.linear_residual()
-    n_excitations, n_outputs = fit.participation.shape[1], fit.noise.size
-    threshold = np.log(_squares(linear, n_outputs)).sum() + limit * (cluster.size - 1) / (linear.size // n_outputs)
-    n_coefficients = cluster.size * (n_excitations + n_outputs) - (n_excitations - 1 + n_outputs)
+    n_lines = response.values.size
+    threshold = float(np.log(response.linear_squares())) + limit * (cluster.size - 1) / n_lines
+    n_coefficients = cluster.size * (fit.participation.shape[1] + 1) - fit.participation.shape[1]
     given_up: set[Law] = set()
     for law in LAWS:
         if budget.spent(CHANGE_CHECK):
@@ -85,17 +105,19 @@ def in_place_of(
             continue
         try:
             changing = response.fitted(law, threshold, budget)
-        except _GivenUp:
+        except _GivenUp as end:
             given_up.add(law)
+            if by_time and end.least > RESPONSE.linear:
+                break
         else:
             if changing is not None:
                 return changing
+    linear.append(poles)
     return None
 
 
-def _squares(residual: Floats, n_outputs: int) -> Floats:
-    squares = (residual.reshape(n_outputs, -1) ** 2).sum(axis=1)
-    return np.asarray(squares + 1e-300)
+def _squares(residual: Floats) -> float:
+    return float((residual**2).sum()) + 1e-300
 
 
 @njit(cache=True, nogil=True)
@@ -117,75 +139,110 @@ def _power(size: float, exponent: float) -> float:
 @njit(cache=True, nogil=True)
 def _exponential(x: complex) -> complex:
     """e^x; of a small x by the series, exact to the last bit."""
-    if abs(x.real) + abs(x.imag) > 0.01:
+    size = abs(x.real) + abs(x.imag)
+    if size > 0.01:
         return complex(np.exp(x))
-    series = 1.0 + 0.0j
-    for factor in INVERSES:
-        series = 1.0 + factor * x * series
-    return series
+    series = 1.0 + x / 4
+    if size > 0.001:
+        series += x * x / 20 * (1.0 + x / 6)
+    return complex(1.0 + x * (1.0 + x / 2 * (1.0 + x / 3 * series)))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _simulated(
     start: np.ndarray, drive: np.ndarray, change: np.ndarray, powers: Floats, by_time: bool, step: complex,
     scale: float, least: float, largest: float, dt: float, middle: float, width: float, faded: float,
-    driven: int, many: int,
+    driven: int, many: int, undriven: float, slopes: bool,
 ) -> np.ndarray:  # fmt: skip
-    """z of a mode at the samples, (n, n_cases), for each row of coefficients c_0, c_1, ... (n_cases, 1 + n_powers).
+    """z of a mode at the samples, (n, 1), beside its derivatives by the unknowns where these are asked for.
+
+    They are the real, then the imaginary parts of the coefficients of the rate and of the further drives. Where z
+    diverges, the last row is NaN.
 
     Args:
-        start: (n_cases,) at the first sample.
-        drive: (n - 1, n_cases) forcing of the constant mode from each sample to the next.
-        change: (n_cases, 1 + n_powers) coefficients of the rate.
+        start: (1 + n_further,) at the first sample, then its derivatives by factors of further drives.
+        drive: (n - 1, 1 + n_further) forcing of the constant mode from each sample to the next, then its derivatives.
+        change: (1 + n_powers,) coefficients c_0, c_1, ... of the rate.
         step: e^{λΔt}.
         scale: largest amplitude of the constant mode.
         middle, width: mean and standard deviation of the time of the energy, as shares of the record.
         driven: number of samples after which there is no forcing.
         many: samples of a step from there on, within which the rate varies linearly.
+        undriven: share of the largest amplitude below which motion and forcing are none.
+        slopes: whether derivatives are asked for.
     """
-    n, n_cases = drive.shape[0] + 1, drive.shape[1]
-    z = np.zeros((n, n_cases), np.complex128)
-    for i in range(n_cases):
-        current = start[i]
-        z[0, i] = current
-        k = 0
-        while k < n - 1:
-            n_steps = 1 if k < driven else min(many, n - 1 - k)
-            propagated = step if n_steps == 1 else step**n_steps
-            force = drive[k, i] if k < driven else 0j
-            first, predicted = 0j, current
-            for stage in range(2):
-                size = (
-                    min(((k + stage * n_steps) / (n - 1) - middle) / width, faded)
-                    if by_time
-                    else max(np.sqrt(predicted.real**2 + predicted.imag**2) / scale, least)
-                )
-                change_rate = change[i, 0]
-                for p in range(powers.size):
-                    change_rate += change[i, p + 1] * _power(size, powers[p])
+    n, n_rates = drive.shape[0] + 1, change.size
+    n_unknowns = n_rates + drive.shape[1] - 1 if slopes else 0
+    units = np.repeat(np.array([1.0 + 0.0j, 1.0j]), n_unknowns)
+    z = np.zeros((n, 1 + units.size), np.complex128)
+    z[0, 0] = start[0]
+    for u in range(units.size):
+        if u % n_unknowns >= n_rates:
+            z[0, 1 + u] = units[u] * start[1 + u % n_unknowns - n_rates]
+    first_slopes, moved, terms = np.zeros_like(units), np.zeros_like(units), np.ones(n_rates)
+    inverse, none, k = 1.0 / scale, (undriven * scale) ** 2, 0
+    while k < n - 1:
+        if z[k, 0].real ** 2 + z[k, 0].imag ** 2 < none and drive[k, 0].real ** 2 + drive[k, 0].imag ** 2 < none:
+            k += 1  # at rest until the next impact
+            continue
+        n_steps = 1 if k < driven else min(many, n - 1 - k)
+        propagated, half_time = step if n_steps == 1 else step**n_steps, 0.5 * n_steps * dt
+        constant, force = propagated * z[k, 0], drive[k, 0] if k < driven else 0j
+        first, rate, predicted = 0j, 0j, z[k, 0]
+        for stage in range(2):
+            base, along = predicted, 0j
+            length = np.sqrt(base.real**2 + base.imag**2)
+            size = max(length * inverse, least)
+            if by_time:
+                size = min(((k + stage * n_steps) / (n - 1) - middle) / width, faded)
+            change_rate = change[0]
+            for p in range(powers.size):
+                terms[p + 1] = _power(size, powers[p])
+                change_rate += change[p + 1] * terms[p + 1]
+                along += change[p + 1] * powers[p] * terms[p + 1]
+            # change of the rate with the motion, per unit of its component along itself
+            along = 0j if by_time or length * inverse <= least else along / (length * length)
+            if stage == 0:
+                first = change_rate
+            rate = 0.5 * (first + change_rate)
+            half = by_rate = 1.0 + 0.0j
+            if stage == 1 or not by_time:
+                half = _exponential(rate * half_time)  # a force acts in steps of one sample only
+                predicted = half * (half * constant + force)
+                by_rate = half_time * half * (2.0 * half * constant + force)
+            for u in range(units.size):
+                at = u % n_unknowns
+                of_motion = z[k, 1 + u] if stage == 0 else moved[u]
+                slope = along * (base.real * of_motion.real + base.imag * of_motion.imag)
+                pushed = 0j
+                if at < n_rates:
+                    slope += units[u] * terms[at]
+                elif k < driven:
+                    pushed = units[u] * drive[k, 1 + at - n_rates]
                 if stage == 0:
-                    first = change_rate
-                rate = 0.5 * (first + change_rate)
-                half = _exponential(0.5 * rate * n_steps * dt)  # a force acts in steps of one sample only
-                predicted = half * (propagated * half * current + force)
-            if n_steps > 1:
-                rate_slope = (rate - first) * 2.0 * dt / n_steps
-                factor, factor_step = step * np.exp(first * dt + 0.5 * rate_slope), np.exp(rate_slope)
-                for j in range(1, n_steps):
-                    z[k + j, i] = z[k + j - 1, i] * factor
-                    factor *= factor_step
-            current = predicted
-            if not abs(current) < largest * scale:
-                z[k + 1 :, i] = np.nan
-                break
-            k += n_steps
-            z[k, i] = current
+                    first_slopes[u] = slope
+                    if by_time:
+                        continue
+                slope = 0.5 * (first_slopes[u] + slope)
+                moved[u] = by_rate * slope + half * (half * propagated * z[k, 1 + u] + pushed)
+                if stage == 1:
+                    first_slopes[u], z[k + n_steps, 1 + u] = slope - first_slopes[u], first_slopes[u]
+        if n_steps > 1:
+            rate_slope = (rate - first) * 2.0 * dt / n_steps
+            factor, factor_step, ratio = step * np.exp(first * dt + 0.5 * rate_slope), np.exp(rate_slope), 1.0 + 0.0j
+            for j in range(1, n_steps):
+                ratio *= factor
+                factor *= factor_step
+                z[k + j, 0] = ratio * z[k, 0]
+                for u in range(units.size):
+                    growth = j * dt * (z[k + n_steps, 1 + u] + j / n_steps * first_slopes[u])
+                    z[k + j, 1 + u] = ratio * z[k, 1 + u] + z[k + j, 0] * growth
+        k += n_steps
+        z[k, 0], z[k, 1:] = predicted, moved
+        if not predicted.real**2 + predicted.imag**2 < (largest * scale) ** 2:
+            z[-1] = np.nan
+            return z
     return z
-
-
-def _with_neighbours(unknowns: Floats) -> Floats:
-    """Unknowns, then those with each slightly larger in turn, (1 + n_unknowns, n_unknowns)."""
-    return np.vstack([unknowns, unknowns + RIVALS.slightly * np.eye(unknowns.size)])
 
 
 class _Response:
@@ -204,9 +261,7 @@ class _Response:
         self.cluster = cluster
         margin = max(RIVALS.about * self.rate, RIVALS.fewest * data.resolution)
         self.low, self.high = poles.imag.min() - margin, poles.imag.max() + margin
-        free = np.eye(self.participation.size)
-        each = [data.modal_coordinate(self.pole, excitation) for excitation in free]
-        self.coordinates = [np.column_stack(parts) for parts in zip(*each, strict=True)]
+        self.coordinates = self._coordinates(self.pole)
         norms = np.sqrt(sum((np.abs(z) ** 2).sum(axis=0) for z in self.coordinates))
         held = int(np.argmax(norms * np.abs(self.participation)))
         self.participation = self.participation / self.participation[held]
@@ -218,23 +273,30 @@ class _Response:
         share = np.concatenate([np.linspace(0.0, 1.0, each.size) for each in energy])
         self.middle = float(np.average(share, weights=np.concatenate(energy) + 1e-300))
         self.width = float(np.sqrt(np.average((share - self.middle) ** 2, weights=np.concatenate(energy) + 1e-300)))
-        self.weights = [np.ones((1, 1))] * fit.noise.size
+        self.weight = np.ones((1, 1))
         if data.weights is not None:
-            self.weights = list(np.vstack([self._about(data.weights[part]) for part in data.rows]).T[:, :, None])
+            self.weight = np.vstack([self._about(data.weights[part]) for part in data.rows])
+        self.regressors = self._lines(regressors(data, fit.poles, fit.participation))
         others = np.setdiff1d(np.arange(fit.poles.size), cluster)
-        self.bases = bases_with_changes(data, fit, others, self.weights, self._lines)
-        self.values = self._beyond(self.bases, self._lines(data.values).T)
+        (self.basis,) = bases_with_changes(self.regressors, fit, others, [self.weight])
+        self.values = self._beyond(self.basis, self._lines(data.values))[:, 0]
+        self.linear_motions = list(self._motions_of_linear())
 
-    def linear_residual(self) -> Floats:
-        """Residual of the linear modes in the lines about the cluster, (n,), all of them re-fitted to first order."""
+    def _coordinates(self, pole: complex) -> list[np.ndarray]:
+        """Response of a pole to each excitation at the samples of each record, (n_samples, n_excitations) each."""
+        real, imaginary = (self.data.as_samples(part) for part in self.data.responses(pole))
+        return [x + 1j * y for x, y in zip(real, imaginary, strict=True)]
+
+    def linear_squares(self) -> float:
+        """Squares of the residual of the linear modes in the lines about the cluster, all re-fitted to first order."""
         every_mode = np.arange(self.fit.poles.size)
-        bases = bases_with_changes(self.data, self.fit, every_mode, self.weights, self._lines, poles_only=False)
-        return np.concatenate(self._beyond(bases, self._lines(self.fit.residual).T))
+        (basis,) = bases_with_changes(self.regressors, self.fit, every_mode, [self.weight], poles_only=False)
+        return _squares(self._beyond(basis, self._lines(self.fit.residual)))
 
-    def _beyond(self, bases: Sequence[Floats], outputs: Iterable[Floats]) -> list[Floats]:
-        """What bases do not explain of each output, (n_lines,) or (n_lines, k), in units of its noise."""
-        scaled = [x / noise for x, noise in zip(outputs, self.fit.noise, strict=True)]
-        return [x - basis @ (basis.T @ x) for x, basis in zip(scaled, bases, strict=True)]
+    def _beyond(self, basis: Floats, rows: Floats) -> Floats:
+        """What a basis does not explain of rows (n_lines, k), in units of the noise."""
+        scaled = rows / self.fit.noise
+        return np.asarray(scaled - basis @ (basis.T @ scaled))
 
     def fitted(self, law: Law, threshold: float, budget: Budget) -> tuple[KnownInputs, complex] | None:
         """The records beside the changing mode of a law, and its pole; None where it leaves too large a residual.
@@ -245,100 +307,121 @@ class _Response:
         Raises:
             _GivenUp: the first step leaves far more, the fit stalls above the threshold, or the time is spent.
         """
-        once = Once(lambda x: self._residual(self._motions(_with_neighbours(x), law)))
         start = self._start(law)
-        unknowns = np.r_[start.real, start.imag]
-        sensitivity = np.linalg.norm(once(unknowns)[1], axis=0)
+        best = np.r_[start.real, start.imag]
+        unknowns, at_start = best.copy(), self._residual(best, law, True)
+        sensitivity = np.linalg.norm(at_start[1], axis=0)
         # After an impact, an initial state excites a mode as the input does.
         active = sensitivity > RESPONSE.insensitive * sensitivity.max()
         if not active.any():
             return None
-
-        def beyond_threshold(residual: Floats) -> float:
-            return float(np.log(_squares(residual, self.fit.noise.size)).sum() - threshold)
-
         beyond: list[float] = []
 
-        def among_active(x: Floats) -> tuple[Floats, Floats]:
-            unknowns[active] = x
-            if len(beyond) == 1:  # without the Jacobian, which takes most of the time
-                first = beyond_threshold(self._residual(self._motions(unknowns[None], law))[0])
-                if min(*beyond, first) > RESPONSE.hopeless:
-                    raise _GivenUp
+        def residual_of(x: Floats) -> Floats:
             if budget.spent(CHANGE_CHECK):
-                raise _GivenUp
-            residual, jacobian = once(unknowns)
-            beyond.append(beyond_threshold(residual))
-            fall, within = RESPONSE.stalled
-            if 0.0 < min(beyond) and min(beyond[:-within], default=np.inf) < min(beyond) + fall:
-                raise _GivenUp
-            return residual, jacobian[:, active]
+                raise _GivenUp(min(beyond, default=0.0))
+            unknowns[active] = x
+            residual = self._residual(unknowns, law)[0] if beyond else at_start[0]
+            least, before = min(beyond, default=np.inf), min(beyond[: -RESPONSE.within + 1], default=np.inf)
+            beyond.append(float(np.log(_squares(residual))) - threshold)
+            if beyond[-1] < least:
+                best[:], least = unknowns, beyond[-1]
+            hopeless = len(beyond) == 2 and least > RESPONSE.hopeless
+            if hopeless or before - least < max(RESPONSE.stalled * least, RESPONSE.settled):
+                raise _GivenUp(least)
+            return residual
 
-        unknowns[active] = Once(among_active).least(unknowns[active], RESPONSE.most_tries)
-        if beyond_threshold(once(unknowns)[0]) > 0.0:
+        def jacobian_of(x: Floats) -> Floats:
+            jacobian = at_start[1] if len(beyond) == 1 else self._residual(unknowns, law, True)[1]
+            return jacobian[:, active]
+
+        try:
+            least_squares(residual_of, best[active], jacobian_of, x_scale="jac", max_nfev=RESPONSE.most_tries)
+        except _GivenUp:
+            if budget.is_past or min(beyond) > 0.0:
+                raise
+        if min(beyond) > 0.0:
             return None
-        motions = self._motions(_with_neighbours(unknowns), law)
-        rows = self.data.rows_of([np.hstack([z.real, z.imag]) for z in motions])
+        rows = self.data.rows_of([np.hstack([z.real, z.imag]) for z in self._motions(best, law, True)])
         further, pole = beyond_linear(self.data, rows, self.pole, self.participation)
         return self.data.with_columns(further, (pole,)), pole
 
     def _start(self, law: Law) -> np.ndarray:
         """Starting coefficients of a law: regression on the sum of the linear modes, from sample to sample."""
-        fit, dt, (by_time, powers) = self.fit, self.data.dt, law
-        weighted_shape = fit.amplitudes[:, self.cluster[0]] / fit.noise**2
-        strength = weighted_shape.conj() @ fit.amplitudes[:, self.cluster]
-        participation = strength @ fit.participation[self.cluster]
-        unit = participation[self.held]
-        regressors: list[np.ndarray] = []
-        rates: list[np.ndarray] = []
-        modes = [
-            (a / unit, pole, self.data.modal_coordinate(pole, l_r))
-            for a, pole, l_r in zip(strength, fit.poles[self.cluster], fit.participation[self.cluster], strict=True)
-        ]
-        for k in range(len(self.coordinates)):
-            z = sum(a * each[k] for a, _, each in modes)
-            propagated = sum(a * np.exp(pole * dt) * each[k][:-1] for a, pole, each in modes)
-            n = z.size
-            time = np.minimum((np.arange(n - 1) / (n - 1) - self.middle) / self.width, RESPONSE.faded)
-            size = time if by_time else np.maximum(np.abs(z[:-1]) / self.scale, RESPONSE.least)
-            regressor = np.column_stack([np.ones(n - 1), size[:, None] ** np.array(powers)])
-            regressors.append(regressor * z[:-1, None])
-            rates.append((propagated * np.exp(-self.pole * dt) - z[:-1]) / dt / self.rate)
-        coefficients = np.linalg.lstsq(np.vstack(regressors), np.concatenate(rates), rcond=None)[0]
-        held_factors = self.participation[self.others]
-        return np.asarray(np.r_[coefficients, (participation[self.others] / unit - held_factors) / self.units])
+        (by_time, powers), size = law, 1 + len(law[1])
+        each = []
+        for z, rate in self.linear_motions:
+            time = np.minimum((np.arange(z.size) / z.size - self.middle) / self.width, RESPONSE.faded)
+            along = time if by_time else np.maximum(np.abs(z) / self.scale, RESPONSE.least)
+            each.append(np.column_stack([z, *(along**power * z for power in powers), rate]))
+        rows = np.vstack(each)
+        products = rows[:, :size].conj().T @ rows
+        coefficients = np.linalg.lstsq(products[:, :size], products[:, size], rcond=None)[0]
+        return np.asarray(np.r_[coefficients, self.linear_factors])
 
-    def _motions(self, cases: Floats, law: Law) -> list[np.ndarray]:
-        """z of each record at the first case, and its change to each other, (n_samples, n_cases) each.
+    def _motions_of_linear(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """The sum of the linear modes in each record, and its rate beyond that of the constant mode times it.
 
-        Args:
-            cases: (n_cases, n_unknowns), as `_with_neighbours` gives, or the first of these alone.
+        Over the rate of decay, (n_samples - 1,) each.
         """
-        (by_time, powers), half = law, cases.shape[1] // 2
-        coefficients = cases[:, :half] + 1j * cases[:, half:]
+        fit, dt = self.fit, self.data.dt
+        poles, participation = fit.poles[self.cluster], fit.participation[self.cluster]
+        strength = (fit.amplitudes[:, self.cluster[0]] / fit.noise**2).conj() @ fit.amplitudes[:, self.cluster]
+        factors = strength @ participation
+        unit = factors[self.held]
+        self.linear_factors = (factors[self.others] / unit - self.participation[self.others]) / self.units
+        each_pole = [self._coordinates(pole) for pole in poles]
+        for k in range(len(self.coordinates)):
+            each = zip(strength / unit, each_pole, participation, strict=True)
+            modes = [a * (z[k][:-1] @ l_r) for a, z, l_r in each]
+            z = np.sum(modes, axis=0)
+            propagated = np.exp((poles - self.pole) * dt) @ modes
+            yield z, (propagated - z) / dt / self.rate
+
+    def _motions(self, unknowns: Floats, law: Law, slopes: bool = False) -> list[np.ndarray]:
+        """z of each record, beside its derivatives by the unknowns where these are asked for, (n_samples, k)."""
+        (by_time, powers), half = law, unknowns.size // 2
+        coefficients = unknowns[:half] + 1j * unknowns[half:]
         size = 1 + len(powers)
-        participation = np.tile(self.participation, (len(cases), 1))
-        participation[:, self.others] += coefficients[:, size:] * self.units
-        step, motions = np.exp(self.pole * self.data.dt), []
+        participation = self.participation.copy()
+        participation[self.others] += coefficients[size:] * self.units
+        dt, motions = self.data.dt, []
+        step = np.exp(self.pole * dt)
         for z in self.coordinates:
-            all_cases = z @ participation.T
-            drive = all_cases[1:] - step * all_cases[:-1]
+            constant = np.column_stack([z @ participation, z[:, self.others] * self.units])
+            drive = constant[1:] - step * constant[:-1]
             driven_samples = np.flatnonzero(np.abs(drive).max(axis=1) > RESPONSE.undriven * self.scale)
             simulated = _simulated(
-                np.ascontiguousarray(all_cases[0]), drive, self.rate * coefficients[:, :size], np.array(powers),
-                by_time, step, self.scale, RESPONSE.least, RESPONSE.largest, self.data.dt, self.middle, self.width,
-                RESPONSE.faded, int(driven_samples[-1]) + 1 if driven_samples.size else 0,
-                max(int(RESPONSE.step / (self.rate * self.data.dt)), 1),
+                constant[0], drive, self.rate * coefficients[:size], np.array(powers), by_time, step, self.scale,
+                RESPONSE.least, RESPONSE.largest, dt, self.middle, self.width, RESPONSE.faded,
+                int(driven_samples[-1]) + 1 if driven_samples.size else 0,
+                max(int(RESPONSE.step / (self.rate * dt)), 1), RESPONSE.undriven, slopes,
             )  # fmt: skip
-            motions.append(np.column_stack([simulated[:, 0], (simulated[:, 1:] - simulated[:, :1]) / RIVALS.slightly]))
+            if slopes:
+                simulated[:, 1 : 1 + size] *= self.rate
+                simulated[:, 1 + half : 1 + half + size] *= self.rate
+            motions.append(simulated)
         return motions
 
-    def _residual(self, motions: list[np.ndarray]) -> tuple[Floats, Floats]:
-        """Residual (n,) and its Jacobian (n, n_unknowns)."""
-        if not all(np.isfinite(each).all() for each in motions):
-            return diverged(self.values, motions[0].shape[1] - 1)
-        rows = np.vstack([self._about(lines_of(np.hstack([z.real, z.imag]))) for z in motions])
-        return projected_residual(self.values, self._beyond(self.bases, [weight * rows for weight in self.weights]))
+    def _residual(self, unknowns: Floats, law: Law, slopes: bool = False) -> tuple[Floats, Floats]:
+        """Residual (n,) with the shape of the motion projected out, and its Jacobian (n, n_unknowns), where asked for.
+
+        The Jacobian is that of Kaufman (1975).
+        """
+        motions = self._motions(unknowns, law, slopes)
+        if not all(np.isfinite(z[-1]).all() for z in motions):
+            return diverged([self.values], unknowns.size)
+        q, r = np.linalg.qr(self._beyond_others([np.column_stack([z[:, 0].real, z[:, 0].imag]) for z in motions]))
+        in_motion = q.T @ self.values
+        a, b = np.linalg.lstsq(r, in_motion, rcond=1e-12)[0]
+        tangents = np.zeros((self.values.size, 0))
+        if slopes:
+            tangents = self._beyond_others([a * z[:, 1:].real + b * z[:, 1:].imag for z in motions])
+        return np.asarray(self.values - q @ in_motion), np.asarray(q @ (q.T @ tangents) - tangents)
+
+    def _beyond_others(self, samples: Sequence[Floats]) -> Floats:
+        """What the other modes do not explain of columns (n_samples, k) of each record, in the lines that count."""
+        return self._beyond(self.basis, self.weight * np.vstack([self._about(lines_of(each)) for each in samples]))
 
     def _lines(self, rows: Floats) -> Floats:
         """Lines about the cluster, from rows of the fit."""
@@ -347,5 +430,8 @@ class _Response:
 
     def _about(self, lines: Floats) -> Floats:
         """Those of the lines of one record that lie about the cluster."""
-        line = np.pi / self.data.dt / len(lines)
-        return lines[max(int(self.low / line), 0) : int(self.high / line) + 2]
+        return lines[self._within(len(lines))]
+
+    def _within(self, n_lines: int) -> slice:
+        line = np.pi / self.data.dt / n_lines
+        return slice(max(int(self.low / line), 0), min(int(self.high / line) + 2, n_lines))

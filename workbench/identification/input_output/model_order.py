@@ -13,8 +13,8 @@ from workbench.identification.input_output.modal_fit import (
     Fit,
     Measurement,
     column_norms,
+    columns,
     modal_coordinate,
-    normalised_columns,
     only,
     orthonormal,
     products_of,
@@ -117,10 +117,7 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float) -> Fi
     """
     poles = poles[_may_be_mode(data, poles) & (poles.real < data.resolution / (2.0 * np.pi))]
     size = 2 * data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
-    columns = np.empty((len(data.values), poles.size * size + data.fixed.shape[1]), order="F")
-    for r, pole in enumerate(poles):
-        columns[:, r * size : (r + 1) * size] = np.hstack(data.responses(pole))
-    columns[:, poles.size * size :] = data.fixed
+    columns = _responses(data, poles, size, data.fixed)
     scale = np.maximum(column_norms(columns), 1e-300)
     together = [data.values] if data.weights is None else np.hsplit(data.values, data.values.shape[1])
     spreads: list[np.ndarray] = []
@@ -159,9 +156,20 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float) -> Fi
     return projected(data, poles, np.array(participation, complex).reshape(poles.size, size // 2))
 
 
-def sure_modes(data: Measurement, start: Fit, options: SelectionOptions) -> Fit:
-    """The fitted modes of a start that exceed the threshold `SELECTION.weak` times, as coloured noise hardly does."""
-    return _Modes(data, options).started(start, SELECTION.weak)
+def sure_modes(data: Measurement, start: Fit, options: SelectionOptions, times: float = SELECTION.weak) -> Fit:
+    """The fitted modes of a start that exceed the threshold several times, `SELECTION.weak` as coloured noise hardly
+    does."""
+    return _Modes(data, options).started(start, times)
+
+
+def _responses(data: Measurement, poles: np.ndarray, size: int, further: np.ndarray) -> np.ndarray:
+    """Columns of `Measurement.responses` of some poles, `size` of each, real parts first, then further columns."""
+    columns = np.empty((len(further), poles.size * size + further.shape[1]), order="F")
+    for first, pole in zip(range(0, poles.size * size, size), poles, strict=True):
+        middle = first + size // 2
+        columns[:, first:middle], columns[:, middle : first + size] = data.responses(pole)
+    columns[:, poles.size * size :] = further
+    return columns
 
 
 def _rank_one_participation(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
@@ -210,7 +218,7 @@ class _Modes:
         strength, participation, pole = max(candidates, key=lambda item: item[0])
         return None if strength < ORDER.enter * self.threshold(model, pole) else (pole, participation)
 
-    def _gains(self, model: Fit, poles: np.ndarray, at_once: int = 8) -> Iterator[tuple[float, np.ndarray]]:
+    def _gains(self, model: Fit, poles: np.ndarray, at_once: int = 16) -> Iterator[tuple[float, np.ndarray]]:
         """`_candidate_gains`, so many poles at a time: a basis is read from memory once for them all."""
         bases, scaled = bases_of(self.data, model), model.residual / model.noise
         for first in range(0, len(poles), at_once):
@@ -234,27 +242,35 @@ class _Modes:
         return best if best[0] > SELECTION.weak * self.threshold(model, best[2]) else None
 
     def extended(self, model: Fit, candidate: tuple[complex, np.ndarray]) -> Fit:
-        pole, participation = self._alone(model, *candidate)
-        poles, factors = np.append(model.poles, pole), np.vstack([model.participation, participation])
-        start = projected(self.data, poles, factors)
+        start = self._among_near(model, *candidate)
         return search(self.data, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
 
-    def _alone(self, model: Fit, pole: complex, participation: np.ndarray) -> tuple[complex, np.ndarray]:
-        """A candidate fitted to the residual of the other modes of a long record, unless it comes near to one of them.
+    def _among_near(self, model: Fit, pole: complex, participation: np.ndarray) -> Fit:
+        """A model and a candidate, which in a long record is first fitted to what the modes far from it leave.
 
-        The steps that a coarse candidate takes to its place cost a fraction of those of all modes together.
+        With the modes near it alone: the steps that a coarse candidate takes to its place cost a fraction of those of
+        all modes together.
         """
-        if len(self.data.values) < MANY_ROWS:
-            return pole, participation
-        residual = copy(self.data)
-        residual.values = model.residual
-        start = projected(residual, np.array([pole]), participation[None])
-        fit = search(residual, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
-        apart = np.abs(np.append(model.poles, pole) - fit.poles[0])
-        near = ORDER.apart * max(abs(fit.poles[0].real), self.data.resolution)
-        if not fit.converged or apart[-1] > near or (apart[:-1] < near).any():
-            return pole, participation
-        return complex(fit.poles[0]), fit.participation[0]
+        data, n = self.data, model.poles.size
+        poles, factors = np.append(model.poles, pole), np.vstack([model.participation, participation])
+
+        def are_near(pole: complex) -> np.ndarray:
+            rates = np.maximum(np.abs(model.poles.real), abs(pole.real))
+            return np.asarray(np.abs(model.poles - pole) < ORDER.apart * np.maximum(rates, data.resolution))
+
+        near = np.append(np.flatnonzero(are_near(pole)), n)
+        if len(data.values) >= MANY_ROWS and near.size <= n:
+            left = copy(data)
+            phi = columns(data, poles[near[:-1]], factors[near[:-1]])[0][:, : 2 * near.size - 2]
+            at_near = np.concatenate([near[:-1], n + near[:-1]])
+            left.values = model.residual + (phi @ model.coefficients[at_near]) * (
+                1.0 if data.weights is None else data.weights
+            )
+            start = projected(left, poles[near], factors[near])
+            fit = search(left, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
+            if not _is_overdamped(fit) and not np.delete(are_near(fit.poles[-1]), near[:-1]).any():
+                poles[near], factors[near] = fit.poles, fit.participation
+        return projected(data, poles, factors)
 
     def gain(self, smaller: Fit, larger: Fit) -> float:
         """Log-likelihood ratio statistic of two fits, the noise of each output a nuisance parameter."""
@@ -370,7 +386,8 @@ def _candidate_gains(
         residual: (n_rows, n_outputs), in units of the noise.
         poles: (n_poles,), each by itself.
     """
-    columns = np.hstack([part for pole in poles for part in data.responses(pole)])
+    size = 2 * data.responses(poles[0])[0].shape[1]
+    columns = _responses(data, poles, size, data.fixed[:, :0])
     scale = np.maximum(column_norms(columns), 1e-300)
     each = np.arange(scale.size).reshape(len(poles), -1)
     strengths, blocks = np.zeros(len(poles)), [list[np.ndarray]() for _ in poles]
@@ -409,10 +426,14 @@ def weights_of(data: Measurement) -> list[np.ndarray]:
 
 def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> np.ndarray:
     """Orthonormal basis (n_rows, n_columns) of the modal coordinates of a fit and the fixed columns, weighted."""
-    each = zip(fit.poles, fit.participation)
-    coordinates = [part for pole, l_r in each for part in modal_coordinate(data.responses(pole), l_r)]
-    phi = weights * (np.column_stack([*coordinates, data.fixed]) if coordinates else data.fixed)
-    return orthonormal(normalised_columns(phi))[0]
+    n = fit.poles.size
+    phi = np.empty((len(data.values), 2 * n + data.fixed.shape[1]), order="F")
+    for r, (pole, l_r) in enumerate(zip(fit.poles, fit.participation, strict=True)):
+        phi[:, 2 * r], phi[:, 2 * r + 1] = modal_coordinate(data.responses(pole), l_r)
+    phi[:, 2 * n :] = data.fixed
+    phi *= weights
+    phi /= np.maximum(column_norms(phi), 1e-300)
+    return orthonormal(phi)[0]
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:

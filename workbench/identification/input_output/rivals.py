@@ -17,9 +17,10 @@ from workbench.identification.input_output.modal_fit import (
     Measurement,
     Pair,
     changes_of,
-    columns,
+    combinations,
     modal_coordinate,
     normalised_columns,
+    orthonormal,
     projected,
 )
 from workbench.identification.signal.searches import Budget
@@ -86,8 +87,9 @@ def in_place_of_clusters(
 
 def orthonormal_basis(rows: np.ndarray, least: float) -> Floats:
     """Orthonormal basis of the columns of a matrix, of singular values above `least`."""
-    u, s, _ = np.linalg.svd(rows, full_matrices=False)
-    return np.asarray(u[:, s > least])
+    q, r = orthonormal(rows)
+    u, s, _ = np.linalg.svd(r)
+    return np.asarray(q @ u[:, s > least])
 
 
 def beyond_linear(data: Measurement, motions: np.ndarray, pole: complex, l_r: np.ndarray) -> tuple[Floats, complex]:
@@ -107,29 +109,24 @@ def beyond_linear(data: Measurement, motions: np.ndarray, pole: complex, l_r: np
 
 
 def bases_with_changes(
-    data: Measurement,
-    fit: Fit,
-    modes: np.ndarray,
-    weights: Sequence[Floats],
-    lines: Callable[[Floats], Floats] = lambda rows: rows,
-    poles_only: bool = True,
+    rows: Floats, fit: Fit, modes: np.ndarray, weights: Sequence[Floats], poles_only: bool = True
 ) -> list[Floats]:
     """Orthonormal columns of some modes, the fixed columns and first-order changes of the modes, one matrix per output.
 
     Args:
+        rows: those that count of the `regressors` of the fit.
         modes: their indices.
-        weights: (n_lines, 1) of each output, inverse relative noise.
-        lines: the lines that count, (n_lines, k), of rows of the measurement, (n_rows, k).
+        weights: (n_rows, 1) of each output, inverse relative noise.
         poles_only: whether only poles may change, or participation factors too.
     """
-    phi, tangents = columns(data, fit.poles[modes], fit.participation[modes])
-    of_mode, half = fit.participation.shape[1] + 1, tangents.shape[1] // 2
+    n, of_mode = fit.poles.size, fit.participation.shape[1] + 1
+    chosen = (of_mode * modes[:, None] + np.arange(of_mode)).ravel()
+    real, imaginary, fixed = rows[:, chosen], rows[:, n * of_mode + chosen], rows[:, 2 * n * of_mode :]
+    phi = np.hstack([real, imaginary, fixed]) @ combinations(fit.participation[modes], fixed.shape[1])
     step = of_mode if poles_only else 1
-    stacked = lines(np.hstack([phi, tangents[:, :half:step], tangents[:, half::step]]))
-    phi, real, imaginary = np.split(stacked, [phi.shape[1], phi.shape[1] + half // step], axis=1)
     bases = []
     for weight, a in zip(weights, np.repeat(fit.amplitudes[:, modes], of_mode // step, axis=1), strict=True):
-        each = weight * np.hstack([phi, changes_of(a, (real, imaginary))])
+        each = weight * np.hstack([phi, changes_of(a, (real[:, ::step], imaginary[:, ::step]))])
         bases.append(orthonormal_basis(normalised_columns(each), RIVALS.collinear))
     return bases
 

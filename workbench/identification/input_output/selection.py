@@ -10,7 +10,6 @@ from workbench.identification.input_output.input_noise import input_noise, with_
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, only, projected, settled
 from workbench.identification.input_output.model_order import (
-    ORDER,
     Selected,
     SelectionOptions,
     fit_of_poles,
@@ -48,7 +47,7 @@ def select(
     """
     budget = options.budget
     start = subspace_start(data, options) if strongest is None else strongest.fit
-    start = settled(data, start, SELECTION.few_steps, budget, ORDER.decided)  # once for all searches from there
+    start = sure_modes(data, start, options, times=1.0)  # once for all searches from there
     sure = sure_modes(data, start, options)
     on_one = on_one_clock(data, sure, lambda other: sure_modes(other, subspace_start(other, options), options), budget)
     if on_one is not None:
@@ -166,8 +165,9 @@ def _alternate_with_noise(
         options: those of the selections that follow.
     """
     budget, estimation = options.budget, "estimation of the noise spectrum"
+    linear: list[np.ndarray] = []
     for _ in range(DRIVEN_SELECTION.noise_rounds):
-        data, selected = _with_changing(data, selected, first_options)
+        data, selected = _with_changing(data, selected, first_options, linear)
         line_std = data.noise_spectrum(selected.fit)
         may_be_more = selected.full and first_options.max_modes < options.max_modes
         if (alike(line_std, data.line_std) and not may_be_more) or budget.spent(estimation):
@@ -181,12 +181,18 @@ def _alternate_with_noise(
     return data, selected
 
 
-def _with_changing(data: KnownInputs, selected: Selected, options: SelectionOptions) -> tuple[KnownInputs, Selected]:
-    """The data with the columns of changing modes, and the modes, as long as these are likelier than close modes."""
+def _with_changing(
+    data: KnownInputs, selected: Selected, options: SelectionOptions, linear: list[np.ndarray]
+) -> tuple[KnownInputs, Selected]:
+    """The data with the columns of changing modes, and the modes, as long as these are likelier than close modes.
+
+    Args:
+        linear: see `changing_response.in_place_of`.
+    """
     # With one input and output both models were compared before.
     compared = data.values.shape[1] * data.n_inputs == 1
     for _ in range(DRIVEN_SELECTION.noise_rounds):
-        changing = beside_changing(data, selected.fit, selected.limit, options.budget)
+        changing = beside_changing(data, selected.fit, selected.limit, options.budget, linear)
         if changing is None:
             break
         fewer = select_modes(changing[0], options, changing[1])

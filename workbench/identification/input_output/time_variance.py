@@ -127,14 +127,19 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
     return fit
 
 
-def beside_changing(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -> tuple[KnownInputs, Fit] | None:
+def beside_changing(
+    data: KnownInputs, fit: Fit, limit: float, budget: Budget, linear: list[np.ndarray]
+) -> tuple[KnownInputs, Fit] | None:
     """The records with the columns of changing modes, and the fit without the modes that modelled their change.
 
     A large change is fitted by several linear modes. Where the Volterra terms of one mode explain what the weaker modes
     about it explain, these are removed and the terms become fixed columns. None where no mode is so.
+
+    Args:
+        linear: see `in_place_of`.
     """
     if fit.noise.size * data.n_inputs == 1:
-        return _beside_rivals(data, fit, limit, budget)
+        return _beside_rivals(data, fit, limit, budget, linear)
     strength = statistic_of_each(fit)
     participation = fit.participation[:, : data.n_inputs].T
     alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > CHANGING.alike
@@ -163,14 +168,17 @@ def beside_changing(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -
     return data, only(data, fit, ~removed)
 
 
-def _beside_rivals(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -> tuple[KnownInputs, Fit] | None:
+def _beside_rivals(
+    data: KnownInputs, fit: Fit, limit: float, budget: Budget, linear: list[np.ndarray]
+) -> tuple[KnownInputs, Fit] | None:
     """`beside_changing` for one input and one output, where shapes tell nothing: the likelier rival model is kept."""
-    alike = np.ones((fit.poles.size, fit.poles.size), bool)
+    omega = fit.poles.imag
+    close = np.abs(np.subtract.outer(omega, omega)) < CHANGING.reach * omega[:, None]
     return in_place_of_clusters(
         data,
         fit,
-        alike,
-        lambda data, cluster: in_place_of(data, fit, cluster, limit, budget),
+        close,
+        lambda data, cluster: in_place_of(data, fit, cluster, limit, budget, linear),
         budget,
     )
 
