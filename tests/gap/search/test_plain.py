@@ -11,6 +11,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_errors
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
+from workbench.gap.search import jointly
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import fit_jointly, size_of, surely_late, with_all_errors
@@ -26,6 +27,7 @@ from workbench.gap.search.plain import (
     with_common_delay,
 )
 from workbench.gap.search.search import Search
+from workbench.gap.search.settings import JOINT
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -281,6 +283,20 @@ def test_a_delay_of_all_sensors_is_the_effect_that_it_is(search, kind):
     named = [effect for effect in found.effects if effect.kind.name == kind]
     assert len(named) == 1 and named[0].values[SENSORS_LATE[kind]] == pytest.approx(0.003, rel=0.02)
     assert all(p < 0.01 for _, p in other_delay_causes(one, found))
+
+
+def test_sensitivities_on_some_records_are_not_kept_for_all_where_the_simulation_of_all_runs_away(search, monkeypatch):
+    one = search((MODULUS,))
+    (record,), level = one.data.records, jointly._residual_level
+    both = replace(one, data=replace(one.data, records=(record, replace(record, name="again"))))
+    far = iter([True])  # the first residual of both records
+    monkeypatch.setattr(
+        jointly,
+        "_residual_level",
+        lambda rig, effects, data: np.inf if len(data.records) == 2 and next(far, False) else level(rig, effects, data),
+    )
+    step = beside_errors(both)
+    assert len(step.errors.values) >= JOINT.few and step.fit.cost_by_channel.shape == (2, 4)
 
 
 def test_an_effect_that_smooth_errors_could_mimic_stays_significant(search):

@@ -238,8 +238,9 @@ def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np
     rows = np.arange(len(by_channel)) != np.argmin(per_unit.sum(axis=1))
     beyond, per = by_channel - sensor_noise, per_unit
     if rows.any():  # the record with the weakest inputs shows the sensor noise
-        beyond, per = by_channel[rows] - by_channel[~rows], per_unit[rows] - per_unit[~rows]
-    share = np.median(np.maximum(beyond, 0.0) / np.maximum(per, 1e-300))
+        with np.errstate(invalid="ignore"):  # the simulation may diverge
+            beyond, per = by_channel[rows] - by_channel[~rows], per_unit[rows] - per_unit[~rows]
+    share = np.median(np.fmax(beyond, 0.0) / np.maximum(per, 1e-300))
     return float(min(np.sqrt(share), LOGGED.most))
 
 

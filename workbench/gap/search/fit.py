@@ -312,7 +312,9 @@ class _Problem:
         """Store the sensitivities to parameters with priors in the chord, if it has none yet."""
         chord = self.chord
         if chord is not None and chord.columns is None and self.has_known_slopes:
-            chord.columns = np.sqrt(self.data.temperature) * self._columns[self.with_prior, : self.data.n_values].T
+            columns = self._columns[self.with_prior, : self.data.n_values].T
+            with np.errstate(invalid="ignore"):  # the temperature is infinite where the simulation diverges
+                chord.columns = np.sqrt(self.data.temperature) * columns
 
     def close(self) -> None:
         """Release the memory of the sensitivities."""

@@ -143,10 +143,10 @@ def fit_jointly(
         power = _residual_level(search.rig, (*effects, errors), data)
         if power > (1.0 - (JOINT.last_settled if until_convergence else JOINT.settled)) * before:
             break
-        fell = power < JOINT.falling * before
-        n_counted += not fell or not np.isfinite(before)
-        # new sensitivities: far from the last ones, in the final fit, or if there are few
-        if known is None and (fell or until_convergence or len(errors.values) < JOINT.few):
+        fell, is_first = power < JOINT.falling * before, not np.isfinite(before)
+        n_counted += not fell or is_first
+        # new sensitivities: of other records, far from the last ones, in the final fit, or if there are few
+        if known is None and (fell or is_first or until_convergence or len(errors.values) < JOINT.few):
             chord = Chord()
         before = power if known is not None or not on_quick else np.inf
         i += 1
