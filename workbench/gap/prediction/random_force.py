@@ -41,7 +41,8 @@ class RandomForceSettings:
     families: int = 3  # shaping filters, likeliest first, that are fitted to two records before the best is to all
     curved_over: float = 2e-3  # of the extent: step of the second difference of the likelihood
     # one random force of the surroundings: largest spread of its rms between records, relative; largest deviation of
-    # the mean square of the whitened residual from 1; largest share of it that inputs and motion predict
+    # the mean square of the whitened residual from 1, which is 0.10 at the truth of a trial with two laws, as these act
+    # on the measured motion; largest share of the force that inputs and motion predict
     level_spread: float = 0.15
     whitened: float = 0.15
     follows: float = 0.1

@@ -107,7 +107,6 @@ class Attribution:
             exchanges: of two channels each.
             nominal: evidence of the rig without them.
         """
-
         return replace(
             self,
             outcome="explained" if self.outcome == "none" else self.outcome,
@@ -134,9 +133,8 @@ class Attribution:
         alone = best_of_each(sorted((*self.tried, *fitted), key=lambda f: f.cost))
         if not self.exchanged:
             return tuple(alone)
-        by_channel = self.search.data.by_channel(self.search.data.residual(self.search.rig))
-        start = Fit((), float(by_channel.mean()), by_channel, 0)
-        return tuple(_with_exchanges(found, self.exchanged) for found in (start, *alone))
+        each = (self.search.without_effects(), *alone)
+        return tuple(_with_exchanges(found, self.exchanged) for found in each)
 
 
 def _with_exchanges(found: Fit, exchanges: tuple[Effect, ...]) -> Fit:

@@ -57,7 +57,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     evidence = _with_laws_on_measured_motion(search, evidence)
     if not looks_random(evidence):
         return None, []
-    alone = fitted_with_random(search, _fit_without_effects(search), evidence)
+    alone = fitted_with_random(search, search.without_effects(), evidence)
     if not search.near(alone[0], RANDOM.near) or alone[1].tonal > TONAL:
         return None, []
     tried = [alone]
@@ -187,12 +187,6 @@ def _removes_enough(search: Search, candidate: Fit, given: Sequence[Effect]) -> 
     """Whether a set removes more of what the given effects leave than small errors of gains and places would."""
     before, after = (cost_of(search.rig, effects, search.data) for effects in (given, candidate.effects))
     return before - after > STEPWISE.least * before
-
-
-def _fit_without_effects(search: Search) -> Fit:
-    """The fit of no effects."""
-    left = search.data.by_channel(search.data.residual(search.rig))
-    return Fit((), float(left.mean()), left, 0)
 
 
 def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:

@@ -67,6 +67,11 @@ class Search:
         """Description length, nats, of one parameter: half the logarithm of the number of values."""
         return 0.5 * float(np.log(self.data.n_values))
 
+    def without_effects(self) -> Fit:
+        """The fit of no effects."""
+        left = self.data.by_channel(self.data.residual(self.rig))
+        return Fit((), float(left.mean()), left, 0)
+
     def explains(self, candidate: Fit) -> bool:
         """Whether the residual of a fit is at the noise floor in every record, up to the integration error.
 
