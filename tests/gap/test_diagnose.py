@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from workbench.draw.gap import plot_single_effects
 from workbench.gap.diagnose import _leaves_unexplained, _note_of_residual, _outcome, diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, Kind, Parameter, apply_all, place_parameters
@@ -300,6 +301,7 @@ def test_wires_that_are_surely_exchanged_are_put_right_before_the_search(hinged_
     assert verdict.shrinkage.overall > 0.95 and sum(verdict.budget.effects.values()) > 0.95
     assert [f.effects[0].kind for f in verdict.attribution.tried] == [gain.kind]  # the exchange was not searched for
     assert [f.labels for f in verdict.attribution.singles] == [(exchange.label,), (gain.label, exchange.label)]
+    assert plot_single_effects(verdict).axes[0].get_title("left") == "best fit of each effect beside the exchange"
     one = diagnose(rig, fitted, validation=replace(kept, outputs=kept.outputs[[2, 1, 0, 3]]), catalogue=both, workers=1)
     assert exchange.kind in {f.effects[0].kind for f in one.attribution.tried}  # not in every record, so it is
     without = diagnose(rig, fitted, validation=kept, catalogue=(gain.kind,), workers=1)

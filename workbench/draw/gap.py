@@ -246,7 +246,10 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force:
 
 
 def plot_single_effects(verdict: Verdict) -> Figure:
-    """The residual of each effect alone, and of a law beyond the catalogue if one explains the gap."""
+    """The residual of each effect alone, and of a law beyond the catalogue if one explains the gap.
+
+    Where channels are exchanged, of each effect beside that exchange.
+    """
     best = verdict.attribution.best
     beyond = [best] if any_beyond(best.effects) else []
     singles = [*beyond, *verdict.attribution.singles[:8]]
@@ -258,6 +261,7 @@ def plot_single_effects(verdict: Verdict) -> Figure:
     ax.barh(labels[::-1], costs[::-1], color=colours[::-1])
     ax.axvline(1.0, color=COLOURS[2], label="noise floor")
     ax.axvline(verdict.attribution.nominal_cost, color=COLOURS[1], linestyle="--", label="nominal")
-    ax.set(xscale="log", xlabel="mean square residual / noise power [-]", title="best fit of each effect alone")
+    title = f"best fit of each effect {'beside the exchange' if verdict.attribution.exchanged else 'alone'}"
+    ax.set(xscale="log", xlabel="mean square residual / noise power [-]", title=title)
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure
