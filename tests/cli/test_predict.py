@@ -92,6 +92,15 @@ def test_tests_are_checked_and_logged_beside_the_case(run, case):
     assert "The model does not hold" in (case / "out" / "late-check.html").read_text()
 
 
+def test_a_fitted_record_is_no_test_in_other_digits_or_cut_short_either(run, case):
+    low = read_case(case / "late").fit[0]
+    digits = np.vectorize(lambda value: float(f"{value:.7g}"))
+    cut = replace(low, outputs=digits(low.outputs[:, :250]), inputs=digits(low.inputs[:, :250]))
+    write_record(cut, case / "again.csv")
+    done = run("check", "late", "again.csv", "--verdict", "verdict.json", "--draws", 40)
+    assert done.exit_code == 2 and "record 'low' was fitted, so it is no test" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from workbench.cli import options
@@ -40,7 +39,7 @@ def check(
     found = read_case(case)
     measured = record_of(found, record, sample_rate_hz)
     check_length(measured)
-    fitted = [one.name for one in found.fit if np.array_equal(one.outputs, measured.outputs)]
+    fitted = [one.name for one in found.fit if measured.repeats(one)]
     if fitted:
         raise ValueError(f"record {fitted[0]!r} was fitted, so it is no test of the model; give another record")
     prediction = predicted(found, measured, verdict, draws=draws, seed=seed, workers=workers)

@@ -27,6 +27,7 @@ QUANTITIES = {
     "voltage": "V",
     "": "",
 }
+SAME = 1e-5  # rms difference of one measurement written twice, to six digits or more, over its rms
 
 
 @dataclass(frozen=True)
@@ -180,6 +181,17 @@ class Record(Printed):
     @property
     def input_names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.input_channels)
+
+    def repeats(self, other: "Record") -> bool:
+        """Whether both hold one measurement, as far as the shorter goes, to the digits that a file may have of it."""
+        if (self.n_outputs, self.n_inputs) != (other.n_outputs, other.n_inputs):
+            return False
+        rows, others = (np.concatenate([record.outputs, record.inputs]) for record in (self, other))
+        n = min(self.n_samples, other.n_samples)
+        rows, others = rows[:, :n], others[:, :n]
+        size = rows.std(axis=1)
+        alike = np.sqrt(((rows - others) ** 2).mean(axis=1)) <= SAME * size
+        return bool(alike.all() and size[: self.n_outputs].any())
 
     def between(self, start: float | None = None, stop: float | None = None) -> "Record":
         """The samples with start <= time <= stop (s); the time axis is kept."""

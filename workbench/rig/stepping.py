@@ -8,9 +8,13 @@ substep in which friction reverses is divided.
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from workbench.arrays import Floats, Integers
 from workbench.rig.elements import AirDrag, MidplaneStretching, PointElement, UserLaw
@@ -18,7 +22,6 @@ from workbench.rig.force_laws import BOUC_WEN, FRICTION, LAWS, N_PARAMETERS, com
 from workbench.rig.linear import propagators
 from workbench.rig.rig import KEPT, Rig
 
-FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
 LANES = 8  # modes per SIMD operation; the number of modes is padded to a multiple, with modes at rest
 # Parts of a substep in which friction reverses, since its force is far from linear there. On a frame, at four substeps
 # per sample, this reduces the power of the error to a thirteenth. Stops, whose force has a corner only, do not gain:
@@ -41,17 +44,53 @@ Work = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
 Kept = tuple[Floats, Floats, Floats, Floats]
 
 
+@intrinsic
+def _row_times(typing: Any, matrix: Any, i: Any, x: Any) -> Any:
+    """LLVM's vectors for `row_times`."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        rows, along = (context.make_array(signature.args[k])(context, builder, values[k]) for k in (0, 2))
+        (n,) = cgutils.unpack_tuple(builder, along.shape)  # type: ignore[no-untyped-call]
+        row = builder.gep(rows.data, [builder.mul(values[1], n)])
+        lanes = ir.VectorType(ir.DoubleType(), LANES)
+        total = cgutils.alloca_once_value(builder, ir.Constant(lanes, [0.0] * LANES))  # type: ignore[no-untyped-call]
+        with cgutils.for_range_slice(builder, n.type(0), n, n.type(LANES)) as (r, _):
+            one, other = (
+                builder.load(builder.bitcast(builder.gep(data, [r]), lanes.as_pointer()), align=8)
+                for data in (row, along.data)
+            )
+            builder.store(builder.fadd(builder.load(total), builder.fmul(one, other)), total)
+        sums = builder.load(total)
+        parts = [builder.extract_element(sums, ir.IntType(32)(lane)) for lane in range(LANES)]
+        while len(parts) > 1:
+            parts = [builder.fadd(a, b) for a, b in zip(parts[::2], parts[1::2], strict=True)]
+        return parts[0]
+
+    return types.float64(matrix, types.intp, x), generate
+
+
+@njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
+def row_times(matrix: Floats, i: int, x: Floats) -> float:
+    """Row i of a matrix (n_rows, n) times x (n,), n a multiple of LANES, both contiguous: one partial sum a lane.
+
+    The order of the sum is fixed. With fastmath it would depend on what else is compiled, and when, so that the last
+    digits of a simulation would differ from one installation to the next.
+    """
+    total: float = _row_times(matrix, i, x)  # type: ignore[call-arg]
+    return total
+
+
 def on_lanes(values: Floats, axes: int = 1) -> Floats:
-    """An array (..., n_modes), or with several last axes of modes, with zeros for modes at rest up to whole lanes."""
-    n_modes = values.shape[-1]
-    padded = np.zeros((*values.shape[: values.ndim - axes], *(n_modes + -n_modes % LANES,) * axes))
+    """An array (..., n_modes), or with several last axes, with zeros up to whole lanes: modes at rest."""
+    kept, wide = values.shape[: values.ndim - axes], values.shape[values.ndim - axes :]
+    padded = np.zeros((*kept, *(size + -size % LANES for size in wide)))
     padded[tuple(slice(size) for size in values.shape)] = values
     return padded
 
 
 @lru_cache(maxsize=KEPT)
 def structure_arrays(rig: Rig) -> Structure:
-    """The structure and its distributed elements as arrays for the compiled steppers, n a multiple of LANES.
+    """The structure and its distributed elements as arrays for the compiled steppers, n and n_points multiples of LANES.
 
     All have one type and memory layout, since numba compiles a stepper again for any other; absent parts are empty
     arrays. The arrays are cached and must not be changed.
@@ -79,8 +118,8 @@ def structure_arrays(rig: Rig) -> Structure:
         float(rig.stiffness_rate),
         stretch,
         stretching,
-        np.ascontiguousarray(on_lanes(shapes).T),
-        drag * weights,
+        np.ascontiguousarray(on_lanes(shapes, 2).T),
+        on_lanes(drag * weights),
     )
 
 
@@ -107,7 +146,7 @@ def law_arrays(rig: Rig) -> Elements:
     return np.array([LAWS[type(e)] for e in points], np.int64), on_lanes(shapes), parameters
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def spread_forces(
     q: Floats,
     v: Floats,
@@ -124,9 +163,10 @@ def spread_forces(
     out[:] = 0.0
     if stretch != 0.0:
         tension = 0.0
+        for s in range(n):
+            for r in range(n):
+                out[r] += stretching[s, r] * q[s]  # symmetric
         for r in range(n):
-            for s in range(n):
-                out[r] += stretching[r, s] * q[s]
             tension += q[r] * out[r]
         for r in range(n):
             out[r] *= -stretch * tension
@@ -138,15 +178,13 @@ def spread_forces(
         for g in range(push.size):
             push[g] *= -drag_weights[g] * abs(push[g])
         for r in range(n):
-            for g in range(push.size):
-                out[r] += drag_shapes[r, g] * push[g]
+            out[r] += row_times(drag_shapes, r, push)
     if coupling.size > 0:
         for r in range(n):
-            for s in range(n):
-                out[r] -= coupling[r, s] * v[s]
+            out[r] -= row_times(coupling, r, v)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _compliances(omega: Floats, c: Floats, h: float, shapes: Floats, linear: Linear) -> None:
     """Fill the propagators (2, 4, n_modes) over a substep, and the compliances between elements.
 
@@ -173,7 +211,7 @@ def _has_friction(kinds: Integers) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def drifted_propagators(
     omega: Floats, c: Floats, h: float, factor: float, elements: Elements, linear: Linear, finely: Linear
 ) -> None:
@@ -186,7 +224,7 @@ def drifted_propagators(
 
 
 # Inlined and without reference counting, since either would cost as much as the work of a substep.
-@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
+@njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
 def _advance_once(
     linear: Linear, drives: Drives, elements: Elements, along: Along, motion: Moving, points: Points, work: Work
 ) -> None:
@@ -213,12 +251,11 @@ def _advance_once(
         guess = 2.0 * point[i] - earlier[i]
         earlier[i], point[i] = point[i], guess
     for sweep in range(2 if distributed else 1):
+        for r in range(n):  # without the forces of the point elements
+            q[r] = base_q[r] + e[0, 3, r] * spread[r]
+            v[r] = base_v[r] + e[1, 3, r] * spread[r]
         for i in range(n_elements):
-            w, u = 0.0, 0.0
-            for r in range(n):
-                w += shapes[i, r] * (base_q[r] + e[0, 3, r] * spread[r])
-                u += shapes[i, r] * (base_v[r] + e[1, 3, r] * spread[r])
-            w_free[i], v_free[i] = w, u
+            w_free[i], v_free[i] = row_times(shapes, i, q), row_times(shapes, i, v)
         if n_elements > 0:
             solve_laws(kinds, parameters, w_free, v_free, aw, av, z, w_old, point)
         for r in range(n):
@@ -248,10 +285,7 @@ def _advance_once(
 def _fill_rates(shapes: Floats, v: Floats, rates: Floats, row: int) -> None:
     """Fill a row of `rates` with the velocities at the elements."""
     for i in range(shapes.shape[0]):
-        rate = 0.0
-        for r in range(shapes.shape[1]):
-            rate += shapes[i, r] * v[r]
-        rates[row, i] = rate
+        rates[row, i] = row_times(shapes, i, v)
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
@@ -359,7 +393,7 @@ def at_rest(n: int, n_elements: int) -> tuple[Linear, Linear, Drives, Moving, Po
     return linear, finely, drives, motion, points, work, kept
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def step_record(
     structure: Structure,
     elements: Elements,
@@ -414,19 +448,14 @@ def step_record(
                     accelerated[r] = old[r] - stiffer * omega[r] ** 2 * q[r] - c[r] * v[r]
             for j in range(n_sensors):
                 moved = q if orders[j] == 0 else v if orders[j] == 1 else accelerated
-                read = 0.0
-                for r in range(n):
-                    read += reading[j, r] * moved[r]
-                error_out[j, k] = measured[j, k] - read
+                error_out[j, k] = measured[j, k] - row_times(reading, j, moved)
             for j in range(n_sensors):
                 error = error_out[j, k]
                 for r in range(n):
                     q[r] += gain[0, j, r] * error
                     v[r] += gain[1, j, r] * error
             for i in range(n_elements):
-                w_old[i] = 0.0
-                for r in range(n):
-                    w_old[i] += shapes[i, r] * q[r]
+                w_old[i] = row_times(shapes, i, q)
         if k == n_samples - 1:
             break
         for sub in range(n_sub):

@@ -198,6 +198,8 @@ def test_a_measurement_given_again_in_other_units_or_digits_is_refused(sound):
     again = replace(sound, name="again", outputs=digits(sound.outputs / 9.80665) * 9.80665)
     with pytest.raises(ValueError, match="hold the same measurement, which would count twice: give it once"):
         of_same_sensors([sound, again])
+    with pytest.raises(ValueError, match="hold the same measurement"):
+        of_same_sensors([sound.between(stop=0.5 * sound.time[-1]), again])
     noise = 1e-4 * sound.outputs.std() * np.random.default_rng(0).standard_normal(sound.outputs.shape)
     assert len(of_same_sensors([sound, replace(sound, outputs=sound.outputs + noise)])) == 2
 

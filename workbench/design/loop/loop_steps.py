@@ -11,7 +11,7 @@ from numba import njit
 from workbench.arrays import Floats
 from workbench.design.estimation.digital import ONSET
 from workbench.rig.force_laws import yield_update
-from workbench.rig.stepping import FAST, LANES, Elements, Structure, advance, at_rest, drifted_propagators
+from workbench.rig.stepping import LANES, Elements, Structure, advance, at_rest, drifted_propagators, row_times
 
 ControllerArrays = tuple[tuple[Floats, ...], ...]  # described in `_commands`
 
@@ -31,7 +31,7 @@ def _static_force(u: float, drive: Floats, j: int, z: Floats, before: Floats) ->
     return min(max(f, -limit), limit)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _row(of_state: Floats, of_reading: Floats, i: int, z: Floats, y: Floats) -> float:
     """Row i of C z + D y."""
     s = 0.0
@@ -42,7 +42,7 @@ def _row(of_state: Floats, of_reading: Floats, i: int, z: Floats, y: Floats) -> 
     return s
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _commands(
     controller: ControllerArrays, k: int, reading: Floats, z: Floats, z_next: Floats, v: Floats, command: Floats
 ) -> None:
@@ -79,7 +79,7 @@ def _commands(
         z[i] = z_next[i]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def loop_record(
     structure: Structure,
     elements: Elements,
@@ -135,8 +135,7 @@ def loop_record(
             truth[j, 0] += seen[0, j, r] * q[r] + seen[1, j, r] * v[r]
         unlagged[j] = truth[j, 0]
     for i in range(n_el):
-        for r in range(n_modes):
-            w_old[i] += shapes[i, r] * q[r]
+        w_old[i] = row_times(shapes, i, q)
     for k in range(n_samples):
         if k == 0 or stiffening != 0.0:
             drifted_propagators(omega, damping, h, 1.0 + stiffening * (k + 0.5) * dt, elements, linear, finely)
@@ -159,10 +158,7 @@ def loop_record(
             if not abs(q[r]) <= RUN_AWAY:
                 return False
         for i in range(n_el):
-            speed = 0.0
-            for r in range(n_modes):
-                speed += shapes[i, r] * v[r]
-            ew[i, k], ev[i, k], ef[i, k] = w_old[i], speed, point[i]
+            ew[i, k], ev[i, k], ef[i, k] = w_old[i], row_times(shapes, i, v), point[i]
         # --- act and move
         for j in range(nu):
             f_out[j, k] = 0.0

@@ -14,7 +14,7 @@ from scipy.linalg import expm, solve_triangular
 from workbench.arrays import Floats
 from workbench.rig.linear import integrated
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.stepping import FAST, LANES
+from workbench.rig.stepping import on_lanes, row_times
 from workbench.structure.modes import Modes
 
 RUNAWAY = 1e100
@@ -220,25 +220,20 @@ def accumulated(a: Floats, q: Floats) -> Floats:
     return whole
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _propagate(a: Floats, x: Floats) -> None:
     """Add a x_k to x_k+1, row after row of x (n_samples + 1, n_lanes); a (n_states, n_lanes)."""
     for k in range(x.shape[0] - 1):
+        now = x[k]
         for i in range(a.shape[0]):
-            total = 0.0
-            for s in range(a.shape[1]):
-                total += a[i, s] * x[k, s]
-            x[k + 1, i] += total
+            x[k + 1, i] += row_times(a, i, now)
 
 
 def driven(a: Floats, drive: Floats) -> Floats:
     """States x_k+1 = a x_k + drive_k from rest: (n_states, n_samples + 1) of a drive (n_states, n_samples)."""
-    n, n_samples = drive.shape
-    n_lanes = LANES * -(-n // LANES)
-    wide, states = np.zeros((n, n_lanes)), np.zeros((n_samples + 1, n_lanes))
-    wide[:, :n], states[1:, :n] = a, drive.T
-    _propagate(wide, states)
-    return states[:, :n].T
+    states = on_lanes(np.pad(drive, ((0, 0), (1, 0))).T)
+    _propagate(on_lanes(a), states)
+    return states[:, : len(a)].T
 
 
 def innovations(filter_: ForceFilter, residual: Floats) -> Floats:

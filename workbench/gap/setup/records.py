@@ -46,7 +46,7 @@ def check_disjoint(records: Sequence[Record], validation: Sequence[Record]) -> N
     """
     for held_out in validation:
         for record in records:
-            if _same(held_out, record):
+            if held_out.repeats(record):
                 raise ValueError(
                     f"validation record {held_out.name!r} repeats the fit record {record.name!r}, so it validates"
                     " nothing; keep another record for validation, or none"
@@ -57,7 +57,7 @@ def repeated(records: Sequence[Record]) -> list[SetupFault]:
     """Faults of records that hold the same samples as another; the later one is left out."""
     faults, repeats = [], set()
     for i, j in combinations(range(len(records)), 2):
-        if j not in repeats and i not in repeats and _same(records[i], records[j]):
+        if j not in repeats and i not in repeats and records[i].repeats(records[j]):
             repeats.add(j)
             first, second = records[i].name, records[j].name
             faults.append(
@@ -102,17 +102,6 @@ def copied(rig: Rig, records: Sequence[Record]) -> list[SetupFault]:
             )
         )
     return faults
-
-
-def _same(one: Record, other: Record) -> bool:
-    """Whether one record repeats the other, or the beginning of it."""
-    n = min(one.n_samples, other.n_samples)
-    if n < 2 or one.outputs.shape[0] != other.outputs.shape[0] or one.n_inputs != other.n_inputs:
-        return False
-    moves = bool(np.ptp(one.outputs[:, :n], axis=1).any())
-    return moves and all(
-        np.array_equal(getattr(one, part)[:, :n], getattr(other, part)[:, :n]) for part in ("outputs", "inputs")
-    )
 
 
 def data_faults(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> tuple[str, ...]:

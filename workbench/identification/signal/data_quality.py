@@ -36,7 +36,6 @@ class DataSettings:
     about: int = 32  # samples on either side of a dropout, which show the motion there
     straight: float = 1e-9  # rounding deviation of samples from a straight line, relative to the output's range
     moves: float = 100.0  # least motion from sample to sample there, in resolutions of the output
-    same: float = 1e-5  # rms difference of one measurement written twice, to six digits or more, over its rms
     block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
 
 
@@ -172,20 +171,12 @@ def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
             )
     for i, record in enumerate(records):
         for other in records[:i]:
-            alike = other.input_names == record.input_names and _are_same(other.outputs, record.outputs)
-            if alike and _are_same(other.inputs, record.inputs):
+            if other.input_names == record.input_names and record.repeats(other):
                 raise ValueError(
                     f"records {other.name!r} and {record.name!r} hold the same measurement, which would count twice:"
                     " give it once"
                 )
     return records
-
-
-def _are_same(rows: np.ndarray, others: np.ndarray) -> bool:
-    """Whether signals (n_signals, n_samples) are the same to the digits that a file may have of their motion."""
-    if rows.shape != others.shape:
-        return False
-    return bool((np.sqrt(((rows - others) ** 2).mean(axis=1)) <= DATA.same * rows.std(axis=1)).all())
 
 
 def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
