@@ -73,6 +73,18 @@ def close_pair(n=6000, noise=0.03):
     return data, poles, settled(data, projected(data, poles, np.ones((2, 1), complex)))
 
 
+def test_what_is_tested_is_not_tested_again(monkeypatch):
+    data, poles, _ = close_pair()
+    tested = []
+    suspects = _Modes.suspects
+    monkeypatch.setattr(_Modes, "suspects", lambda self, model: (tested.append(model), suspects(self, model))[1])
+    found = select_modes(data, SelectionOptions(4))
+    assert tested
+    tested.clear()
+    again = select_modes(data, SelectionOptions(8), found.fit, is_tested=True)
+    assert not tested and (again.fit.poles == found.fit.poles).all() and found.fit.poles.size == poles.size
+
+
 def test_inputs_are_transformed_once_for_all_searches_of_candidates(monkeypatch):
     data, _, fit = close_pair()
     transformed = []

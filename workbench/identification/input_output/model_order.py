@@ -95,16 +95,21 @@ class Selected:
         return self if fit is self.fit else replace(self, fit=fit, statistic=statistic_of_each(fit))
 
 
-def select_modes(data: Measurement, options: SelectionOptions, start: Fit | None = None) -> Selected:
+def select_modes(
+    data: Measurement, options: SelectionOptions, start: Fit | None = None, *, is_tested: bool = False
+) -> Selected:
     """The modes whose likelihood ratio exceeds the threshold for noise, by forward and backward stepwise selection.
 
     Args:
         start: modes to start from; none unless given.
+        is_tested: whether each mode of the start was tested in a selection from the same measurement.
     """
     problem = _Modes(data, options)
     selection = Stepwise(problem, options.max_modes, ORDER.most_weak, None, forgets=True, budget=options.budget)
     fit = projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex))
-    if start is not None and start.poles.size:
+    if start is not None and is_tested:
+        fit = start
+    elif start is not None and start.poles.size:
         try:
             fit = selection.backward(problem.started(projected(data, start.poles, start.participation)))
         except np.linalg.LinAlgError:
