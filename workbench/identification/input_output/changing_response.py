@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, regressors
+from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.noise_spectrum import lines_of
 from workbench.identification.input_output.rivals import (
     RIVALS,
@@ -79,11 +79,18 @@ class _GivenUp(Exception):
 
 
 def in_place_of(
-    data: KnownInputs, fit: Fit, cluster: np.ndarray, limit: float, budget: Budget, linear: list[np.ndarray]
+    data: KnownInputs,
+    fit: Fit,
+    cluster: np.ndarray,
+    rows: Floats,
+    limit: float,
+    budget: Budget,
+    linear: list[np.ndarray],
 ) -> tuple[KnownInputs, complex] | None:
     """`in_place_of_clusters`, for one cluster: the records beside the changing mode, and its pole.
 
     Args:
+        rows: `regressors` of the fit.
         linear: poles of each cluster that no law replaced with an earlier estimate of the noise, added to. They are not
             tried again: about a few modes it weights all lines much alike, whichever the model.
     """
@@ -91,7 +98,7 @@ def in_place_of(
     same = -RESPONSE.same * poles.real
     if any(each.size == poles.size and (np.abs(each - poles) < same).all() for each in linear):
         return None
-    response = _Response(data, fit, cluster)
+    response = _Response(data, fit, cluster, rows)
     n_lines = response.values.size
     threshold = float(np.log(response.linear_squares())) + limit * (cluster.size - 1) / n_lines
     n_coefficients = cluster.size * (fit.participation.shape[1] + 1) - fit.participation.shape[1]
@@ -251,7 +258,7 @@ class _Response:
     The poles of the other modes may change to first order.
     """
 
-    def __init__(self, data: KnownInputs, fit: Fit, cluster: np.ndarray) -> None:
+    def __init__(self, data: KnownInputs, fit: Fit, cluster: np.ndarray, rows: Floats) -> None:
         self.data, self.fit = data, fit
         poles = fit.poles[cluster]
         rates = np.maximum(-poles.real, RIVALS.slowest * data.resolution)
@@ -276,7 +283,7 @@ class _Response:
         self.weight = np.ones((1, 1))
         if data.weights is not None:
             self.weight = np.vstack([self._about(data.weights[part]) for part in data.rows])
-        self.regressors = self._lines(regressors(data, fit.poles, fit.participation))
+        self.regressors = self._lines(rows)
         others = np.setdiff1d(np.arange(fit.poles.size), cluster)
         (self.basis,) = bases_with_changes(self.regressors, fit, others, [self.weight])
         self.values = self._beyond(self.basis, self._lines(data.values))[:, 0]

@@ -15,6 +15,7 @@ the modes are fitted with its terms up to the third order as fixed columns.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -174,11 +175,12 @@ def _beside_rivals(
     """`beside_changing` for one input and one output, where shapes tell nothing: the likelier rival model is kept."""
     omega = fit.poles.imag
     close = np.abs(np.subtract.outer(omega, omega)) < CHANGING.reach * omega[:, None]
+    rows_of = cache(lambda data: regressors(data, fit.poles, fit.participation))
     return in_place_of_clusters(
         data,
         fit,
         close,
-        lambda data, cluster: in_place_of(data, fit, cluster, limit, budget, linear),
+        lambda data, cluster: in_place_of(data, fit, cluster, rows_of(data), limit, budget, linear),
         budget,
     )
 
