@@ -4,8 +4,9 @@
 
 with a few powers p, those of a free decay (`backbone`). The forcing from sample to sample is that of the constant
 mode; the remaining change of the rate is integrated by Heun's method, and its derivatives by the unknowns with it. The
-changing mode has no more parameters than the linear modes, so the model of the higher likelihood is preferred. All are
-compared in the lines of the cosine transform about the modes.
+changing mode has no more parameters than the linear modes. For those that it has less, linear modes must be likelier by
+the threshold of a further mode; of equally many, the likelier model is preferred. All are compared in the lines of the
+cosine transform about the modes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -99,9 +100,8 @@ def in_place_of(
     if any(each.size == poles.size and (np.abs(each - poles) < same).all() for each in linear):
         return None
     response = _Response(data, fit, cluster, rows)
-    n_lines = response.values.size
-    threshold = float(np.log(response.linear_squares())) + limit * (cluster.size - 1) / n_lines
-    n_coefficients = cluster.size * (fit.participation.shape[1] + 1) - fit.participation.shape[1]
+    squares, n_excitations = float(np.log(response.linear_squares())), fit.participation.shape[1]
+    n_coefficients = cluster.size * (n_excitations + 1) - n_excitations
     given_up: set[Law] = set()
     for law in LAWS:
         if budget.spent(CHANGE_CHECK):
@@ -110,8 +110,9 @@ def in_place_of(
         parts = {other for other in LAWS if other[0] == by_time and set(other[1]) < set(powers)}
         if len(powers) + 1 > n_coefficients or (parts and parts <= given_up):
             continue
+        fewer = (n_coefficients - len(powers) - 1) / (n_excitations + 1)  # unknowns, in those of a mode
         try:
-            changing = response.fitted(law, threshold, budget)
+            changing = response.fitted(law, squares + limit * fewer / response.values.size, budget)
         except _GivenUp as end:
             given_up.add(law)
             if by_time and end.least > RESPONSE.linear:
