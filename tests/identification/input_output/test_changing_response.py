@@ -1,6 +1,7 @@
 import control
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from workbench.identification.driven import identify_driven
 from workbench.identification.input_output import changing_response, time_variance
@@ -101,6 +102,22 @@ def test_two_linear_modes_are_no_changing_one_after_a_step_of_the_law_of_time(mo
     # the law of time, its start with its derivatives and one step without; once, although the noise spectrum is
     # estimated again
     assert with_slopes == [True, False]
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_two_modes_that_the_blow_hardly_excites_are_no_changing_one(seed):
+    """One mode of a law of amplitude has as many unknowns as the two, and was a little less likely."""
+    rng, n, dt, force = np.random.default_rng(seed), 8000, 1e-4, np.zeros(8000)
+    force[1000:1012] = np.sin(np.pi * np.arange(12) / 12) ** 2
+    hz = np.array([187.1, 199.2, 217.1, 2823.4, 2833.6])
+    zeta, size = np.array([0.0104, 0.0196, 0.0183, 0.0076, 0.018]), np.array([-0.8, 0.3, -0.65, 0.79, -0.61])
+    poles = np.exp(2.0 * np.pi * hz * (-zeta + 1j * np.sqrt(1.0 - zeta**2)) * dt)
+    outputs = np.zeros(n)
+    for pole, a in zip(poles, size, strict=True):
+        outputs += a * lfilter([1.0, -2.0, 1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], force)
+    outputs += 0.003 * outputs.std() * rng.standard_normal(n)
+    record = Record(dt, outputs[None], (Channel("a", "acceleration"),), force[None], (Channel("F", "force"),))
+    np.testing.assert_allclose(identify_driven(record).modes.frequencies_hz, hz, rtol=1e-3)
 
 
 @pytest.mark.parametrize(("apart", "compared"), [(1.1, True), (1.2, False)])

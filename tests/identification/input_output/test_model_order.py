@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from scipy.signal import lfilter
 
 from workbench.identification.input_output import model_order
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import projected, search, settled
+from workbench.identification.input_output.modal_fit import columns, projected, search, settled
 from workbench.identification.input_output.model_order import SelectionOptions, _Modes, select_modes
 from workbench.identification.signal.searches import overdamped
 from workbench.records.record import Channel, Record
@@ -58,3 +61,50 @@ def test_a_candidate_of_a_long_record_is_fitted_with_its_neighbours_before_all_m
     np.testing.assert_allclose(trial.poles.imag, poles.imag, rtol=1e-3)
     (near, of_near), (every, of_all) = fits
     assert (near, every) == (2, 4) and of_all < of_near
+
+
+def close_pair(n=6000, noise=0.03):
+    """Two modes half a bandwidth apart, driven by white force, and the fit of both."""
+    rng, dt, hz = np.random.default_rng(4), 1e-3, np.array([130.0, 130.8])
+    u, poles = rng.standard_normal((1, n)), 2.0 * np.pi * hz * (-0.006 + 1j)
+    y = sum(np.imag(lfilter([0.0, 1.0], [1.0, -np.exp(pole * dt)], u.astype(complex))) for pole in poles)
+    record = Record(dt, y + noise * y.std() * rng.standard_normal(y.shape), (Channel("y"),), u, (Channel("u"),))
+    data = KnownInputs([record], at_rest=True, hold="zero", feedthrough=True)
+    return data, poles, settled(data, projected(data, poles, np.ones((2, 1), complex)))
+
+
+def test_what_is_tested_is_not_tested_again(monkeypatch):
+    data, poles, _ = close_pair()
+    tested = []
+    suspects = _Modes.suspects
+    monkeypatch.setattr(_Modes, "suspects", lambda self, model: (tested.append(model), suspects(self, model))[1])
+    found = select_modes(data, SelectionOptions(4))
+    assert tested
+    tested.clear()
+    again = select_modes(data, SelectionOptions(8), found.fit, is_tested=True)
+    assert not tested and (again.fit.poles == found.fit.poles).all() and found.fit.poles.size == poles.size
+
+
+def test_inputs_are_transformed_once_for_all_searches_of_candidates(monkeypatch):
+    data, _, fit = close_pair()
+    transformed = []
+    correlate = KnownInputs._autocorrelations
+    monkeypatch.setattr(KnownInputs, "_autocorrelations", lambda self: (transformed.append(self), correlate(self))[1])
+    first, second = data.candidates(data.values), data.candidates(data.values)
+    assert len(transformed) == 1 and (first == second).all()
+    assert not (data.candidates(fit.residual)[:1] == first[:1]).any() and len(transformed) == 1
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_basis_of_many_rows_is_that_of_its_columns(weighted):
+    """By the products that the fit holds, as by reflections."""
+    data, _, fit = close_pair()
+    if weighted:
+        std = 1.0 + 0.5 * np.sin(np.linspace(0.0, 9.0, len(data.values)))[:, None]
+        data = replace(data, line_std=[std])
+        fit = projected(data, fit.poles, fit.participation)
+    (basis,) = model_order.bases_of(data, fit)
+    phi = columns(data, fit.poles, fit.participation)[0] * (1.0 if data.weights is None else data.weights)
+    exact = np.linalg.qr(phi)[0]
+    np.testing.assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-9)
+    np.testing.assert_allclose(basis @ (basis.T @ exact), exact, atol=1e-9)

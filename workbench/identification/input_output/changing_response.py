@@ -4,8 +4,9 @@
 
 with a few powers p, those of a free decay (`backbone`). The forcing from sample to sample is that of the constant
 mode; the remaining change of the rate is integrated by Heun's method, and its derivatives by the unknowns with it. The
-changing mode has no more parameters than the linear modes, so the model of the higher likelihood is preferred. All are
-compared in the lines of the cosine transform about the modes.
+changing mode has no more parameters than the linear modes. For those that it has less, linear modes must be likelier by
+the threshold of a further mode; of equally many, the likelier model is preferred. All are compared in the lines of the
+cosine transform about the modes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,7 @@ from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, regressors
+from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.noise_spectrum import lines_of
 from workbench.identification.input_output.rivals import (
     RIVALS,
@@ -79,11 +80,18 @@ class _GivenUp(Exception):
 
 
 def in_place_of(
-    data: KnownInputs, fit: Fit, cluster: np.ndarray, limit: float, budget: Budget, linear: list[np.ndarray]
+    data: KnownInputs,
+    fit: Fit,
+    cluster: np.ndarray,
+    rows: Floats,
+    limit: float,
+    budget: Budget,
+    linear: list[np.ndarray],
 ) -> tuple[KnownInputs, complex] | None:
     """`in_place_of_clusters`, for one cluster: the records beside the changing mode, and its pole.
 
     Args:
+        rows: `regressors` of the fit.
         linear: poles of each cluster that no law replaced with an earlier estimate of the noise, added to. They are not
             tried again: about a few modes it weights all lines much alike, whichever the model.
     """
@@ -91,10 +99,9 @@ def in_place_of(
     same = -RESPONSE.same * poles.real
     if any(each.size == poles.size and (np.abs(each - poles) < same).all() for each in linear):
         return None
-    response = _Response(data, fit, cluster)
-    n_lines = response.values.size
-    threshold = float(np.log(response.linear_squares())) + limit * (cluster.size - 1) / n_lines
-    n_coefficients = cluster.size * (fit.participation.shape[1] + 1) - fit.participation.shape[1]
+    response = _Response(data, fit, cluster, rows)
+    squares, n_excitations = float(np.log(response.linear_squares())), fit.participation.shape[1]
+    n_coefficients = cluster.size * (n_excitations + 1) - n_excitations
     given_up: set[Law] = set()
     for law in LAWS:
         if budget.spent(CHANGE_CHECK):
@@ -103,8 +110,9 @@ def in_place_of(
         parts = {other for other in LAWS if other[0] == by_time and set(other[1]) < set(powers)}
         if len(powers) + 1 > n_coefficients or (parts and parts <= given_up):
             continue
+        fewer = (n_coefficients - len(powers) - 1) / (n_excitations + 1)  # unknowns, in those of a mode
         try:
-            changing = response.fitted(law, threshold, budget)
+            changing = response.fitted(law, squares + limit * fewer / response.values.size, budget)
         except _GivenUp as end:
             given_up.add(law)
             if by_time and end.least > RESPONSE.linear:
@@ -251,7 +259,7 @@ class _Response:
     The poles of the other modes may change to first order.
     """
 
-    def __init__(self, data: KnownInputs, fit: Fit, cluster: np.ndarray) -> None:
+    def __init__(self, data: KnownInputs, fit: Fit, cluster: np.ndarray, rows: Floats) -> None:
         self.data, self.fit = data, fit
         poles = fit.poles[cluster]
         rates = np.maximum(-poles.real, RIVALS.slowest * data.resolution)
@@ -276,7 +284,7 @@ class _Response:
         self.weight = np.ones((1, 1))
         if data.weights is not None:
             self.weight = np.vstack([self._about(data.weights[part]) for part in data.rows])
-        self.regressors = self._lines(regressors(data, fit.poles, fit.participation))
+        self.regressors = self._lines(rows)
         others = np.setdiff1d(np.arange(fit.poles.size), cluster)
         (self.basis,) = bases_with_changes(self.regressors, fit, others, [self.weight])
         self.values = self._beyond(self.basis, self._lines(data.values))[:, 0]

@@ -21,6 +21,7 @@ line by line of the cosine transform of all columns.
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from math import factorial
+from threading import local
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,7 @@ from workbench.identification.signal.projection import (
 from workbench.identification.signal.searches import SELECTION
 from workbench.records.band_limited import later, response_of_pole, spectrum_of
 from workbench.records.record import Record
+from workbench.threads import at_once
 
 # φ_k(x) = Σ x^i / (i + k)!; its last term is below rounding for |x| < 6. Below Nyquist |Im λΔt| < π.
 TERMS = 40
@@ -149,7 +151,8 @@ class KnownInputs:
         fastest = max(0.1 * np.pi / self.dt, 2.0 / span)
         self.rates = np.geomspace(0.5 / span, fastest, max(int(np.log(fastest * span)) + 2, 3))
         self.cells = self.rates.size * max(lengths)
-        self._last: tuple[complex, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] | None = None
+        self._last = local()
+        self._kept: dict[float, list[Floats]] = {}
 
     def with_columns(self, rows: Floats, changing: tuple[complex, ...]) -> "KnownInputs":
         """The same records with the fixed columns of changing modes, (n_rows, n_columns), rows as in `values`."""
@@ -357,15 +360,15 @@ class KnownInputs:
         """For each record: z of each input from rest, derivative of its forcing, and decay of a unit initial state.
 
         The derivative of c_0 u_k + c_1 u_k+1 is by λ; (n_inputs, n_samples) twice, (n_samples,). Cached for the last
-        pole.
+        pole of each thread.
         """
-        if self._last is None or self._last[0] != pole:
-            each = [
+        if getattr(self._last, "pole", None) != pole:
+            self._last.pole = pole
+            self._last.each = [
                 (*self._driven(u, spectrum, pole), powers(pole * self.dt, u.shape[1]))
                 for u, spectrum in zip(self.driving, self.spectra, strict=True)
             ]
-            self._last = pole, each
-        return self._last[1]
+        return list(self._last.each)
 
     def _driven(self, inputs: Floats, spectrum: Complexes, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         """z of each input from rest, and the derivative of its forcing by λ, (n_inputs, n_samples) each."""
@@ -411,37 +414,64 @@ class KnownInputs:
         frequencies at that rate of decay. The initial state is an impulse before the first sample.
         """
         size, omega = self.size, 2.0 * np.pi * np.fft.rfftfreq(self.size, self.dt)
-        lags = np.arange(size // 2)
-        cross_correlations, autocorrelations = [], []
+        lags, n_outputs = np.arange(size // 2), residual.shape[1]
+        cross_correlations = []
         for record, rows in zip(self.records, self.rows):
-            weights = np.ones((1, residual.shape[1])) if self.weights is None else self.weights[rows]
+            weights = np.ones((1, n_outputs)) if self.weights is None else self.weights[rows]
             y = np.fft.rfft(self.samples(weights * residual[rows]).T, size)
-            lines = np.pi / self.dt * np.arange(len(weights)) / len(weights)
-            line_weights = np.array([np.interp(omega, lines, weight**2) for weight in weights.T])
-            delayed = self._shifted(record.inputs)[:, self.first :]
-            excitations = [*delayed] if self.at_rest else [*delayed, np.eye(1, delayed.shape[1])[0]]
-            for u in filter(np.any, excitations):
-                spectrum = np.fft.rfft(u, size)
-                cross_correlations.append(np.fft.irfft(y * spectrum.conj(), size)[:, : size // 2])
-                autocorrelations.append(np.fft.irfft(line_weights * np.abs(spectrum) ** 2, size)[:, : size // 2])
-        poles, strength = [], []
-        for rate in self.rates:
-            decay = np.exp(-rate * self.dt * lags)
-            oscillates = omega > max(0.5 * self.resolution, rate / SELECTION.most_damped)
-            score = np.zeros(omega.size)
+            cross_correlations += [
+                np.fft.irfft(y * np.fft.rfft(u, size).conj(), size)[:, : size // 2] for u in self._exciting(record)
+            ]
+
+        autocorrelations = [] if self._kept else self._autocorrelations()
+
+        def of_rate(rate: float) -> tuple[Complexes, Floats]:
+            """Poles of this rate of decay, and their scores."""
+            decay, score = np.exp(-rate * self.dt * lags), np.zeros(omega.size)
             # The correlation is normalised by the power of the pole's response to the input.
-            for r, autocorrelation in zip(cross_correlations, autocorrelations):
-                correlation = np.abs(np.fft.rfft(r * decay, size)) ** 2
-                power = 2.0 * np.fft.rfft(autocorrelation * decay, size).real - autocorrelation[:, :1]
-                floor = 1e-12 * autocorrelation[:, :1]
-                score += (correlation / np.maximum(power / (1.0 - np.exp(-2.0 * rate * self.dt)), floor)).sum(axis=0)
-            score[~oscillates] = 0.0
+            powers = self._kept[rate] if rate in self._kept else self._powers(rate, decay, autocorrelations)
+            for r, power in zip(cross_correlations, powers, strict=True):
+                score += (np.abs(np.fft.rfft(r * decay, size)) ** 2 / power).sum(axis=0)
+            score[omega <= max(0.5 * self.resolution, rate / SELECTION.most_damped)] = 0.0
             peaks = 1 + np.flatnonzero((score[1:-1] > score[:-2]) & (score[1:-1] >= score[2:]))
             best = peaks[np.argsort(score[peaks])[-SELECTION.peaks_a_rate :]]
-            poles.append(-rate + 1j * omega[best])
-            strength.append(score[best])
+            return np.asarray(-rate + 1j * omega[best]), score[best]
+
+        poles, strength = zip(*at_once(of_rate, self.rates, long=len(residual) >= MANY_ROWS), strict=True)
         order = np.argsort(np.concatenate(strength))[::-1]
-        return np.concatenate(poles)[order[: 3 * SELECTION.peaks_a_rate]]
+        return np.asarray(np.concatenate(poles)[order[: 3 * SELECTION.peaks_a_rate]])
+
+    def _exciting(self, record: Record) -> list[Floats]:
+        """The excitations of a record that are not zero, (n_samples,) each."""
+        delayed = self._shifted(record.inputs)[:, self.first :]
+        excitations = [*delayed] if self.at_rest else [*delayed, np.eye(1, delayed.shape[1])[0]]
+        return list(filter(np.any, excitations))
+
+    def _powers(self, rate: float, decay: Floats, autocorrelations: list[Floats]) -> list[Floats]:
+        """Power of the response of a pole of a rate of decay at each line, to each excitation, weighted as each output.
+
+        (n_outputs, n_lines), or (1, n_lines) where all have equal weight; then kept for the next search.
+        """
+        powers = []
+        for autocorrelation in autocorrelations:
+            power = 2.0 * np.fft.rfft(autocorrelation * decay, self.size).real - autocorrelation[:, :1]
+            floor = 1e-12 * autocorrelation[:, :1]
+            powers.append(np.maximum(power / (1.0 - np.exp(-2.0 * rate * self.dt)), floor))
+        if all(len(power) == 1 for power in powers):
+            self._kept[rate] = powers
+        return powers
+
+    def _autocorrelations(self) -> list[Floats]:
+        """Autocorrelation of each excitation of each record, weighted as each output, (n_outputs or 1, n_lags)."""
+        size, omega, found = self.size, 2.0 * np.pi * np.fft.rfftfreq(self.size, self.dt), []
+        for record, rows in zip(self.records, self.rows):
+            weights = np.ones((1, 1)) if self.weights is None else self.weights[rows]
+            lines = np.pi / self.dt * np.arange(len(weights)) / len(weights)
+            line_weights = np.array([np.interp(omega, lines, weight**2) for weight in weights.T])
+            for u in self._exciting(record):
+                power = line_weights * np.abs(np.fft.rfft(u, size)) ** 2
+                found.append(np.fft.irfft(power, size)[:, : size // 2])
+        return found
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         longest = max(self.rows, key=lambda rows: rows.stop - rows.start)

@@ -33,7 +33,6 @@ class LinesOfPoles:
 
     def __init__(self, inputs: Floats, first: int, dt: float, at_rest: bool) -> None:
         self.inputs, self.first, self.dt, self.at_rest = np.ascontiguousarray(inputs), first, dt, at_rest
-        self._last: tuple[complex, Complexes, Complexes] | None = None
         self.size = inputs.shape[1] - first
         angles = np.pi / self.size * np.arange(self.size)
         half = np.sqrt(2.0 / self.size) * np.exp(-0.5j * angles)
@@ -71,18 +70,16 @@ class LinesOfPoles:
         _lines(self.turn, self.half, self.spectra, factors, ends, participation, rows, real, imaginary)
 
     def _factors(self, pole: complex, held: Sources) -> tuple[Complexes, Complexes]:
-        """m, c_0, c_1 and their derivatives, and what `_ends` gives; cached for the last pole."""
-        if self._last is None or self._last[0] != pole:
-            m, n = np.exp(pole * self.dt), self.inputs.shape[1]
-            factors = np.array([m, *held[0], self.dt * m, *held[1]], complex)
-            # what acts before is forgotten to rounding by the last sample
-            reach = int(min(FORGOTTEN / max(-pole.real * self.dt, FORGOTTEN / n), n))
-            ends = _ends(self.inputs, self.first, n - reach, factors)
-            if not self.at_rest:
-                before, after = m**self.first, -(m**n)
-                ends = np.vstack([ends, [before, after, self.first * self.dt * before, n * self.dt * after]])
-            self._last = pole, factors, ends
-        return self._last[1:]
+        """m, c_0, c_1 and their derivatives, and what `_ends` gives."""
+        m, n = np.exp(pole * self.dt), self.inputs.shape[1]
+        factors = np.array([m, *held[0], self.dt * m, *held[1]], complex)
+        # what acts before is forgotten to rounding by the last sample
+        reach = int(min(FORGOTTEN / max(-pole.real * self.dt, FORGOTTEN / n), n))
+        ends = _ends(self.inputs, self.first, n - reach, factors)
+        if not self.at_rest:
+            before, after = m**self.first, -(m**n)
+            ends = np.vstack([ends, [before, after, self.first * self.dt * before, n * self.dt * after]])
+        return factors, ends
 
 
 def _parts(values: Complexes) -> Floats:

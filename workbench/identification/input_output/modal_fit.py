@@ -18,15 +18,17 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
+from workbench.arrays import Floats
 from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.identification.signal.projection import pole_blocks
 from workbench.identification.signal.searches import FIT, Budget, minimise
+from workbench.threads import at_once
 
 Pair = tuple[np.ndarray, np.ndarray]
 # From this many rows on, the Gram matrix is that of the tangents less that of their projections: to form the projected
 # tangents takes three times as long, and the rounding error of the difference is below the noise of so many rows
 MANY_ROWS = 5000
-BLOCK = 2048  # rows at a time: these stay in the processor's cache
+BLOCK = 8192  # rows at a time: these stay in the processor's cache, and are as many tasks for its cores
 # Length of a unit column orthogonal to the others, below which Cholesky factors lose it in rounding
 LEAST_INDEPENDENT = 1e-5
 # The same where only products of the columns are known, whose rounding error grows with its inverse square
@@ -177,9 +179,12 @@ def regressors(
     x = np.empty((n_rows, 2 * n * q + n_fixed), order="F") if into is None else into
     x[:, 2 * n * q :] = data.fixed
     real, imaginary = x[:, : n * q], x[:, n * q : 2 * n * q]
-    for r, (pole, l_r) in enumerate(zip(poles, participation)):
+
+    def write(r: int) -> None:
         of_mode = slice(r * q, (r + 1) * q)
-        data.tangents(pole, l_r, real[:, of_mode], imaginary[:, of_mode])
+        data.tangents(poles[r], participation[r], real[:, of_mode], imaginary[:, of_mode])
+
+    at_once(write, range(n), long=n_rows >= MANY_ROWS)
     return x
 
 
@@ -218,7 +223,7 @@ def _parts_by_products(data: Measurement, x: np.ndarray, combined: np.ndarray) -
     else:
         each = zip(data.weights.T[:, :, None], data.values.T[:, :, None], strict=True)
     for weight, y in each:
-        products = products_of(x, weight)
+        products, moments = products_of(x, weight, y)
         with_columns = combined.T @ products
         of_columns = with_columns @ combined
         size = np.maximum(np.sqrt(np.diag(of_columns)), 1e-300)
@@ -226,22 +231,46 @@ def _parts_by_products(data: Measurement, x: np.ndarray, combined: np.ndarray) -
         if factor.size and np.diag(factor).min() < LEAST_INDEPENDENT_OF_PRODUCTS:
             raise np.linalg.LinAlgError("columns that are nearly dependent")
         inverse = solve_triangular(factor, np.eye(size.size)) / size[:, None]
-        qt, qy = inverse.T @ with_columns[:, t], inverse.T @ (combined.T @ (x.T @ (weight * y)))
+        qt, qy = inverse.T @ with_columns[:, t], inverse.T @ (combined.T @ moments)
         coefficients = inverse @ qy
-        residual = y - weight * (x @ (combined @ coefficients))
-        slopes, gram, sizes = x[:, t].T @ (weight * residual), products[t, t], np.sqrt(np.diag(products)[t])
-        yield Part(residual, coefficients, gram - qt.T @ qt, slopes, inverse @ inverse.T, inverse @ qt, sizes)
+        residual, slopes = _left(x, weight, y, combined @ coefficients)
+        gram, sizes = products[t, t], np.sqrt(np.diag(products)[t])
+        yield Part(residual, coefficients, gram - qt.T @ qt, slopes[t], inverse @ inverse.T, inverse @ qt, sizes)
 
 
-def products_of(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """X^T W² X of columns X (n_rows, n_columns), weights (n_rows, 1), or (1, 1) for rows of equal weight."""
-    if len(weight) == 1:
-        return np.asarray(weight**2 * (x.T @ x))
-    products = np.zeros((x.shape[1], x.shape[1]))
-    for first in range(0, len(x), BLOCK):
-        block = weight[first : first + BLOCK] * x[first : first + BLOCK]
-        products += block.T @ block
-    return products
+def products_of(x: Floats, weight: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """X^T W² X of columns X (n_rows, n_columns), and X^T W y of weighted readings (n_rows, n_outputs).
+
+    Args:
+        weight: (n_rows, 1), or (1, 1) for rows of equal weight.
+    """
+
+    def of_rows(rows: slice) -> tuple[Floats, Floats]:
+        block = x[rows] if len(weight) == 1 else weight[rows] * x[rows]
+        return block.T @ block, block.T @ y[rows]
+
+    scale = weight[0, 0] if len(weight) == 1 else 1.0
+    each = at_once(of_rows, blocks(len(x)))
+    products, moments = (np.sum(parts, axis=0) for parts in zip(*each, strict=True))
+    return scale**2 * products, scale * moments
+
+
+def _left(x: Floats, weight: Floats, y: Floats, coefficients: Floats) -> tuple[Floats, Floats]:
+    """The residual of weighted readings (n_rows, n_outputs) beside columns X, and its products with W X."""
+    residual = np.empty_like(y)
+
+    def of_rows(rows: slice) -> Floats:
+        w = weight if len(weight) == 1 else weight[rows]
+        residual[rows] = y[rows] - w * (x[rows] @ coefficients)
+        return np.asarray(x[rows].T @ (w * residual[rows]))
+
+    slopes = sum(at_once(of_rows, blocks(len(x))))
+    return residual, np.asarray(slopes)
+
+
+def blocks(n_rows: int) -> list[slice]:
+    """Rows at a time."""
+    return [slice(first, min(first + BLOCK, n_rows)) for first in range(0, n_rows, BLOCK)]
 
 
 def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:

@@ -3,18 +3,24 @@
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain
 
 import numpy as np
 from scipy.stats import chi2
 
+from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import marginal_statistics_of, statistic_of, statistic_of_each
 from workbench.identification.input_output.modal_fit import (
+    LEAST_INDEPENDENT_OF_PRODUCTS,
     MANY_ROWS,
     Fit,
     Measurement,
+    Part,
     column_norms,
     columns,
     modal_coordinate,
+    normalised_columns,
     only,
     orthonormal,
     products_of,
@@ -24,6 +30,7 @@ from workbench.identification.input_output.modal_fit import (
 )
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget, Stepwise, overdamped
 from workbench.structure.modes import mac
+from workbench.threads import at_once
 
 
 @dataclass(frozen=True)
@@ -88,16 +95,21 @@ class Selected:
         return self if fit is self.fit else replace(self, fit=fit, statistic=statistic_of_each(fit))
 
 
-def select_modes(data: Measurement, options: SelectionOptions, start: Fit | None = None) -> Selected:
+def select_modes(
+    data: Measurement, options: SelectionOptions, start: Fit | None = None, *, is_tested: bool = False
+) -> Selected:
     """The modes whose likelihood ratio exceeds the threshold for noise, by forward and backward stepwise selection.
 
     Args:
         start: modes to start from; none unless given.
+        is_tested: whether each mode of the start was tested in a selection from the same measurement.
     """
     problem = _Modes(data, options)
     selection = Stepwise(problem, options.max_modes, ORDER.most_weak, None, forgets=True, budget=options.budget)
     fit = projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex))
-    if start is not None and start.poles.size:
+    if start is not None and is_tested:
+        fit = start
+    elif start is not None and start.poles.size:
         try:
             fit = selection.backward(problem.started(projected(data, start.poles, start.participation)))
         except np.linalg.LinAlgError:
@@ -124,10 +136,11 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float) -> Fi
     coefficients: list[np.ndarray] = []
     variances: list[np.ndarray] = []
     for weights, y in zip(weights_of(data), together, strict=True):
-        gram = products_of(columns, weights) / np.outer(scale, scale)
+        gram, moments = products_of(columns, weights, y)
+        gram /= np.outer(scale, scale)
         gram[np.diag_indices_from(gram)] *= 1.0 + ORDER.collinear
         spreads.append(np.linalg.inv(gram))
-        coefficients.append(spreads[-1] @ (columns.T @ (weights * y) / scale[:, None]))
+        coefficients.append(spreads[-1] @ (moments / scale[:, None]))
         rss = ((y - weights * (columns @ (coefficients[-1] / scale[:, None]))) ** 2).sum(axis=0)
         variances.append(
             np.maximum(rss / max(len(columns) - columns.shape[1], 1), ORDER.floor**2 * (y**2).mean(axis=0))
@@ -165,9 +178,12 @@ def sure_modes(data: Measurement, start: Fit, options: SelectionOptions, times: 
 def _responses(data: Measurement, poles: np.ndarray, size: int, further: np.ndarray) -> np.ndarray:
     """Columns of `Measurement.responses` of some poles, `size` of each, real parts first, then further columns."""
     columns = np.empty((len(further), poles.size * size + further.shape[1]), order="F")
-    for first, pole in zip(range(0, poles.size * size, size), poles, strict=True):
-        middle = first + size // 2
-        columns[:, first:middle], columns[:, middle : first + size] = data.responses(pole)
+
+    def write(r: int) -> None:
+        first, middle, end = size * r, size * r + size // 2, size * (r + 1)
+        columns[:, first:middle], columns[:, middle:end] = data.responses(poles[r])
+
+    at_once(write, range(poles.size), long=len(columns) >= MANY_ROWS)
     columns[:, poles.size * size :] = further
     return columns
 
@@ -218,11 +234,13 @@ class _Modes:
         strength, participation, pole = max(candidates, key=lambda item: item[0])
         return None if strength < ORDER.enter * self.threshold(model, pole) else (pole, participation)
 
-    def _gains(self, model: Fit, poles: np.ndarray, at_once: int = 16) -> Iterator[tuple[float, np.ndarray]]:
-        """`_candidate_gains`, so many poles at a time: a basis is read from memory once for them all."""
+    def _gains(self, model: Fit, poles: np.ndarray, together: int = 16) -> Iterator[tuple[float, np.ndarray]]:
+        """`_candidate_gains`, two times so many poles at a time: a basis is read from memory once for many."""
         bases, scaled = bases_of(self.data, model), model.residual / model.noise
-        for first in range(0, len(poles), at_once):
-            yield from _candidate_gains(self.data, bases, scaled, poles[first : first + at_once])
+        groups = [poles[first : first + together] for first in range(0, len(poles), together)]
+        gains_of = partial(_candidate_gains, self.data, bases, scaled)
+        for first in range(0, len(groups), 2):
+            yield from chain(*at_once(gains_of, groups[first : first + 2], long=len(scaled) >= MANY_ROWS))
 
     def _still_clear(self, model: Fit) -> Scored | None:
         """The strongest candidate of a smaller model, where its gain in this one is clear; for long records.
@@ -412,9 +430,12 @@ def _candidate_gains(
     ]
 
 
-def bases_of(data: Measurement, fit: Fit) -> list[np.ndarray]:
+def bases_of(data: Measurement, fit: Fit) -> list[Floats]:
     """`basis_of` for each output, or one for all outputs of equal weights."""
-    return [basis_of(data, fit, weights) for weights in weights_of(data)]
+    phi = _modal_columns(data, fit)
+    if data.weights is None:
+        return [basis_of(phi, fit.parts[0])]
+    return [basis_of(weights[:, None] * phi, part) for weights, part in zip(data.weights.T, fit.parts, strict=True)]
 
 
 def weights_of(data: Measurement) -> list[np.ndarray]:
@@ -424,16 +445,33 @@ def weights_of(data: Measurement) -> list[np.ndarray]:
     return list((data.weights / np.sqrt((data.weights**2).mean(axis=0))).T[:, :, None])
 
 
-def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> np.ndarray:
-    """Orthonormal basis (n_rows, n_columns) of the modal coordinates of a fit and the fixed columns, weighted."""
+def _modal_columns(data: Measurement, fit: Fit) -> Floats:
+    """Modal coordinates and fixed columns Φ (n_rows, n_columns), as `modal_fit.columns`, without their tangents."""
     n = fit.poles.size
     phi = np.empty((len(data.values), 2 * n + data.fixed.shape[1]), order="F")
-    for r, (pole, l_r) in enumerate(zip(fit.poles, fit.participation, strict=True)):
-        phi[:, 2 * r], phi[:, 2 * r + 1] = modal_coordinate(data.responses(pole), l_r)
+
+    def write(r: int) -> None:
+        phi[:, r], phi[:, n + r] = modal_coordinate(data.responses(fit.poles[r]), fit.participation[r])
+
+    at_once(write, range(n), long=len(phi) >= MANY_ROWS)
     phi[:, 2 * n :] = data.fixed
-    phi *= weights
-    phi /= np.maximum(column_norms(phi), 1e-300)
-    return orthonormal(phi)[0]
+    return phi
+
+
+def basis_of(phi: Floats, part: Part) -> Floats:
+    """Orthonormal basis (n_rows, n_columns) of the weighted columns of a fit to outputs of these weights.
+
+    Of many rows by the inverse of their products, which the fit holds, where these are independent enough.
+    """
+    size = np.sqrt(np.diag(part.spread))
+    if len(phi) >= MANY_ROWS:
+        try:
+            factor = np.linalg.cholesky(part.spread / np.outer(size, size))
+            if np.diag(factor).min(initial=1.0) > LEAST_INDEPENDENT_OF_PRODUCTS:
+                return np.asarray(phi @ (size[:, None] * factor))
+        except np.linalg.LinAlgError:
+            pass
+    return orthonormal(normalised_columns(phi))[0]
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:

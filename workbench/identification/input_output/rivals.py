@@ -4,8 +4,10 @@ To first order, its motion beyond that of a linear mode spans a few columns. Whe
 close linear modes, these are removed and the columns stay as fixed columns of the measurement.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -13,6 +15,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import statistic_of_each
 from workbench.identification.input_output.modal_fit import (
+    MANY_ROWS,
     Fit,
     Measurement,
     Pair,
@@ -24,6 +27,7 @@ from workbench.identification.input_output.modal_fit import (
     projected,
 )
 from workbench.identification.signal.searches import Budget
+from workbench.threads import at_once
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,8 @@ class RivalSettings:
     most_poles: int = 20  # steps to the linear mode nearest to a changing one
     same_pole: float = 1e-6  # of the decay rate: a smaller step ends them
     collinear: float = 1e-9  # singular value of columns of unit length, below which it is rounding error
+    # of the largest singular value: the products of columns give those above it to four digits
+    clear: float = 1e-6
     significant: float = 1e-4  # singular value of the columns of a changing mode, above which they count
 
 
@@ -70,26 +76,48 @@ def in_place_of_clusters(
     rates = np.maximum(-fit.poles.real, 0.5 * data.resolution)
     distance = np.abs(np.subtract.outer(fit.poles.imag, fit.poles.imag))
     close = alike & (distance < RIVALS.near * np.add.outer(rates, rates))
-    poles, removed = fit.poles.copy(), np.zeros(fit.poles.size, bool)
-    for r in np.argsort(-strength):
-        others = np.flatnonzero(close[r] & (strength < strength[r]) & ~removed & ~removed[r])
-        others = others[np.argsort(distance[r, others])]
-        for k in range(others.size, max(others.size - RIVALS.most_clusters, 0), -1):
-            if budget.spent("check of modes that change"):
-                break
-            rival = rival_of(data, np.r_[r, others[:k]])
+    poles, removed, order = fit.poles.copy(), np.zeros(fit.poles.size, bool), np.argsort(-strength)
+
+    def clusters(first: int) -> Iterator[tuple[int, np.ndarray]]:
+        """Clusters to try, with the rank of the strongest mode of each, from a rank on."""
+        for rank, r in enumerate(order[first:], first):
+            others = np.flatnonzero(close[r] & (strength < strength[r]) & ~removed & ~removed[r])
+            others = others[np.argsort(distance[r, others])]
+            for k in range(others.size, max(others.size - RIVALS.most_clusters, 0), -1):
+                yield rank, np.r_[r, others[:k]]
+
+    tries = clusters(0)
+    while (two := list(islice(tries, 2))) and not budget.spent("check of modes that change"):
+        rivals = at_once(partial(rival_of, data), [cluster for _, cluster in two])
+        for (rank, cluster), rival in zip(two, rivals, strict=True):
             if rival is not None:
-                data, poles[r] = rival
-                removed[others[:k]] = True
+                data, poles[cluster[0]] = rival
+                removed[cluster[1:]] = True
+                tries = clusters(rank + 1)
                 break
     return (data, projected(data, poles[~removed], fit.participation[~removed])) if removed.any() else None
 
 
 def orthonormal_basis(rows: np.ndarray, least: float) -> Floats:
-    """Orthonormal basis of the columns of a matrix, of singular values above `least`."""
-    q, r = orthonormal(rows)
-    u, s, _ = np.linalg.svd(r)
-    return np.asarray(q @ u[:, s > least])
+    """Orthonormal basis of the columns of a matrix, of singular values above `least`.
+
+    Of many rows by their products, in which singular values far below the largest are lost: these again by what is left
+    without the others. Reflections take five times as long.
+    """
+    if len(rows) < MANY_ROWS:
+        q, r = orthonormal(rows)
+        u, s, _ = np.linalg.svd(r)
+        return np.asarray(q @ u[:, s > least])
+    basis = np.empty((len(rows), 0))
+    while rows.shape[1]:
+        squares, directions = np.linalg.eigh(rows.T @ rows)
+        clear = squares > max(least**2, RIVALS.clear**2 * squares[-1])
+        if not clear.any():
+            break
+        basis = np.hstack([basis, orthonormal(rows @ (directions[:, clear] / np.sqrt(squares[clear])))[0]])
+        rows = rows @ directions[:, ~clear]
+        rows -= basis @ (basis.T @ rows)
+    return basis
 
 
 def beyond_linear(data: Measurement, motions: np.ndarray, pole: complex, l_r: np.ndarray) -> tuple[Floats, complex]:

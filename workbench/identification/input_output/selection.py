@@ -98,10 +98,11 @@ def select_strongest(data: KnownInputs, options: SelectionOptions, start: Fit | 
     As long as all are sure, as many more are searched: strong modes left out would be taken for noise.
     """
     fit = subspace_start(data, options) if start is None else start
-    few = _few_of(options, fit.poles.size)
+    few, is_tested = _few_of(options, fit.poles.size), False
     while True:
-        selected = only_predictive(data, select_modes(data, few, fit), options.budget)
-        fit = selected.fit
+        found = select_modes(data, few, fit, is_tested=is_tested)
+        selected = only_predictive(data, found, options.budget)
+        fit, is_tested = selected.fit, selected.fit is found.fit
         if fit.poles.size < few.max_modes or few.max_modes == options.max_modes:
             return selected
         # beside the residual about each: noise of the inputs leaves peaks at the modes far above white noise

@@ -15,6 +15,7 @@ the modes are fitted with its terms up to the third order as fixed columns.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -79,10 +80,10 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     x = np.hstack([x, *slopes_in_time(data, fit, x)])
     known = slice(0, x.shape[1] - 2 * n)
     normal, right_side = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
-    unweighted = products_of(x, np.ones((1, 1))) if data.weights is None else None
+    unweighted = products_of(x, np.ones((1, 1)), fit.residual)[0] if data.weights is None else None
     for j, (a, noise, residual) in enumerate(zip(fit.amplitudes, fit.noise, fit.residual.T, strict=True)):
         weight = np.ones((1, 1)) if data.weights is None else data.weights[:, j : j + 1]
-        products = products_of(x, weight) if unweighted is None else unweighted
+        products = products_of(x, weight, fit.residual)[0] if unweighted is None else unweighted
         real, imaginary = np.diag(a.real), np.diag(a.imag)
         along = np.vstack([np.zeros((known.stop, 2 * n)), np.block([[real, -imaginary], [-imaginary, -real]])]) / noise
         along[known] = -scaled_inverse(products[known, known]) @ products[known] @ along  # beside all known columns
@@ -174,11 +175,12 @@ def _beside_rivals(
     """`beside_changing` for one input and one output, where shapes tell nothing: the likelier rival model is kept."""
     omega = fit.poles.imag
     close = np.abs(np.subtract.outer(omega, omega)) < CHANGING.reach * omega[:, None]
+    rows_of = cache(lambda data: regressors(data, fit.poles, fit.participation))
     return in_place_of_clusters(
         data,
         fit,
         close,
-        lambda data, cluster: in_place_of(data, fit, cluster, limit, budget, linear),
+        lambda data, cluster: in_place_of(data, fit, cluster, rows_of(data), limit, budget, linear),
         budget,
     )
 

@@ -23,6 +23,7 @@ from scipy.optimize import least_squares
 from workbench.arrays import Floats
 from workbench.deadline import Deadline
 from workbench.structure.modes import mac
+from workbench.threads import is_piece
 
 State = TypeVar("State")
 SECONDS = 30.0  # processor time limit
@@ -89,7 +90,7 @@ class Budget(Deadline):
 
     def spent(self, search: str) -> bool:
         """Whether the time is up; then `search` is recorded as unfinished."""
-        if self.progress is not None:
+        if self.progress is not None and not is_piece():  # a caller need not expect another thread
             self.progress(search, min((self._now - self._begun) / (self._whole - self._begun), 1.0))
         if not self.is_past:
             return False
