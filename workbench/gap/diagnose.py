@@ -3,12 +3,10 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.cases.case import Case
 from workbench.deadline import Deadline
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_in
@@ -243,16 +241,6 @@ def diagnose(
                 *(_note_of_large_errors(errors) if outcome == "explained" else ()),
             ),
         )
-
-
-def diagnose_case(case: Case, **options: Any) -> Verdict:
-    """`diagnose` of a case, stated in its units.
-
-    Args:
-        case: rig and records.
-        options: of `diagnose`.
-    """
-    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, units=case.units, **options)
 
 
 def _faulty(effects: Sequence[Effect]) -> set[str]:
