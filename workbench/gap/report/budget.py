@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import TENSION, deviations_of, group_of, label_of, parted
 from workbench.gap.effects.structural import buckling_load
@@ -239,18 +240,14 @@ def budget_of(
         settle: seconds at the start of each record that are not compared.
     """
 
-    def powers_with(chosen: Sequence[Effect]) -> np.ndarray:
-        """Mean square residual (n_records,) with these effects."""
-        return np.array([residual_power(rig, chosen, record, settle) for record in records])
-
     labels, causes = labels_of(effects, rig.modes.domain), list(effects)
     common, varying = (None, None) if errors is None else parted(errors)
     if varying is not None:
         labels.append(label_of(varying.target.figure))
         causes.append(varying)
     causes += [] if common is None else [common]
-    nominal, left = powers_with(()), powers_with(causes)
-    without = [powers_with([c for c in causes if c is not cause]) for cause in causes]
+    nominal, left = (residual_powers(rig, chosen, records, settle) for chosen in ((), causes))
+    without = [residual_powers(rig, [c for c in causes if c is not cause], records, settle) for cause in causes]
     weights = np.array([np.maximum(w - left, 0.0) for w in without]).reshape(len(causes), len(records))
     total = weights.sum(axis=0)
     removed = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
@@ -290,21 +287,16 @@ def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
     ]
 
 
-def residual_power(rig: Rig, effects: Sequence[Effect], record: Record, settle: float) -> float:
-    """Mean square residual of a record by a rig with effects, as `mean_square`; `RUNAWAY` for an impossible rig."""
+def residual_powers(rig: Rig, effects: Sequence[Effect], records: Sequence[Record], settle: float) -> Floats:
+    """Mean square residual (n_records,) by a rig with effects, as `signal_power`; `RUNAWAY` for an impossible rig."""
     try:
         corrected = apply_all(rig, effects)
     except (ValueError, np.linalg.LinAlgError):
-        return RUNAWAY
-    return mean_square(corrected, record, settle)
-
-
-def mean_square(rig: Rig, record: Record, settle: float) -> float:
-    """Mean square residual of a record by a rig, each sensor scaled by the standard deviation of its readings."""
+        return np.full(len(records), RUNAWAY)
     # without one of two effects that balance each other, the response may diverge
     with np.errstate(over="ignore", invalid="ignore"):
-        left = signal_power(record, record.outputs - predict(rig, record), settle)
-    return left if left < RUNAWAY else RUNAWAY
+        powers = [signal_power(record, record.outputs - predict(corrected, record), settle) for record in records]
+    return np.array([power if power < RUNAWAY else RUNAWAY for power in powers])
 
 
 def signal_power(record: Record, readings: np.ndarray, settle: float) -> float:
@@ -435,7 +427,7 @@ def with_held_out(
 
         def objective(deviation: float, record: Record = record, name: str = name) -> float:
             own = replace(errors, values={**errors.values, name: deviation})
-            return residual_power(rig, (*others, own), record, settle)
+            return float(residual_powers(rig, (*others, own), [record], settle)[0])
 
         found = minimize_scalar(
             objective, bounds=(-bound, bound), method="bounded", options={"xatol": TOLERANCE * bound}

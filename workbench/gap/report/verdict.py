@@ -11,8 +11,7 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.where import Where
 from workbench.gap.report.budget import MOSTLY, REMARKED, Budget, RecordToRecord, Shrinkage, labels_of
-from workbench.gap.report.experiment import Experiment
-from workbench.gap.report.record_checks import Detectability
+from workbench.gap.report.experiment import Detectability, Experiment
 from workbench.gap.search.attribute import Attribution
 from workbench.records.units import SI, Units
 from workbench.renamed import Renamed
@@ -76,6 +75,11 @@ class Verdict:
     def shows_gap(self) -> bool:
         """Whether the fitted records have a gap, so that it can be located."""
         return self.outcome != "none" and not self.disagreeing
+
+    @property
+    def is_decided(self) -> bool:
+        """Whether the gap is explained, or there is none."""
+        return self.outcome in ("none", "explained")
 
     @property
     def probability(self) -> float:
@@ -295,7 +299,6 @@ class Verdict:
 
     def to_json(self) -> dict[str, Any]:
         """The verdict as the case format writes it, with the shares and estimates behind it."""
-        known = self.outcome in ("none", "explained")
         effects = [effect_json(effect, self.nominal) for effect in self._named]
         shrink, guessed = self.shrinkage, self.attribution.search.data.guessed
         return {
@@ -303,8 +306,8 @@ class Verdict:
             "units": asdict(self.units),
             "outcome": self.outcome,
             "sentence": self.sentence,
-            "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
-            "nearest": [] if known else effects,
+            "effects": effects if self.is_decided else [{"kind": "unknown", "parameters": {}}],
+            "nearest": [] if self.is_decided else effects,
             "probability": rounded(self.probability) if self.outcome == "explained" else None,
             "alternatives": [
                 {"kind": label, "words": words, "probability": rounded(p)}

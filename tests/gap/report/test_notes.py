@@ -9,7 +9,7 @@ from workbench.cases.case import Case
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
-from workbench.gap.report.levels import steady_remainder
+from workbench.gap.report.notes import steady_remainder
 from workbench.rig.actuators import Actuator
 from workbench.study.pages.verdict_page import verdict_page
 
