@@ -12,7 +12,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import TENSION, deviations_of, group_of, label_of, parted
 from workbench.gap.effects.structural import buckling_load
 from workbench.gap.prediction.noise import loudest_logging_noise
-from workbench.gap.prediction.residuals import FitData, lead_of
+from workbench.gap.prediction.residuals import FitData, lead_of, scale_of
 from workbench.gap.search.settings import JOINT
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -122,12 +122,6 @@ def block_length(rig: Rig, record: Record) -> int:
     rates = (rig.modes.zeta * rig.modes.omega)[rig.modes.omega > 0]
     decay = 3.0 / max(rates.min(), 1e-12) / record.sample_time if rates.size else record.n_samples
     return int(np.clip(decay, record.n_samples // 20, max(record.n_samples // 8, 1)))
-
-
-def scale_of(measured: np.ndarray) -> np.ndarray:
-    """Standard deviation (n_outputs, 1) of each sensor's readings (n_outputs, n_samples); 1 where they are constant."""
-    scale = measured.std(axis=1, keepdims=True)
-    return np.where(scale > 0, scale, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
