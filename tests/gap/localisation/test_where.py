@@ -67,6 +67,17 @@ def test_a_tone_on_one_sensor_late_in_one_record(rig, measured):
     assert found.record_gaps[1] > 10 * NOISE / loud.outputs.std()
 
 
+def test_a_record_at_rest_that_a_coarse_converter_reads_as_zero_has_no_gap_and_spoils_no_share(rig, measured):
+    louder = replace(rig, actuators=tuple(replace(a, gain=1.3) for a in rig.actuators))
+    gap = measured(louder, "gap", 0.3, 2)
+    rest = replace(gap, name="rest", inputs=0.0 * gap.inputs, outputs=0.0 * gap.outputs)
+    found, alone = where(rig, [gap, rest]), where(rig, [gap])
+    assert found.record_gaps[1] == 0.0 and not found.time_shares[1].any()
+    assert found.mode_shares == pytest.approx(alone.mode_shares) and found.beyond_noise == alone.beyond_noise
+    nothing = where(rig, [rest])
+    assert nothing.linear_share == 0.0 and np.isfinite(nothing.sensor_shares).all() and nothing.beyond_noise == 0.0
+
+
 def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig, measured):
     frequency = 1.1 * rig.modes.frequencies_hz[1]
     real = replace(rig, elements=(PeriodicForce(1.37, frequency, 0.05, 0.3),))

@@ -290,10 +290,11 @@ def linear_share(rig: Rig, seen: Sequence[tuple[Record, Floats]], shares: Floats
     """
     chosen = [int(r) for r in np.argsort(-shares)[: WHERE.most_modes] if shares[r] > 0]
     sizes = np.sqrt(np.mean([record.outputs.var(axis=1) for record, _ in seen], axis=0))[:, None]
+    sizes = np.where(sizes > 0, sizes, 1.0)
     pieces = []
     for record, residual in seen:
         # regressors and residual are divided by the level, so that every record has equal weight in the same model
-        level = np.sqrt(np.mean((record.outputs / sizes) ** 2))
+        level = np.sqrt(np.mean((record.outputs / sizes) ** 2)) or 1.0
         pieces.append((_regressors(rig, chosen, record) / level, residual / sizes / level))
     if len(pieces) == 1:
         half = pieces[0][0].shape[1] // 2
@@ -311,7 +312,8 @@ def linear_share(rig: Rig, seen: Sequence[tuple[Record, Floats]], shares: Floats
         for i, ridge in enumerate(RIDGES * strengths[-1]):
             weights = target / (np.maximum(strengths, 0.0) + ridge)[:, None]
             left[i] += min(float(((y - weights.T @ shown) ** 2).sum()), float((y**2).sum()))
-    return float(np.clip(1.0 - left.min() / sum(float((y**2).sum()) for _, y in pieces), 0.0, 1.0))
+    whole = sum(float((y**2).sum()) for _, y in pieces)
+    return float(np.clip(1.0 - left.min() / whole, 0.0, 1.0)) if whole > 0 else 0.0
 
 
 def _regressors(rig: Rig, chosen: Sequence[int], record: Record) -> np.ndarray:

@@ -58,7 +58,7 @@ def noise_found(residuals: Sequence[np.ndarray], coloured: np.ndarray | None = N
     under = np.min([_power_under_peaks(residual) for residual in residuals], axis=0)
     # a residual equally strong in two records of different levels is noise of whatever colour
     alike = whole[1] < NOISE.alike * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
-    same = whole < NOISE.same * whole[0]
+    same = whole <= NOISE.same * whole[0]  # the quietest record itself too, if its residual is zero
     noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
     power: Floats = np.where(alike | (under > NOISE.loud * whole[0]) | coloured, noise, under)
     return np.sqrt(power)
