@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.gap.effects.catalogue import CATALOGUE, in_words
-from workbench.gap.effects.effect import COORDINATES, Effect, Kind, apply_all
+from workbench.gap.effects.effect import COORDINATES, Effect, Kind, apply_all, can_be
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
@@ -219,10 +219,13 @@ def _response(rig: Rig, effects: tuple[Effect, ...], trial: FitData) -> tuple[np
     for i, effect in enumerate(effects):
         if effect.kind.applied_first:  # nominal errors are held fixed
             continue
-        for parameter in effect.parameters(rig):
-            step = 1e-4 * max(abs(effect.values[parameter.name]), 1e-6)
-            values = dict(effect.values)
-            values[parameter.name] += step
-            changed = (*effects[:i], replace(effect, values=values), *effects[i + 1 :])
+        for name, value in ((p.name, effect.values[p.name]) for p in effect.parameters(rig)):
+            size = 1e-4 * max(abs(value), 1e-6)
+            ahead, behind = (
+                (*effects[:i], replace(effect, values={**effect.values, name: value + step}), *effects[i + 1 :])
+                for step in (size, -size)
+            )
+            # backwards from the end of the structure, or from another limit
+            changed, step = (ahead, size) if can_be(rig, ahead) else (behind, -size)
             slopes.append((trial.residual(apply_all(rig, changed)) - centre) / step)
     return centre, slopes
