@@ -88,6 +88,34 @@ def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig
     assert found.path == "structure" and found.linear_share < 0.1
 
 
+def at_rates(rig, real, sample_times, quantities):
+    """One record a sample time, of 20 s, with forces held over 0.1 s."""
+    for dt in sample_times:
+        rng = np.random.default_rng(round(1 / dt))
+        inputs = np.repeat(0.3 * rng.normal(size=200), round(0.1 / dt))[None]
+        clean = simulate(real, inputs, sample_time=dt).outputs
+        force, *read = (
+            Channel(p.name, q, at=p.at) for p, q in zip((*rig.actuators, *rig.sensors), quantities, strict=True)
+        )
+        outputs = clean + NOISE * rng.normal(size=clean.shape)
+        yield Record(dt, outputs, tuple(read), inputs=inputs, input_channels=(force,), name=f"{dt}")
+
+
+@pytest.mark.parametrize("sample_times", [(0.01, 0.0025), (0.0025, 0.01)])
+def test_records_of_different_sample_rates_place_a_force_together(rig, sample_times):
+    quantities = ("force", *(sensor.quantity for sensor in rig.sensors))
+    real = replace(rig, elements=(CubicSpring(1.37, 3000.0),))
+    seen = evidence(rig, list(at_rates(rig, real, sample_times, quantities)))
+    found, there = locate_force(seen), seen.place(1.37)
+    assert abs(found.at - 1.37) < min(0.01 * rig.modes.length, 4.0 * found.at_std) and found.is_single_force
+    assert there.strength_along(there.displacement**3) == pytest.approx(3000.0, rel=0.2)
+    shaken = replace(rig, elements=(PeriodicForce(1.37, 1.3, 0.05, 0.3),))
+    start, *_ = kind_named("periodic_disturbance").starts(
+        evidence(rig, list(at_rates(rig, shaken, sample_times, quantities))), None
+    )
+    assert start["frequency"] == pytest.approx(1.3, rel=0.01) and start["amplitude"] == pytest.approx(0.05, rel=0.2)
+
+
 @pytest.mark.slow
 def test_a_force_is_placed_without_the_sensor_that_is_at_fault(rig, measured):
     faulty = rig.sensors[1]

@@ -137,15 +137,34 @@ class Evidence:
         return self.rig.modes.domain
 
     @cached_property
-    def model(self) -> SampledModel:
-        """The rig's modes and sensors, discretised."""
-        noise = self.data.noise
-        return sampled_model(self.rig.modes, self.rig.sensors, noise, self.data.counted[0].sample_time)
+    def models(self) -> dict[float, SampledModel]:
+        """The rig's modes and sensors, discretised, by sample time of the records."""
+        modes, sensors, noise = self.rig.modes, self.rig.sensors, self.data.noise
+        sample_times = dict.fromkeys(record.sample_time for record in self.data.counted)
+        return {sample_time: sampled_model(modes, sensors, noise, sample_time) for sample_time in sample_times}
 
-    def filter_at(self, where: Where, rms: float, memory: float) -> ForceFilter:
-        """The filter for an unknown force at a place, of an rms, N, and a correlation time `memory`, in samples."""
-        modes, sample_time = self.rig.modes, self.data.counted[0].sample_time
-        return wandering_force_filter(modes, self.model, modes.phi_at(where), rms, memory * sample_time, sample_time)
+    @property
+    def model(self) -> SampledModel:
+        """That of the first record."""
+        return self.models[self.data.counted[0].sample_time]
+
+    def filters_at(self, where: Where, size: tuple[float, float]) -> dict[float, ForceFilter]:
+        """The filter for an unknown force at a place, by sample time.
+
+        Args:
+            where: the place.
+            size: rms of the force, N, and its correlation time, in samples of the first record.
+        """
+        modes, (rms, memory) = self.rig.modes, size
+        time, shape = memory * self.data.counted[0].sample_time, modes.phi_at(where)
+        each = self.models.items()
+        return {dt: wandering_force_filter(modes, model, shape, rms, time, dt) for dt, model in each}
+
+    def _log_likelihood(self, where: Where, size: tuple[float, float], n_records: int | None = None) -> float:
+        """Log-likelihood of an unknown force at a place, of a size as of `filters_at`, in the first or all records."""
+        filters = self.filters_at(where, size)
+        each = zip(self.data.counted[:n_records], self.residuals, strict=False)
+        return sum(log_likelihood(filters[record.sample_time], [residual]) for record, residual in each)
 
     @cached_property
     def places(self) -> Any:
@@ -173,13 +192,13 @@ class Evidence:
         """Rms, N, and correlation time, in samples, of the unmodelled force: the likeliest of a coarse grid."""
         if self.given_size is not None:
             return self.given_size
-        quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
+        quick = max(2, len(self.residuals) - 2)
         sizes = [(share * self.data.force_rms, memory) for memory in EVIDENCE.memories for share in EVIDENCE.levels]
 
         coarse = self._coarse_places
 
         def likelihood(size: tuple[float, float]) -> float:
-            return max(log_likelihood(self.filter_at(x, *size), quick) for x in coarse)
+            return max(self._log_likelihood(x, size, quick) for x in coarse)
 
         return max(zip(self.workers.map(likelihood, sizes), sizes, strict=True), key=lambda each: each[0])[1]
 
@@ -198,14 +217,18 @@ class Evidence:
         """Log-likelihood of an unknown force at each of `places`; approximate, except for an interval."""
         if not isinstance(self.domain, Interval):
             return -0.5 * self.screened(self.places)
-        residuals, size = list(self.residuals), self.size
-        along = self.workers.map(lambda x: log_likelihood(self.filter_at(x, *size), residuals), self.places)
-        return np.array(along)
+        size = self.size
+        return np.array(self.workers.map(lambda x: self._log_likelihood(x, size), self.places))
 
     @cached_property
     def lines(self) -> list[Lines]:
-        """Spectral lines of every record's residual."""
-        return lines_of(self.rig, self.model, self.residuals, self.data.counted[0].sample_time)
+        """Spectral lines of every record's residual, record by record of each sample time."""
+        records = list(zip(self.data.counted, self.residuals, strict=True))
+        return [
+            lines
+            for dt, model in self.models.items()
+            for lines in lines_of(self.rig, model, [left for record, left in records if record.sample_time == dt], dt)
+        ]
 
     def informative(self, where: Where) -> list[Lines]:
         """The lines, weighted by the share of their power that is due to a force at a place."""
@@ -291,9 +314,9 @@ class Evidence:
 
     def _refined_peak(self, at: float) -> tuple[float, float]:
         """The peak of the log-likelihood near a place of the grid: position and height."""
-        spacing, residuals = self.places[1] - self.places[0], list(self.residuals)
+        spacing = self.places[1] - self.places[0]
         found = minimize_scalar(
-            lambda x: -log_likelihood(self.filter_at(x, *self.size), residuals),
+            lambda x: -self._log_likelihood(x, self.size),
             bounds=(at - EVIDENCE.beside * spacing, at + EVIDENCE.beside * spacing),
             method="bounded",
             options={"xatol": EVIDENCE.resolved * spacing},
@@ -308,11 +331,11 @@ class Evidence:
 
     def place(self, where: Where) -> ForceAndMotion:
         """The smoothed unmodelled force at a place, and the motion there."""
-        kalman = self.filter_at(where, *self.size)
+        filters = self.filters_at(where, self.size)
         n, shape = self.rig.modes.n_modes, self.rig.modes.phi_at(where)
         pieces = []
-        for motion, residual in zip(self.motions, self.residuals, strict=True):
-            states = smoothed_states(kalman, residual)
+        for record, motion, residual in zip(self.data.counted, self.motions, self.residuals, strict=True):
+            states = smoothed_states(filters[record.sample_time], residual)
             error_q, error_v, force = states[:n], states[n : 2 * n], states[2 * n]
             error_a = -(self.rig.modes.omega[:, None] ** 2) * error_q - self.rig.modes.damping @ error_v
             pieces.append(

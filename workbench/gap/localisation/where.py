@@ -58,7 +58,7 @@ class Where:
         mode_shares: (n_modes,) share of the gap in the band around each natural frequency; rigid modes have equal parts
             of the band below half the first elastic frequency.
         share_above: of the gap, above the band of the last mode.
-        band_edges_hz: (n_bands + 1,) octaves down from half the sample rate, the lowest open to zero.
+        band_edges_hz: (n_bands + 1,) octaves down from half the highest sample rate, the lowest open to zero.
         band_shares: (n_bands,) share of the gap in each.
         sensor_shares: (n_outputs,).
         time_shares: (n_records, 8) of each record's gap, by eighths of its length.
@@ -136,7 +136,8 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
     frequencies = rig.modes.frequencies_hz
     mode_shares, above = _by_mode(frequencies, seen)
     in_band = np.where(frequencies > 0, mode_shares, mode_shares[frequencies == 0].sum())
-    octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - WHERE.octaves, 1)]
+    fastest = min(record.sample_time for record in data.counted)
+    octaves = np.r_[0.0, 0.5 / fastest * 2.0 ** np.arange(1 - WHERE.octaves, 1)]
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
     both = list(zip(data.counted, evidence.residuals, strict=True))
     share = linear_share(rig, [both[i] for i in with_gap], mode_shares)

@@ -252,9 +252,10 @@ def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilte
         data: records, with the sensors' noise.
         share: standard deviation of white noise on each input, over the input's rms.
     """
-    model = sampled_model(rig.modes, rig.sensors, data.noise, data.records[0].sample_time)
+    sample_times = {record.sample_time for record in data.records}
+    models = {dt: sampled_model(rig.modes, rig.sensors, data.noise, dt) for dt in sample_times}
     patterns = np.column_stack([a.gain * shape_of(rig.modes, a) for a in rig.actuators])
-    return {r.name: force_filter(model, patterns, _variances(r, share)) for r in data.records}
+    return {r.name: force_filter(models[r.sample_time], patterns, _variances(r, share)) for r in data.records}
 
 
 def _variances(record: Record, share: float) -> Floats:
