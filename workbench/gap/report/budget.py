@@ -85,7 +85,7 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale
         before[record.name], after[record.name] = (float(np.sqrt(e.mean())) for e in errors)
         floor[record.name] = float(np.sqrt((noise**2).mean()))
-        length = block_length(nominal, record)
+        length = block_length(nominal, measured.shape[1], record.sample_time)
         for start in range(0, measured.shape[1], length):
             piece = slice(start, start + length)
             blocks.append([errors[0][:, piece].mean(), errors[1][:, piece].mean(), (noise**2).mean()])
@@ -114,14 +114,14 @@ def _closed(before: float, after: float, floor: float) -> float:
     return float(1.0 - np.sqrt(max(after - floor, 0.0) / (before - floor)))
 
 
-def block_length(rig: Rig, record: Record) -> int:
-    """Samples of a block of a record: three decay times of the slowest elastic mode, 1/20 to 1/8 of the record.
+def block_length(rig: Rig, n_samples: int, sample_time: float) -> int:
+    """Samples of a block: three decay times of the slowest elastic mode, 1/20 to 1/8 of the samples that are compared.
 
     Residuals of such blocks are nearly independent.
     """
     rates = (rig.modes.zeta * rig.modes.omega)[rig.modes.omega > 0]
-    decay = 3.0 / max(rates.min(), 1e-12) / record.sample_time if rates.size else record.n_samples
-    return int(np.clip(decay, record.n_samples // 20, max(record.n_samples // 8, 1)))
+    decay = 3.0 / max(rates.min(), 1e-12) / sample_time if rates.size else n_samples
+    return int(np.clip(decay, max(n_samples // 20, 1), max(n_samples // 8, 1)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,7 +112,7 @@ def steady_remainder(rig: Rig, records: Sequence[Record], *, settle: float = 0.0
         lead = lead_of(record, settle)
         power = (((record.outputs - predict(rig, record))[:, lead:] / noise) ** 2).mean(axis=0)
         if level > 0 and power.mean() > (1.0 + WHERE.clear) ** 2:
-            blocks = np.array_split(power, power.size // block_length(rig, record))
+            blocks = np.array_split(power, power.size // block_length(rig, power.size, record.sample_time))
             means = np.array([block.mean() for block in blocks])
             scatter = means.std(ddof=1) / np.sqrt(means.size)
             by_level.append((level, power.mean() - 1.0, scatter / (power.mean() - 1.0), record.name))
