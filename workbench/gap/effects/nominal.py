@@ -26,7 +26,7 @@ from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints, centred_at, middle, reach
 from workbench.structure.member import Beam, Structure
-from workbench.structure.modes import Modes, PointShapes, Shapes
+from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.profile import Profile
 
 STIFFNESS, TENSION = "stiffness", "axial load"  # the first includes the effect of temperature on a modulus
@@ -235,7 +235,8 @@ def _with_profile_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]
     if not isinstance(structure, Structure):
         if not mass.any():
             return rig
-        return replace(rig, modes=replace(modes, shapes=_scaled(modes.shapes, float(np.exp(-0.5 * mass[0])))))
+        shapes, factor = modes.shapes, float(np.exp(-0.5 * mass[0]))
+        return replace(rig, modes=replace(modes, shapes=lambda at, derivative: factor * shapes(at, derivative)))
     profiles = {stiffness_name(structure): stiffness, "mass_per_length": mass}
     changed: dict[str, Any] = {
         name: _with_variation(getattr(structure, name), amplitudes, structure.length)
@@ -302,11 +303,6 @@ def _with_couplings(modes: Modes, values: dict[str, float]) -> Modes:
         return modes
     shapes, turn = modes.shapes, expm(angles - angles.T * (modes.omega > 0))
     return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) @ turn)
-
-
-def _scaled(shapes: Shapes, factor: float) -> Shapes:
-    """Mode shapes times a factor."""
-    return lambda located, derivative: factor * shapes(located, derivative)
 
 
 _structure_solved = solved_once(_with_structural_errors)
@@ -465,8 +461,7 @@ def nominal_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, start: Mappi
         prior: of the errors.
         start: start values by name; all others are zero.
     """
-    start = {} if start is None else start
-    values = {p.name: float(np.clip(start.get(p.name, 0.0), p.low, p.high)) for p in _parameters(rig, prior)}
+    values = {p.name: float(np.clip((start or {}).get(p.name, 0.0), p.low, p.high)) for p in _parameters(rig, prior)}
     return Effect(NOMINAL_ERRORS, prior, values)
 
 

@@ -255,13 +255,12 @@ def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilte
     sample_times = {record.sample_time for record in data.records}
     models = {dt: sampled_model(rig.modes, rig.sensors, data.noise, dt) for dt in sample_times}
     patterns = np.column_stack([a.gain * shape_of(rig.modes, a) for a in rig.actuators])
-    return {r.name: force_filter(models[r.sample_time], patterns, _variances(r, share)) for r in data.records}
-
-
-def _variances(record: Record, share: float) -> Floats:
-    """Variances (n_inputs,) of the input noise, none of them zero."""
-    power: Floats = share**2 * (record.inputs**2).mean(axis=1)
-    return np.maximum(power, max(LOGGED.quietest * power.max(), 1e-300))
+    filters = {}
+    for record in data.records:
+        power = share**2 * (record.inputs**2).mean(axis=1)
+        variances = np.maximum(power, max(LOGGED.quietest * power.max(), 1e-300))  # none of them zero
+        filters[record.name] = force_filter(models[record.sample_time], patterns, variances)
+    return filters
 
 
 class LikeliestShare(NamedTuple):

@@ -216,7 +216,7 @@ class FitData:
 
     @property
     def _from_the_first_sample(self) -> "FitData":
-        return self._with_its_lead if self.settle else self
+        return self._with_its_lead if self.settle else self  # cached, a reference to itself would outlive the search
 
     @cached_property
     def _with_its_lead(self) -> "FitData":

@@ -198,7 +198,10 @@ class Verdict:
             below = f"below the tolerance of {100.0 * tolerance:g} %"
             return f"The gap beyond the noise is {_percent(beyond)} of the signal, {below}."
         if self.record_to_record is not None:
-            return self._record_to_record_in_words(self.record_to_record)
+            varying = self.record_to_record
+            share = _percent(self.budget.effects.get(varying.label, 0.0))
+            how = f"The {varying.figure} differs from record to record by {varying.words}"
+            return f"{how}. This causes {share} of the gap{self._rest}."
         if self.budget.errors_are_small:
             return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
         return (
@@ -240,12 +243,6 @@ class Verdict:
         if self.budget.noise >= SHOWN:
             parts.append(f"{_percent(self.budget.noise)} is noise")
         return "; " + ", ".join(parts) if parts else ""
-
-    def _record_to_record_in_words(self, varying: RecordToRecord) -> str:
-        """The sentence if the gap is caused by a parameter that varies from record to record."""
-        share = _percent(self.budget.effects.get(varying.label, 0.0))
-        how = f"The {varying.figure} differs from record to record by {varying.words}"
-        return f"{how}. This causes {share} of the gap{self._rest}."
 
     @property
     def _is_open(self) -> bool:
