@@ -129,10 +129,19 @@ def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
     """Standard deviation of each sensor's white noise (n_outputs,), before anything is known of the gap.
 
     From the quietest bands of the measured outputs and of the nominal residuals.
+
+    Raises:
+        ValueError: for a sensor without noise, stated or not, as in records of a simulation.
     """
     left = [record.outputs - predict(rig, record) for record in records]
     bands = [_band_means(series) for series in (*left, *(record.outputs for record in records))]
     least = np.min([np.quantile(means, NOISE.least, axis=1) for means in bands], axis=0)
+    for sensor, power in zip(rig.sensors, least, strict=True):
+        if not (power or sensor.noise_std):
+            raise ValueError(
+                f"the records show no noise of sensor {sensor.name}, by which its residual is weighted: state its"
+                " noise_std"
+            )
     guess: Floats = np.sqrt(least / NOISE.of_least)
     return guess
 
