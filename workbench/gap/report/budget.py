@@ -36,6 +36,8 @@ MOSTLY = 0.5  # of the gap: its greater part; if that is unexplained, the fitted
 RUNAWAY = 1e30  # mean square of a divergent residual, in units of the signal's
 COMMON = 2.0  # times the scatter of delays: a larger mean is reported as a common delay
 DRAWS = 400  # bootstrap draws, for the interval of the shrinkage
+REACH = 4.0  # standard deviations from record to record: bound of the deviation of a held-out record
+TOLERANCE = 1e-3  # of that bound: accuracy of the deviation
 # names in the plural of the groups of errors that are reported in per cent
 PLURAL = {
     "stiffness": "stiffness",
@@ -345,10 +347,6 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-REACH = 4.0  # standard deviations from record to record: bound of the deviation of a held-out record
-TOLERANCE = 1e-3  # of that bound: accuracy of the deviation
-
-
 @dataclass(frozen=True, eq=False)
 class RecordToRecord:
     """A parameter of the nominal model that varies from record to record, as it was fitted.
@@ -412,19 +410,21 @@ def with_held_out(
     if errors is None:
         return tuple(effects)
     others = [e for e in effects if e is not errors]
-    bound = REACH * errors.target.record
-    values = dict(errors.values)
+    bound, values = REACH * errors.target.record, dict(errors.values)
+
+    def power(deviation: float, record: Record, name: str) -> float:
+        own = replace(errors, values={**errors.values, name: deviation})
+        return float(residual_powers(rig, (*others, own), [record], settle)[0])
+
     for record in records:
         name = f"record_{record.name}"
-        if name in values:
-            continue
-
-        def objective(deviation: float, record: Record = record, name: str = name) -> float:
-            own = replace(errors, values={**errors.values, name: deviation})
-            return float(residual_powers(rig, (*others, own), [record], settle)[0])
-
-        found = minimize_scalar(
-            objective, bounds=(-bound, bound), method="bounded", options={"xatol": TOLERANCE * bound}
-        )
-        values[name] = float(found.x)
+        if name not in values:
+            found = minimize_scalar(
+                power,
+                bounds=(-bound, bound),
+                args=(record, name),
+                method="bounded",
+                options={"xatol": TOLERANCE * bound},
+            )
+            values[name] = float(found.x)
     return (*others, replace(errors, values=values))
