@@ -405,7 +405,7 @@ def where_json(where: Where) -> dict[str, Any]:
 
 def _named_with_target(effect: Effect) -> str:
     """An effect in words without its parameters, such as: a constant force of an actuator (F2)."""
-    _, _, target = effect.label.rstrip("]").partition("[")
+    _, _, target = effect.label.removesuffix("]").partition("[")
     return effect.words + (f" ({target})" if target else "")
 
 
