@@ -190,25 +190,21 @@ def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
             low = JUST_LATE if sensor.name in prior.late else -LARGEST_DELAY
             high = 0.0 if sensor.name in prior.early else LARGEST_DELAY
             yield with_prior(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
+    # a port, and the sensor that alone reads its errors
+    ports: list[tuple[Actuator | Sensor, str]] = [
+        *((actuator, "") for actuator in rig.actuators),
+        *((sensor, sensor.name) for sensor in rig.sensors),
+    ]
     if prior.gain:
-        yield from (with_prior(_gain_name(actuator), prior.gain, PROFILE_UNIT) for actuator in rig.actuators)
-        yield from (
-            with_prior(_gain_name(sensor), prior.gain, PROFILE_UNIT, sensor=sensor.name) for sensor in rig.sensors
-        )
-    ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
+        yield from (with_prior(_gain_name(port), prior.gain, PROFILE_UNIT, sensor=own) for port, own in ports)
     if prior.place:
-        for port in ports:
-            own = port.name if isinstance(port, Sensor) else ""
+        for port, own in ports:
             for name, low, high in zip(_place_names(rig, port), *_place_bounds(rig, port), strict=True):
                 yield with_prior(name, prior.place, PLACE_UNIT, float(low), float(high), own)
     if prior.shape:
-        for port in ports:
-            own = port.name if isinstance(port, Sensor) else ""
-            yield from (
-                with_prior(n, prior.shape, PROFILE_UNIT, sensor=own) for n in _shape_names(port, rig.modes.n_modes)
-            )
-        for point in prior.points:
-            yield from (with_prior(n, prior.shape, PROFILE_UNIT) for n in _shape_names(point, rig.modes.n_modes))
+        for at, own in (*ports, *((point, "") for point in prior.points)):
+            for name in _shape_names(at, rig.modes.n_modes):
+                yield with_prior(name, prior.shape, PROFILE_UNIT, sensor=own)
     if prior.record:
         yield from (with_prior(f"record_{name}", prior.record, PROFILE_UNIT) for name in prior.records)
 
