@@ -89,15 +89,11 @@ def _stretching_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
     return [{"coefficient": s * tension / max(stretch, 1e-300)} for s in np.geomspace(1e-3, 30.0, 14)]
 
 
-def _stretching_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    unit = Scales.of(rig).stiffness  # tension over a squared slope times length
-    return (positive("coefficient", "N/m", unit, high=1e15, neutral=0.0),)
-
-
 MIDPLANE_STRETCHING = Kind(
     name="midplane_stretching",
     path="structure",
-    parameters=_stretching_parameters,
+    # tension over a squared slope times length
+    parameters=lambda rig, _: (positive("coefficient", "N/m", Scales.of(rig).stiffness, high=1e15, neutral=0.0),),
     apply=lambda rig, _, v: with_element(rig, MidplaneStretching(v["coefficient"])),
     starts=_stretching_starts,
     targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
@@ -412,15 +408,13 @@ def _quadratic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]
             yield {**place_values(place.at), "coefficient": share * c}
 
 
-def _quadratic_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    unit = Scales.of(rig).damping / Scales.of(rig).speed
-    return (*place_parameters(rig), positive("coefficient", "N s^2/m^2", unit, neutral=0.0))
-
-
 QUADRATIC_DAMPER = Kind(
     name="quadratic_damper",
     path="structure",
-    parameters=_quadratic_parameters,
+    parameters=lambda rig, _: (
+        *place_parameters(rig),
+        positive("coefficient", "N s^2/m^2", Scales.of(rig).damping / Scales.of(rig).speed, neutral=0.0),
+    ),
     apply=lambda rig, _, v: with_element(rig, PowerDamper(place_of(v), v["coefficient"], 1.0, 2.0)),
     starts=_quadratic_starts,
     nonlinear=True,

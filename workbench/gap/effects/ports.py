@@ -115,8 +115,21 @@ def _commands(evidence: Evidence, target: str, *, changes: bool = False) -> np.n
     return values if values.size else np.ones(1)
 
 
-def _sample_time(evidence: Evidence) -> float:
-    return evidence.data.records[0].sample_time
+def _quantiles(name: str, *shares: float, of_rates: bool = False) -> Starts:
+    """Starts at quantiles of the command, or of its rate of change."""
+
+    def starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
+        values = _commands(evidence, target, changes=of_rates)
+        if of_rates:
+            values = values / evidence.data.records[0].sample_time
+        return [{name: float(q)} for q in np.quantile(values, shares)]
+
+    return starts
+
+
+def _in_samples(name: str, *times: float) -> Starts:
+    """Starts at times in samples."""
+    return lambda evidence, _: [{name: n * evidence.data.records[0].sample_time} for n in times]
 
 
 def _time_scale(rig: Rig) -> float:
@@ -216,7 +229,7 @@ ACTUATOR_LAG = _actuator(
     low=1e-6,
     high=1e4,
     size=_time_scale,
-    starts=lambda evidence, _: [{"time_constant": s * _sample_time(evidence)} for s in (0.1, 0.4, 1.2, 4.0, 12.0)],
+    starts=_in_samples("time_constant", 0.1, 0.4, 1.2, 4.0, 12.0),
 )
 
 ACTUATOR_DELAY = _actuator(
@@ -229,9 +242,7 @@ ACTUATOR_DELAY = _actuator(
     low=1e-9,
     high=1e4,
     size=_time_scale,
-    starts=lambda evidence, _: [
-        {"delay": s * _sample_time(evidence)} for s in (0.1, 0.4, 0.8, 1.3, 1.8, 2.5, 3.5, 5.0, 8.0, 12.0)
-    ],
+    starts=_in_samples("delay", 0.1, 0.4, 0.8, 1.3, 1.8, 2.5, 3.5, 5.0, 8.0, 12.0),
 )
 
 ACTUATOR_SATURATION = _actuator(
@@ -244,9 +255,7 @@ ACTUATOR_SATURATION = _actuator(
     high=1e12,
     size=_force_scale,
     nonlinear=True,
-    starts=lambda evidence, target: [
-        {"limit": float(q)} for q in np.quantile(_commands(evidence, target), (0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
-    ],
+    starts=_quantiles("limit", 0.5, 0.65, 0.8, 0.9, 0.96, 0.99),
 )
 
 ACTUATOR_DEAD_ZONE = _actuator(
@@ -261,9 +270,7 @@ ACTUATOR_DEAD_ZONE = _actuator(
     high=1e12,
     size=_force_scale,
     nonlinear=True,
-    starts=lambda evidence, target: [
-        {"width": float(q)} for q in np.quantile(_commands(evidence, target), (0.03, 0.08, 0.15, 0.3, 0.5, 0.7))
-    ],
+    starts=_quantiles("width", 0.03, 0.08, 0.15, 0.3, 0.5, 0.7),
 )
 
 
@@ -283,12 +290,6 @@ ACTUATOR_BIAS = Kind(
 )
 
 
-def _rate_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    """Quantiles of the rates of change of the command."""
-    steps = _commands(evidence, target, changes=True) / _sample_time(evidence)
-    return [{"rate": float(q)} for q in np.quantile(steps, (0.1, 0.3, 0.5, 0.7, 0.9, 0.99))]
-
-
 ACTUATOR_RATE_LIMIT = _actuator(
     "actuator_rate_limit",
     "rate",
@@ -299,7 +300,7 @@ ACTUATOR_RATE_LIMIT = _actuator(
     low=1e-300,
     high=1e300,
     nonlinear=True,
-    starts=_rate_starts,
+    starts=_quantiles("rate", 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, of_rates=True),
 )
 
 
@@ -447,7 +448,7 @@ SENSOR_LAG = _sensor(
     "time_constant",
     "s",
     "a lag of the sensors",
-    starts=lambda evidence, _: [{"time_constant": s * _sample_time(evidence)} for s in (0.1, 0.4, 1.2, 4.0, 12.0)],
+    starts=_in_samples("time_constant", 0.1, 0.4, 1.2, 4.0, 12.0),
     log=True,
     low=1e-6,
     high=1e4,
@@ -462,7 +463,7 @@ SENSOR_DELAY = _sensor(
     "delay",
     "s",
     "a delay of a sensor",
-    starts=lambda evidence, _: [{"delay": s * _sample_time(evidence)} for s in (0.1, 0.4, 0.8, 1.3, 2.5, 5.0)],
+    starts=_in_samples("delay", 0.1, 0.4, 0.8, 1.3, 2.5, 5.0),
     log=True,
     low=1e-9,
     high=1e4,

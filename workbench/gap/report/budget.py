@@ -394,8 +394,8 @@ class RecordToRecord:
 
     def to_json(self) -> dict[str, Any]:
         """The parameter, its spread and its deviations as plain numbers: relative, or in the unit of force."""
-        by_record = {name: float(f"{value:.4g}") for name, value in self.values.items()}
-        return {"figure": self.figure, "std": float(f"{self.spread:.4g}"), "by_record": by_record}
+        by_record = {name: _rounded(value) for name, value in self.values.items()}
+        return {"figure": self.figure, "std": _rounded(self.spread), "by_record": by_record}
 
 
 def with_held_out(
