@@ -109,6 +109,8 @@ def test_records_of_different_sample_rates_place_a_force_together(rig, sample_ti
     found, there = locate_force(seen), seen.place(1.37)
     assert abs(found.at - 1.37) < min(0.01 * rig.modes.length, 4.0 * found.at_std) and found.is_single_force
     assert there.strength_along(there.displacement**3) == pytest.approx(3000.0, rel=0.2)
+    slower = replace(seen.data.records[0], sample_time=(1.0 + 1e-8) * sample_times[0])
+    assert evidence(rig, [*seen.data.records, slower]).sample_times == (*sample_times, sample_times[0])
     shaken = replace(rig, elements=(PeriodicForce(1.37, 1.3, 0.05, 0.3),))
     start, *_ = kind_named("periodic_disturbance").starts(
         evidence(rig, list(at_rates(rig, shaken, sample_times, quantities))), None

@@ -59,7 +59,8 @@ def _is_distortion(frequency: float, records: Sequence[Record]) -> bool:
 
 def _periodic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     records, sample_time = evidence.data.counted, evidence.data.records[0].sample_time
-    alike = [record.sample_time == sample_time for record in records]  # only their samples have a mean
+    # only samples of one rate have a mean
+    alike = [bool(np.isclose(record.sample_time, sample_time, rtol=1e-6, atol=0.0)) for record in records]
     shortest = min(record.n_samples for record, is_alike in zip(records, alike, strict=True) if is_alike)
     starts = np.cumsum([0, *(record.n_samples for record in records)])[:-1][alike]
     for place in evidence.at_peaks:

@@ -35,6 +35,7 @@ class EvidenceSettings:
     levels: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0)  # rms of an unmodelled force over that of the inputs
     memories: tuple[float, ...] = (10.0, 1000.0)  # its correlation time, in samples
     most_peaks: int = 3  # of the likelihood that are kept
+    one_rate: float = 1e-6  # relative difference of the sample times of two records that are taken for one
     places: int = 40  # of the grid along an interval
     beside: float = 0.95  # of the grid spacing: range about a peak in which it is refined
     resolved: float = 2e-3  # of the grid spacing: tolerance of the refinement
@@ -137,16 +138,23 @@ class Evidence:
         return self.rig.modes.domain
 
     @cached_property
+    def sample_times(self) -> tuple[float, ...]:
+        """Of each record, s; those of clocks that agree to a millionth are one."""
+        found: list[float] = []
+        for dt in (record.sample_time for record in self.data.counted):
+            found.append(next((known for known in found if np.isclose(known, dt, EVIDENCE.one_rate, 0.0)), dt))
+        return tuple(found)
+
+    @cached_property
     def models(self) -> dict[float, SampledModel]:
         """The rig's modes and sensors, discretised, by sample time of the records."""
         modes, sensors, noise = self.rig.modes, self.rig.sensors, self.data.noise
-        sample_times = dict.fromkeys(record.sample_time for record in self.data.counted)
-        return {sample_time: sampled_model(modes, sensors, noise, sample_time) for sample_time in sample_times}
+        return {dt: sampled_model(modes, sensors, noise, dt) for dt in dict.fromkeys(self.sample_times)}
 
     @property
     def model(self) -> SampledModel:
         """That of the first record."""
-        return self.models[self.data.counted[0].sample_time]
+        return self.models[self.sample_times[0]]
 
     def filters_at(self, where: Where, size: tuple[float, float]) -> dict[float, ForceFilter]:
         """The filter for an unknown force at a place, by sample time.
@@ -156,15 +164,15 @@ class Evidence:
             size: rms of the force, N, and its correlation time, in samples of the first record.
         """
         modes, (rms, memory) = self.rig.modes, size
-        time, shape = memory * self.data.counted[0].sample_time, modes.phi_at(where)
+        time, shape = memory * self.sample_times[0], modes.phi_at(where)
         each = self.models.items()
         return {dt: wandering_force_filter(modes, model, shape, rms, time, dt) for dt, model in each}
 
     def _log_likelihood(self, where: Where, size: tuple[float, float], n_records: int | None = None) -> float:
         """Log-likelihood of an unknown force at a place, of a size as of `filters_at`, in the first or all records."""
         filters = self.filters_at(where, size)
-        each = zip(self.data.counted[:n_records], self.residuals, strict=False)
-        return sum(log_likelihood(filters[record.sample_time], [residual]) for record, residual in each)
+        each = list(zip(self.sample_times, self.residuals, strict=True))[:n_records]
+        return sum(log_likelihood(filters[dt], [residual]) for dt, residual in each)
 
     @cached_property
     def places(self) -> Any:
@@ -223,11 +231,11 @@ class Evidence:
     @cached_property
     def lines(self) -> list[Lines]:
         """Spectral lines of every record's residual, record by record of each sample time."""
-        records = list(zip(self.data.counted, self.residuals, strict=True))
+        each = list(zip(self.sample_times, self.residuals, strict=True))
         return [
             lines
             for dt, model in self.models.items()
-            for lines in lines_of(self.rig, model, [left for record, left in records if record.sample_time == dt], dt)
+            for lines in lines_of(self.rig, model, [residual for own, residual in each if own == dt], dt)
         ]
 
     def informative(self, where: Where) -> list[Lines]:
@@ -334,8 +342,8 @@ class Evidence:
         filters = self.filters_at(where, self.size)
         n, shape = self.rig.modes.n_modes, self.rig.modes.phi_at(where)
         pieces = []
-        for record, motion, residual in zip(self.data.counted, self.motions, self.residuals, strict=True):
-            states = smoothed_states(filters[record.sample_time], residual)
+        for dt, motion, residual in zip(self.sample_times, self.motions, self.residuals, strict=True):
+            states = smoothed_states(filters[dt], residual)
             error_q, error_v, force = states[:n], states[n : 2 * n], states[2 * n]
             error_a = -(self.rig.modes.omega[:, None] ** 2) * error_q - self.rig.modes.damping @ error_v
             pieces.append(
