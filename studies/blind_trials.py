@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from workbench.cases.case import read_case
-from workbench.gap.diagnose import diagnose_case
+from workbench.gap.diagnose_case import diagnose_case
 
 NEEDS_DATA = "a folder of case folders"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.gap.diagnose import diagnose_case
+from workbench.gap.diagnose_case import diagnose_case
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors

@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.draw.style import COLOURS, new_figure
 from workbench.draw.trials import FAMILY
-from workbench.gap.diagnose import diagnose_case
+from workbench.gap.diagnose_case import diagnose_case
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring

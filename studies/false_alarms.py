@@ -3,7 +3,7 @@
 from itertools import cycle
 from pathlib import Path
 
-from workbench.gap.diagnose import diagnose_case
+from workbench.gap.diagnose_case import diagnose_case
 from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, SIZES, TRIPLE
 from workbench.trials.make import make_trial
 

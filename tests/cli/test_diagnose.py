@@ -46,7 +46,7 @@ def test_exchanged_inputs_stop_a_diagnosis_and_are_corrected_on_request(run, tmp
         seen.extend([*records, *validation])
         raise ValueError("the search has begun")
 
-    monkeypatch.setattr("workbench.gap.diagnose.diagnose", search)
+    monkeypatch.setattr("workbench.gap.diagnose_case.diagnose", search)
     for option, order in (("--correct", [0, 1]), ("--uncorrected", [1, 0])):
         seen.clear()
         assert "the search has begun" in run("diagnose", tmp_path / "crossed", option).output
@@ -112,7 +112,7 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
         settled.append(options["settle"])
         raise ValueError("the search has begun")
 
-    monkeypatch.setattr("workbench.gap.diagnose.diagnose", search)
+    monkeypatch.setattr("workbench.gap.diagnose_case.diagnose", search)
     options = ("--nominal", tmp_path / "low.csv", "--records", tmp_path / "high.csv", "--inputs", "F1")
     assert "--quantity" in run("diagnose", *options).output
     assert "the search has begun" in run("diagnose", *options, "--quantity", "displacement").output

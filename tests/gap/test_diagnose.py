@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from workbench.draw.gap import plot_single_effects
-from workbench.gap.diagnose import _leaves_unexplained, _note_of_residual, _outcome, diagnose
+from workbench.gap.diagnose import _leaves_unexplained, _outcome, diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, Kind, Parameter, apply_all, place_parameters
 from workbench.gap.effects.nonlinear import with_element
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.budget import Budget, Shrinkage
+from workbench.gap.report.notes import _of_residual
 from workbench.gap.report.record_checks import RecordsError
 from workbench.gap.search.fit import fit
 from workbench.rig.elements import OneSidedStop, UserLaw
@@ -328,13 +329,13 @@ def test_a_rest_of_the_model_is_noted_with_its_size_and_not_called_noise():
     """100 times the power of the noise is 10 times its rms; of a gap as large as the signal, 1e-5 are 0.32 % of it."""
     noise = {"noise_stated": (1.0,), "noise_found": (1.8,)}
     rest = Budget({}, 1.0 - 1.01e-5, 1e-5, 1e-7, {}, **noise)
-    assert [*_note_of_residual(rest, 1.0, 0.01)] == [
+    assert [*_of_residual(rest, 1.0, 0.01)] == [
         "The residual above the noise is 0.32 % of the signal, 10 times the noise: below the tolerance of 1 %, so its"
         " cause was not searched for."
     ]
-    assert [note.endswith("an effect is missing.") for note in _note_of_residual(rest, 1.0, 0.001)] == [True]
+    assert [note.endswith("an effect is missing.") for note in _of_residual(rest, 1.0, 0.001)] == [True]
     assert rest.noise_remark.startswith("What looks like noise is 1.8 times the model's noise_std; part of it may be")
-    assert not [*_note_of_residual(Budget({}, 0.9, 0.04, 0.06, {}, **noise), 1.0, 0.01)]
+    assert not [*_of_residual(Budget({}, 0.9, 0.04, 0.06, {}, **noise), 1.0, 0.01)]
 
 
 @pytest.mark.parametrize(

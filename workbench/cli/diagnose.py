@@ -61,7 +61,7 @@ def diagnose(
     Example: workbench diagnose --nominal low.csv --records high.csv --inputs F --quantity acceleration
     """
     from workbench.cases.case import read_case
-    from workbench.gap.diagnose import diagnose_case
+    from workbench.gap.diagnose_case import diagnose_case
     from workbench.gap.report.record_checks import check_alive
     from workbench.gap.setup.corrections import without_faults
     from workbench.gap.setup.faults import setup_faults

@@ -24,7 +24,8 @@ def uncertain_rig(
     Raises:
         ValueError: the verdict is of another case, or the set-up has certain faults, such as swapped channels.
     """
-    from workbench.gap.diagnose import SECONDS, diagnose_case
+    from workbench.gap.diagnose import SECONDS
+    from workbench.gap.diagnose_case import diagnose_case
     from workbench.gap.setup.faults import setup_faults
     from workbench.gap.setup.records import check_disjoint
     from workbench.robust.posterior import UncertainRig

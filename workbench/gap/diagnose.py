@@ -1,55 +1,50 @@
 """The diagnosis: from rig and records to a verdict."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.cases.case import Case
 from workbench.deadline import Deadline
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_in
-from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior, deviations_of
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
 from workbench.gap.effects.nonlinear import any_beyond
-from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.localisation.where import Where, locate, locate_force
+from workbench.gap.localisation.evidence import Evidence, locate_force
+from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.noise import LOGGED, noise_guessed
 from workbench.gap.prediction.residuals import lead_of
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.budget import (
-    PLURAL,
     Budget,
     Shrinkage,
     are_small,
     budget_of,
-    mean_square,
     measure,
     noise_power,
     power_of_inputs,
-    residual_power,
+    residual_powers,
     signal_power,
     sizes_of,
     with_held_out,
 )
-from workbench.gap.report.experiment import Experiment, next_experiment
-from workbench.gap.report.levels import steady_remainder
-from workbench.gap.report.record_checks import check_modes, check_records, detectability
+from workbench.gap.report.experiment import Experiment, detectability, next_experiment
+from workbench.gap.report.notes import notes_of
+from workbench.gap.report.record_checks import check_modes, check_records
 from workbench.gap.report.verdict import NEAR, Verdict
 from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.gap.search.finish import with_equals
 from workbench.gap.search.jointly import too_large
 from workbench.gap.search.settings import JOINT
 from workbench.gap.setup.faults import exchanges, setup_faults
-from workbench.gap.setup.records import check_disjoint, data_faults
+from workbench.gap.setup.records import check_disjoint
 from workbench.records.record import Record, as_records
 from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
-from workbench.structure.printed import joined_in_words
 from workbench.threads import one_blas_thread
 
 LIKELY = 0.01  # probability from which an alternative deserves an experiment
@@ -64,10 +59,6 @@ UNEXPLAINED = 0.05  # of the gap: a set that leaves more explains it in part
 CHANCE = 5.0  # standard deviations of the mean square of white noise: a larger excess is significant
 SECONDS = 120.0  # of processor time of this process and one beside it: twice what cases of a laboratory take at most
 SEARCH_SHARE = 0.8  # of that time; the rest is for intervals, budget and the next experiment
-ABOVE = 0.2  # of the gap: a larger share above the last mode of the model is remarked
-
-
-OVER_FITTING = "The best set explains the records that it was fitted to, but not the validation records: over-fitting."
 
 
 @former_arguments(free_nominal="uncertain_nominal", report="progress")
@@ -126,8 +117,6 @@ def diagnose(
     sharing = Workers.at_hand() if workers is None else Workers(workers)
     allowed = None if seconds is None else SEARCH_SHARE * seconds * (2.0 if sharing.number == 1 else 1.0)
     deadline = Deadline(allowed)
-    for record in (*records, *validation):
-        _check_channels(rig, record)
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     shortest = min(record.n_samples * record.sample_time for record in (*records, *validation))
@@ -201,12 +190,8 @@ def diagnose(
             attribution = replace(attribution, outcome="part")
             outcome, effects = _outcome(attribution, shrinkage, beyond, disagreeing), ()
             budget = budget_for(effects, logged=_input_noise(attribution, outcome))
-        is_settled = outcome in ("none", "explained")
-        in_records = () if is_settled else data_faults(rig, records, settle=settle)
-        in_validation = () if is_settled else data_faults(rig, validation, settle=settle)
         where = locate(nominal, effects, place() if as_given else locate_force(nominal.without(faulty)))
-        of_setup = any(record.name in fault.records for fault in faults for record in validation)
-        return Verdict(
+        verdict = Verdict(
             case=name,
             outcome=outcome,
             disagreeing=disagreeing,
@@ -222,37 +207,11 @@ def diagnose(
             experiment=_next_experiment(rig, attribution, sharing, units),
             tolerance=tolerance,
             units=units,
-            notes=(
-                *(fault.sentence for fault in faults),
-                *in_records,
-                *in_validation,
-                *(
-                    [OVER_FITTING]
-                    if outcome == "part" != attribution.outcome and not (in_validation or of_setup)
-                    else []
-                ),
-                *([] if is_settled or disagreeing else _notes_of_gap(outcome, where, budget, rig, units)),
-                *(
-                    []
-                    if is_settled
-                    else filter(None, [steady_remainder(corrected, (*records, *validation), settle=settle)])
-                ),
-                *(_note_of_residual(budget, power, tolerance) if is_settled and attribution.best.effects else ()),
-                *_notes(attribution, budget, seconds, without_noise, is_settled),
-                *_note_of_record_deviations(errors, attribution, validation),
-                *(_note_of_large_errors(errors) if outcome == "explained" else ()),
-            ),
         )
-
-
-def diagnose_case(case: Case, **options: Any) -> Verdict:
-    """`diagnose` of a case, stated in its units.
-
-    Args:
-        case: rig and records.
-        options: of `diagnose`.
-    """
-    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, units=case.units, **options)
+        notes = notes_of(
+            verdict, records, validation, faults=faults, errors=errors, power=power, settle=settle, seconds=seconds
+        )
+        return replace(verdict, notes=notes)
 
 
 def _faulty(effects: Sequence[Effect]) -> set[str]:
@@ -302,7 +261,7 @@ def _errors_are_plausible(effects: Sequence[Effect]) -> bool:
 
 def _residual_power(rig: Rig, effects: Sequence[Effect], held_out: Sequence[Record], settle: float) -> float:
     """Mean square residual of a rig with effects, summed over records, each sensor scaled by its standard deviation."""
-    return sum(residual_power(rig, effects, record, settle) for record in held_out)
+    return float(sum(residual_powers(rig, effects, held_out, settle)))
 
 
 def _power_of_difference(
@@ -324,7 +283,7 @@ def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray
         return "unknown"
     if found.outcome == "explained" and _over_fits(found, shrinkage, beyond):
         return "part"
-    closes = shrinkage is None or shrinkage.overall >= NEAR or bool(_unpredictable(found))
+    closes = shrinkage is None or shrinkage.overall >= NEAR or _unpredictable(found)
     return "unknown" if found.outcome == "part" and not (found.best.effects and closes) else found.outcome
 
 
@@ -371,8 +330,7 @@ def _power_beyond_effects(
     if found.logged and held_out:
         beyond = found.logged**2 * power_of_inputs(rig, held_out, settle)
     if any(effect not in found.best.effects for effect in accounted):
-        rigs = [apply_all(rig, effects) for effects in (found.best.effects, accounted)]
-        common, own = (np.array([mean_square(r, record, settle) for record in held_out]) for r in rigs)
+        common, own = (residual_powers(rig, each, held_out, settle) for each in (found.best.effects, accounted))
         beyond = beyond + common - own
     return beyond
 
@@ -427,23 +385,9 @@ def _over_fits(found: Attribution, shrinkage: Shrinkage | None, beyond: float | 
     )
 
 
-def _unpredictable(found: Attribution) -> list[str]:
-    """Sentences on the parts of the response that no model can predict."""
-    return list(dict.fromkeys(effect.kind.unpredictable for effect in found.best.effects if effect.kind.unpredictable))
-
-
-def _check_channels(rig: Rig, record: Record) -> None:
-    """Refuse a record whose inputs or outputs are not those of the rig, in its order."""
-    for kind, parts, names in (
-        ("input", rig.actuators, record.input_names),
-        ("output", rig.sensors, record.output_names),
-    ):
-        expected = tuple(part.name for part in parts)
-        if names != expected:
-            raise ValueError(
-                f"record {record.name!r}: its {kind}s are {', '.join(names) or 'none'}; the rig has"
-                f" {', '.join(expected)}, in that order"
-            )
+def _unpredictable(found: Attribution) -> bool:
+    """Whether no model can predict a part of the response."""
+    return any(effect.kind.unpredictable for effect in found.best.effects)
 
 
 def _next_experiment(rig: Rig, found: Attribution, workers: Workers, units: Units) -> Experiment | None:
@@ -453,74 +397,3 @@ def _next_experiment(rig: Rig, found: Attribution, workers: Workers, units: Unit
         if explained and probability > LIKELY:
             return replace(next_experiment(rig, found.best, other, found.search.data, workers), time=units.time)
     return None
-
-
-def _note_of_large_errors(errors: Effect | None) -> tuple[str, ...]:
-    """A note that nominal errors are so large that they may include an effect."""
-    if errors is None or not isinstance(errors.target, NominalPrior):
-        return ()
-    large = [PLURAL[group] for group in too_large(errors) if group in PLURAL]
-    if not large:
-        return ()
-    return (
-        f"The errors of the model in {joined_in_words(large)} are larger than those of a careful test: a linear effect,"
-        " such as a damper or a mass, may be hidden among them.",
-    )
-
-
-def _notes_of_gap(outcome: str, where: Where, budget: Budget, rig: Rig, units: Units) -> Iterator[str]:
-    """Notes on a gap that is not explained."""
-    if where.share_above > ABOVE:
-        last = f"{rig.modes.frequencies_hz[-1]:.4g} {'Hz' if units.time == 's' else f'1/{units.time}'}"
-        yield (
-            f"{100.0 * where.share_above:.0f} % of the gap lies above the last mode of the model ({last}): add modes to"
-            " the model, or excite and compare below that."
-        )
-    if where.is_distorted:
-        i, j = np.unravel_index(where.distortions.argmax(), where.distortions.shape)
-        yield (
-            f"Record {where.record_names[i]!r}: on {('odd', 'even')[j]} lines that the inputs do not excite, the gap is"
-            f" {10.0 * np.log10(where.distortions[i, j]):.0f} dB above the noise: a nonlinearity is present."
-        )
-    if outcome == "unknown" and budget.is_open and budget.errors:
-        yield "Most of the gap is unexplained, so the fitted sizes of the model's errors are not meaningful."
-
-
-def _note_of_record_deviations(errors: Effect | None, found: Attribution, held_out: Sequence[Record]) -> Iterator[str]:
-    """A note that the deviation of a parameter that varies from record to record was fitted to held-out records."""
-    fitted = set(deviations_of(errors.values)) if errors is not None else set()
-    own = [record.name for record in held_out if record.name in fitted - {r.name for r in found.search.data.records}]
-    if errors is not None and own and deviations_of(errors.values)[own[0]]:
-        yield (
-            f"The {errors.target.figure} of record{'s' if len(own) > 1 else ''} {joined_in_words(own)} was fitted to"
-            " the record itself for the budget; the share of the gap that closes is computed without it."
-        )
-
-
-def _note_of_residual(budget: Budget, power: float, tolerance: float) -> Iterator[str]:
-    """A note on the residual of an explained gap above the noise; power: mean square of the gap."""
-    if budget.leaves_more_than_noise:
-        rest, times = np.sqrt(budget.unexplained * power), np.sqrt(budget.unexplained / budget.noise)
-        below = rest < tolerance
-        why = (
-            f"below the tolerance of {100 * tolerance:g} %, so its cause was not searched for"
-            if below
-            else "an effect is missing"
-        )
-        yield f"The residual above the noise is {100 * rest:.2g} % of the signal, {times:.2g} times the noise: {why}."
-
-
-def _notes(
-    found: Attribution, budget: Budget, seconds: float | None, without_noise: Collection[str], is_settled: bool
-) -> tuple[str, ...]:
-    """General notes; `without_noise` are the sensors whose noise was not stated."""
-    names = [sensor.name for sensor in found.search.rig.sensors if sensor.name in without_noise]
-    taken = f"noise_std of {', '.join(names)} is not stated; it was estimated from the records."
-    cut = f"The search reached its limit of time, `seconds` {seconds}; a larger one lets it continue."
-    notes = (
-        *([taken] if without_noise else []),
-        *([cut] if found.is_cut else []),
-        budget.noise_remark if is_settled and not without_noise else "",  # otherwise the residual is not only noise
-        *_unpredictable(found),
-    )
-    return tuple(note for note in notes if note)

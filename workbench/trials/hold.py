@@ -12,7 +12,7 @@ import numpy as np
 
 from workbench.cases.case import Case, read_case
 from workbench.cases.writing import write_case
-from workbench.gap.diagnose import diagnose_case
+from workbench.gap.diagnose_case import diagnose_case
 from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, MIMICS, SIZES, TRIPLE
 from workbench.trials.make import KINDS, OUTSIDE_KINDS, find_trial_with_plant
 from workbench.trials.rigs import FRAMES, MEMBERS, PLATES

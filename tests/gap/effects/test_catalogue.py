@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from workbench.gap.effects.catalogue import CATALOGUE, in_words, kind_named
-from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all, contained, simpler_forms
+from workbench.gap.effects.effect import (
+    COORDINATES,
+    Effect,
+    Kind,
+    Parameter,
+    apply_all,
+    contained,
+    label_in_words,
+    simpler_forms,
+)
 from workbench.gap.effects.environment import _is_distortion
 from workbench.gap.effects.nonlinear import POWER_DAMPER, POWER_SPRING, in_catalogue
 from workbench.gap.effects.ports import clipped_level, exchanged_last
@@ -376,6 +385,13 @@ def test_sets_are_named_in_words():
     assert in_words("swapped_outputs[d1, d2]").endswith(" (d1, d2)") and in_words("own_law") == "own law"
     mine = replace(kind_named("cubic_spring"), name="own_law", phrase="a quadratic spring")
     assert in_words("own_law", [mine]) == "a quadratic spring"
+
+
+def test_channels_keep_their_names_in_words():
+    """As a file heads its columns."""
+    assert in_words("actuator_gain[drive_1 [N]]") == "a wrong actuator gain (drive_1 [N])"
+    assert label_in_words("actuator_gain[drive_1 [N]]") == "actuator gain (drive_1 [N])"
+    assert label_in_words("bouc_wen") == "Bouc-Wen" and label_in_words("point_mass[x = 1]") == "point mass (x = 1)"
 
 
 @pytest.mark.parametrize("offset", [-2.0, 0.0])

@@ -7,9 +7,9 @@ import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.localisation import force_lines
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.evidence import Evidence, locate_force
 from workbench.gap.localisation.force_lines import lines_of
-from workbench.gap.localisation.where import locate, locate_force
+from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.records.record import Channel, Record
@@ -67,6 +67,17 @@ def test_a_tone_on_one_sensor_late_in_one_record(rig, measured):
     assert found.record_gaps[1] > 10 * NOISE / loud.outputs.std()
 
 
+def test_a_record_at_rest_that_a_coarse_converter_reads_as_zero_has_no_gap_and_spoils_no_share(rig, measured):
+    louder = replace(rig, actuators=tuple(replace(a, gain=1.3) for a in rig.actuators))
+    gap = measured(louder, "gap", 0.3, 2)
+    rest = replace(gap, name="rest", inputs=0.0 * gap.inputs, outputs=0.0 * gap.outputs)
+    found, alone = where(rig, [gap, rest]), where(rig, [gap])
+    assert found.record_gaps[1] == 0.0 and not found.time_shares[1].any()
+    assert found.mode_shares == pytest.approx(alone.mode_shares) and found.beyond_noise == alone.beyond_noise
+    nothing = where(rig, [rest])
+    assert nothing.linear_share == 0.0 and np.isfinite(nothing.sensor_shares).all() and nothing.beyond_noise == 0.0
+
+
 def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig, measured):
     frequency = 1.1 * rig.modes.frequencies_hz[1]
     real = replace(rig, elements=(PeriodicForce(1.37, frequency, 0.05, 0.3),))
@@ -75,6 +86,36 @@ def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig
     assert found.at_std < 0.005 * rig.modes.length
     assert 2 in found.modes and found.place.is_single_force and found.place.share > 0.999
     assert found.path == "structure" and found.linear_share < 0.1
+
+
+def at_rates(rig, real, sample_times, quantities):
+    """One record a sample time, of 20 s, with forces held over 0.1 s."""
+    for dt in sample_times:
+        rng = np.random.default_rng(round(1 / dt))
+        inputs = np.repeat(0.3 * rng.normal(size=200), round(0.1 / dt))[None]
+        clean = simulate(real, inputs, sample_time=dt).outputs
+        force, *read = (
+            Channel(p.name, q, at=p.at) for p, q in zip((*rig.actuators, *rig.sensors), quantities, strict=True)
+        )
+        outputs = clean + NOISE * rng.normal(size=clean.shape)
+        yield Record(dt, outputs, tuple(read), inputs=inputs, input_channels=(force,), name=f"{dt}")
+
+
+@pytest.mark.parametrize("sample_times", [(0.01, 0.0025), (0.0025, 0.01)])
+def test_records_of_different_sample_rates_place_a_force_together(rig, sample_times):
+    quantities = ("force", *(sensor.quantity for sensor in rig.sensors))
+    real = replace(rig, elements=(CubicSpring(1.37, 3000.0),))
+    seen = evidence(rig, list(at_rates(rig, real, sample_times, quantities)))
+    found, there = locate_force(seen), seen.place(1.37)
+    assert abs(found.at - 1.37) < min(0.01 * rig.modes.length, 4.0 * found.at_std) and found.is_single_force
+    assert there.strength_along(there.displacement**3) == pytest.approx(3000.0, rel=0.2)
+    slower = replace(seen.data.records[0], sample_time=(1.0 + 1e-8) * sample_times[0])
+    assert evidence(rig, [*seen.data.records, slower]).sample_times == (*sample_times, sample_times[0])
+    shaken = replace(rig, elements=(PeriodicForce(1.37, 1.3, 0.05, 0.3),))
+    start, *_ = kind_named("periodic_disturbance").starts(
+        evidence(rig, list(at_rates(rig, shaken, sample_times, quantities))), None
+    )
+    assert start["frequency"] == pytest.approx(1.3, rel=0.01) and start["amplitude"] == pytest.approx(0.05, rel=0.2)
 
 
 @pytest.mark.slow

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from workbench.gap.prediction.noise import is_noise_alone, noise_guessed
+from workbench.gap.diagnose import diagnose
+from workbench.gap.prediction.noise import is_noise_alone, noise_found, noise_guessed
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -35,6 +36,21 @@ def test_noise_has_no_peaks_and_does_not_go_with_the_level(n):
         assert not is_noise_alone(white, [records[0], records[0]]), "of one level it may be anything"
         assert not is_noise_alone([white[0], 3.0 * white[1]], records)
         assert not is_noise_alone(white + moved / moved.std(), records)
+
+
+@pytest.mark.parametrize("n_records", [1, 2])
+def test_a_residual_of_zero_has_no_noise(n_records):
+    """As of records that the nominal rig itself has made."""
+    noisy = np.random.default_rng(0).normal(size=(n_records, 1000))
+    found = noise_found([np.array([np.zeros(1000), row]) for row in noisy])
+    assert found[0] == 0.0 and found[1] == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_noise_of_records_without_any_is_to_be_stated(hinged_rig):
+    rig = replace(hinged_rig(2), sensors=(Sensor("d", 0.7),))
+    clean = simulate(rig, np.ones((1, 200)), sample_time=0.01)
+    with pytest.raises(ValueError, match=r"the records show no noise of sensor d, .*: state its noise_std"):
+        diagnose(rig, clean, workers=1)
 
 
 @pytest.mark.parametrize("noise", [1e-5, 1e-4, 1e-3])

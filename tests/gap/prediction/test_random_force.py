@@ -1,11 +1,24 @@
 """A random disturbance follows nothing that the rig does; a force that pulls harder the nearer it is does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, lsim
 
-from workbench.gap.prediction.random_force import TONAL, _power, followed, lost_between_samples, tonal
+from workbench.gap.prediction.random_force import (
+    TONAL,
+    _power,
+    fit_random_force,
+    followed,
+    lost_between_samples,
+    tonal,
+)
+from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import colour_of
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
 
 N = 2000
 
@@ -85,3 +98,18 @@ def test_a_flat_colour_has_the_poles_of_a_butterworth_filter(stages, memory):
     assert np.sort_complex(found) == pytest.approx(np.sort_complex(poles), abs=1e-9)
     impulse = lfilter([1.0], np.poly(poles), np.eye(1, N)[0])
     assert _power(colour) == pytest.approx((impulse**2).sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("start", [1.97, 2.0])
+def test_a_random_force_at_a_free_tip_is_fitted_from_the_tip_too(hinged_beam, record_of, start):
+    beam, rng = replace(hinged_beam, left="clamped", right="free"), np.random.default_rng(5)
+    sensors = tuple(Sensor(f"d{x}", x, noise_std=1e-5) for x in (0.7, 1.6))
+    rig = Rig(beam.modes(2), (Actuator("F", 0.45),), sensors, structure=beam)
+    real = replace(rig, actuators=(*rig.actuators, Actuator("hidden", 2.0)))
+    inputs = np.array([[1.0], [0.2]]) * rng.normal(size=(2, 1000))
+    both = record_of(real, inputs, rng, name="both")
+    record = replace(both, inputs=inputs[:1], input_channels=both.input_channels[:1])
+    data = FitData((record,), np.full(2, 1e-5))
+    found = fit_random_force(rig, data, data.differences(rig), [start], 1.0)
+    assert found.rms == pytest.approx(0.2, rel=0.15) and found.at == pytest.approx(2.0, abs=0.01)
+    assert 0.0 < found.at_std[0] < 0.01

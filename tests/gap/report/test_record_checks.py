@@ -9,7 +9,8 @@ from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Kind
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
-from workbench.gap.report.record_checks import RecordsError, check_modes, check_records, detectability
+from workbench.gap.report.experiment import detectability
+from workbench.gap.report.record_checks import RecordsError, check_modes, check_records
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import LinearSpring, PeriodicForce
 from workbench.rig.rig import Rig

@@ -7,7 +7,8 @@ import pytest
 from scipy.signal import butter, lfilter, sosfilt
 
 from workbench.deadline import Deadline
-from workbench.gap.diagnose import diagnose, diagnose_case
+from workbench.gap.diagnose import diagnose
+from workbench.gap.diagnose_case import diagnose_case
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_errors

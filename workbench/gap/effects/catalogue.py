@@ -51,6 +51,6 @@ def in_words(labels: str, catalogue: Iterable[Kind] = CATALOGUE) -> str:
     phrases = {kind.name: kind.words for kind in catalogue}
     words = []
     for label in labels.split(" + "):
-        name, _, target = label.rstrip("]").partition("[")
+        name, _, target = label.removesuffix("]").partition("[")
         words.append(phrases.get(name, name.replace("_", " ")) + (f" ({target})" if target else ""))
     return joined_in_words(words)

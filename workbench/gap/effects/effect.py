@@ -396,10 +396,11 @@ SPELLINGS = (
 
 def label_in_words(label: str) -> str:
     """A label as shown in figures and notes: actuator gain (F2), Bouc-Wen."""
-    words = label.replace("[", " (").replace("]", ")").replace("_", " ")
+    name, _, target = label.partition("[")
+    words = name.replace("_", " ")
     for plain, spelt in SPELLINGS:
         words = words.replace(plain, spelt)
-    return words
+    return words + (f" ({target.removesuffix(']').replace('][', ') (')})" if target else "")
 
 
 def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:

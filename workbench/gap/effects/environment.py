@@ -59,12 +59,14 @@ def _is_distortion(frequency: float, records: Sequence[Record]) -> bool:
 
 def _periodic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     records, sample_time = evidence.data.counted, evidence.data.records[0].sample_time
-    shortest = min(record.n_samples for record in records)
-    ends = np.cumsum([0, *(record.n_samples for record in records)])
+    # only samples of one rate have a mean
+    alike = [bool(np.isclose(record.sample_time, sample_time, rtol=1e-6, atol=0.0)) for record in records]
+    shortest = min(record.n_samples for record, is_alike in zip(records, alike, strict=True) if is_alike)
+    starts = np.cumsum([0, *(record.n_samples for record in records)])[:-1][alike]
     for place in evidence.at_peaks:
         if isinstance(place.at, Between):
             continue
-        mean = np.mean([place.force[a : a + shortest] for a in ends[:-1]], axis=0)
+        mean = np.mean([place.force[start : start + shortest] for start in starts], axis=0)
         frequency, amplitude, phase = tone(mean, sample_time)
         lead = records[0].start_time - evidence.data.records[0].start_time
         if lead:  # the phase refers to the start of the record

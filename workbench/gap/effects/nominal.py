@@ -26,7 +26,7 @@ from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints, centred_at, middle, reach
 from workbench.structure.member import Beam, Structure
-from workbench.structure.modes import Modes, PointShapes, Shapes
+from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.profile import Profile
 
 STIFFNESS, TENSION = "stiffness", "axial load"  # the first includes the effect of temperature on a modulus
@@ -190,25 +190,21 @@ def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
             low = JUST_LATE if sensor.name in prior.late else -LARGEST_DELAY
             high = 0.0 if sensor.name in prior.early else LARGEST_DELAY
             yield with_prior(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
+    # a port, and the sensor that alone reads its errors
+    ports: list[tuple[Actuator | Sensor, str]] = [
+        *((actuator, "") for actuator in rig.actuators),
+        *((sensor, sensor.name) for sensor in rig.sensors),
+    ]
     if prior.gain:
-        yield from (with_prior(_gain_name(actuator), prior.gain, PROFILE_UNIT) for actuator in rig.actuators)
-        yield from (
-            with_prior(_gain_name(sensor), prior.gain, PROFILE_UNIT, sensor=sensor.name) for sensor in rig.sensors
-        )
-    ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
+        yield from (with_prior(_gain_name(port), prior.gain, PROFILE_UNIT, sensor=own) for port, own in ports)
     if prior.place:
-        for port in ports:
-            own = port.name if isinstance(port, Sensor) else ""
+        for port, own in ports:
             for name, low, high in zip(_place_names(rig, port), *_place_bounds(rig, port), strict=True):
                 yield with_prior(name, prior.place, PLACE_UNIT, float(low), float(high), own)
     if prior.shape:
-        for port in ports:
-            own = port.name if isinstance(port, Sensor) else ""
-            yield from (
-                with_prior(n, prior.shape, PROFILE_UNIT, sensor=own) for n in _shape_names(port, rig.modes.n_modes)
-            )
-        for point in prior.points:
-            yield from (with_prior(n, prior.shape, PROFILE_UNIT) for n in _shape_names(point, rig.modes.n_modes))
+        for at, own in (*ports, *((point, "") for point in prior.points)):
+            for name in _shape_names(at, rig.modes.n_modes):
+                yield with_prior(name, prior.shape, PROFILE_UNIT, sensor=own)
     if prior.record:
         yield from (with_prior(f"record_{name}", prior.record, PROFILE_UNIT) for name in prior.records)
 
@@ -235,7 +231,8 @@ def _with_profile_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]
     if not isinstance(structure, Structure):
         if not mass.any():
             return rig
-        return replace(rig, modes=replace(modes, shapes=_scaled(modes.shapes, float(np.exp(-0.5 * mass[0])))))
+        shapes, factor = modes.shapes, float(np.exp(-0.5 * mass[0]))
+        return replace(rig, modes=replace(modes, shapes=lambda at, derivative: factor * shapes(at, derivative)))
     profiles = {stiffness_name(structure): stiffness, "mass_per_length": mass}
     changed: dict[str, Any] = {
         name: _with_variation(getattr(structure, name), amplitudes, structure.length)
@@ -302,11 +299,6 @@ def _with_couplings(modes: Modes, values: dict[str, float]) -> Modes:
         return modes
     shapes, turn = modes.shapes, expm(angles - angles.T * (modes.omega > 0))
     return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) @ turn)
-
-
-def _scaled(shapes: Shapes, factor: float) -> Shapes:
-    """Mode shapes times a factor."""
-    return lambda located, derivative: factor * shapes(located, derivative)
 
 
 _structure_solved = solved_once(_with_structural_errors)
@@ -465,8 +457,7 @@ def nominal_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, start: Mappi
         prior: of the errors.
         start: start values by name; all others are zero.
     """
-    start = {} if start is None else start
-    values = {p.name: float(np.clip(start.get(p.name, 0.0), p.low, p.high)) for p in _parameters(rig, prior)}
+    values = {p.name: float(np.clip((start or {}).get(p.name, 0.0), p.low, p.high)) for p in _parameters(rig, prior)}
     return Effect(NOMINAL_ERRORS, prior, values)
 
 

@@ -53,10 +53,8 @@ def with_element(rig: Rig, element: Element) -> Rig:
 def _cubic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
         k = place.strength_along(place.displacement**3)
-        for share in (0.3, 1.0, 3.0):
+        for share in (0.3, 1.0, -1.0, 3.0):
             yield {**place_values(place.at), "stiffness": share * k}
-            if share == 1.0:
-                yield {**place_values(place.at), "stiffness": -share * k}
 
 
 def _cubic_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
@@ -91,15 +89,11 @@ def _stretching_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
     return [{"coefficient": s * tension / max(stretch, 1e-300)} for s in np.geomspace(1e-3, 30.0, 14)]
 
 
-def _stretching_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    unit = Scales.of(rig).stiffness  # tension over a squared slope times length
-    return (positive("coefficient", "N/m", unit, high=1e15, neutral=0.0),)
-
-
 MIDPLANE_STRETCHING = Kind(
     name="midplane_stretching",
     path="structure",
-    parameters=_stretching_parameters,
+    # tension over a squared slope times length
+    parameters=lambda rig, _: (positive("coefficient", "N/m", Scales.of(rig).stiffness, high=1e15, neutral=0.0),),
     apply=lambda rig, _, v: with_element(rig, MidplaneStretching(v["coefficient"])),
     starts=_stretching_starts,
     targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
@@ -158,9 +152,8 @@ def _contact_starts(two_sided: bool) -> Callable[[Evidence, object], Iterator[di
             for gap in levels:
                 over = np.maximum(reach - gap, 0.0) * np.sign(place.displacement)
                 k = place.strength_along(over)
-                if k > 0:
-                    yield {**place_values(place.at), "stiffness": k, "gap": float(gap)}
-                    yield {**place_values(place.at), "stiffness": 4 * k, "gap": float(gap)}
+                for share in (1.0, 4.0) if k > 0 else ():
+                    yield {**place_values(place.at), "stiffness": share * k, "gap": float(gap)}
 
     return starts
 
@@ -201,9 +194,8 @@ def _friction_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
         speed = float(np.sqrt(np.mean(place.velocity**2)))
         for share in (0.02, 0.1, 0.3):
             force = place.strength_along(np.tanh(place.velocity / (share * speed)))
-            if force > 0:
-                yield {**place_values(place.at), "force": force, "smoothing_speed": share * speed}
-                yield {**place_values(place.at), "force": 2 * force, "smoothing_speed": share * speed}
+            for part in (1.0, 2.0) if force > 0 else ():
+                yield {**place_values(place.at), "force": part * force, "smoothing_speed": share * speed}
 
 
 def _as_damper(friction: Effect, _: Rig) -> tuple[Effect, ...]:
@@ -285,9 +277,8 @@ def _bouc_wen_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
             k = place.strength_along(hysteresis(place.displacement, share * size))
-            if k > 0:
-                yield {**place_values(place.at), "stiffness": k, "yield_displacement": share * size}
-                yield {**place_values(place.at), "stiffness": 2 * k, "yield_displacement": share * size}
+            for part in (1.0, 2.0) if k > 0 else ():
+                yield {**place_values(place.at), "stiffness": part * k, "yield_displacement": share * size}
 
 
 def _as_friction(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
@@ -417,15 +408,13 @@ def _quadratic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]
             yield {**place_values(place.at), "coefficient": share * c}
 
 
-def _quadratic_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    unit = Scales.of(rig).damping / Scales.of(rig).speed
-    return (*place_parameters(rig), positive("coefficient", "N s^2/m^2", unit, neutral=0.0))
-
-
 QUADRATIC_DAMPER = Kind(
     name="quadratic_damper",
     path="structure",
-    parameters=_quadratic_parameters,
+    parameters=lambda rig, _: (
+        *place_parameters(rig),
+        positive("coefficient", "N s^2/m^2", Scales.of(rig).damping / Scales.of(rig).speed, neutral=0.0),
+    ),
     apply=lambda rig, _, v: with_element(rig, PowerDamper(place_of(v), v["coefficient"], 1.0, 2.0)),
     starts=_quadratic_starts,
     nonlinear=True,

@@ -23,12 +23,10 @@ from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Interval, NamedPoints, Where, centred_at, reach
 
-OF_CHANNEL = "sensor_quantisation"  # kind that belongs to the channel, not to the sensor on its wire
 SENSOR_UNIT = "unit of the sensor"
 # of a residual's mean square: cross-talk is tried where another sensor's reading explains more of it
 LEAST_CROSSTALK = 0.05
 Starts = Callable[[Evidence, Any], Iterable[dict[str, Any]]]
-Apply = Callable[[Rig, Any, dict[str, Any]], Rig]
 
 SLOW_ENTRY = 0.1  # of the rms step between samples: a reading that reaches its top in a larger step is cut off there
 # stay at the top, in units of the time to stop at the deceleration before it: three times as long as up and back
@@ -43,19 +41,13 @@ def each_actuator(rig: Rig) -> tuple[str, ...]:
     return tuple(a.name for a in rig.actuators if not a.direct)
 
 
-def actuators_or_all(rig: Rig) -> tuple[str, ...]:
-    """Every actuator alone, and all of them together if there are several."""
-    names = each_actuator(rig)
-    return ((ALL, *names) if len(names) > 1 else names) if names else ()
-
-
 def each_sensor(rig: Rig) -> tuple[str, ...]:
     return tuple(s.name for s in rig.sensors)
 
 
-def sensors_or_all(rig: Rig) -> tuple[str, ...]:
-    names = each_sensor(rig)
-    return (ALL, *names) if len(names) > 1 else names
+def or_all(each: Callable[[Rig], tuple[str, ...]]) -> Callable[[Rig], tuple[str, ...]]:
+    """Every target alone, and all of them together if there are several."""
+    return lambda rig: (ALL, *each(rig)) if len(each(rig)) > 1 else each(rig)
 
 
 def _change_actuators(rig: Rig, target: str, **changes: Any) -> Rig:
@@ -100,8 +92,8 @@ def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
         later = [e for e in ordered[at + 1 :] if e.kind.path == exchange.kind.path and not e.kind.applied_first]
         if any(isinstance(e.target, tuple) for e in later):  # such an effect may involve both channels, so it stays
             continue
-        moved = [
-            replace(e, target=names.get(e.target, e.target)) if e in later and e.kind.name != OF_CHANNEL else e
+        moved = [  # quantisation is of the channel, not of the sensor on its wire
+            replace(e, target=names.get(e.target, e.target)) if e in later and e.kind is not SENSOR_QUANTISATION else e
             for e in ordered[at + 1 :]
         ]
         errors = sum(e.kind.applied_first for e in moved)
@@ -123,8 +115,21 @@ def _commands(evidence: Evidence, target: str, *, changes: bool = False) -> np.n
     return values if values.size else np.ones(1)
 
 
-def _sample_time(evidence: Evidence) -> float:
-    return evidence.data.records[0].sample_time
+def _quantiles(name: str, *shares: float, of_rates: bool = False) -> Starts:
+    """Starts at quantiles of the command, or of its rate of change."""
+
+    def starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
+        values = _commands(evidence, target, changes=of_rates)
+        if of_rates:
+            values = values / evidence.data.records[0].sample_time
+        return [{name: float(q)} for q in np.quantile(values, shares)]
+
+    return starts
+
+
+def _in_samples(name: str, *times: float) -> Starts:
+    """Starts at times in samples."""
+    return lambda evidence, _: [{name: n * evidence.data.records[0].sample_time} for n in times]
 
 
 def _time_scale(rig: Rig) -> float:
@@ -150,7 +155,7 @@ def _one_parameter_kind(
     attribute: str | None = None,
     neutral: float | None = None,
     size: Callable[[Rig], float] = lambda rig: 1.0,
-    apply: Apply | None = None,
+    apply: Callable[[Rig, Any, dict[str, Any]], Rig] | None = None,
     **options: Any,
 ) -> Kind:
     """A kind with one parameter, which sets an attribute of an actuator or a sensor.
@@ -220,11 +225,11 @@ ACTUATOR_LAG = _actuator(
     "s",
     "a lag of the actuators",
     neutral=0.0,
-    targets=actuators_or_all,
+    targets=or_all(each_actuator),
     low=1e-6,
     high=1e4,
     size=_time_scale,
-    starts=lambda evidence, _: [{"time_constant": s * _sample_time(evidence)} for s in (0.1, 0.4, 1.2, 4.0, 12.0)],
+    starts=_in_samples("time_constant", 0.1, 0.4, 1.2, 4.0, 12.0),
 )
 
 ACTUATOR_DELAY = _actuator(
@@ -233,13 +238,11 @@ ACTUATOR_DELAY = _actuator(
     "s",
     "a delay of the actuators",
     neutral=0.0,
-    targets=actuators_or_all,
+    targets=or_all(each_actuator),
     low=1e-9,
     high=1e4,
     size=_time_scale,
-    starts=lambda evidence, _: [
-        {"delay": s * _sample_time(evidence)} for s in (0.1, 0.4, 0.8, 1.3, 1.8, 2.5, 3.5, 5.0, 8.0, 12.0)
-    ],
+    starts=_in_samples("delay", 0.1, 0.4, 0.8, 1.3, 1.8, 2.5, 3.5, 5.0, 8.0, 12.0),
 )
 
 ACTUATOR_SATURATION = _actuator(
@@ -247,14 +250,12 @@ ACTUATOR_SATURATION = _actuator(
     "limit",
     "N",
     "saturation of the actuators",
-    targets=actuators_or_all,
+    targets=or_all(each_actuator),
     low=1e-12,
     high=1e12,
     size=_force_scale,
     nonlinear=True,
-    starts=lambda evidence, target: [
-        {"limit": float(q)} for q in np.quantile(_commands(evidence, target), (0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
-    ],
+    starts=_quantiles("limit", 0.5, 0.65, 0.8, 0.9, 0.96, 0.99),
 )
 
 ACTUATOR_DEAD_ZONE = _actuator(
@@ -264,14 +265,12 @@ ACTUATOR_DEAD_ZONE = _actuator(
     "a dead zone of the actuators",
     attribute="dead_zone",
     neutral=0.0,
-    targets=actuators_or_all,
+    targets=or_all(each_actuator),
     low=1e-12,
     high=1e12,
     size=_force_scale,
     nonlinear=True,
-    starts=lambda evidence, target: [
-        {"width": float(q)} for q in np.quantile(_commands(evidence, target), (0.03, 0.08, 0.15, 0.3, 0.5, 0.7))
-    ],
+    starts=_quantiles("width", 0.03, 0.08, 0.15, 0.3, 0.5, 0.7),
 )
 
 
@@ -291,23 +290,17 @@ ACTUATOR_BIAS = Kind(
 )
 
 
-def _rate_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    """Quantiles of the rates of change of the command."""
-    steps = _commands(evidence, target, changes=True) / _sample_time(evidence)
-    return [{"rate": float(q)} for q in np.quantile(steps, (0.1, 0.3, 0.5, 0.7, 0.9, 0.99))]
-
-
 ACTUATOR_RATE_LIMIT = _actuator(
     "actuator_rate_limit",
     "rate",
     "N/s",
     "a rate limit of the actuators",
     attribute="rate_limit",
-    targets=actuators_or_all,
+    targets=or_all(each_actuator),
     low=1e-300,
     high=1e300,
     nonlinear=True,
-    starts=_rate_starts,
+    starts=_quantiles("rate", 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, of_rates=True),
 )
 
 
@@ -328,7 +321,7 @@ ACTUATOR_HYSTERESIS = Kind(
         rig, target, hysteresis_share=v["share"], hysteresis_width=v["width"]
     ),
     starts=_hysteresis_starts,
-    targets=actuators_or_all,
+    targets=or_all(each_actuator),
     nonlinear=True,
     simpler=lambda effect, _: (  # at zero width
         (Effect(ACTUATOR_GAIN, effect.target, {"gain": 1.0 - effect.values["share"]}),) if effect.target != ALL else ()
@@ -425,8 +418,10 @@ SENSOR_GAIN = _sensor(
 )
 
 
-def _mean_residual(evidence: Evidence, target: str) -> float:
-    return float(np.mean(_residual(evidence, target)))
+def _residual(evidence: Evidence, name: str) -> np.ndarray:
+    """Residual (n_samples,) of a sensor over all records, joined."""
+    j = each_sensor(evidence.rig).index(name)
+    return np.concatenate([residual[j] for residual in evidence.residuals])
 
 
 SENSOR_BIAS = _sensor(
@@ -434,7 +429,7 @@ SENSOR_BIAS = _sensor(
     "bias",
     SENSOR_UNIT,
     "a sensor bias",
-    starts=lambda evidence, target: [{"bias": _mean_residual(evidence, target)}],
+    starts=lambda evidence, target: [{"bias": float(np.mean(_residual(evidence, target)))}],
     signed=True,
 )
 
@@ -443,7 +438,7 @@ SENSOR_DRIFT = _sensor(
     "drift_over_record",
     SENSOR_UNIT,
     "a sensor drift",
-    starts=lambda evidence, target: [{"drift_over_record": 2.0 * _mean_residual(evidence, target)}],
+    starts=lambda evidence, target: [{"drift_over_record": 2.0 * float(np.mean(_residual(evidence, target)))}],
     attribute="drift",
     signed=True,
 )
@@ -453,13 +448,13 @@ SENSOR_LAG = _sensor(
     "time_constant",
     "s",
     "a lag of the sensors",
-    starts=lambda evidence, _: [{"time_constant": s * _sample_time(evidence)} for s in (0.1, 0.4, 1.2, 4.0, 12.0)],
+    starts=_in_samples("time_constant", 0.1, 0.4, 1.2, 4.0, 12.0),
     log=True,
     low=1e-6,
     high=1e4,
     size=_time_scale,
     neutral=0.0,
-    targets=sensors_or_all,
+    targets=or_all(each_sensor),
 )
 
 
@@ -468,7 +463,7 @@ SENSOR_DELAY = _sensor(
     "delay",
     "s",
     "a delay of a sensor",
-    starts=lambda evidence, _: [{"delay": s * _sample_time(evidence)} for s in (0.1, 0.4, 0.8, 1.3, 2.5, 5.0)],
+    starts=_in_samples("delay", 0.1, 0.4, 0.8, 1.3, 2.5, 5.0),
     log=True,
     low=1e-9,
     high=1e4,
@@ -484,12 +479,6 @@ def _predicted(evidence: Evidence, name: str) -> np.ndarray:
     return np.concatenate([record.outputs[j] - residual[j] for record, residual in records])
 
 
-def _residual(evidence: Evidence, name: str) -> np.ndarray:
-    """Residual (n_samples,) of a sensor over all records, joined."""
-    j = each_sensor(evidence.rig).index(name)
-    return np.concatenate([residual[j] for residual in evidence.residuals])
-
-
 def _crosstalk_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
     """Share of the second sensor's prediction in the residual of the first, if that explains enough of it."""
     residual, source = _residual(evidence, pair[0]), _predicted(evidence, pair[1])
@@ -498,8 +487,13 @@ def _crosstalk_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[st
     return [{"share": share}] if share**2 * size > LEAST_CROSSTALK * float(residual @ residual) else []
 
 
+def _noise(rig: Rig) -> dict[str, float]:
+    """Standard deviation of the noise of each sensor by name, none of them zero."""
+    return {sensor.name: max(sensor.noise_std, 1e-300) for sensor in rig.sensors}
+
+
 def _share_parameters(rig: Rig, pair: tuple[str, str]) -> tuple[Parameter, ...]:
-    noise = {sensor.name: max(sensor.noise_std, 1e-300) for sensor in rig.sensors}
+    noise = _noise(rig)
     ratio = noise[pair[0]] / noise[pair[1]]
     return (Parameter("share", "", -1e3 * ratio, 1e3 * ratio, scale=0.1 * ratio, neutral=0.0),)
 
@@ -520,8 +514,7 @@ SENSOR_CROSSTALK = Kind(
 
 def _swapped_output_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
     """One start if the readings of the two sensors agree better with the predictions of each other; else none."""
-    noise = {sensor.name: max(sensor.noise_std, 1e-300) for sensor in evidence.rig.sensors}
-    own = crossed = 0.0
+    noise, own, crossed = _noise(evidence.rig), 0.0, 0.0
     for name, other in (pair, pair[::-1]):
         residual = _residual(evidence, name)
         measured = _predicted(evidence, name) + residual
@@ -591,15 +584,15 @@ def step_of(readings: np.ndarray) -> float | None:
     return step if np.abs(inside - step * np.round(inside / step)).max() < 0.05 * step else None
 
 
-def _readings(evidence: Evidence, target: str) -> list[np.ndarray]:
-    """Readings (n_samples,) of a sensor in each record."""
-    j = each_sensor(evidence.rig).index(target)
-    return [record.outputs[j] for record in evidence.data.records]
+def _read(name: str, measure: Callable[[list[np.ndarray]], float | None]) -> Starts:
+    """One start, a parameter that a sensor's readings (n_samples,) of all records show; none if they do not."""
 
+    def starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
+        j = each_sensor(evidence.rig).index(target)
+        value = measure([record.outputs[j] for record in evidence.data.records])
+        return [] if value is None else [{name: value}]
 
-def _clipping_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    level = clipped_level(_readings(evidence, target))
-    return [{"limit": level}] if level is not None else []
+    return starts
 
 
 SENSOR_CLIPPING = _sensor(
@@ -607,7 +600,7 @@ SENSOR_CLIPPING = _sensor(
     "limit",
     SENSOR_UNIT,
     "clipping of a sensor",
-    starts=_clipping_starts,
+    starts=_read("limit", clipped_level),
     log=True,
     low=1e-300,
     nonlinear=True,
@@ -615,17 +608,12 @@ SENSOR_CLIPPING = _sensor(
 )
 
 
-def _rounding_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-    step = step_of(np.concatenate(_readings(evidence, target)))
-    return [{"step": step}] if step is not None else []
-
-
 SENSOR_QUANTISATION = _sensor(
     "sensor_quantisation",
     "step",
     SENSOR_UNIT,
     "rounding of a sensor",
-    starts=_rounding_starts,
+    starts=_read("step", lambda rows: step_of(np.concatenate(rows))),
     log=True,
     low=1e-300,
     nonlinear=True,

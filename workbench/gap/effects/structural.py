@@ -10,7 +10,6 @@ import numpy as np
 from workbench.gap.effects.effect import (
     Effect,
     Evidence,
-    ForceAndMotion,
     Kind,
     Parameter,
     Scales,
@@ -205,12 +204,6 @@ MODULUS_ERROR = Kind(
 # --- attachments at a point
 
 
-def _regressed(place: ForceAndMotion, series: str) -> float:
-    """Least-squares coefficient k of force = -k x, with x the named series of the motion."""
-    x = getattr(place, series)
-    return float(-np.dot(place.force, x) / max(np.dot(x, x), 1e-300))
-
-
 def _point_starts(
     name: str, series: str, unit: str, *, between: bool = True, signed: bool = False
 ) -> Callable[[Evidence, object], Iterator[dict[str, Any]]]:
@@ -219,7 +212,7 @@ def _point_starts(
         for place in evidence.at_peaks:
             if isinstance(place.at, Between) and not between:
                 continue
-            k = _regressed(place, series)
+            k = replace(place, absorbed=False).strength_along(getattr(place, series))  # a linear force is sought itself
             for share in (0.4, 1.0, 2.0):
                 if k > 0 or signed:
                     yield {**place_values(place.at), name: share * k}
@@ -471,8 +464,9 @@ MODAL_DAMPING = Kind(
 DRIFTS = (0.02, 0.05, 0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # relative, over a record: start values of either sign
 
 
-def _duration(evidence: Evidence) -> float:
-    return max(record.n_samples * record.sample_time for record in evidence.data.records)
+def _drift_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
+    longest = max(record.n_samples * record.sample_time for record in evidence.data.records)
+    return [{"rate": share / longest} for share in (*(-share for share in DRIFTS[::-1]), *DRIFTS)]
 
 
 STIFFNESS_DRIFT = Kind(
@@ -482,11 +476,7 @@ STIFFNESS_DRIFT = Kind(
         Parameter("rate", "1/s", -1.0 / Scales.of(rig).time, 10.0 / Scales.of(rig).time, scale=1e-4, neutral=0.0),
     ),
     apply=lambda rig, _, v: replace(rig, stiffness_rate=v["rate"]),
-    starts=lambda evidence, _: [
-        {"rate": sign * share / _duration(evidence)}
-        for sign, shares in ((-1.0, DRIFTS[::-1]), (1.0, DRIFTS))
-        for share in shares
-    ],
+    starts=_drift_starts,
     phrase="a stiffness that drifts in time",
 )
 

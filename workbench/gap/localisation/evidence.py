@@ -1,13 +1,14 @@
-"""Evidence of an unmodelled force, before any effect is assumed: its place, the force, and the motion there."""
+"""An unmodelled force, before any effect is assumed: its place, the force itself, and the motion there."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import ForceAndMotion
 from workbench.gap.localisation.force_lines import Lines, lines_of, screened
 from workbench.gap.prediction.residuals import FitData
@@ -20,9 +21,11 @@ from workbench.gap.prediction.unmodelled_force import (
     wandering_force_filter,
 )
 from workbench.gap.prediction.workers import ALONE, Workers
+from workbench.renamed import Renamed
 from workbench.rig.motion import Motion
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Rectangle, Where
+from workbench.threads import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class EvidenceSettings:
     levels: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0)  # rms of an unmodelled force over that of the inputs
     memories: tuple[float, ...] = (10.0, 1000.0)  # its correlation time, in samples
     most_peaks: int = 3  # of the likelihood that are kept
+    one_rate: float = 1e-6  # relative difference of the sample times of two records that are taken for one
     places: int = 40  # of the grid along an interval
     beside: float = 0.95  # of the grid spacing: range about a peak in which it is refined
     resolved: float = 2e-3  # of the grid spacing: tolerance of the refinement
@@ -45,7 +49,29 @@ class EvidenceSettings:
     many_points: int = 12  # named points up to which all are candidates
 
 
+@dataclass(frozen=True)
+class LocalisationSettings:
+    """Constants of the localisation of one force."""
+
+    valleys: int = 3  # local minima of the misfit that are refined
+    rounds: int = 3  # alternations between the place and the weights of the lines
+    beside: float = 0.95  # of the grid spacing: range about a minimum in which it is refined
+    resolved: float = 1e-3  # of the grid spacing: tolerance of the refinement
+    pairs_shown: int = 12  # of named points
+    two_sigma: float = 4.0  # rise of the misfit at two standard errors
+    noise: float = 0.1  # of the noise power: largest excess of the residual given one force
+    all_but: float = 1e-5  # of the gap, likewise
+    chance: float = 3.0  # standard deviations of a sum of squares
+    edge: float = 1e-4  # of the length: least distance of a place from the ends
+    near: float = 0.02  # of a rectangle's size: first simplex about a peak
+    tolerance: float = 1e-2  # of the misfit, in units of the noise variance
+    evaluations: int = 60  # of the simplex search
+    curved_over: float = 0.1  # of that simplex: step of the second difference of the misfit
+    bisections: int = 6  # of the distance at which the misfit has risen
+
+
 EVIDENCE = EvidenceSettings()
+LOCALISATION = LocalisationSettings()
 FEWER_PLACES = 20  # of the grid, when some effects are given
 
 
@@ -112,15 +138,41 @@ class Evidence:
         return self.rig.modes.domain
 
     @cached_property
-    def model(self) -> SampledModel:
-        """The rig's modes and sensors, discretised."""
-        noise = self.data.noise
-        return sampled_model(self.rig.modes, self.rig.sensors, noise, self.data.counted[0].sample_time)
+    def sample_times(self) -> tuple[float, ...]:
+        """Of each record, s; those of clocks that agree to a millionth are one."""
+        found: list[float] = []
+        for dt in (record.sample_time for record in self.data.counted):
+            found.append(next((known for known in found if np.isclose(known, dt, EVIDENCE.one_rate, 0.0)), dt))
+        return tuple(found)
 
-    def filter_at(self, where: Where, rms: float, memory: float) -> ForceFilter:
-        """The filter for an unknown force at a place, of an rms, N, and a correlation time `memory`, in samples."""
-        modes, sample_time = self.rig.modes, self.data.counted[0].sample_time
-        return wandering_force_filter(modes, self.model, modes.phi_at(where), rms, memory * sample_time, sample_time)
+    @cached_property
+    def models(self) -> dict[float, SampledModel]:
+        """The rig's modes and sensors, discretised, by sample time of the records."""
+        modes, sensors, noise = self.rig.modes, self.rig.sensors, self.data.noise
+        return {dt: sampled_model(modes, sensors, noise, dt) for dt in dict.fromkeys(self.sample_times)}
+
+    @property
+    def model(self) -> SampledModel:
+        """That of the first record."""
+        return self.models[self.sample_times[0]]
+
+    def filters_at(self, where: Where, size: tuple[float, float]) -> dict[float, ForceFilter]:
+        """The filter for an unknown force at a place, by sample time.
+
+        Args:
+            where: the place.
+            size: rms of the force, N, and its correlation time, in samples of the first record.
+        """
+        modes, (rms, memory) = self.rig.modes, size
+        time, shape = memory * self.sample_times[0], modes.phi_at(where)
+        each = self.models.items()
+        return {dt: wandering_force_filter(modes, model, shape, rms, time, dt) for dt, model in each}
+
+    def _log_likelihood(self, where: Where, size: tuple[float, float], n_records: int | None = None) -> float:
+        """Log-likelihood of an unknown force at a place, of a size as of `filters_at`, in the first or all records."""
+        filters = self.filters_at(where, size)
+        each = list(zip(self.sample_times, self.residuals, strict=True))[:n_records]
+        return sum(log_likelihood(filters[dt], [residual]) for dt, residual in each)
 
     @cached_property
     def places(self) -> Any:
@@ -148,13 +200,13 @@ class Evidence:
         """Rms, N, and correlation time, in samples, of the unmodelled force: the likeliest of a coarse grid."""
         if self.given_size is not None:
             return self.given_size
-        quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
+        quick = max(2, len(self.residuals) - 2)
         sizes = [(share * self.data.force_rms, memory) for memory in EVIDENCE.memories for share in EVIDENCE.levels]
 
         coarse = self._coarse_places
 
         def likelihood(size: tuple[float, float]) -> float:
-            return max(log_likelihood(self.filter_at(x, *size), quick) for x in coarse)
+            return max(self._log_likelihood(x, size, quick) for x in coarse)
 
         return max(zip(self.workers.map(likelihood, sizes), sizes, strict=True), key=lambda each: each[0])[1]
 
@@ -172,21 +224,44 @@ class Evidence:
     def profile(self) -> np.ndarray:
         """Log-likelihood of an unknown force at each of `places`; approximate, except for an interval."""
         if not isinstance(self.domain, Interval):
-            return -0.5 * self._misfits(self.places)
-        residuals, size = list(self.residuals), self.size
-        along = self.workers.map(lambda x: log_likelihood(self.filter_at(x, *size), residuals), self.places)
-        return np.array(along)
-
-    def _misfits(self, places: Sequence[Any]) -> np.ndarray:
-        """Residual sum of squares given one force of any law at each of the places, in units of the noise."""
-        shapes = np.array([self.rig.modes.phi_at(where) for where in places])
-        misfits: np.ndarray = np.sum([screened(lines, shapes) for lines in self.lines], axis=0)
-        return misfits
+            return -0.5 * self.screened(self.places)
+        size = self.size
+        return np.array(self.workers.map(lambda x: self._log_likelihood(x, size), self.places))
 
     @cached_property
     def lines(self) -> list[Lines]:
-        """Spectral lines of every record's residual."""
-        return lines_of(self.rig, self.model, self.residuals, self.data.counted[0].sample_time)
+        """Spectral lines of every record's residual, record by record of each sample time."""
+        each = list(zip(self.sample_times, self.residuals, strict=True))
+        return [
+            lines
+            for dt, model in self.models.items()
+            for lines in lines_of(self.rig, model, [residual for own, residual in each if own == dt], dt)
+        ]
+
+    def informative(self, where: Where) -> list[Lines]:
+        """The lines, weighted by the share of their power that is due to a force at a place."""
+        shape = self.rig.modes.phi_at(where)
+        return [each.weighted(each.force_share(shape)) for each in self.lines]
+
+    def misfit(self, where: Where, lines: Sequence[Lines] | None = None) -> float:
+        """Residual sum of squares given one force of any law at a place, transients included, in units of the noise.
+
+        Args:
+            where: the place.
+            lines: weighted ones; None for all, with equal weights.
+        """
+        shape = self.rig.modes.phi_at(where)
+        return float(sum(each.misfit(shape) for each in (self.lines if lines is None else lines)))
+
+    def misfits(self, places: Sequence[Any], lines: Sequence[Lines]) -> Floats:
+        """The misfit at each of the places."""
+        return np.array(self.workers.map(lambda where: self.misfit(where, lines), places))
+
+    def screened(self, places: Sequence[Any], lines: Sequence[Lines] | None = None) -> Floats:
+        """The approximate misfit at each of many places, without transients."""
+        shapes = np.array([self.rig.modes.phi_at(where) for where in places])
+        misfits: Floats = np.sum([screened(each, shapes) for each in (self.lines if lines is None else lines)], axis=0)
+        return misfits
 
     @cached_property
     def _likeliest_places(self) -> tuple[Any, ...]:
@@ -228,16 +303,11 @@ class Evidence:
             [(float(np.clip(x + dx, 0.0, a)), float(np.clip(y + dy, 0.0, b))) for dx in offsets for dy in offsets]
             for x, y in mirrored
         ]
-        misfits = self._misfits([where for places in around for where in places]).reshape(len(around), -1)
+        misfits = self.screened([where for places in around for where in places]).reshape(len(around), -1)
         refined = [places[int(np.argmin(row))] for places, row in zip(around, misfits, strict=True)]
-        misfits_there = self.workers.map(self._misfit, refined)
+        misfits_there = self.workers.map(self.misfit, refined)
         order = np.argsort(misfits_there, kind="stable")
         return tuple(_spaced([refined[i] for i in order], rectangle, EVIDENCE.narrow, EVIDENCE.most_peaks))
-
-    def _misfit(self, where: Where) -> float:
-        """Residual sum of squares given one force of any law at a place, transients included, in units of the noise."""
-        shape = self.rig.modes.phi_at(where)
-        return float(sum(lines.misfit(shape) for lines in self.lines))
 
     @cached_property
     def peaks(self) -> tuple[Any, ...]:
@@ -246,19 +316,15 @@ class Evidence:
             return self.given_places
         if not isinstance(self.domain, Interval):
             return self._likeliest_places
-        profile, places = self.profile, np.asarray(self.places, float)
-        padded = np.r_[-np.inf, profile, -np.inf]
-        peaks_found = np.flatnonzero((profile >= padded[:-2]) & (profile >= padded[2:]))
-        refined = self.workers.map(
-            self._refined_peak, places[peaks_found[np.argsort(-profile[peaks_found])][: EVIDENCE.most_peaks]]
-        )
+        peaks_found = self.places[_minima(-self.profile)[: EVIDENCE.most_peaks]]
+        refined = self.workers.map(self._refined_peak, peaks_found)
         return tuple(at for at, _ in sorted(refined, key=lambda top: -top[1]))
 
     def _refined_peak(self, at: float) -> tuple[float, float]:
         """The peak of the log-likelihood near a place of the grid: position and height."""
-        spacing, residuals = self.places[1] - self.places[0], list(self.residuals)
+        spacing = self.places[1] - self.places[0]
         found = minimize_scalar(
-            lambda x: -log_likelihood(self.filter_at(x, *self.size), residuals),
+            lambda x: -self._log_likelihood(x, self.size),
             bounds=(at - EVIDENCE.beside * spacing, at + EVIDENCE.beside * spacing),
             method="bounded",
             options={"xatol": EVIDENCE.resolved * spacing},
@@ -273,11 +339,11 @@ class Evidence:
 
     def place(self, where: Where) -> ForceAndMotion:
         """The smoothed unmodelled force at a place, and the motion there."""
-        kalman = self.filter_at(where, *self.size)
+        filters = self.filters_at(where, self.size)
         n, shape = self.rig.modes.n_modes, self.rig.modes.phi_at(where)
         pieces = []
-        for motion, residual in zip(self.motions, self.residuals, strict=True):
-            states = smoothed_states(kalman, residual)
+        for dt, motion, residual in zip(self.sample_times, self.motions, self.residuals, strict=True):
+            states = smoothed_states(filters[dt], residual)
             error_q, error_v, force = states[:n], states[n : 2 * n], states[2 * n]
             error_a = -(self.rig.modes.omega[:, None] ** 2) * error_q - self.rig.modes.damping @ error_v
             pieces.append(
@@ -303,3 +369,155 @@ def _spaced(
         if len(peaks_found) == most:
             break
     return peaks_found
+
+
+def _minima(values: Floats) -> np.ndarray:
+    """Indices of the local minima of a series, deepest first."""
+    padded = np.r_[np.inf, values, np.inf]
+    bottoms = np.flatnonzero((values <= padded[:-2]) & (values <= padded[2:]))
+    return bottoms[np.argsort(values[bottoms])]
+
+
+@dataclass(frozen=True, eq=False)
+class ForceLocation:
+    """Likelihood of one force of any law at each place, and the likeliest place.
+
+    Attributes:
+        places: (n_places,) on the structure.
+        profile: (n_places,) log-likelihood, relative to that of the likeliest place.
+        at: the likeliest place.
+        at_std: standard error of the place, m, from a quarter of the 2-sigma interval, inflated by the residual above
+            the noise; on a rectangle along the longer axis of the region; 0 for named places.
+        share: of the gap's power above the noise that one force there explains.
+        is_single_force: whether one force reduces the gap to noise, or to a negligible share; None if that cannot be
+            tested: no gap, one sensor, or records too short.
+    """
+
+    places: Sequence[Any]
+    profile: np.ndarray
+    at: Any
+    at_std: float
+    share: float
+    is_single_force: bool | None
+
+    holds = Renamed("is_single_force")
+
+
+@one_blas_thread
+def locate_force(evidence: Evidence) -> ForceLocation:
+    """Locate the one force, of any law, that best explains the gap.
+
+    One sensor locates nothing, since a force anywhere explains its readings. Sensors with a lag are left out.
+    """
+    evidence = evidence.without([sensor.name for sensor in evidence.rig.sensors if sensor.time_constant > 0])
+    domain, places = evidence.domain, evidence.places
+    at: Any = evidence.peaks[0]
+    if len(evidence.rig.sensors) < 2:
+        std = 0.0 if isinstance(domain, NamedPoints) else domain.size / np.sqrt(12.0)
+        return ForceLocation(places, np.zeros(len(places)), at, std, 0.0, None)
+    informative = evidence.informative(at)
+    if isinstance(domain, Interval):
+        valleys = places[_minima(evidence.misfits(places, informative))[: LOCALISATION.valleys]]
+        # minima are compared by equal weights: each one's own would favour it
+        at = min(evidence.workers.map(partial(_refined, evidence), valleys), key=evidence.misfit)
+        informative = evidence.informative(at)
+        profile, std = evidence.misfits(places, informative), _deviation(evidence, informative, at)
+    elif isinstance(domain, Rectangle):
+        refined = [_refined_over(evidence, domain, peak) for peak in evidence.peaks]
+        at, std = min(refined, key=lambda each: evidence.misfit(each[0]))
+        informative = evidence.informative(at)
+        profile = evidence.screened(places, informative)
+    else:
+        ranked = [places[i] for i in np.argsort(-evidence.profile, kind="stable") if isinstance(places[i], Between)]
+        points = [where for where in places if not isinstance(where, Between)]
+        places = [*points, *ranked[: LOCALISATION.pairs_shown]]
+        profile = evidence.misfits(places, informative)
+        at, std = places[int(np.argmin(profile))], 0.0
+    lowest = min(evidence.misfit(at, informative), profile.min())
+    degrees_of_freedom = sum(each.degrees_of_freedom for each in evidence.lines)
+    left = evidence.misfit(at) / max(degrees_of_freedom, 1) - 1.0
+    std *= np.sqrt(max(left, 0.0) + 1.0)
+    return ForceLocation(places, -0.5 * (profile - lowest), at, std, *_explained(evidence, degrees_of_freedom, left))
+
+
+def _explained(evidence: Evidence, degrees_of_freedom: int, left: float) -> tuple[float, bool | None]:
+    """Share of the gap's power that one force explains, and whether that is all of it; None if it cannot be tested.
+
+    Args:
+        evidence: of the nominal rig.
+        degrees_of_freedom: of the residual given the force.
+        left: its power above the noise, in units of the noise power.
+    """
+    values = 2 * sum(each.left.size for each in evidence.lines)
+    gap = sum(each.power for each in evidence.lines) - values
+    if degrees_of_freedom == 0 or gap < LOCALISATION.chance * np.sqrt(2.0 * values):
+        return 0.0, None
+    chance = LOCALISATION.chance * np.sqrt(2.0 / degrees_of_freedom)
+    share = float(np.clip(1.0 - left * degrees_of_freedom / gap, 0.0, 1.0))
+    return share, bool(left < LOCALISATION.noise + chance or share > 1.0 - LOCALISATION.all_but)
+
+
+def _refined_over(
+    evidence: Evidence, rectangle: Rectangle, top: tuple[float, float]
+) -> tuple[tuple[float, float], float]:
+    """The local minimum of the misfit on a rectangle, and its standard error along the longer axis, m."""
+    informative, extent = evidence.informative(top), np.array(rectangle.length)
+
+    def inside(xy: Floats) -> tuple[float, float]:
+        x, y = np.clip(xy, LOCALISATION.edge * extent, (1.0 - LOCALISATION.edge) * extent)
+        return float(x), float(y)
+
+    def misfit(xy: Floats) -> float:
+        return evidence.misfit(inside(xy), informative)
+
+    reach = LOCALISATION.near * rectangle.size
+    options = {
+        "initial_simplex": np.array(top) + reach * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]),
+        "xatol": LOCALISATION.resolved * reach,
+        "fatol": LOCALISATION.tolerance,
+        "maxfev": LOCALISATION.evaluations,
+    }
+    found = minimize(misfit, top, method="Nelder-Mead", options=options)
+    at, step = inside(found.x), LOCALISATION.curved_over * reach
+    curvatures = [misfit(at + h) + misfit(at - h) - 2.0 * found.fun for h in step * np.array([(1, 0), (0, 1)])]
+    flattest = max(min(curvatures), 1e-12)  # of |r|², twice the log-likelihood ratio
+    return at, float(min(step * np.sqrt(2.0 / flattest), rectangle.size))
+
+
+def _refined(evidence: Evidence, top: float) -> float:
+    """The local minimum of the misfit along an interval."""
+    at, informative = float(top), evidence.informative(top)
+    length, spacing = evidence.domain.size, evidence.places[1] - evidence.places[0]
+    edge, beside = LOCALISATION.edge * length, LOCALISATION.beside * spacing
+    for _ in range(LOCALISATION.rounds):
+        found = minimize_scalar(
+            evidence.misfit,
+            bounds=(max(at - beside, edge), min(at + beside, length - edge)),
+            args=(informative,),
+            method="bounded",
+            options={"xatol": LOCALISATION.resolved * spacing},
+        )
+        moved, at = abs(found.x - at), float(found.x)
+        informative = evidence.informative(at)
+        if moved < LOCALISATION.resolved * spacing:
+            break
+    return at
+
+
+def _deviation(evidence: Evidence, lines: Sequence[Lines], at: float) -> float:
+    """Standard error of a place along an interval, m: a quarter of that in which the misfit rises by less than 4."""
+    length, level = evidence.domain.size, evidence.misfit(at, lines) + LOCALISATION.two_sigma
+
+    def is_outside(x: float) -> bool:
+        return not 0 < x < length or evidence.misfit(x, lines) > level
+
+    def distance(side: float) -> float:
+        inside, outside = 0.0, 1e-5 * length
+        while outside < length and not is_outside(at + side * outside):
+            inside, outside = outside, 2.0 * outside
+        for _ in range(LOCALISATION.bisections):
+            middle = 0.5 * (inside + outside)
+            inside, outside = (inside, middle) if is_outside(at + side * middle) else (middle, outside)
+        return outside
+
+    return (distance(-1.0) + distance(1.0)) / 4.0

@@ -144,7 +144,8 @@ class Observer:
         gain = np.zeros((2, rig.modes.n_modes, self.whitening.shape[0]))
         known = min(rig.modes.n_modes, self.gain.shape[1])
         gain[:, :known] = self.gain[:, :known]
-        moved = [j for j, each in enumerate(zip(rig.sensors, self.sensors, strict=True)) if not _reads_the_same(*each)]
+        reads = [[(s.at, s.quantity, s.direction) for s in sensors] for sensors in (rig.sensors, self.sensors)]
+        moved = [j for j, (now, then) in enumerate(zip(*reads, strict=True)) if now != then]
         if moved and _is_unstable(rig, gain, sample_time):
             gain[:, :, moved] = 0.0
             if _is_unstable(rig, gain, sample_time):
@@ -157,11 +158,6 @@ def _structure_only(rig: Rig) -> Rig:
     """The rig with only its structure and ideal sensors."""
     sensors = tuple(Sensor(s.name, s.at, s.quantity, gain=s.gain, direction=s.direction) for s in rig.sensors)
     return replace(rig, actuators=(), elements=(), sensors=sensors)
-
-
-def _reads_the_same(one: Sensor, other: Sensor) -> bool:
-    """Whether two sensors measure the same quantity at the same place."""
-    return (one.at, one.quantity, one.direction) == (other.at, other.quantity, other.direction)
 
 
 def _is_unstable(rig: Rig, gain: Floats, sample_time: float) -> bool:

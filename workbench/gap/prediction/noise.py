@@ -58,7 +58,7 @@ def noise_found(residuals: Sequence[np.ndarray], coloured: np.ndarray | None = N
     under = np.min([_power_under_peaks(residual) for residual in residuals], axis=0)
     # a residual equally strong in two records of different levels is noise of whatever colour
     alike = whole[1] < NOISE.alike * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
-    same = whole < NOISE.same * whole[0]
+    same = whole <= NOISE.same * whole[0]  # the quietest record itself too, if its residual is zero
     noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
     power: Floats = np.where(alike | (under > NOISE.loud * whole[0]) | coloured, noise, under)
     return np.sqrt(power)
@@ -129,10 +129,19 @@ def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
     """Standard deviation of each sensor's white noise (n_outputs,), before anything is known of the gap.
 
     From the quietest bands of the measured outputs and of the nominal residuals.
+
+    Raises:
+        ValueError: for a sensor without noise, stated or not, as in records of a simulation.
     """
     left = [record.outputs - predict(rig, record) for record in records]
     bands = [_band_means(series) for series in (*left, *(record.outputs for record in records))]
     least = np.min([np.quantile(means, NOISE.least, axis=1) for means in bands], axis=0)
+    for sensor, power in zip(rig.sensors, least, strict=True):
+        if not (power or sensor.noise_std):
+            raise ValueError(
+                f"the records show no noise of sensor {sensor.name}, by which its residual is weighted: state its"
+                " noise_std"
+            )
     guess: Floats = np.sqrt(least / NOISE.of_least)
     return guess
 
@@ -252,15 +261,15 @@ def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilte
         data: records, with the sensors' noise.
         share: standard deviation of white noise on each input, over the input's rms.
     """
-    model = sampled_model(rig.modes, rig.sensors, data.noise, data.records[0].sample_time)
+    sample_times = {record.sample_time for record in data.records}
+    models = {dt: sampled_model(rig.modes, rig.sensors, data.noise, dt) for dt in sample_times}
     patterns = np.column_stack([a.gain * shape_of(rig.modes, a) for a in rig.actuators])
-    return {r.name: force_filter(model, patterns, _variances(r, share)) for r in data.records}
-
-
-def _variances(record: Record, share: float) -> Floats:
-    """Variances (n_inputs,) of the input noise, none of them zero."""
-    power: Floats = share**2 * (record.inputs**2).mean(axis=1)
-    return np.maximum(power, max(LOGGED.quietest * power.max(), 1e-300))
+    filters = {}
+    for record in data.records:
+        power = share**2 * (record.inputs**2).mean(axis=1)
+        variances = np.maximum(power, max(LOGGED.quietest * power.max(), 1e-300))  # none of them zero
+        filters[record.name] = force_filter(models[record.sample_time], patterns, variances)
+    return filters
 
 
 class LikeliestShare(NamedTuple):

@@ -148,7 +148,7 @@ def fit_random_force(
     def loss(point: np.ndarray, family: tuple[Where, int, bool], records: list[np.ndarray]) -> float:
         start, stages, flat = family
         memory = memory_at(point)
-        if not ((point[:d] > 0.0) & (point[:d] < 1.0)).all() or memory > RANDOM_FORCE.longest_memory:
+        if not ((point[:d] >= 0.0) & (point[:d] <= 1.0)).all() or memory > RANDOM_FORCE.longest_memory:
             return 1e300
         kalman = _filter(model, rig, place_of(point, start), np.exp(point[d]), colour_of(memory, stages, flat=flat))
         value = -2.0 * log_likelihood(kalman, records)
@@ -165,8 +165,9 @@ def fit_random_force(
     steps = np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, place), log_size, logit_of_memory])])
 
     def refined(start: np.ndarray, family: tuple[Where, int, bool], records: list[np.ndarray], most: int) -> Any:
+        inwards = np.r_[np.where(start[:d] + place > 1.0, -1.0, 1.0), 1.0, 1.0]
         options = {
-            "initial_simplex": start + steps,
+            "initial_simplex": start + inwards * steps,
             "xatol": RANDOM_FORCE.tolerance,
             "fatol": RANDOM_FORCE.loss_tolerance,
             "maxfev": most,
@@ -271,9 +272,12 @@ def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float
 
 
 def _curvature_std(loss: Callable[[np.ndarray], float], point: np.ndarray, j: int, step: float) -> float:
-    """Standard error of a coordinate from the curvature of `loss`, minus twice the log-likelihood; 0 if not convex."""
-    ahead, behind = point.copy(), point.copy()
-    ahead[j] += step
-    behind[j] -= step
-    curvature = (loss(ahead) - 2.0 * loss(point) + loss(behind)) / step**2
+    """Standard error of a coordinate from the curvature of `loss`, minus twice the log-likelihood; 0 if not convex.
+
+    At an edge, where the coordinate is 0 or 1, the curvature is that beside it.
+    """
+    behind, centre, ahead = np.array([point] * 3)
+    centre[j] = np.clip(point[j], step, 1.0 - step)
+    behind[j], ahead[j] = centre[j] - step, centre[j] + step
+    curvature = (loss(ahead) - 2.0 * loss(centre) + loss(behind)) / step**2
     return float(np.sqrt(2.0 / curvature)) if 0 < curvature < 1e300 else 0.0

@@ -28,6 +28,12 @@ def lead_of(record: Record, settle: float) -> int:
     return min(round(settle / record.sample_time), record.n_samples - 1)
 
 
+def scale_of(measured: Floats) -> Floats:
+    """Standard deviation (n_outputs, 1) of each sensor's readings (n_outputs, n_samples); 1 where they are constant."""
+    scale: Floats = measured.std(axis=1, keepdims=True)
+    return np.where(scale > 0, scale, 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class FitData:
     """Records of a fit, never validation records, and how their residual is formed.
@@ -210,7 +216,7 @@ class FitData:
 
     @property
     def _from_the_first_sample(self) -> "FitData":
-        return self._with_its_lead if self.settle else self
+        return self._with_its_lead if self.settle else self  # cached, a reference to itself would outlive the search
 
     @cached_property
     def _with_its_lead(self) -> "FitData":

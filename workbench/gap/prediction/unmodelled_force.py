@@ -5,6 +5,7 @@ an unknown force at x (a first-order random process) gives the likelihood of tha
 and the motion there.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from workbench.structure.modes import Modes
 RUNAWAY = 1e100
 WHITE = np.zeros((1, 1))  # colour of a force that is uncorrelated from sample to sample
 TETHER = 1e-4  # radians a sample: frequency given to rigid modes
-DOUBLINGS = 40  # of the number of samples summed over, at most
+DOUBLINGS = 40  # of the number of samples of a sum or of a steady state, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,21 +180,13 @@ def wandering_force_filter(
 
 
 def _steady_state(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray) -> ForceFilter:
-    """The steady-state filter of a transition, an output and a process noise covariance."""
-    covariance = steady_covariance(a, h, q, noise_variance)
-    s = h @ covariance @ h.T + np.diag(noise_variance)
-    gain = np.linalg.solve(s, h @ covariance @ a.T).T
-    return ForceFilter(a, h, covariance, gain, s)
+    """The steady-state filter of a transition, an output and a process noise covariance, by doubling.
 
-
-def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:
-    """Steady-state prediction covariance (n_states, n_states) of the Kalman filter, by structure-preserving doubling.
-
-    Chu, Fan, Lin & Wang, Int. J. Control 77 (2004) 767. A filter needs about fifteen doublings.
+    Chu, Fan, Lin & Wang, Int. J. Control 77 (2004) 767: it preserves the structure; about fifteen doublings are needed.
     """
     ak, gk, hk = a.T.copy(), h.T @ (h / noise_variance[:, None]), q.copy()
     eye = np.eye(a.shape[0])
-    for _ in range(40):
+    for _ in range(DOUBLINGS):
         inverse = np.linalg.inv(eye + gk @ hk)
         forward = ak @ inverse
         change = ak.T @ hk @ inverse @ ak
@@ -202,8 +195,10 @@ def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_varianc
         hk = hk + change
         if np.abs(change).max() <= 1e-10 * np.abs(hk).max():
             break
-    covariance: np.ndarray = 0.5 * (hk + hk.T)
-    return covariance
+    covariance = 0.5 * (hk + hk.T)
+    s = h @ covariance @ h.T + np.diag(noise_variance)
+    gain = np.linalg.solve(s, h @ covariance @ a.T).T
+    return ForceFilter(a, h, covariance, gain, s)
 
 
 def accumulated(a: Floats, q: Floats) -> Floats:
@@ -242,25 +237,23 @@ def innovations(filter_: ForceFilter, residual: Floats) -> Floats:
     return residual - filter_.h @ driven(closed, filter_.gain @ residual)[:, :-1]
 
 
-def log_likelihoods(filter_: ForceFilter, residual: Floats) -> Floats:
-    """Gaussian log-likelihood of each sample of a residual given those before it, constants left out: (n_samples,).
+def log_likelihood(filter_: ForceFilter, residuals: Sequence[Floats]) -> float:
+    """Gaussian log-likelihood of residual records under the filter, constants left out.
 
     -∞ if the innovations diverge, or if the covariance is not positive by rounding, as with absurdly large readings.
     """
-    e = innovations(filter_, residual)
-    if not np.abs(e).max() < RUNAWAY:
-        return np.full(e.shape[1], -np.inf)
-    try:
-        white = _of_unit_covariance(filter_, e)
-    except np.linalg.LinAlgError:
-        return np.full(e.shape[1], -np.inf)
-    squares: Floats = np.einsum("jk,jk->k", white, white)
-    return -0.5 * (squares + float(np.linalg.slogdet(filter_.innovation)[1]))
-
-
-def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
-    """Gaussian log-likelihood of residual records under the filter, constants left out."""
-    return float(sum(log_likelihoods(filter_, residual).sum() for residual in residuals))
+    found = 0.0
+    for residual in residuals:
+        e = innovations(filter_, residual)
+        if not np.abs(e).max() < RUNAWAY:
+            return -np.inf
+        try:
+            white = _of_unit_covariance(filter_, e)
+        except np.linalg.LinAlgError:
+            return -np.inf
+        squares = np.einsum("jk,jk->k", white, white)
+        found += float((-0.5 * (squares + float(np.linalg.slogdet(filter_.innovation)[1]))).sum())
+    return found
 
 
 def whiten(filter_: ForceFilter, residual: Floats) -> Floats:

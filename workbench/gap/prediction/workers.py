@@ -138,17 +138,12 @@ class Workers:
         finally:
             if child is not None:
                 child.end()
-            _release()
-
-
-def _release() -> None:
-    """Wait for ended processes, and free the arrays that were given back."""
-    for pid in _Child.ending:
-        with suppress(ChildProcessError):
-            os.waitpid(pid, 0)
-    _Child.ending = []
-    for spare in _spare.values():
-        spare.clear()
+            for pid in _Child.ending:
+                with suppress(ChildProcessError):
+                    os.waitpid(pid, 0)
+            _Child.ending = []
+            for spare in _spare.values():
+                spare.clear()
 
 
 ALONE = Workers(1)

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import TENSION, deviations_of, group_of, label_of, parted
 from workbench.gap.effects.structural import buckling_load
 from workbench.gap.prediction.noise import loudest_logging_noise
-from workbench.gap.prediction.residuals import FitData, lead_of
+from workbench.gap.prediction.residuals import FitData, lead_of, scale_of
 from workbench.gap.search.settings import JOINT
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -35,6 +36,8 @@ MOSTLY = 0.5  # of the gap: its greater part; if that is unexplained, the fitted
 RUNAWAY = 1e30  # mean square of a divergent residual, in units of the signal's
 COMMON = 2.0  # times the scatter of delays: a larger mean is reported as a common delay
 DRAWS = 400  # bootstrap draws, for the interval of the shrinkage
+REACH = 4.0  # standard deviations from record to record: bound of the deviation of a held-out record
+TOLERANCE = 1e-3  # of that bound: accuracy of the deviation
 # names in the plural of the groups of errors that are reported in per cent
 PLURAL = {
     "stiffness": "stiffness",
@@ -84,7 +87,7 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale
         before[record.name], after[record.name] = (float(np.sqrt(e.mean())) for e in errors)
         floor[record.name] = float(np.sqrt((noise**2).mean()))
-        length = block_length(nominal, record)
+        length = block_length(nominal, measured.shape[1], record.sample_time)
         for start in range(0, measured.shape[1], length):
             piece = slice(start, start + length)
             blocks.append([errors[0][:, piece].mean(), errors[1][:, piece].mean(), (noise**2).mean()])
@@ -113,20 +116,14 @@ def _closed(before: float, after: float, floor: float) -> float:
     return float(1.0 - np.sqrt(max(after - floor, 0.0) / (before - floor)))
 
 
-def block_length(rig: Rig, record: Record) -> int:
-    """Samples of a block of a record: three decay times of the slowest elastic mode, 1/20 to 1/8 of the record.
+def block_length(rig: Rig, n_samples: int, sample_time: float) -> int:
+    """Samples of a block: three decay times of the slowest elastic mode, 1/20 to 1/8 of the samples that are compared.
 
     Residuals of such blocks are nearly independent.
     """
     rates = (rig.modes.zeta * rig.modes.omega)[rig.modes.omega > 0]
-    decay = 3.0 / max(rates.min(), 1e-12) / record.sample_time if rates.size else record.n_samples
-    return int(np.clip(decay, record.n_samples // 20, max(record.n_samples // 8, 1)))
-
-
-def scale_of(measured: np.ndarray) -> np.ndarray:
-    """Standard deviation (n_outputs, 1) of each sensor's readings (n_outputs, n_samples); 1 where they are constant."""
-    scale = measured.std(axis=1, keepdims=True)
-    return np.where(scale > 0, scale, 1.0)
+    decay = 3.0 / max(rates.min(), 1e-12) / sample_time if rates.size else n_samples
+    return int(np.clip(decay, max(n_samples // 20, 1), max(n_samples // 8, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,18 +236,14 @@ def budget_of(
         settle: seconds at the start of each record that are not compared.
     """
 
-    def powers_with(chosen: Sequence[Effect]) -> np.ndarray:
-        """Mean square residual (n_records,) with these effects."""
-        return np.array([residual_power(rig, chosen, record, settle) for record in records])
-
     labels, causes = labels_of(effects, rig.modes.domain), list(effects)
     common, varying = (None, None) if errors is None else parted(errors)
     if varying is not None:
         labels.append(label_of(varying.target.figure))
         causes.append(varying)
     causes += [] if common is None else [common]
-    nominal, left = powers_with(()), powers_with(causes)
-    without = [powers_with([c for c in causes if c is not cause]) for cause in causes]
+    nominal, left = (residual_powers(rig, chosen, records, settle) for chosen in ((), causes))
+    without = [residual_powers(rig, [c for c in causes if c is not cause], records, settle) for cause in causes]
     weights = np.array([np.maximum(w - left, 0.0) for w in without]).reshape(len(causes), len(records))
     total = weights.sum(axis=0)
     removed = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
@@ -290,21 +283,16 @@ def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
     ]
 
 
-def residual_power(rig: Rig, effects: Sequence[Effect], record: Record, settle: float) -> float:
-    """Mean square residual of a record by a rig with effects, as `mean_square`; `RUNAWAY` for an impossible rig."""
+def residual_powers(rig: Rig, effects: Sequence[Effect], records: Sequence[Record], settle: float) -> Floats:
+    """Mean square residual (n_records,) by a rig with effects, as `signal_power`; `RUNAWAY` for an impossible rig."""
     try:
         corrected = apply_all(rig, effects)
     except (ValueError, np.linalg.LinAlgError):
-        return RUNAWAY
-    return mean_square(corrected, record, settle)
-
-
-def mean_square(rig: Rig, record: Record, settle: float) -> float:
-    """Mean square residual of a record by a rig, each sensor scaled by the standard deviation of its readings."""
+        return np.full(len(records), RUNAWAY)
     # without one of two effects that balance each other, the response may diverge
     with np.errstate(over="ignore", invalid="ignore"):
-        left = signal_power(record, record.outputs - predict(rig, record), settle)
-    return left if left < RUNAWAY else RUNAWAY
+        powers = [signal_power(record, record.outputs - predict(corrected, record), settle) for record in records]
+    return np.array([power if power < RUNAWAY else RUNAWAY for power in powers])
 
 
 def signal_power(record: Record, readings: np.ndarray, settle: float) -> float:
@@ -359,10 +347,6 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-REACH = 4.0  # standard deviations from record to record: bound of the deviation of a held-out record
-TOLERANCE = 1e-3  # of that bound: accuracy of the deviation
-
-
 @dataclass(frozen=True, eq=False)
 class RecordToRecord:
     """A parameter of the nominal model that varies from record to record, as it was fitted.
@@ -410,8 +394,8 @@ class RecordToRecord:
 
     def to_json(self) -> dict[str, Any]:
         """The parameter, its spread and its deviations as plain numbers: relative, or in the unit of force."""
-        by_record = {name: float(f"{value:.4g}") for name, value in self.values.items()}
-        return {"figure": self.figure, "std": float(f"{self.spread:.4g}"), "by_record": by_record}
+        by_record = {name: _rounded(value) for name, value in self.values.items()}
+        return {"figure": self.figure, "std": _rounded(self.spread), "by_record": by_record}
 
 
 def with_held_out(
@@ -426,19 +410,21 @@ def with_held_out(
     if errors is None:
         return tuple(effects)
     others = [e for e in effects if e is not errors]
-    bound = REACH * errors.target.record
-    values = dict(errors.values)
+    bound, values = REACH * errors.target.record, dict(errors.values)
+
+    def power(deviation: float, record: Record, name: str) -> float:
+        own = replace(errors, values={**errors.values, name: deviation})
+        return float(residual_powers(rig, (*others, own), [record], settle)[0])
+
     for record in records:
         name = f"record_{record.name}"
-        if name in values:
-            continue
-
-        def objective(deviation: float, record: Record = record, name: str = name) -> float:
-            own = replace(errors, values={**errors.values, name: deviation})
-            return residual_power(rig, (*others, own), record, settle)
-
-        found = minimize_scalar(
-            objective, bounds=(-bound, bound), method="bounded", options={"xatol": TOLERANCE * bound}
-        )
-        values[name] = float(found.x)
+        if name not in values:
+            found = minimize_scalar(
+                power,
+                bounds=(-bound, bound),
+                args=(record, name),
+                method="bounded",
+                options={"xatol": TOLERANCE * bound},
+            )
+            values[name] = float(found.x)
     return (*others, replace(errors, values=values))

@@ -1,29 +1,21 @@
-"""Checks before a fit: whether records and model agree in principle, and which effects the records can show."""
+"""Checks before a fit: whether records and model agree in principle."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.effect import COORDINATES, Effect, Kind
 from workbench.gap.effects.structural import modes_of
-from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.residuals import FitData, lead_of
+from workbench.gap.prediction.residuals import lead_of
 from workbench.records.record import Record
-from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
-from workbench.structure.domain import Between, NamedPoints, Where, same_place
+from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
 from workbench.structure.supports import PointMass
 
-INDISTINGUISHABLE = 0.995  # correlation of two responses
-DETECTABLE = 25.0  # of chi-squared: five standard deviations
 WRONG_SIGN = -0.95  # correlation of a reading with the prediction
 WRONG_UNIT = 50.0  # ratio of a reading and the prediction, or its inverse
 NO_EFFECT = 500.0  # times smaller than the prediction, at all outputs: no effect reduces the response so much
@@ -35,12 +27,9 @@ ABOVE_NOISE = 5.0  # times the noise: smaller signals are not compared
 CORRELATED = 0.5  # correlation of a reading with the prediction, whatever its unit
 SATURATED = 0.5  # share of the samples at the largest magnitude
 LEAST_SAMPLES = 16  # of a record, as in a case folder
-THINNING = 3  # every third value of the residual is used
-SUBSTEPS = 2  # of a sample: detectability needs no more
 # relative tolerances of a natural frequency, a damping and a modal mass: solving a structure again changes them by less
 OFF_FREQUENCY, OFF_DAMPING, OFF_MASS = 1e-3, 0.02, 0.02
 QUADRATURE = 200  # points along a member for the integral of its modal mass
-DECADES = (1e2, 1e-2, 1e4, 1e-4)  # factors on a strength, tried one after the other
 
 
 # standard deviations (n_sensors,) of the readings and of the predictions, by record as a message names it
@@ -51,35 +40,18 @@ class RecordsError(ValueError):
     """Raised for records that cannot have been measured on their rig."""
 
 
-@dataclass(frozen=True, eq=False)
-class Detectability:
-    """Which effects the records can show and which they can distinguish, before any fit.
-
-    Attributes:
-        strengths: change of the residual by an effect, in standard deviations, by its label; at the first strength that
-            is detectable, or at the one with the largest change.
-        undetectable: labels of effects that are detectable at no strength.
-        indistinguishable: pairs of labels whose responses are the same up to a factor, with their correlation.
-    """
-
-    strengths: dict[str, float]
-    undetectable: tuple[str, ...]
-    indistinguishable: tuple[tuple[str, str, float], ...]
-
-    invisible, alike = Renamed("undetectable"), Renamed("indistinguishable")
-
-
 def check_records(
     rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0
 ) -> None:
-    """Refuse records, to be fitted or held out, whose channels cannot be those of the rig.
+    """Refuse records, to be fitted or held out, whose channels are not, or cannot be, those of the rig.
 
     Args:
         settle: seconds at the start of each record that are not compared.
 
     Raises:
-        RecordsError: for a sensor with the wrong sign or in other units, a saturated or flat channel, a sensor that is
-            dead in one record, a record shorter than a period of the first mode, or no input that drives the rig.
+        RecordsError: for channels that are not the rig's in its order, a sensor with the wrong sign or in other units,
+            a saturated or flat channel, a sensor that is dead in one record, a record shorter than a period of the
+            first mode, or no input that drives the rig.
     """
     if not rig.actuators:
         raise RecordsError("the rig has no actuators, so nothing drives its model; a free decay is for wb.identify")
@@ -91,10 +63,18 @@ def check_records(
 
 
 def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0) -> None:
-    """Refuse records of few samples and channels that are saturated or flat: checks that need no model.
+    """Refuse records of other channels or few samples, and channels that are saturated or flat: no model is needed.
 
     Args, Raises: as `check_records`.
     """
+    channels = ("input", [a.name for a in rig.actuators]), ("output", [s.name for s in rig.sensors])
+    for record in (*records, *validation):
+        for (what, expected), names in zip(channels, (record.input_names, record.output_names), strict=True):
+            if list(names) != expected:
+                raise RecordsError(
+                    f"record {record.name!r}: its {what}s are {', '.join(names) or 'none'}; the rig has"
+                    f" {', '.join(expected)}, in that order"
+                )
     _check_not_saturated(rig, records)
     for these, what in ((records, "record"), (validation, "validation record")):
         for record in these:
@@ -306,86 +286,3 @@ def _check_not_saturated(rig: Rig, records: Sequence[Record]) -> None:
                 f"record {records[int(np.argmax([s.mean() for s in at_top]))].name!r}: output {sensor.name!r} is at"
                 f" ±{top:g} for {100 * share:.0f} % of all its samples: it is saturated; lower the level or the gain"
             )
-
-
-def detectability(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Detectability:
-    """The detectability of each kind of effect, from simulations at a strength that the records show."""
-    rig, data = evidence.rig, evidence.data.stepped(SUBSTEPS)
-    base = data.residual(rig)
-    labels, responses, strengths = [], [], {}
-    candidates = [(k, target) for k in catalogue if k.found_in != "residual" for target in k.targets(rig)]
-    for effect, change in evidence.workers.map(lambda each: _first_detectable(*each, evidence, data, base), candidates):
-        if effect is None:
-            continue
-        size = float(np.linalg.norm(change))
-        strengths[effect.label] = size * float(np.sqrt(THINNING))
-        if size**2 * THINNING > DETECTABLE:
-            labels.append(effect.label)
-            responses.append((change / size).astype(np.float32))
-    correlation = np.abs(np.array(responses) @ np.array(responses).T) if responses else np.zeros((0, 0))
-    same = [
-        (labels[i], labels[j], float(correlation[i, j]))
-        for i in range(len(labels))
-        for j in range(i + 1, len(labels))
-        if correlation[i, j] > INDISTINGUISHABLE and labels[i].split("[")[0] != labels[j].split("[")[0]
-    ]
-    return Detectability(
-        strengths=strengths,
-        undetectable=tuple(label for label, size in strengths.items() if size**2 <= DETECTABLE),
-        indistinguishable=tuple(sorted(same, key=lambda pair: -pair[2])),
-    )
-
-
-def _first_detectable(
-    kind: Kind, target: Any, evidence: Evidence, data: FitData, base: Floats
-) -> tuple[Effect | None, Floats]:
-    """An effect at the first detectable strength, or at that of largest change; and its change (n,) of the residual."""
-    best, change, most = None, np.zeros(0), -1.0
-    for effect in _at_strengths(kind, target, evidence):
-        with np.errstate(over="ignore", invalid="ignore"):
-            try:
-                moved = (data.residual(effect.apply(evidence.rig)) - base)[::THINNING]
-                chi_squared = float(moved @ moved) * THINNING
-            except (ValueError, np.linalg.LinAlgError):
-                continue
-        if np.isfinite(chi_squared) and chi_squared > most:
-            best, change, most = effect, moved, chi_squared
-        if most > DETECTABLE:
-            break
-    return best, change
-
-
-def _at_strengths(kind: Kind, target: Any, evidence: Evidence) -> Iterator[Effect]:
-    """An effect at the start values of a search, and with each parameter of the first and last changed by decades.
-
-    Start values follow from the unmodelled force. If there is none they are arbitrary: their place may be at a support,
-    where no effect shows. So the place of largest motion is tried last.
-    """
-    starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
-    if starts:
-        yield starts[0]
-        yield from _by_decades(starts[0], evidence.rig)
-        yield from starts[1:]
-        yield from _by_decades(starts[-1], evidence.rig)
-        if starts[0].at is not None:
-            moved = starts[0].moved_to(_place_of_largest_motion(evidence))
-            yield moved
-            yield from _by_decades(moved, evidence.rig)
-
-
-def _place_of_largest_motion(evidence: Evidence) -> Where:
-    """The place with the largest displacement, among those where a force is searched for."""
-    power = sum(motion.displacement @ motion.displacement.T for motion in evidence.motions)
-    places = [where for where in evidence.places if not isinstance(where, Between)]
-    shapes = evidence.rig.modes.phi(places)
-    largest: Where = same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
-    return largest
-
-
-def _by_decades(effect: Effect, rig: Rig) -> Iterator[Effect]:
-    """The effect with one parameter, but no coordinate, multiplied by each factor of `DECADES`."""
-    for factor in DECADES:
-        for parameter in effect.parameters(rig):
-            if parameter.name not in COORDINATES:
-                moved = float(np.clip(effect.values[parameter.name] * factor, parameter.low, parameter.high))
-                yield replace(effect, values={**effect.values, parameter.name: moved})

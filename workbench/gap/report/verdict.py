@@ -11,8 +11,7 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.where import Where
 from workbench.gap.report.budget import MOSTLY, REMARKED, Budget, RecordToRecord, Shrinkage, labels_of
-from workbench.gap.report.experiment import Experiment
-from workbench.gap.report.record_checks import Detectability
+from workbench.gap.report.experiment import Detectability, Experiment
 from workbench.gap.search.attribute import Attribution
 from workbench.records.units import SI, Units
 from workbench.renamed import Renamed
@@ -76,6 +75,11 @@ class Verdict:
     def shows_gap(self) -> bool:
         """Whether the fitted records have a gap, so that it can be located."""
         return self.outcome != "none" and not self.disagreeing
+
+    @property
+    def is_decided(self) -> bool:
+        """Whether the gap is explained, or there is none."""
+        return self.outcome in ("none", "explained")
 
     @property
     def probability(self) -> float:
@@ -194,7 +198,10 @@ class Verdict:
             below = f"below the tolerance of {100.0 * tolerance:g} %"
             return f"The gap beyond the noise is {_percent(beyond)} of the signal, {below}."
         if self.record_to_record is not None:
-            return self._record_to_record_in_words(self.record_to_record)
+            varying = self.record_to_record
+            share = _percent(self.budget.effects.get(varying.label, 0.0))
+            how = f"The {varying.figure} differs from record to record by {varying.words}"
+            return f"{how}. This causes {share} of the gap{self._rest}."
         if self.budget.errors_are_small:
             return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
         return (
@@ -236,12 +243,6 @@ class Verdict:
         if self.budget.noise >= SHOWN:
             parts.append(f"{_percent(self.budget.noise)} is noise")
         return "; " + ", ".join(parts) if parts else ""
-
-    def _record_to_record_in_words(self, varying: RecordToRecord) -> str:
-        """The sentence if the gap is caused by a parameter that varies from record to record."""
-        share = _percent(self.budget.effects.get(varying.label, 0.0))
-        how = f"The {varying.figure} differs from record to record by {varying.words}"
-        return f"{how}. This causes {share} of the gap{self._rest}."
 
     @property
     def _is_open(self) -> bool:
@@ -295,7 +296,6 @@ class Verdict:
 
     def to_json(self) -> dict[str, Any]:
         """The verdict as the case format writes it, with the shares and estimates behind it."""
-        known = self.outcome in ("none", "explained")
         effects = [effect_json(effect, self.nominal) for effect in self._named]
         shrink, guessed = self.shrinkage, self.attribution.search.data.guessed
         return {
@@ -303,8 +303,8 @@ class Verdict:
             "units": asdict(self.units),
             "outcome": self.outcome,
             "sentence": self.sentence,
-            "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
-            "nearest": [] if known else effects,
+            "effects": effects if self.is_decided else [{"kind": "unknown", "parameters": {}}],
+            "nearest": [] if self.is_decided else effects,
             "probability": rounded(self.probability) if self.outcome == "explained" else None,
             "alternatives": [
                 {"kind": label, "words": words, "probability": rounded(p)}
@@ -405,7 +405,7 @@ def where_json(where: Where) -> dict[str, Any]:
 
 def _named_with_target(effect: Effect) -> str:
     """An effect in words without its parameters, such as: a constant force of an actuator (F2)."""
-    _, _, target = effect.label.rstrip("]").partition("[")
+    _, _, target = effect.label.removesuffix("]").partition("[")
     return effect.words + (f" ({target})" if target else "")
 
 

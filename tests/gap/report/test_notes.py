@@ -9,7 +9,8 @@ from workbench.cases.case import Case
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
-from workbench.gap.report.levels import steady_remainder
+from workbench.gap.report.budget import measure
+from workbench.gap.report.notes import steady_remainder
 from workbench.rig.actuators import Actuator
 from workbench.study.pages.verdict_page import verdict_page
 
@@ -53,6 +54,14 @@ def test_what_no_input_drives_is_as_large_at_every_level(rig, shaken, levels, hi
     assert (remark is not None) == is_steady
     if remark:
         assert "does not grow with the inputs" in remark and "record '1'" in remark and "times as large" in remark
+
+
+def test_blocks_are_of_what_is_compared_once_settled(rig, shaken):
+    """The last tenth of each record has as many blocks as a whole one, so that its remark has a standard error."""
+    assert "does not grow" in steady_remainder(rig, shaken((1.0, 4.0), hidden=1.0), settle=36.0)
+    late = replace(rig, actuators=(replace(LOGGED, gain=1.2),))
+    low, high = measure(rig, late, shaken((1.0,), hidden=1.0, gain=1.2), settle=36.0).ci95
+    assert low < high
 
 
 def test_an_unexplained_gap_that_does_not_grow_is_remarked_and_what_is_closed_has_its_measure(rig, shaken, tmp_path):
