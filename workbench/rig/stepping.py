@@ -90,7 +90,7 @@ def on_lanes(values: Floats, axes: int = 1) -> Floats:
 
 @lru_cache(maxsize=KEPT)
 def structure_arrays(rig: Rig) -> Structure:
-    """The structure and its distributed elements as arrays for the compiled steppers, n and n_points multiples of LANES.
+    """The structure and its distributed elements as arrays for the steppers, n and n_points multiples of LANES.
 
     All have one type and memory layout, since numba compiles a stepper again for any other; absent parts are empty
     arrays. The arrays are cached and must not be changed.

@@ -67,11 +67,11 @@ def test_a_law_is_named_beside_them_and_its_interval_holds(rig, measured):
     assert abs(effect.values["stiffness"] - STIFFNESS) < 2.5 * effect.deviations["stiffness"]
 
 
-def beside_modes_of(rig, records) -> Stepwise:
+def beside_modes_of(rig, records, catalogue=CATALOGUE) -> Stepwise:
     data = FitData(tuple(records), np.array([s.noise_std for s in rig.sensors]))
     nominal = data.by_channel(data.residual(rig))
     quick, first = most_informative(data, nominal)
-    return Stepwise(Search(rig, data, quick, first, CATALOGUE, lambda *_: None, ALONE, nominal, by_mode=True))
+    return Stepwise(Search(rig, data, quick, first, catalogue, lambda *_: None, ALONE, nominal, by_mode=True))
 
 
 def test_a_gain_far_from_the_others_is_an_effect(rig, measured):
@@ -82,6 +82,16 @@ def test_a_gain_far_from_the_others_is_an_effect(rig, measured):
     (effect,) = beside.last.effects
     assert (effect.kind.name, effect.target) == ("sensor_gain", rig.sensors[1].name)
     assert effect.values["gain"] < 0.9
+    others = beside_modes_of(rig, fitted, tuple(kind for kind in CATALOGUE if kind is not effect.kind))
+    assert not others.calibrate(), "a kind that is not to be tried is not named"
+
+
+def test_a_record_that_reads_a_constant_is_compared_with_the_others(rig, measured):
+    *fitted, _ = measured()
+    still = replace(fitted[0], outputs=np.zeros_like(fitted[0].outputs), name="still")
+    data = FitData((*fitted, still), np.array([s.noise_std for s in rig.sensors]))
+    by_channel = data.by_channel(data.residual(rig))
+    assert "still" in {record.name for record in most_informative(data, by_channel)[0].records}
 
 
 @pytest.mark.slow

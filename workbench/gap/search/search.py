@@ -242,6 +242,7 @@ def most_informative(data: FitData, by_channel: np.ndarray) -> tuple[FitData, Fi
     """
     by_record = by_channel.mean(axis=1)
     scale = np.array([np.mean((r.outputs.std(axis=1) / data.noise) ** 2) for r in data.counted])
+    scale = np.maximum(scale, 1e-12)  # of readings that are constant
     order = [int(np.argmax(by_record)), *np.argsort(-(by_record - 1.0) / scale)]
     names = [data.records[i].name for i in list(dict.fromkeys(int(i) for i in order))[:2]]
     return data.only(tuple(names)).stepped(2), data.only((names[0],)).stepped(2)

@@ -790,6 +790,8 @@ class Stepwise:
             return step
         _, side, port = name.split("_", 2)
         kind = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}[side]
+        if kind not in self.search.catalogue:
+            return step
         effect = Effect(kind, port, {"gain": float(np.exp(gains[name]))})
         found = fit_from_zero(self.search, (*step.effects, effect))  # other nominal errors have absorbed part of it
         gain = found.effects[-1].values["gain"]
