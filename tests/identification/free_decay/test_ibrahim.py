@@ -125,7 +125,7 @@ def test_refusals(bar_modes):
     for instants in ({"first": -3}, {"spacing": 0}):
         with pytest.raises(ValueError, match="the first instant is sample 0 or later"):
             two_delays(record, columns=12, **instants)
-    short = replace(record.between(0.0, 0.19), name="short")
+    short = replace(record.between(0.1, 0.29), name="short")
     with pytest.raises(ValueError, match="record 'short' has 20 samples and 25 delays were taken"):
         stacked_delays([record, short], n_modes=2, delays=25)
     with pytest.raises(ValueError, match="same outputs"):
