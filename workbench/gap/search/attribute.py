@@ -487,10 +487,11 @@ def _decide_beyond_singles(
     by_mode = None if search.is_over or (is_explained and stepwise.has_plausible_errors) else with_mode_errors(stepwise)
     if by_mode is not None or is_explained:
         return (by_mode or stepwise).decision()
-    varied = None if search.is_over else with_record_deviations(stepwise)
+    # a law at one point is asked for first: it takes a second, and a selection beside deviations minutes
+    other_law = None if search.is_over else force_of_other_law(search, evidence)
+    varied = None if other_law is not None or search.is_over else with_record_deviations(stepwise)
     if varied is not None:
         return varied.decision()
-    other_law = None if search.is_over else force_of_other_law(search, evidence)
     pairs = all_pairs.copy()
     # implausible nominal errors show a missing effect, so sets of few effects without nominal errors come first
     is_better = stepwise.last.is_plausible and stepwise.last.fit.cost < min(f.cost for f in (start, *singles))
