@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from workbench.rig.stepping import LANES, on_lanes, row_times
+from workbench.rig.lanes import LANES, on_lanes, row_times
 
 # Compiles some functions of a simulation, which another process then takes from the cache
 SOME = """

@@ -186,9 +186,8 @@ class Record(Printed):
         """Whether both hold one measurement, as far as the shorter goes, to the digits that a file may have of it."""
         if (self.n_outputs, self.n_inputs) != (other.n_outputs, other.n_inputs):
             return False
-        rows, others = (np.concatenate([record.outputs, record.inputs]) for record in (self, other))
         n = min(self.n_samples, other.n_samples)
-        rows, others = rows[:, :n], others[:, :n]
+        rows, others = (np.concatenate([r.outputs[:, :n], r.inputs[:, :n]]) for r in (self, other))
         size = rows.std(axis=1)
         alike = np.sqrt(((rows - others) ** 2).mean(axis=1)) <= SAME * size
         return bool(alike.all() and size[: self.n_outputs].any())

@@ -10,6 +10,7 @@ from workbench.records.band_limited import finer
 from workbench.records.record import Record
 from workbench.rig.driving import actuator_force, drives, motion_correction, on_finer_steps, sinusoid_on_substeps
 from workbench.rig.elements import PeriodicForce, RandomForce
+from workbench.rig.lanes import on_lanes
 from workbench.rig.linear import (
     ModalPoles,
     held_response,
@@ -23,7 +24,7 @@ from workbench.rig.linear import (
 from workbench.rig.motion import Motion, Step
 from workbench.rig.readings import read, reading_of
 from workbench.rig.rig import KEPT, Rig, participation_of
-from workbench.rig.stepping import Forces, Observer, law_arrays, on_lanes, step_record, structure_arrays
+from workbench.rig.stepping import Forces, Observer, law_arrays, step_record, structure_arrays
 from workbench.structure.modes import Modes
 
 BAND_STEPS = 32  # linear steps of a band-limited input per sample interval: an error of 0.05 % at 0.4 of the rate

@@ -11,7 +11,8 @@ from numba import njit
 from workbench.arrays import Floats
 from workbench.design.estimation.digital import ONSET
 from workbench.rig.force_laws import yield_update
-from workbench.rig.stepping import LANES, Elements, Structure, advance, at_rest, drifted_propagators, row_times
+from workbench.rig.lanes import LANES, row_times
+from workbench.rig.stepping import Elements, Structure, advance, at_rest, drifted_propagators
 
 ControllerArrays = tuple[tuple[Floats, ...], ...]  # described in `_commands`
 

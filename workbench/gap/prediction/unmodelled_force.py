@@ -13,9 +13,9 @@ from numba import njit
 from scipy.linalg import expm, solve_triangular
 
 from workbench.arrays import Floats
+from workbench.rig.lanes import on_lanes, row_times
 from workbench.rig.linear import integrated
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.stepping import on_lanes, row_times
 from workbench.structure.modes import Modes
 
 RUNAWAY = 1e100
