@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyuff
 
 from workbench.cases.case import Case, CaseError, files_of, read_case, read_units
 from workbench.cases.nominal import read_rig
@@ -292,6 +293,57 @@ def test_a_file_whose_units_are_of_another_quantity_is_refused(case, tmp_path, h
     np.savetxt(file.with_suffix(".csv"), table, "%.17g", ",", header=header, comments="")
     text = (folder / "case.toml").read_text()
     (folder / "case.toml").write_text(text.replace(file.name, file.with_suffix(".csv").name))
+    with pytest.raises(CaseError, match=words):
+        read_case(folder)
+
+
+def _measured_by_others(folder: Path, *, channels: str) -> Record:
+    """Makes the first record of a case a universal file whose channels are nodes; the record as it was."""
+    known = read_case(folder).fit[0]
+    file = folder / tomllib.loads((folder / "case.toml").read_text())["record"][0]["file"]
+    nodes = zip((12, 12, 14, 13), (12, 8, 13, 13), (*known.inputs, *known.outputs)[::-1], strict=True)
+    common = {"binary": 1, "func_type": 1, "ref_node": 0, "ref_dir": 0, "num_pts": known.n_samples, "x": known.time,
+              "abscissa_spacing": 1, "abscissa_min": 0.0, "abscissa_inc": known.sample_time,
+              "abscissa_spec_data_type": 17, "orddenom_spec_data_type": 0}  # fmt: skip
+    uff = pyuff.UFF(str(file.with_suffix(".uff")))
+    for number, (node, quantity, data) in enumerate(nodes, start=1):
+        entry = {"rsp_node": node, "rsp_dir": number, "ordinate_spec_data_type": quantity, "data": data}
+        uff.write_sets(pyuff.prepare_58(**(common | entry), return_full_dict=False), "add")
+    text = (folder / "case.toml").read_text()
+    named = text.replace(file.name, file.with_suffix(".uff").name, 1)
+    (folder / "case.toml").write_text(channels + named if channels.startswith("channels") else named + channels)
+    return known
+
+
+CHANNELS = """[channels]
+"node 12 direction 1" = "a1"
+"node 12 direction 2" = "d1"
+"node 14 direction 3" = "tap"
+"node 13 direction 4" = "F1"
+"""
+
+
+def test_a_channel_of_another_name_is_the_one_that_the_case_says(folder):
+    known = _measured_by_others(folder, channels=CHANNELS)
+    read = read_case(folder)
+    assert Path(tomllib.loads((folder / "case.toml").read_text())["record"][1]["file"]).suffix == ".npz"
+    np.testing.assert_allclose(read.fit[0].outputs, known.outputs, rtol=1e-12)
+    np.testing.assert_allclose(read.fit[0].inputs, known.inputs, rtol=1e-12)
+    assert read.validation[0].output_names == read.fit[0].output_names == ("d1", "a1")
+
+
+@pytest.mark.parametrize(
+    ("channels", "words"),
+    [
+        ("", r"channel 'F1' of case.toml is missing; .*where 'node 12 direction 1' is that channel, say so in \[chan"),
+        (CHANNELS.replace('"d1"', '"a1"'), "two channels are 'a1' by .channels. of case.toml"),
+        (CHANNELS.replace('"d1"', '"d2"'), r"\[channels\]: node 12 direction 2 is one of F1, tap, d1, a1; got 'd2'"),
+        (CHANNELS.replace('"node 12 direction 2"', '"a1"'), r"\[channels\]: a1 is the name of an input, an output or"),
+        ("channels = 3\n", r"\[channels\] must be a table of .*; got 3"),
+    ],
+)
+def test_channels_that_are_not_those_of_the_case_are_refused(folder, channels, words):
+    _measured_by_others(folder, channels=channels)
     with pytest.raises(CaseError, match=words):
         read_case(folder)
 

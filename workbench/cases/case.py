@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from workbench.cases.nominal import rig_of
-from workbench.cases.tables import CaseError, check_keys, inside, number, shown, table_of, tables, text
+from workbench.cases.tables import CaseError, check_keys, inside, number, one_of, shown, table_of, tables, text
 from workbench.records.files import read_record
 from workbench.records.limits import RecordFileError, check_file
 from workbench.records.npz_file import arrays as load_arrays
@@ -56,9 +56,9 @@ def read_case(folder: str | Path) -> Case:
         raise CaseError(f"{folder} has no case.toml, so it is not a case folder")
     table = table_of(path)
     rig = rig_of(table, path)
-    hold, units = _hold(table, str(path)), _units(table, path)
+    hold, units, renamed = _hold(table, str(path)), _units(table, path), _renamed(table, path, rig)
     records = [
-        (_read_record(folder, {"input_hold": hold, **entry}, rig, path, units), _use(entry, path))
+        (_read_record(folder, {"input_hold": hold, **entry}, rig, path, units, renamed), _use(entry, path))
         for entry in tables(table, "record", path)
     ]
     fit = tuple(record for record, use in records if use == "fit")
@@ -121,6 +121,19 @@ def read_units(path: str | Path) -> Units:
     return _units(table_of(Path(path)), Path(path))
 
 
+def _renamed(table: dict[str, Any], path: Path, rig: Rig) -> dict[str, str]:
+    """The input or output of each channel that a file calls by another name."""
+    entries, where = table.get("channels", {}), f"{path}: [channels]"
+    if not isinstance(entries, dict):
+        raise CaseError(f'{where} must be a table of "name in a file" = "input or output"; got {shown(entries)}')
+    known = [port.name for port in (*rig.actuators, *rig.sensors)]
+    renamed = {name: one_of(entries, name, known, where) for name in entries}
+    for name in renamed:
+        if name in ("t", *known):
+            raise CaseError(f"{where}: {name} is the name of an input, an output or time; it cannot be another's")
+    return renamed
+
+
 def _hold(table: dict[str, Any], where: str) -> str:
     """The hold of the inputs between samples."""
     hold = table.get("input_hold", "zero")
@@ -139,7 +152,9 @@ def _use(entry: dict[str, Any], path: Path) -> str:
     return str(use)
 
 
-def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, units: Units) -> Record:
+def _read_record(
+    folder: Path, entry: dict[str, Any], rig: Rig, path: Path, units: Units, renamed: Mapping[str, str]
+) -> Record:
     name = entry["name"]
     where = f"{path}: record {name!r}"
     check_keys(entry, RECORD, where)
@@ -147,7 +162,7 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path, unit
     if sample_time <= 0:
         raise CaseError(f"{where}: sample_time must be positive; got {sample_time:g}")
     file = inside(folder, text(entry, "file", where), where)
-    arrays, stated = _arrays(file, where, units)
+    arrays, stated = _arrays(file, where, units, renamed)
     _check_channels(file, arrays, rig)
     _check_instants(file, arrays["t"], sample_time, rig)
     for sensor in rig.sensors:
@@ -194,8 +209,10 @@ def _check_channels(file: Path, arrays: dict[str, np.ndarray], rig: Rig) -> None
     if missing:
         unknown = [name for name in extra if name.startswith((f"{missing[0]} [", f"{missing[0]} ("))]
         unit = f", where the unit of {shown(unknown[0])} is not known" if unknown else ""
+        remedy = "" if unit or not extra else f"; where {shown(extra[0])} is that channel, say so in [channels]"
         raise CaseError(
-            f"{file}: channel {missing[0]!r} of case.toml is missing; the file has {shown(sorted(arrays))}{unit}"
+            f"{file}: channel {missing[0]!r} of case.toml is missing; the file has"
+            f" {shown(sorted(arrays))}{unit}{remedy}"
         )
     if extra:
         raise CaseError(f"{file}: channel {shown(extra[0])} is not named in case.toml; name it there or leave it out")
@@ -235,8 +252,10 @@ def signals_of(record: Record) -> dict[str, np.ndarray]:
     return {"t": record.time, **{channel.name: row for _, channel, row in record.signals()}}
 
 
-def _arrays(file: Path, where: str, units: Units) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """The arrays of a file by name, and the units that it states."""
+def _arrays(
+    file: Path, where: str, units: Units, renamed: Mapping[str, str]
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """The arrays of a file by their name in the case, and the units that it states."""
     if not file.is_file():
         raise CaseError(f"{where}: there is no file {file}")
     stated: dict[str, str] = {}
@@ -250,7 +269,11 @@ def _arrays(file: Path, where: str, units: Units) -> tuple[dict[str, np.ndarray]
             stated = {channel.name: channel.unit for _, channel, _ in record.signals()}
     except RecordFileError as error:
         raise CaseError(str(error)) from error
+    names = [renamed.get(name, name) for name in arrays]
     for name, values in arrays.items():
         if values.dtype.kind not in "fiu" or values.size > MOST_SAMPLES:
             raise CaseError(f"{file}: array {name!r} must hold at most {MOST_SAMPLES} real numbers")
-    return {name: values.astype(float) for name, values in arrays.items()}, stated
+        if names.count(renamed.get(name, name)) > 1:
+            raise CaseError(f"{file}: two channels are {renamed.get(name, name)!r} by [channels] of case.toml")
+    stated = {renamed.get(name, name): unit for name, unit in stated.items()}
+    return {renamed.get(name, name): values.astype(float) for name, values in arrays.items()}, stated

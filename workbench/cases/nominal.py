@@ -35,7 +35,7 @@ MOST_MODES = 200
 PLATE_TOLERANCE = 1e-5  # of frequencies; where a clamped edge meets a free one, 1e-6 may need too many functions
 
 # The keys of each table; any other key is refused as a misspelling.
-TABLES = ("title", "input_hold", "units", "structure", "input", "output", "record")
+TABLES = ("title", "input_hold", "units", "channels", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
