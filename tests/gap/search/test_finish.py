@@ -10,7 +10,7 @@ from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, contained
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search import attribute, finish, screening
+from workbench.gap.search import finish, screening, stages
 from workbench.gap.search.finish import finished, simplest, widened, with_equals
 from workbench.gap.search.fit import fit
 from workbench.gap.search.screening import on_whole_records
@@ -116,13 +116,13 @@ def test_what_a_set_comes_to_at_bounds_is_told_to_the_last(rig):
 def test_what_is_not_taken_to_its_end_is_still_there_and_all_are_there_once(rig, search, monkeypatch):
     one = search(SPRING.apply(rig, None, {"at": 0.62, "stiffness": 3.0}), level=0.02)
     ended = []
-    monkeypatch.setattr(attribute, "finished", lambda search, candidate: ended.append(candidate) or candidate)
+    monkeypatch.setattr(stages, "finished", lambda search, candidate: ended.append(candidate) or candidate)
     first = fit(rig, (Effect(SPRING, None, {"at": 0.62, "stiffness": 3.0}),), one.data)
     assert one.explains(first)
     linear = replace(first, effects=(Effect(MODULUS, None, {"factor": 1.01}),), cost=first.cost + 0.1, falling=0.0)
     yields = Effect(BOUC_WEN, None, {"at": 0.62, "stiffness": 3.0, "yield_displacement": 3.0})
     stepped = replace(linear, effects=(yields,), cost=first.cost + 0.2)
-    found = attribute._finished_best(one, [first, linear, stepped])
+    found = stages._finished_best(one, [first, linear, stepped])
     assert ended == [first, stepped]
     assert sorted(found, key=lambda f: f.cost) == [first, linear, stepped]
 

@@ -1,4 +1,4 @@
-"""Attribution of the gap to effects: each kind alone, then with nominal errors and in pairs, until noise is left."""
+"""Attribution of the gap to the set of effects that the search decides for, with intervals and significance."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,40 +10,28 @@ from workbench.arrays import Floats
 from workbench.deadline import NEVER, Deadline
 from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out, simpler_forms
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
-from workbench.gap.effects.nonlinear import BEYOND, any_beyond, in_catalogue
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION, clipped_level, exchanged_last, step_of
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.localisation.where import of_one_sensor
 from workbench.gap.prediction.noise import (
     LEAST_LOGGED,
-    is_noise_alone,
     logging_noise,
-    noise_found,
     shows_input_noise,
 )
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search.beside_random import decide_on_random, random_with_effects, random_with_nominal_errors
-from workbench.gap.search.finish import best_of_each, finished, ranked, relocated, simplest, widened
+from workbench.gap.search.finish import best_of_each, widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import with_all_errors
-from workbench.gap.search.nominal_figures import with_mode_errors, with_record_deviations
-from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import (
-    NO_UNIFORM_ERROR,
-    are_uniform_errors,
-    is_plausible_error,
     uniform_as_nominal_errors,
 )
-from workbench.gap.search.screening import Screening, on_whole_records, one_more
-from workbench.gap.search.search import Decision, Search, best_of_each_kind, most_informative, nearest, promise
-from workbench.gap.search.settings import ATTRIBUTION, LAW, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
-from workbench.gap.search.stepwise import Stepwise
+from workbench.gap.search.search import Search, best_of_each_kind, most_informative
+from workbench.gap.search.settings import ATTRIBUTION, SELECTION
+from workbench.gap.search.stages import Stages
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import is_stepped
 from workbench.threads import one_blas_thread
 
 
@@ -98,7 +86,7 @@ class Attribution:
         best = _refitted(search, others, self.weighed)
         best = with_intervals(search.rig, best, self.weighed, search.workers, logged=self.logged)
         best = replace(best, effects=(*self.seen, *best.effects))
-        return replace(self, best=best, noise=noise_of(search, best))
+        return replace(self, best=best, noise=search.noise_with(best))
 
     def with_exchanges(self, exchanges: tuple[Effect, ...], nominal: Evidence) -> "Attribution":
         """The attribution to the nominal rig, of one to that rig with channels exchanged.
@@ -221,29 +209,8 @@ def attribute(
     of_nominal = data.by_channel(data.residual(nominal.rig))
     start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0)
     search = Search(rig, data, *most_informative(data, start.cost_by_channel), catalogue, report, workers, of_nominal)
-    decision: Decision | None = None
-    singles: list[Fit] = []
-    ahead: list[Fit] = []
-    if not seen and _is_small(nominal, tolerance):
-        decision = Decision("none", start)
-    elif not search.explains(start) and is_noise_alone(evidence.residuals, data.counted):
-        decision = Decision("none", start, noise=noise_found(evidence.residuals))
-    elif uncertain_nominal and not search.explains(start):
-        decision = _decide_with_nominal_errors(search, tolerance)
-    elif not search.explains(start) and not _of_one_sensor(start):
-        decision, singles = decide_on_random(search, evidence)
-    if decision is None:
-        report("one effect", 0.1)
-        screened = Screening.of(search, (), evidence)
-        ahead = one_more(search, (), evidence, screened)
-        report("one effect, on whole records", 0.3)
-        singles = _single_effects(search, start, ahead)
-        alone, singles = _decide_on_singles(search, start, singles)
-        decision = unless_other_law(search, alone, evidence) if alone else None
-        decision = decision or _random_at_one_sensor(search, start, evidence)
-        decision = decision or _decide_beyond_singles(search, start, singles, ahead, screened, evidence, tolerance)
-        decision = nearest(search, start, decision, singles)
-    outcome, best, random, rivals, noise, own_search = decision
+    stages = Stages(search, start, evidence, nominal, tolerance, uncertain_nominal)
+    outcome, best, random, rivals, noise, own_search = stages.decision()
     is_cut = search.is_over
     final_search = own_search or search
     best = uniform_as_nominal_errors(search, best, alone=random is not None)
@@ -260,7 +227,7 @@ def attribute(
         best = with_identified_errors(final_search, best, identified_prior, seen)
     logged = final_search.logged
     if random is None:
-        logged = logged or _input_noise_of(search, best, noise_of(search, best) if noise is None else noise)
+        logged = logged or _input_noise_of(search, best, search.noise_with(best) if noise is None else noise)
         if outcome == "explained":
             best = with_all_errors(final_search, best)
         best = with_intervals(
@@ -274,7 +241,7 @@ def attribute(
             is_insignificant = any(not e.stands_out(search.rig) for e in named if e not in seen)
             outcome = "none" if not named else "unknown" if is_insignificant else outcome
     if noise is None:
-        noise = noise_of(search, best) if random is None else search.data.noise
+        noise = search.noise_with(best) if random is None else search.data.noise
     report("done", 1.0)
     return Attribution(
         outcome=outcome,
@@ -282,8 +249,8 @@ def attribute(
         random=random,
         alternatives=rivals,
         nominal_cost=float(of_nominal.mean()),
-        tried=tuple(singles),
-        ahead=tuple(ahead),
+        tried=tuple(stages.singles),
+        ahead=tuple(stages.ahead),
         evidence=nominal,
         search=search,
         weighed=final_search.data,
@@ -362,16 +329,6 @@ def with_identified_errors(search: Search, best: Fit, identified: IdentifiedPrio
     return replace(found, effects=(*seen, *found.effects))
 
 
-def _is_small(nominal: Evidence, tolerance: float) -> bool:
-    """Whether the gap above the noise is within a tolerance, or a tenth of the noise, in every record."""
-    for record, residual in zip(nominal.data.counted, nominal.residuals, strict=True):
-        scale = record.outputs.std(axis=1, keepdims=True)
-        noise_floor = float(((nominal.data.noise[:, None] / scale) ** 2).mean())
-        if float(((residual / scale) ** 2).mean()) - noise_floor > max(tolerance**2, ATTRIBUTION.a_tenth * noise_floor):
-            return False
-    return tolerance > 0
-
-
 def _input_noise_of(search: Search, best: Fit, noise: np.ndarray) -> float:
     """Input noise, as a share of the inputs' rms, from the residual of a set above the sensor noise (n_outputs,).
 
@@ -387,237 +344,3 @@ def _input_noise_of(search: Search, best: Fit, noise: np.ndarray) -> float:
     data = search.data.with_noise(noise)
     is_shown = share > LEAST_LOGGED and shows_input_noise(rig, data, data.differences(rig), share)
     return share if is_shown else 0.0
-
-
-def noise_of(search: Search, best: Fit) -> np.ndarray:
-    """Standard deviation of each sensor's noise (n_outputs,), estimated from the residual of a set.
-
-    A residual within the stated noise is all noise: coloured noise has peaks, which an estimate from the quiet bands
-    misses, and differs between records.
-    """
-    residuals = search.data.differences(apply_all(search.rig, best.effects))
-    rms = np.sqrt(np.mean([(residual**2).mean(axis=1) for residual in residuals], axis=0))
-    noise: np.ndarray = np.maximum(noise_found(residuals), np.minimum(rms, search.data.noise))
-    return noise
-
-
-def _single_effects(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
-    """Single effects on whole records, best first."""
-    promising = [f for f in ahead if f.cost < SELECTION.promising] or ahead[:1]
-    if not search.explains(start):
-        return on_whole_records(search, promising, ATTRIBUTION.finalists)
-    # only a significant gain matters, and there may be no effect at all
-    to_cost = start.cost - SEARCH.significant
-    return on_whole_records(search, promising, ATTRIBUTION.finalists, to_cost=to_cost, at_first=ATTRIBUTION.briefly)
-
-
-def _of_one_sensor(start: Fit) -> bool:
-    """Whether only one of several sensors disagrees: its own fault is likelier than a random force."""
-    excess = np.maximum(start.cost_by_channel.mean(axis=0) - 1.0, 0.0)
-    return excess.size > 1 and of_one_sensor(excess)
-
-
-def _random_at_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decision | None:
-    """The decision for a random disturbance that only one sensor shows, if its own faults do not explain it."""
-    return decide_on_random(search, evidence)[0] if _of_one_sensor(start) else None
-
-
-def _decide_on_singles(search: Search, start: Fit, singles: list[Fit]) -> tuple[Decision | None, list[Fit]]:
-    """The decision if at most one effect explains the records, else None; and the single effects, best first."""
-    good = [f for f in singles if search.significant(f, start.cost)]
-    if search.explains(start) and not good:
-        return Decision("none", start), singles
-    ended = _finished_best(search, good[:4])
-    explaining = [f for f in ended if search.explains(f)]
-    if not explaining:
-        near = [f for f in ended[:2] if search.near(f, RANDOM.near)]
-        moved = search.side_by_side(relocated, near)
-        explaining = [f for f in moved if search.explains(f)]
-        singles = sorted((*moved, *singles), key=lambda f: f.cost)
-    if explaining:
-        best, rivals = ranked(search, [simplest(search, f) for f in explaining])
-        return Decision("explained", best, rivals=rivals), singles
-    if search.explains(start):
-        return Decision("none", start), singles
-    return None, singles
-
-
-def _finished_best(search: Search, fits: Sequence[Fit]) -> list[Fit]:
-    """The fits; those that more iterations or finer substeps may bring to the noise floor are refined."""
-    promising = [f for f in fits if f.cost < ATTRIBUTION.far_behind * fits[0].cost]
-    if fits and search.explains(fits[0]):
-        near = fits[0].cost + SEARCH.rival
-        promising = [
-            f for f in promising if promise(f, SEARCH.further) < near or is_stepped(apply_all(search.rig, f.effects))
-        ]
-    return [*search.side_by_side(finished, promising), *(f for f in fits if f not in promising)]
-
-
-def _decide_beyond_singles(
-    search: Search,
-    start: Fit,
-    singles: Sequence[Fit],
-    ahead: Sequence[Fit],
-    screened: Screening,
-    evidence: Evidence,
-    tolerance: float,
-) -> Decision:
-    """The decision among nominal errors, several effects, random forces and a law beyond the catalogue."""
-    all_pairs = Pairs.at_once(search, screened)
-    pair = _pair_at_noise_floor(all_pairs.copy(), start, singles[:1])
-    if pair is not None:
-        return pair
-    stepwise = Stepwise(search, tolerance, ahead)
-    alone = _single_in_louder_noise(search, start, singles, stepwise)
-    if alone is not None:
-        return alone
-    is_near_noise = min(f.cost for f in (start, *singles)) < 1.0 + STEPWISE.no_gap
-    # damping is hardly known: if only its errors are large, only an effect that makes them smaller is searched for
-    is_explained = stepwise.is_sufficient or stepwise.without_errors() or stepwise.by_singles() or stepwise.by_few()
-    is_explained = is_explained or stepwise.by_almost_alone(singles)
-    is_explained = is_explained or (stepwise.is_noise_only and stepwise.has_plausible_errors)
-    if not ((is_explained and stepwise.is_noise_only) or is_near_noise or search.is_over):
-        random = random_with_effects(search, singles)
-        if random is None and not is_explained:
-            random = random_with_nominal_errors(search, stepwise.steps[0])
-        if random is not None:
-            return random
-    if is_explained:
-        stepwise.run()
-    by_mode = None if search.is_over or (is_explained and stepwise.has_plausible_errors) else with_mode_errors(stepwise)
-    if by_mode is not None or is_explained:
-        return (by_mode or stepwise).decision()
-    # a law at one point is asked for first: it takes a second, and a selection beside deviations minutes
-    other_law = None if search.is_over else force_of_other_law(search, evidence)
-    varied = None if other_law is not None or search.is_over else with_record_deviations(stepwise)
-    if varied is not None:
-        return varied.decision()
-    pairs = all_pairs.copy()
-    # implausible nominal errors show a missing effect, so sets of few effects without nominal errors come first
-    is_better = stepwise.last.is_plausible and stepwise.last.fit.cost < min(f.cost for f in (start, *singles))
-    if other_law is None and is_better:
-        stepwise.run()
-        if stepwise.is_conclusive:
-            return stepwise.decision()
-    explained = pairs.explain or (other_law is None and pairs.with_a_third())
-    decision = pairs.decision(start)
-    if other_law is not None:
-        return law_or_decision(other_law, search, decision)
-    if explained and not (are_uniform_errors(decision.best.effects) and stepwise.needs_no_effect):
-        return decision
-    stepwise.run()
-    if not stepwise.is_conclusive and stepwise.decision().outcome != "explained" and pairs.by_exchange():
-        decision = pairs.decision(start)
-        if not (are_uniform_errors(decision.best.effects) and stepwise.needs_no_effect):
-            return decision
-    decision = nearest(search, start, stepwise.decision(), pairs.found)
-    if decision.outcome in ("explained", "none") or search.is_over:
-        return decision
-    random = random_with_effects(search, pairs.found[:1])
-    return random or random_with_nominal_errors(search, stepwise.steps[0], surely=False) or decision
-
-
-def _pair_at_noise_floor(pairs: Pairs, start: Fit, singles: Sequence[Fit]) -> Decision | None:
-    """Two effects that explain the records with the stated sensor noise, or None.
-
-    None also if one is a plausible error of the model or has no significant parameter, or if one is a uniform error and
-    the other uniform error surely explains more. A search with nominal errors takes longer, so these pairs come first.
-    """
-    search = pairs.search
-    near = [effect for f in singles if search.near(f, PAIRS.most) for effect in f.effects]
-    if not (pairs.explain or pairs.with_any(near)):
-        return None
-    decision = pairs.decision(start)
-    effects = decision.best.effects
-    if are_uniform_errors(effects) or any(is_plausible_error(effect, search) for effect in effects):
-        return None
-    missing = [effect for effect in NO_UNIFORM_ERROR if effect.kind not in {e.kind for e in effects}]
-    if len(missing) == 1:  # an imperfect model has both uniform errors, and a damper may stand for one of damping
-        both = fit(search.rig, (*effects, *missing), search.data, iterations=ATTRIBUTION.together)
-        if search.surely_better(both, decision.best.cost, 1):
-            return None
-    sure = with_intervals(search.rig, decision.best, search.data, search.workers).effects
-    return decision if all(effect.stands_out(search.rig) for effect in sure) else None
-
-
-def _single_in_louder_noise(search: Search, start: Fit, singles: Sequence[Fit], stepwise: Stepwise) -> Decision | None:
-    """The decision for a single effect that explains the records if the noise is louder than stated, or None.
-
-    One effect has fewer parameters than nominal errors that fit equally well.
-    """
-    stated, best = search.data.noise, singles[0] if singles else start
-    under_errors = np.sqrt(stepwise.last.sensor_noise) * stated
-    noise = np.clip(noise_of(search, best), stated, (1.0 + ATTRIBUTION.a_tenth) ** 0.5 * under_errors)
-    if np.median(noise / stated) ** 2 < 1.0 + ATTRIBUTION.a_tenth:
-        return None
-    louder = search.with_noise(noise)
-
-    def in_louder(candidate: Fit) -> Fit:
-        by_channel = candidate.cost_by_channel * (stated / noise) ** 2
-        return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
-
-    promising = [f for f in map(in_louder, singles) if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
-    decision = _decide_on_singles(louder, in_louder(start), promising)[0] if promising else None
-    if decision is None or decision.outcome != "explained":
-        return None
-    return decision._replace(noise=noise)
-
-
-def _decide_with_nominal_errors(search: Search, tolerance: float) -> Decision:
-    """The decision with nominal errors from the first."""
-    stepwise = Stepwise(search, tolerance)
-    varied = None if stepwise.is_sufficient else with_record_deviations(stepwise)
-    if varied is not None:
-        return varied.decision()
-    stepwise.run()
-    return stepwise.decision()
-
-
-def force_of_other_law(search: Search, evidence: Evidence) -> Fit | None:
-    """A force at one point that explains the records alone, with a law beyond the catalogue or a power law in it.
-
-    Two effects at one place can fit many laws, so this comes before pairs are accepted. None if there is none.
-    """
-    search.report("one force of a law beyond the catalogue", 0.35)
-    beyond = replace(search, catalogue=BEYOND)
-    promising = [f for f in one_more(beyond, (), evidence) if f.cost < SELECTION.promising]
-    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.cost_limit)
-    return next((f for f in (_as_catalogue_kind(search, f) for f in fits) if search.explains(f)), None)
-
-
-def _as_catalogue_kind(search: Search, law: Fit) -> Fit:
-    """A fit of a force of another law, replaced by the kind of the catalogue that has its power, if there is one."""
-    known = in_catalogue(law.effects[0])
-    return law if known is None else finished(search, fit(search.rig, (known,), search.data))
-
-
-def unless_other_law(search: Search, decision: Decision, evidence: Evidence) -> Decision:
-    """The decision, or that for a law beyond the catalogue if the records surely prefer it to one law at a point.
-
-    Args:
-        search: records and nominal rig.
-        decision: to be compared.
-        evidence: of the nominal rig.
-    """
-    best = decision.best
-    if decision.outcome != "explained" or len(best.effects) != 1:
-        return decision
-    (effect,) = best.effects
-    if not effect.kind.nonlinear or effect.at is None:
-        return decision
-    search.report("one force of a law beyond the catalogue", 0.9)
-    beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.at)
-    as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
-    promising = [f for f in one_more(beyond, (), there) if f.cost < as_near]
-    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.cost_limit)
-    other = [f for f in fits if in_catalogue(f.effects[0]) is None]
-    sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
-    law = next(sure, None)
-    return decision if law is None else law_or_decision(law, search, decision)
-
-
-def law_or_decision(law: Fit, search: Search, decision: Decision) -> Decision:
-    """The decision for the likelier of a force of another law and the sets of a decision."""
-    named = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
-    best, rivals = ranked(search, [law, *named])
-    return Decision("unknown" if any_beyond(best.effects) else "explained", best, rivals=rivals)

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind
+from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.nominal import STIFFNESS, NominalPrior
 from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
 from workbench.gap.prediction.innovations import Observer
-from workbench.gap.prediction.noise import input_filters, logging_noise_power
+from workbench.gap.prediction.noise import input_filters, logging_noise_power, noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter
@@ -176,6 +176,17 @@ class Search:
         """The same search with nominal errors that are re-estimated with every candidate, to first order."""
         data = self.data.with_nuisance(sensitivity(self.rig, (errors,), self.data, self.workers))
         return replace(self, data=data, held=(errors,))
+
+    def noise_with(self, found: Fit) -> np.ndarray:
+        """Standard deviation of each sensor's noise (n_outputs,), estimated from the residual of a set of effects.
+
+        A residual within the stated noise is all noise: coloured noise has peaks, which an estimate from the quiet
+        bands misses, and differs between records.
+        """
+        residuals = self.data.differences(apply_all(self.rig, found.effects))
+        rms = np.sqrt(np.mean([(residual**2).mean(axis=1) for residual in residuals], axis=0))
+        noise: np.ndarray = np.maximum(noise_found(residuals), np.minimum(rms, self.data.noise))
+        return noise
 
     @property
     def prior(self) -> NominalPrior:
