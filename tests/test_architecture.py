@@ -1,8 +1,11 @@
 """Imports run from the ground floor up, those inside functions too."""
 
 import ast
+import re
 from functools import cache
 from pathlib import Path
+
+import pytest
 
 import workbench
 
@@ -163,3 +166,14 @@ def test_each_engine_has_one_door():
 def test_only_the_command_prints():
     wrong = [name for name, _, called in modules() if "print" in called and not name.startswith("cli/")]
     assert not wrong, wrong
+
+
+@pytest.mark.parametrize(("page", "most"), [("gap", 15), ("identification", 8)])
+def test_the_course_can_be_read_in_a_few_files(page, most):
+    course = (ROOT.parent / f"docs/theory/{page}.md").read_text(encoding="utf-8").split("## Reading the code")[1]
+    files = re.findall(r"^\| `([a-z_/]+)\.py` \|", course.split("\n## ")[0], re.MULTILINE)
+    assert 1 < len(files) <= most
+    imported = {name: set(targets) for name, targets, _ in modules()}
+    for number, name in enumerate(files[1:], start=1):
+        target = f"workbench.{page}.{name}".replace("/", ".")
+        assert any(target in imported[f"{page}/{above}.py"] for above in files[:number]), name

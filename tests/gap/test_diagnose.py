@@ -14,8 +14,8 @@ from workbench.gap.effects.nonlinear import with_element
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.budget import Budget, Shrinkage
 from workbench.gap.report.notes import _of_residual
-from workbench.gap.report.record_checks import RecordsError
 from workbench.gap.search.fit import fit
+from workbench.gap.setup.record_checks import RecordsError
 from workbench.rig.elements import OneSidedStop, UserLaw
 from workbench.rig.rig import Rig
 from workbench.trials.make import make_trial

@@ -62,9 +62,9 @@ def diagnose(
     """
     from workbench.cases.case import read_case
     from workbench.gap.diagnose_case import diagnose_case
-    from workbench.gap.report.record_checks import check_alive
     from workbench.gap.setup.corrections import without_faults
     from workbench.gap.setup.faults import setup_faults
+    from workbench.gap.setup.record_checks import check_alive
     from workbench.gap.setup.records import check_disjoint
     from workbench.study.measured_case import measured_case
     from workbench.study.pages.verdict_page import verdict_page

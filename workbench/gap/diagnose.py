@@ -32,13 +32,13 @@ from workbench.gap.report.budget import (
 )
 from workbench.gap.report.experiment import Experiment, detectability, next_experiment
 from workbench.gap.report.notes import notes_of
-from workbench.gap.report.record_checks import check_modes, check_records
 from workbench.gap.report.verdict import NEAR, Verdict
 from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.gap.search.finish import with_equals
 from workbench.gap.search.jointly import too_large
 from workbench.gap.search.settings import JOINT
 from workbench.gap.setup.faults import exchanges, setup_faults
+from workbench.gap.setup.record_checks import check_modes, check_records
 from workbench.gap.setup.records import check_disjoint
 from workbench.records.record import Record, as_records
 from workbench.records.units import SI, Units

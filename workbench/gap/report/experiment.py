@@ -12,8 +12,8 @@ from workbench.gap.effects.effect import COORDINATES, Effect, Kind, apply_all, c
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.report.record_checks import LEAST_SAMPLES
 from workbench.gap.search.fit import Fit
+from workbench.gap.setup.record_checks import LEAST_SAMPLES
 from workbench.records.record import Record
 from workbench.renamed import Renamed
 from workbench.rig.rig import Rig

@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import Kind
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.experiment import detectability
-from workbench.gap.report.record_checks import RecordsError, check_modes, check_records
+from workbench.gap.setup.record_checks import RecordsError, check_modes, check_records
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import LinearSpring, PeriodicForce
 from workbench.rig.rig import Rig
