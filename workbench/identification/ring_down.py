@@ -182,7 +182,7 @@ def _missing_modes(refined: Refined, n_modes: int | None) -> list[str]:
     if n_modes is None or found >= n_modes:
         return []
     return [
-        f"{found} of the {n_modes} modes asked for are found: no other decaying oscillation can be told in the records"
+        f"{found} of the {n_modes} modes asked for are found: no further one is significant in the records"
     ]
 
 

@@ -203,8 +203,8 @@ def try_out(rig: Rig, design: Design) -> Tried:
     fastest = float(loop.poles.real.max())
     if fastest * design.final_time > MOST_GROWTH:
         raise DesignError(
-            f"the loop is unstable, with a pole at {fastest:+.3g} rad/s, by observation spillover of residual modes;"
-            " move or add sensors, or raise R"
+            f"the loop is unstable, with a pole at {fastest:+.3g} rad/s: control and observation spillover of residual"
+            " modes, if they have little damping; move or add sensors, or raise R"
         )
     state = impulse_state(modes, design.impulse_at)
     at_rest = state.copy()

@@ -47,7 +47,7 @@ def test_errors_beside_the_forces_that_are_believed_are_white(hinged_rig, quanti
     outputs += noise[:, None] * rng.normal(size=outputs.shape)
     channels = tuple(Channel(s.name, s.quantity) for s in rig.sensors)
     record = Record(dt, outputs, channels, np.zeros((1, 20_000)), (Channel("F", "force"),))
-    errors = Observer.of(rig, noise, 1.0, dt).innovations(rig, record, 1)[:, 1000:]
+    errors = Observer.of(rig, noise, 1.0, [4.0 * dt, dt]).innovations(rig, record, 1)[:, 1000:]
     np.testing.assert_allclose(np.cov(errors), np.eye(4), atol=0.05)
     for lag in (1, 2, 5):
         assert np.abs(errors[:, lag:] @ errors[:, :-lag].T / errors.shape[1]).max() < 0.04

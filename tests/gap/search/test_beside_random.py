@@ -18,6 +18,7 @@ from workbench.gap.search.beside_random import looks_random, random_with_effects
 from workbench.gap.search.fit import Fit
 from workbench.gap.search.jointly import evaluated
 from workbench.gap.search.search import Search
+from workbench.records.resample import decimate
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import AirDrag, CoulombFriction, OneSidedStop
 from workbench.rig.simulate import simulate
@@ -60,6 +61,13 @@ def test_only_what_keeps_its_level_looks_random(rig, records):
     assert not looks_random(evidence(told, records(stiffer, 0.0)))
 
 
+def test_no_random_force_is_sought_over_several_sample_rates(rig, records):
+    told = replace(rig, actuators=rig.actuators[:1])
+    *others, last = records(rig, 0.05)
+    assert looks_random(evidence(told, others))
+    assert not looks_random(evidence(told, [*others, decimate(last, 2)]))
+
+
 def test_what_drifts_far_below_the_first_mode_is_not_the_forces_level(rig, records):
     # accelerometers hardly see it: what an estimate of the force does there is chance
     seen = evidence(replace(rig, actuators=rig.actuators[:1]), records(rig, 0.05))
@@ -77,7 +85,7 @@ def test_what_a_right_law_leaves_beside_a_random_force_is_its_linear_answer(rig,
     (weak, *_), (plain, *_) = records(real, 0.05), records(rig, 0.05)
     quiet = simulate(replace(rig, actuators=rig.actuators[:1]), plain.inputs, sample_time=0.01).outputs
     truth = plain.outputs - quiet  # the same wind on the structure without the law
-    observer = Observer.of(told, noise, 0.1, 0.01, at=1.3, rms=0.05)
+    observer = Observer.of(told, noise, 0.1, [0.01], at=1.3, rms=0.05)
     left = observer.residual_on_measured_motion(told, weak, 8)
     whole = weak.outputs - simulate(told, weak.inputs, sample_time=0.01).outputs
     error = [np.sqrt(np.mean((r - truth) ** 2) / np.mean(truth**2)) for r in (left, whole)]

@@ -110,13 +110,13 @@ def test_errors_ahead_of_a_linear_rig_are_those_of_steps_through_time(rig, recor
     """A linear rig is set right in closed form, by what its errors over the whole record leave of themselves."""
     rng = np.random.default_rng(2)
     record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng)
-    observer = Observer.of(rig, np.full(4, NOISE), 1.0, DT)
+    observer = Observer.of(rig, np.full(4, NOISE), 1.0, [DT])
     softer = kind_named("modulus_error").apply(rig, None, {"factor": 0.9})
     for other in (softer, GAIN.apply(softer, "d2", {"gain": 1.3})):
         data = FitData((record,), np.full(4, NOISE))
         ahead = observer.innovations_of_linear(other, data.residual(other).reshape(4, -1) * NOISE, DT, 1)
-        stepped = prediction_errors(other, record.inputs, record.outputs, observer.gain, sample_time=DT, substeps=1)
-        np.testing.assert_allclose(ahead, observer.whitening @ stepped, atol=1e-6 * np.abs(ahead).max())
+        stepped = prediction_errors(other, record.inputs, record.outputs, observer.gains[DT], sample_time=DT, substeps=1)
+        np.testing.assert_allclose(ahead, observer.whitening[DT] @ stepped, atol=1e-6 * np.abs(ahead).max())
 
 
 def test_two_of_a_kind_beside_one_another_explain_nothing(search):

@@ -1,7 +1,8 @@
 """The number of modes to control, by the energy that remains: that of uncontrolled modes and spillover.
 
 Control of the lowest n modes leaves the disturbance's energy Σ_{r>n} E_r in the others (5.27) and adds the spillover
-W_R (5.43).
+W_R (5.43). Their sum is the mean over the phase of the residual modes when control starts; at a given phase it differs
+by Σ_r Re(conj(q_r' + iω_r q_r) b_rᵀ F(iω_r)).
 """
 
 from collections.abc import Callable
@@ -48,7 +49,7 @@ class ControlledModeCount:
 
     @property
     def residual(self) -> Floats:
-        """Remaining energy (n_counts,), J: of the uncontrolled modes, plus spillover."""
+        """Mean remaining energy (n_counts,), J: of the uncontrolled modes, plus spillover."""
         return self.uncontrolled + self.spillover
 
     untouched, spilled, left = Renamed("uncontrolled"), Renamed("spillover"), Renamed("residual")

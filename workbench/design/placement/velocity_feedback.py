@@ -36,7 +36,7 @@ class FeedbackTask:
     Attributes:
         modes: all of them controlled, with their damping.
         actuator: of a pair; its own place and name do not matter.
-        gain: (n_pairs, n_pairs) H, force per rate; if its symmetric part is positive definite, it damps every mode.
+        gain: (n_pairs, n_pairs) H, force per rate; if its symmetric part is positive definite, it adds no negative damping.
         state: (2 n_modes,) x_0.
         spacing: least distance between the middles of neighbours, m.
     """
@@ -56,7 +56,7 @@ class FeedbackTask:
                 f"the state has {2 * self.modes.n_modes} entries for {self.modes.n_modes} modes; got {self.state.shape}"
             )
         if not (self.modes.omega > 0).all():
-            raise DesignError("a rigid-body mode keeps its energy under rate feedback; select the elastic modes")
+            raise DesignError("a rigid-body mode keeps its displacement under rate feedback; select the elastic modes")
         first, last = self.reach
         if first + (self.n_pairs - 1) * self.spacing > last:
             raise DesignError(

@@ -1,6 +1,6 @@
 """Innovations: errors of one-step-ahead predictions by a rig with all its laws, corrected at every sample."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -28,13 +28,13 @@ class Observer:
     """A steady-state Kalman filter of a rig's modes, with random forces on all of them.
 
     Attributes:
-        gain: (2, n_modes, n_outputs) of their displacements and velocities.
-        whitening: (n_outputs, n_outputs) matrix that gives innovations unit covariance.
+        gains: (2, n_modes, n_outputs) of their displacements and velocities, by sample time.
+        whitening: (n_outputs, n_outputs) matrix that gives innovations unit covariance, by sample time.
         sensors: that it is designed for.
     """
 
-    gain: np.ndarray
-    whitening: np.ndarray
+    gains: Mapping[float, Floats]
+    whitening: Mapping[float, Floats]
     sensors: tuple[Sensor, ...]
 
     @classmethod
@@ -43,7 +43,7 @@ class Observer:
         rig: Rig,
         noise: np.ndarray,
         force: float,
-        sample_time: float,
+        sample_times: Iterable[float],
         *,
         at: Where | None = None,
         rms: float = 0.0,
@@ -55,7 +55,7 @@ class Observer:
             rig: with the modes.
             noise: (n_outputs,) standard deviation of each sensor's noise.
             force: rms of the inputs, N.
-            sample_time: s.
+            sample_times: of the records, s.
             at, rms: place and rms, N, of a further random force.
             loose: rms of the process noise forces over that of the inputs: the less, the lower the gain.
         """
@@ -65,12 +65,14 @@ class Observer:
         forces = loose * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
         shape = np.zeros(n) if at is None else modes.phi_at(at)
         patterns, variances = np.column_stack([np.eye(n), shape]), np.r_[forces**2, rms**2]
-        model = sampled_model(modes, _instantaneous(rig).sensors, noise, sample_time)
-        found = force_filter(model, patterns, variances)
-        # from the predictor form to a correction of the state at this sample
-        gain = np.linalg.solve(model.transition, found.gain[: 2 * n])
-        whitening = np.linalg.inv(np.linalg.cholesky(found.innovation))
-        return cls(gain.reshape(2, n, -1).copy(), whitening, rig.sensors)
+        gains, whitening = {}, {}
+        for dt in sample_times:
+            model = sampled_model(modes, _instantaneous(rig).sensors, noise, dt)
+            found = force_filter(model, patterns, variances)
+            # from the predictor form to a correction of the state at this sample
+            gains[dt] = np.linalg.solve(model.transition, found.gain[: 2 * n]).reshape(2, n, -1).copy()
+            whitening[dt] = np.linalg.inv(np.linalg.cholesky(found.innovation))
+        return cls(gains, whitening, rig.sensors)
 
     def innovations(
         self, rig: Rig, record: Record, substeps: int, motion: Callable[[], Motion] | None = None
@@ -86,7 +88,7 @@ class Observer:
             motion: returns that of the whole record with these substeps, if it may be cached.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # the simulation may diverge
-            errors: Floats = self.whitening @ self._innovations(rig, record, substeps, motion)
+            errors: Floats = self.whitening[record.sample_time] @ self._innovations(rig, record, substeps, motion)
         return errors
 
     def residual_on_measured_motion(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
@@ -132,7 +134,7 @@ class Observer:
         gain, no_inputs = self._gain_for(rig, sample_time), np.zeros((0, left.shape[1]))
         substeps = 1 if rig.modes.proportional else substeps
         errors = prediction_errors(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
-        white: Floats = self.whitening @ errors
+        white: Floats = self.whitening[sample_time] @ errors
         return white
 
     @lru_cache(maxsize=KEPT)  # noqa: B019  an observer is a few arrays
@@ -141,9 +143,10 @@ class Observer:
 
         Where relocated sensors make the observer unstable, their gain is zero, and if need be the whole gain.
         """
-        gain = np.zeros((2, rig.modes.n_modes, self.whitening.shape[0]))
-        known = min(rig.modes.n_modes, self.gain.shape[1])
-        gain[:, :known] = self.gain[:, :known]
+        designed = self.gains[sample_time]
+        gain = np.zeros((2, rig.modes.n_modes, designed.shape[2]))
+        known = min(rig.modes.n_modes, designed.shape[1])
+        gain[:, :known] = designed[:, :known]
         reads = [[(s.at, s.quantity, s.direction) for s in sensors] for sensors in (rig.sensors, self.sensors)]
         moved = [j for j, (now, then) in enumerate(zip(*reads, strict=True)) if now != then]
         if moved and _is_unstable(rig, gain, sample_time):

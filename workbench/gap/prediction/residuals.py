@@ -73,6 +73,11 @@ class FitData:
         """Number of measured values."""
         return sum(record.outputs.size for record in self.counted)
 
+    @property
+    def sample_times(self) -> tuple[float, ...]:
+        """Those of the records, s, each once."""
+        return tuple(dict.fromkeys(record.sample_time for record in self.records))
+
     def only(self, names: tuple[str, ...]) -> "FitData":
         """The same residual on some of the records."""
         return replace(self, records=tuple(r for r in self.records if r.name in names))
@@ -129,7 +134,7 @@ class FitData:
         """
         if self.observer is not None:  # innovations with a random force are one-step-ahead errors already
             return replace(self, nuisance=None)
-        observer = Observer.of(rig, self.noise, self.force_rms, self.records[0].sample_time, loose=loose)
+        observer = Observer.of(rig, self.noise, self.force_rms, self.sample_times, loose=loose)
         return replace(self, observer=observer, whiteners={}, nuisance=None)
 
     @cached_property

@@ -24,7 +24,12 @@ from workbench.structure.domain import Between, NamedPoints
 
 
 def looks_random(evidence: Evidence) -> bool:
-    """Whether the unmodelled force is equally strong in every record, unrelated to inputs and motion, and no tone."""
+    """Whether the unmodelled force is equally strong in every record, unrelated to inputs and motion, and no tone.
+
+    False for records of several sample rates: the force varies within a sample, so it has another strength at each.
+    """
+    if len(set(evidence.sample_times)) > 1:
+        return False
     records, place = evidence.data.counted, evidence.at_peaks[0]
     forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
     elastic = evidence.rig.modes.omega[evidence.rig.modes.omega > 0] / (2.0 * np.pi)
@@ -246,7 +251,7 @@ def _observer(search: Search, rig: Rig, found: RandomForceFit | None = None) -> 
     """The observer of a rig that a random force acts on."""
     data = search.data
     force, at = (0.0, None) if found is None else (found.rms, found.at)
-    return Observer.of(rig, data.noise, data.force_rms, data.records[0].sample_time, at=at, rms=force)
+    return Observer.of(rig, data.noise, data.force_rms, data.sample_times, at=at, rms=force)
 
 
 def _with_laws_on_measured_motion(search: Search, evidence: Evidence, observer: Observer | None = None) -> Evidence:

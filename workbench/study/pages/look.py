@@ -22,7 +22,7 @@ from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.printed import counted
 from workbench.study.pages.page import PageContent, block
 
-HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strongest at [Hz]")
+HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "std", "strongest at [Hz]")
 FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)
 MOTIONS = re.compile(r"acc|beschl|vib|disp|veloc|geschw|(^|[^a-z])weg", re.IGNORECASE)
 PEAKS = 4  # per channel
