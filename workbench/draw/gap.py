@@ -90,10 +90,10 @@ def plot_where(verdict: Verdict) -> Figure:
     _plot_modes(by_mode, verdict)
     tops = [f"{top:.3g}" if top < 1000.0 else f"{top:.0f}" for top in where.band_edges_hz[1:]]
     by_octave.bar(tops, 100 * where.band_shares, color=COLOURS[0])
-    by_octave.set(title="by octave", xlabel="up to [Hz]", ylabel="share of the gap [%]")
+    by_octave.set(title="by octave", xlabel="upper edge of the band [Hz]", ylabel="share of the gap's power [%]")
     names = [s.name for s in verdict.nominal.sensors]
     by_sensor.bar(names, 100 * where.sensor_shares, color=COLOURS[2])
-    by_sensor.set(title="by sensor", ylabel="share of the gap [%]")
+    by_sensor.set(title="by sensor", ylabel="share of the gap's power [%]")
     by_sensor.tick_params(axis="x", rotation=90 if len(names) > FEW_BARS else 0)
     order = np.argsort(where.input_levels)
     by_level.plot(where.input_levels[order], where.record_gaps[order], "o-", color=COLOURS[1])
@@ -127,7 +127,7 @@ def _plot_modes(ax: Axes, verdict: Verdict) -> None:
         bars[-1].set_color(GREY)
     shown = few_ticks(np.arange(len(shares)))
     ax.set_xticks(shown, [[*shares][i] for i in shown])
-    ax.set(title="by mode: the band around each frequency", xlabel="mode", ylabel="share of the gap [%]")
+    ax.set(title="by mode: the band around each frequency", xlabel="mode", ylabel="share of the gap's power [%]")
 
 
 def _plot_places(ax: Axes, verdict: Verdict) -> None:

@@ -47,7 +47,7 @@ def plot_standard_errors(refined: Refined) -> Figure:
     )
     for ax, values, title in zip(axes, relative, ("frequency", "damping ratio")):
         ax.semilogy(modes, values, "o-")
-        ax.set_title(f"standard error of the {title}, relative")
+        ax.set(title=title, ylabel="relative standard error")
     axes[1].set(xlabel="mode", xticks=few_ticks(modes))
     return figure
 

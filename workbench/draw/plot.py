@@ -120,7 +120,8 @@ def _(result: ModalFilter) -> Figure:
     where = result.positions if along else 1 + np.arange(len(result.positions))
     for r, weights in enumerate(result.displacement):
         ax.plot(where, weights, "o-" if along else "o", label=f"mode {r + 1}")
-    ax.set(xlabel="x of the sensor" if along else "sensor", ylabel="weight of its displacement", title="modal filter")
+    ax.set(xlabel="x of the sensor [m]" if along else "sensor", ylabel="weight of its displacement [√kg]")
+    ax.set_title("modal filter")
     ax.legend(ncols=2)
     return figure
 

@@ -181,9 +181,7 @@ def _missing_modes(refined: Refined, n_modes: int | None) -> list[str]:
     found = refined.modes.n_modes
     if n_modes is None or found >= n_modes:
         return []
-    return [
-        f"{found} of the {n_modes} modes asked for are found: no further one is significant in the records"
-    ]
+    return [f"{found} of the {n_modes} modes asked for are found: no further one is significant in the records"]
 
 
 def _cut_to_decay(record: Record, start: float | None) -> tuple[Record, list[str]]:

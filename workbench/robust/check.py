@@ -17,7 +17,7 @@ from workbench.robust.verification import LEVEL
 from workbench.structure.modes import freeze
 from workbench.structure.printed import Printed
 
-UNLIKELY = 0.01  # significance level: the model is rejected if fewer tests of a true model come out as badly
+UNLIKELY = 0.01  # significance level of either test, over time and in bands: a true model fails one in at most 2 %
 LEAST_SAMPLES = 40  # of a record: of fewer samples, less than two of a sensor lie outside the bands of a true model
 COLUMNS = ("checked", "record", "readings", "coverage", "expected_least", "worst_sensor", "worst_coverage", "holds")
 
@@ -67,7 +67,7 @@ class PredictionCheck(Printed):
 
     @property
     def probability(self) -> float:
-        """p-value: the lesser of those over time and in the frequency bands."""
+        """The smaller of the p-values over time and in the frequency bands: two tests, each at the level UNLIKELY."""
         return min(self._probabilities)
 
     @property

@@ -367,7 +367,7 @@ class SampledModes(Printed):
     def phase_collinearity(self) -> Floats:
         """Modal phase collinearity MPC (n_modes,): 1 for a real shape, 0 for a travelling wave.
 
-        Pappa, Elliott & Schenk, NASA TM-102664 (1990).
+        Pappa, Elliott & Schenk, NASA TM-107607 (1992).
         """
         x, y = self.shapes.real, self.shapes.imag
         sxx, syy, sxy = (x * x).sum(0), (y * y).sum(0), (x * y).sum(0)

@@ -115,7 +115,8 @@ def test_errors_ahead_of_a_linear_rig_are_those_of_steps_through_time(rig, recor
     for other in (softer, GAIN.apply(softer, "d2", {"gain": 1.3})):
         data = FitData((record,), np.full(4, NOISE))
         ahead = observer.innovations_of_linear(other, data.residual(other).reshape(4, -1) * NOISE, DT, 1)
-        stepped = prediction_errors(other, record.inputs, record.outputs, observer.gains[DT], sample_time=DT, substeps=1)
+        gain, inputs, outputs = observer.gains[DT], record.inputs, record.outputs
+        stepped = prediction_errors(other, inputs, outputs, gain, sample_time=DT, substeps=1)
         np.testing.assert_allclose(ahead, observer.whitening[DT] @ stepped, atol=1e-6 * np.abs(ahead).max())
 
 

@@ -165,7 +165,8 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
                 )
     raise DesignError(
         f"B of the controlled modes is singular (condition {condition:.2g}): the actuators at"
-        f" {', '.join(text(a.at) for a in actuators)} cannot control modes {[r + 1 for r in controlled]} independently; move them apart or off a node"
+        f" {', '.join(text(a.at) for a in actuators)} cannot control modes {[r + 1 for r in controlled]}"
+        " independently; move them apart or off a node"
     )
 
 

@@ -36,7 +36,8 @@ class FeedbackTask:
     Attributes:
         modes: all of them controlled, with their damping.
         actuator: of a pair; its own place and name do not matter.
-        gain: (n_pairs, n_pairs) H, force per rate; if its symmetric part is positive definite, it adds no negative damping.
+        gain: (n_pairs, n_pairs) H, force per rate; it adds no negative damping if its symmetric part is
+            positive definite.
         state: (2 n_modes,) x_0.
         spacing: least distance between the middles of neighbours, m.
     """

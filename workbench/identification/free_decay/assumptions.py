@@ -82,7 +82,7 @@ class AmplitudeDependence:
         """Frequency, damping and amplitude of mode r in each segment, as text."""
         seen = np.flatnonzero(np.isfinite(self.omega[:, r]))
         each = zip(self.omega[seen, r] / (2.0 * np.pi), self.zeta[seen, r], self.amplitude[seen, r], strict=True)
-        return "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at {size:.3g}" for f, zeta, size in each)
+        return "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at amplitude {size:.3g}" for f, zeta, size in each)
 
 
 @one_blas_thread
