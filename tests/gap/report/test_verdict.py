@@ -12,6 +12,14 @@ from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.report.budget import budget_of, measure
+from workbench.gap.report.verdict import proportional_points
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import CubicSpring
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes, PointShapes
 from workbench.study.pages.verdict_page import verdict_tables
 
 
@@ -216,3 +224,33 @@ def test_a_single_force_that_leaves_little_beyond_the_noise_is_not_said_to_expla
     for share, words in ((0.99995, "leaves 0.005 % of the gap, more than noise"), (0.97, "explains 97 % of it")):
         place = replace(found.where.place, share=share, is_single_force=False)
         assert replace(found, where=replace(found.where, place=place)).location_in_words.endswith(words)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "alike"),
+    [
+        ([[1.0], [0.7], [-0.4]], ("P2", "P3")),
+        ([[1.0], [1.0], [0.0]], ()),  # P2 moves as P1 does, and P3 not at all
+        ([[1.0, 0.6], [0.5, 0.3], [0.4, 1.1]], ("P2",)),
+        ([[1.0, 0.6], [0.7, -0.9], [0.4, 1.1]], ()),
+    ],
+)
+def test_points_that_move_in_proportion_are_said_to_fit_as_well(shapes, alike):
+    omega = np.array([50.0, 132.0])[: len(shapes[0])]
+    points = NamedPoints(("P1", "P2", "P3"))
+    modes = Modes(omega=omega, damping=np.diag(0.02 * omega), shapes=PointShapes(np.array(shapes)), domain=points)
+    assert proportional_points("P1", modes) == alike
+    rig = Rig(modes, (Actuator("F", "P1"),), (Sensor("w1", "P1", noise_std=1e-5),))
+    real, rng = replace(rig, elements=(CubicSpring("P1", 1e8),)), np.random.default_rng(3)
+    records = []
+    for level in (1.0, 3.0):
+        record = simulate(real, level * np.repeat(rng.normal(size=(1, 100)), 5, axis=1), sample_time=0.002)
+        read = record.outputs + 1e-5 * rng.normal(size=record.outputs.shape)
+        records.append(replace(record, outputs=read, name=f"{level:g} N"))
+    verdict = diagnose(rig, records, catalogue=(kind_named("cubic_spring"),))
+    (effect,) = verdict.to_json()["effects"]
+    if effect["at"] == "P1":
+        assert effect.get("or_at", []) == list(alike)
+        assert ("at P1 (or in proportion at P2" in verdict.sentence) == bool(alike)
+    else:
+        assert "P1" in effect["or_at"]

@@ -17,11 +17,13 @@ from workbench.records.units import SI, Units
 from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.modes import Modes
 from workbench.structure.printed import joined_in_words, rounded
 
 NEAR = 0.05  # of the gap: a set that closes less is not stated as the nearest
 SHOWN = 0.005  # of the gap: smaller shares are not stated
 NEARLY_ALL = 0.99  # of the gap: a single force that explains more lacks only what noise shows
+PROPORTIONAL = 1e-6  # relative: deviation of the shape at a point from a multiple of that at another
 SAME_PLACE = 0.02  # of the extent: places as close as this agree
 
 
@@ -358,6 +360,9 @@ def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
         entry |= _place_json(effect.at)
         spread = [rounded(effect.deviations.get(name, 0.0)) for name in COORDINATES if name in effect.values]
         entry["at_std"] = spread if len(spread) > 1 else spread[0]
+        alike = proportional_points(effect.at, nominal.modes)
+        if alike:
+            entry["or_at"] = list(alike)
     return entry
 
 
@@ -429,7 +434,30 @@ def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
         text += f" {kind.fixed_place(effect, nominal)[1]}"
     elif effect.at is not None:
         text += f" {place_in_words(effect.at, effect.deviations)}"
+        alike = proportional_points(effect.at, nominal.modes)
+        if alike:
+            more = f" and {len(alike) - 3} others" if len(alike) > 3 else ""
+            text += f" (or in proportion at {' or '.join(alike[:3])}{more})"
     return text
+
+
+def proportional_points(where: Any, modes: Modes) -> tuple[str, ...]:
+    """Other named points that move in proportion to a point in every mode, though not as it does.
+
+    A law there with its constants scaled gives the same readings, so that no record distinguishes the points.
+    """
+    if not isinstance(where, str):
+        return ()
+    shape = modes.phi_at(where)
+    size = float(np.linalg.norm(shape))
+    found = []
+    for name in map(str, modes.domain.grid(0)):
+        other = modes.phi_at(name)
+        ratio = float(other @ shape) / max(size**2, 1e-300)
+        is_proportional = np.linalg.norm(other - ratio * shape) < PROPORTIONAL * np.linalg.norm(other)
+        if is_proportional and abs(abs(ratio) - 1.0) > PROPORTIONAL:
+            found.append(name)
+    return tuple(found)
 
 
 def place_in_words(where: Any, deviations: Mapping[str, float]) -> str:
