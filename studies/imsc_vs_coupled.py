@@ -10,7 +10,7 @@ from matplotlib.ticker import NullFormatter
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.laws.coupled import controlled_plant, coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles, riccati_gains, riccati_matrices
 from workbench.design.laws.on_off import on_off
@@ -126,8 +126,8 @@ def every_design(places):
     ways = {
         "exact coordinates": lambda law: law,
         "modal filter": lambda law: filtered(law, displacement_filter(own, SENSORS, 1.0)),
-        "Luenberger": lambda law: luenberger(modes, law, readings, poles=(-0.3 + 1j) * own.omega),
-        "Kalman": lambda law: kalman(modes, law, readings, disturbance=1.0, noise=1e-2),
+        "Luenberger": lambda law: luenberger_controller(modes, law, readings, poles=(-0.3 + 1j) * own.omega),
+        "Kalman": lambda law: kalman_controller(modes, law, readings, disturbance=1.0, noise=1e-2),
     }
     laws = {
         "IMSC, Riccati": lambda: imsc(modes, 4, actuators, weight=MODAL_WEIGHT),

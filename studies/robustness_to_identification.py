@@ -4,7 +4,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
@@ -65,8 +65,10 @@ def designs(modes):
     return {
         "IMSC, modal filter, 11 sensors": filtered(laws["IMSC"], displacement_filter(own, SENSORS, 1.0)),
         "coupled LQR, modal filter, 11 sensors": filtered(laws["coupled LQR"], displacement_filter(own, SENSORS, 1.0)),
-        "coupled LQR, Luenberger, 3 sensors": luenberger(modes, laws["coupled LQR"], few, poles=poles),
-        "coupled LQR, Kalman, 6 sensors": kalman(modes, laws["coupled LQR"], more, disturbance=1.0, noise=1e-2),
+        "coupled LQR, Luenberger, 3 sensors": luenberger_controller(modes, laws["coupled LQR"], few, poles=poles),
+        "coupled LQR, Kalman, 6 sensors": kalman_controller(
+            modes, laws["coupled LQR"], more, disturbance=1.0, noise=1e-2
+        ),
     }
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.law import Law
 from workbench.design.loop.closed_loop import close_loop, close_with
@@ -63,11 +63,13 @@ def study(outcome, data=None):
 
     def observed(actuators, sensors, share=1.0):
         sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensors)]
-        return luenberger(modes, law(actuators, share), sensors, poles=(-0.3 + 1j) * modes.omega[:CONTROLLED])
+        return luenberger_controller(
+            modes, law(actuators, share), sensors, poles=(-0.3 + 1j) * modes.omega[:CONTROLLED]
+        )
 
     def estimated(actuators, sensors, share=1.0):
         sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensors)]
-        return kalman(modes, law(actuators, share), sensors, disturbance=1.0, noise=1e-2)
+        return kalman_controller(modes, law(actuators, share), sensors, disturbance=1.0, noise=1e-2)
 
     def through_filter(actuators, sensors, share=1.0):
         return filtered(law(actuators, share), displacement_filter(modes.select(range(CONTROLLED)), sensors, 1.0))

@@ -75,7 +75,9 @@ def test_a_response_at_many_points_shows_those_that_move_most():
 
 def test_an_explanation_at_named_points_is_printed_and_drawn():
     law = wb.imsc(FRAME, 1, [wb.Actuator("F1", "S3")], weight=1.0)
-    explained = wb.explain_spillover(FRAME, wb.kalman(FRAME, law, [wb.Sensor("y", "S3")], disturbance=1.0, noise=0.1))
+    explained = wb.explain_spillover(
+        FRAME, wb.kalman_controller(FRAME, law, [wb.Sensor("y", "S3")], disturbance=1.0, noise=0.1)
+    )
     assert "S3 to F1" in str(explained) and str(explained).startswith("closed loop of 3 modes: ")
     assert "sensor at S3 → F1" in [label.get_text() for label in plot(explained).axes[1].get_yticklabels()]
     assert "place [m]" not in str(law)
@@ -97,7 +99,9 @@ def test_work_that_residual_modes_lose_is_drawn_below_zero():
 @pytest.mark.filterwarnings("error")
 def test_without_residual_modes_a_figure_says_so():
     law = wb.imsc(BEAM, 3, [wb.Actuator(f"F{i}", at) for i, at in enumerate((0.3, 0.6, 0.9))], weight=1.0)
-    explained = wb.explain_spillover(BEAM, wb.kalman(BEAM, law, [wb.Sensor("y", 0.8)], disturbance=1.0, noise=0.1))
+    explained = wb.explain_spillover(
+        BEAM, wb.kalman_controller(BEAM, law, [wb.Sensor("y", 0.8)], disturbance=1.0, noise=0.1)
+    )
     for result in (explained, wb.spillover(BEAM, law, wb.impulse_state(BEAM, 0.8))):
         assert "no mode is residual" in plot(result).axes[0].texts[0].get_text()
 

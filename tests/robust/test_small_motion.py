@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from workbench.design.estimation.digital import sampled
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.rig_loop import LoopTest, run_loop
@@ -24,7 +24,7 @@ DT = 0.01
 @pytest.fixture(scope="module")
 def controller(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.05)
-    return sampled(kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-2), DT)
+    return sampled(kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-2), DT)
 
 
 def test_the_slowest_pole_is_that_of_the_simulated_motion(rig, controller):
@@ -82,7 +82,7 @@ def test_a_cubic_spring_is_worth_what_harmonic_balance_says(rig, controller):
 
 def test_with_one_sensor_the_margin_is_that_of_the_complementary_sensitivity(rig):
     law = imsc(rig.modes, 1, rig.actuators[:1], weight=0.5)
-    controller = sampled(kalman(rig.modes, law, rig.sensors[:1], disturbance=1.0, noise=1e-2), DT)
+    controller = sampled(kalman_controller(rig.modes, law, rig.sensors[:1], disturbance=1.0, noise=1e-2), DT)
     plant = control.c2d(state_space(rig.modes, rig.actuators[:1], rig.sensors[:1]), DT)
     loop = plant * controller.state_space()
     grid = np.linspace(2.0, 12.0, 4001)

@@ -116,7 +116,10 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
     model = _model(own, forced, actuators, sample_time, "delay" in steps)
     estimator = loop.controller.estimator
     if estimator is None:
-        raise DesignError("the controller does not name its estimator; make it by luenberger, kalman or filtered")
+        raise DesignError(
+            "the controller does not name its estimator; make it by luenberger_controller, kalman_controller or"
+            " filtered"
+        )
     output = _output(loop, reads, sensors, model.hold, "sensors" in steps)
     a, b, c, d, e = _matrices(model, loop, estimator, output)
     gain, dead_zone = _values(actuators, "gain"), _values(actuators, "dead_zone")

@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import sampled
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import imsc, pole_gains
 from workbench.design.laws.law import DesignError, Law, separation
@@ -47,7 +47,8 @@ def controlled_by(design: Design) -> tuple[int, ...]:
     if not isinstance(design, Design):
         raise TypeError(
             f"the controller in use is a law, a controller or a placement task; got {type(design).__name__}: make one"
-            " by imsc, coupled_lqr, coupled_poles or on_off, with an estimator by luenberger or kalman"
+            " by imsc, coupled_lqr, coupled_poles or on_off, with an estimator by luenberger_controller or"
+            " kalman_controller"
         )
     return tuple(range(design.n_controlled)) if isinstance(design, PlacementTask) else law_of(design).controlled
 
@@ -71,8 +72,8 @@ def loop_on_rig(rig: Rig, design: Design, test: LoopTest) -> Loop:
     if isinstance(design, Controller):
         if design.designed_by is None:
             raise DesignError(
-                f"{design.name} does not say how its estimator was designed: make it by luenberger, kalman or"
-                " filtered(law, hermite_filter(...))"
+                f"{design.name} does not say how its estimator was designed: make it by luenberger_controller,"
+                " kalman_controller or filtered(law, hermite_filter(...))"
             )
         sensors = tuple(_same_sensor(rig, s) for s in design.sensors)
         return Loop(rig.modes, law, replace(design, law=_linear(law), sensors=sensors))
@@ -110,7 +111,7 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
     best, least = None, -np.inf
     for factor in SPEEDS:
         try:
-            controller = kalman(rig.modes, law, sensors, disturbance=disturbance, noise=factor * noise)
+            controller = kalman_controller(rig.modes, law, sensors, disturbance=disturbance, noise=factor * noise)
         except DesignError:
             continue
         loop = loop_poles(rig, sampled(controller, test.sample_time))

@@ -238,7 +238,7 @@ def check_loop_kinds(controller: object, test: object) -> None:
     if not isinstance(controller, DigitalController):
         raise TypeError(
             f"the controller must be a DigitalController; got {type(controller).__name__}: make one of a law and an"
-            " estimator by sampled(kalman(...), sample_time)"
+            " estimator by sampled(kalman_controller(...), sample_time)"
         )
     check_test(test)
 

@@ -14,7 +14,7 @@ from scipy.signal import cont2discrete
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays, sampled
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.export.export import export, write_controller
 from workbench.design.export.sampled import sample_design
 from workbench.design.export.sampled_loop import sampled_loop
@@ -45,7 +45,7 @@ def modes(hinged_beam):
 @pytest.fixture(scope="module")
 def observer(modes):
     law = imsc(modes, 2, ACTUATORS, weight=1.0)
-    return luenberger(modes, law, SENSORS, poles=modes.omega[:2] * (-0.3 + 1j))
+    return luenberger_controller(modes, law, SENSORS, poles=modes.omega[:2] * (-0.3 + 1j))
 
 
 def everything(rng) -> DigitalController:
@@ -277,7 +277,7 @@ def test_what_cannot_be_handed_over_is_refused_with_the_remedy(modes, observer, 
     with pytest.raises(ValueError, match=r"above 0; got -0\.01"):
         sampled(observer, -0.01)
     fierce = imsc(modes, 2, ACTUATORS, weight=1e-4)
-    unstable = luenberger(modes, fierce, SENSORS, poles=20 * modes.omega[:2] * (-0.3 + 1j))
+    unstable = luenberger_controller(modes, fierce, SENSORS, poles=20 * modes.omega[:2] * (-0.3 + 1j))
     with pytest.raises(DesignError, match=r"unstable in continuous time.*Kalman filter by less disturbance"):
         export(modes, unstable, sample_rate_hz=1e4)
 
@@ -291,7 +291,7 @@ def test_a_slow_actuator_is_in_the_margin_of_continuous_time():
     modes, drive = beam.modes(6), Actuator("a", 0.80816, time_constant=0.076105)
     law = coupled_lqr(modes, 1, [drive], weight=0.0014165)
     sensors = [Sensor("y", 1.46274)]
-    controller = kalman(modes, law, sensors, disturbance=1.0, noise=1.0374e-6)
+    controller = kalman_controller(modes, law, sensors, disturbance=1.0, noise=1.0374e-6)
     parts = (controller.state, controller.reads, controller.commands, controller.direct)
     true = control.feedback(state_space(modes, [drive], sensors), control.ss(*parts), sign=1).poles().real.max()
     found = sample_design(modes, controller, sample_rate_hz=2000.0)

@@ -8,7 +8,7 @@ import pytest
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import hermite_filter
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.export.export import export
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc, imsc_poles, pole_gains, riccati_gains, riccati_matrices
@@ -132,8 +132,14 @@ def test_a_state_of_another_size_starts_no_response():
             lambda: on_off(modes(), 2, actuators(2.0, 3.0), force=[1, 2, 3], dead_band=0.1),
             "force is one .*mode, 2; got 3",
         ),
-        (lambda: kalman(modes(), relay(), [Sensor("y", 3.0)], disturbance=1, noise=1), "on-off, which has no gain"),
-        (lambda: luenberger(modes(), relay(), [Sensor("y", 3.0)], poles=[-1 + 1j]), "on-off, which has no gain"),
+        (
+            lambda: kalman_controller(modes(), relay(), [Sensor("y", 3.0)], disturbance=1, noise=1),
+            "on-off, which has no gain",
+        ),
+        (
+            lambda: luenberger_controller(modes(), relay(), [Sensor("y", 3.0)], poles=[-1 + 1j]),
+            "on-off, which has no gain",
+        ),
         (lambda: filtered(relay(), hermite_filter(modes(1), [1.0, 8.0], 1.0)), "on-off, which has no gain"),
         (lambda: close_loop(modes(), relay()), "on-off, which has no gain"),
         (lambda: explain_spillover(modes(), relay()), "on-off, which has no gain"),

@@ -7,7 +7,7 @@ import pytest
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, FrictionForward, sampled
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_with, impulse_state, initial_response
 from workbench.design.loop.rig_loop import LoopTest, run_loop
@@ -96,7 +96,7 @@ def test_what_is_read_is_what_the_sensors_read(rig):
 
 def test_a_fast_loop_comes_to_the_exact_continuous_one(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
-    controller = kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-2)
+    controller = kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-2)
     loop = close_with(rig.modes, controller)
     state = impulse_state(rig.modes, 0.8)
     errors = []
@@ -147,7 +147,7 @@ def test_what_does_not_fit_is_named(rig):
 
 def test_the_linear_part_is_pythons_control(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
-    controller = kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-4)
+    controller = kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-4)
     import control
 
     continuous = control.ss(controller.state, controller.reads, controller.commands, controller.direct)

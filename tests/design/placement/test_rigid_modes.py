@@ -4,7 +4,7 @@ import control
 import numpy as np
 import pytest
 
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError
@@ -102,8 +102,8 @@ def test_rigid_modes_take_as_many_displacements_and_actuators(modes):
     law = imsc(modes, 2, [Actuator("a", 0.4), Actuator("b", 1.1)], weight=1.0)
     pair = [Sensor("y", 0.75), Sensor("v", 1.2, "velocity")]
     design = (
-        lambda sensors: luenberger(modes, law, sensors, poles=[-1 + 3j, -2 + 6j]),
-        lambda sensors: kalman(modes, law, sensors, disturbance=1e-4, noise=1e-8),
+        lambda sensors: luenberger_controller(modes, law, sensors, poles=[-1 + 3j, -2 + 6j]),
+        lambda sensors: kalman_controller(modes, law, sensors, disturbance=1e-4, noise=1e-8),
     )
     for one in design:
         with pytest.raises(

@@ -8,7 +8,7 @@ import pytest
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
-from workbench.design.estimation.observers import kalman, luenberger, usual_poles
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller, usual_poles
 from workbench.design.laws.coupled import controlled_plant, coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
@@ -39,7 +39,7 @@ def observed(modes, at, share=1.0, actuators=ACTUATORS):
     law = coupled_lqr(modes, 3, actuators, weight=1.0)
     law = Law(share * law.gain, law.controlled, law.actuators, law.name)
     sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(np.atleast_1d(at))]
-    return luenberger(modes, law, sensors, poles=(-0.3 + 1j) * modes.omega[:3])
+    return luenberger_controller(modes, law, sensors, poles=(-0.3 + 1j) * modes.omega[:3])
 
 
 def through_filter(modes, actuators, places, share=1.0):
@@ -64,7 +64,7 @@ def test_kalman_gain_is_that_of_the_dual_regulator():
     modes = beam(3)
     law = coupled_lqr(modes, 3, ACTUATORS, weight=1.0)
     sensors = [Sensor("y", 3.1), Sensor("v", 4.4, "velocity")]
-    gain = kalman(modes, law, sensors, disturbance=0.5, noise=[1e-2, 1e-3]).reads
+    gain = kalman_controller(modes, law, sensors, disturbance=0.5, noise=[1e-2, 1e-3]).reads
     a, _ = controlled_plant(modes, range(3), ACTUATORS)
     shapes = modes.phi([3.1, 4.4])
     c = np.block([[shapes[:1], np.zeros((1, 3))], [np.zeros((1, 3)), shapes[1:]]])
@@ -158,8 +158,10 @@ def test_rigid_and_overdamped_residual_modes_have_their_poles_too(ends, zeta, co
     ).modes(6)
     law = imsc(modes, controlled, [Actuator("A", 0.2), Actuator("B", 0.45)], weight=0.1)
     sensors = [Sensor("y1", 0.15), Sensor("y2", 0.4)]
-    told = explain_spillover(modes, luenberger(modes, law, sensors, poles=usual_poles(modes, controlled)))
-    peer = poles_by_python_control(modes, luenberger(modes, law, sensors, poles=usual_poles(modes, controlled)))
+    told = explain_spillover(modes, luenberger_controller(modes, law, sensors, poles=usual_poles(modes, controlled)))
+    peer = poles_by_python_control(
+        modes, luenberger_controller(modes, law, sensors, poles=usual_poles(modes, controlled))
+    )
     assert {moved.mode for moved in told.shifts} == set(range(6)) - set(controlled)
     assert told.margin == pytest.approx(-peer.real.max(), rel=1e-6)
     for moved in told.shifts:
@@ -181,7 +183,7 @@ def test_the_rigid_displacement_that_no_sensor_reads_stays_where_it_is(quantitie
     ).modes(6)
     law = imsc(free, (2, 3), [Actuator("A", 0.2), Actuator("B", 0.45)], weight=0.1)
     sensors = [Sensor(f"y{at}", at, quantity) for at, quantity in zip((0.15, 0.4), quantities)]
-    told = explain_spillover(free, luenberger(free, law, sensors, poles=usual_poles(free, (2, 3))))
+    told = explain_spillover(free, luenberger_controller(free, law, sensors, poles=usual_poles(free, (2, 3))))
     rigid = [moved for moved in told.shifts if moved.mode in (0, 1)]
     still = [moved for moved in rigid if abs(moved.closed_pole) < 1e-9]
     assert len(still) == quantities.count("velocity") and all(path.shift == 0 for m in still for path in m.paths)
@@ -271,7 +273,9 @@ def test_remedies_move_whatever_stands_anywhere(kind):
     def redesign(actuators, sensors, share):
         law = imsc(modes, count, actuators, weight=weight)
         sensors = [Sensor(f"y{i}", at) for i, at in enumerate(sensors)]
-        return luenberger(modes, replace(law, gain=share * law.gain), sensors, poles=usual_poles(modes, range(count)))
+        return luenberger_controller(
+            modes, replace(law, gain=share * law.gain), sensors, poles=usual_poles(modes, range(count))
+        )
 
     assert close_with(modes, redesign(actuators, places, 1.0)).margin < 0
     found = {r.kind: r for r in spillover_remedies(modes, redesign, actuators, places)}
@@ -304,11 +308,21 @@ def test_the_filter_cures_it_with_sensors_enough():
         (lambda m: observed(m, 5.0), "mode 2 is unobservable"),
         (lambda m: observed(m, []), "needs a sensor"),
         (
-            lambda m: kalman(m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], disturbance=1, noise=0),
-            "noise",
+            lambda m: kalman_controller(
+                m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], disturbance=1, noise=0
+            ),
+            "the noise intensity must be a positive number; got 0",
         ),
         (
-            lambda m: luenberger(m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], poles=[1 + 1j] * 3),
+            lambda m: kalman_controller(
+                m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], disturbance=[1.0, -1.0, 1.0], noise=1.0
+            ),
+            "the disturbance intensity must be a positive number, 3 positive numbers or a positive definite 3 x 3",
+        ),
+        (
+            lambda m: luenberger_controller(
+                m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], poles=[1 + 1j] * 3
+            ),
             "mode 1 of the observer is not stable",
         ),
     ],
@@ -335,7 +349,7 @@ def test_paths_add_up_where_damping_couples_the_modes(damper):
     modes, poles = chain(damper)
     law = imsc(modes, 2, [Actuator("a", "n2"), Actuator("b", "n5")], weight=0.05)
     found = explain_spillover(
-        modes, luenberger(modes, law, [Sensor("y1", "n0"), Sensor("y2", "n4")], poles=[-3 + 5j, -4 + 11j])
+        modes, luenberger_controller(modes, law, [Sensor("y1", "n0"), Sensor("y2", "n4")], poles=[-3 + 5j, -4 + 11j])
     )
     for shift in found.shifts:
         assert np.abs(poles - shift.pole).min() < 1e-9 * abs(shift.pole)
@@ -356,7 +370,7 @@ def test_lags_and_delays_are_in_the_loop(late):
     """Against python-control, which takes a delay by its own Padé approximation; the paths count them too."""
     modes, (acts, reads) = beam(4, zeta=0.02), late
     law = coupled_lqr(modes, 1, [Actuator("F", 3.0, **acts)], weight=0.1)
-    controller = kalman(modes, law, [Sensor("y", 4.2, **reads)], disturbance=1.0, noise=1e-3)
+    controller = kalman_controller(modes, law, [Sensor("y", 4.2, **reads)], disturbance=1.0, noise=1e-3)
     found = explain_spillover(modes, controller)
     prompt = [replace(part, delay=0.0) for part in (*law.actuators, *controller.sensors)]
     plant = state_space(modes, prompt[:1], prompt[1:])
@@ -392,7 +406,9 @@ def test_a_marginally_stable_loop_needs_no_remedy():
     def redesign(actuators, sensors, share):
         law = coupled_lqr(modes, 3, actuators, weight=0.1)
         sensors = [Sensor(f"y{i}", x) for i, x in enumerate(sensors)]
-        return luenberger(modes, replace(law, gain=share * law.gain), sensors, poles=[-1 + 1j, -2 + 2j, -3 + 20j])
+        return luenberger_controller(
+            modes, replace(law, gain=share * law.gain), sensors, poles=[-1 + 1j, -2 + 2j, -3 + 20j]
+        )
 
     actuators = [Actuator("a", 0.1), Actuator("b", 1.3), Actuator("c", 1.9)]
     assert close_with(modes, redesign(actuators, [0.1, 1.3], 1.0)).stability == "marginally stable"
@@ -410,7 +426,7 @@ def test_the_dominant_path_of_a_pole_that_moves_left_is_what_moves_it():
     ).modes(6)
     law = imsc(modes, 2, [Actuator("F1", 0.6575), Actuator("F2", 1.057)], weight=1.0)
     sensors = [Sensor("y", 0.75), Sensor("v", 1.2, "velocity")]
-    controller = luenberger(modes, law, sensors, poles=modes.omega[:2] * (-0.3 + 1j))
+    controller = luenberger_controller(modes, law, sensors, poles=modes.omega[:2] * (-0.3 + 1j))
     third = next(shift for shift in explain_spillover(modes, controller).shifts if shift.mode == 2)
     assert third.shift.real < 0.0
     assert third.dominant.text == "1.2 to F1" and third.dominant.shift.real < 0.7 * third.shift.real

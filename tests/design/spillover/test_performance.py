@@ -7,7 +7,7 @@ from scipy.integrate import simpson
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
@@ -36,7 +36,7 @@ STATE = np.r_[np.zeros(6), impulse_state(MODES, 6.3)[6:8], np.zeros(4)]
 
 def test_figures_of_a_loop_with_an_observer_are_those_of_its_motion():
     sensors = [Sensor("a", 2.2), Sensor("b", 7.1)]
-    controller = kalman(MODES, LAW, sensors, disturbance=1.0, noise=0.1)
+    controller = kalman_controller(MODES, LAW, sensors, disturbance=1.0, noise=0.1)
     told = performance(close_with(MODES, controller), STATE, weight=3.0, final_time=40.0)
     shapes = MODES.phi([a.at for a in ACTUATORS]).T
     seen = np.hstack([MODES.phi([s.at for s in sensors]), np.zeros((2, 6))])

@@ -178,8 +178,8 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
     """
     if not isinstance(controller, Controller):
         raise TypeError(
-            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by kalman,"
-            " luenberger or filtered"
+            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by"
+            " kalman_controller, luenberger_controller or filtered"
         )
     if not 0 < number(sample_time, "sample_time", "s") < np.inf:
         raise ValueError(f"sample_time must be above 0; got {sample_time:g} s")

@@ -141,8 +141,9 @@ def sample_design(
         )
     if not isinstance(controller, Controller | Law | OnOffLaw):
         raise TypeError(
-            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by kalman,"
-            " luenberger or filtered; a DigitalController is sampled already, write_controller writes it"
+            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by"
+            " kalman_controller, luenberger_controller or filtered; a DigitalController is sampled already,"
+            " write_controller writes it"
         )
     if isinstance(controller, OnOffLaw):
         raise DesignError(
@@ -151,8 +152,8 @@ def sample_design(
         )
     if not isinstance(controller, Controller):
         raise DesignError(
-            f"{controller.name} acts on modal coordinates, which no sensor reads; put it on an observer (luenberger,"
-            " kalman) or through a modal filter first"
+            f"{controller.name} acts on modal coordinates, which no sensor reads; put it on an observer"
+            " (luenberger_controller, kalman_controller) or through a modal filter first"
         )
     number(computing_delay, "computing_delay", "s")
     if not (np.isfinite(number(sample_rate_hz, "sample_rate_hz", "Hz")) and sample_rate_hz > 0):

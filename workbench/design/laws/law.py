@@ -95,17 +95,18 @@ def linear(law: object) -> Law:
     return law
 
 
-def positive_definite(value: ArrayLike, size: int, refusal: str) -> np.ndarray:
+def positive_definite(value: ArrayLike, size: int, what: str) -> np.ndarray:
     """A number, a diagonal (size,) or a matrix (size, size) as a matrix.
 
     Raises:
-        DesignError: a value that is not symmetric and positive definite; `refusal` begins the message.
+        DesignError: a value that is not symmetric and positive definite; the message says what it is, `what`.
     """
     given = np.asarray(value, float)
     matrix = given * np.eye(size) if given.ndim == 0 else np.diag(given) if given.ndim == 1 else given
     fits = matrix.shape == (size, size) and np.isfinite(matrix).all()
     if not fits or not np.allclose(matrix, matrix.T) or not (np.linalg.eigvalsh(matrix) > 0).all():
-        raise DesignError(f"{refusal}; got {given}")
+        several = f", {size} positive numbers or a positive definite {size} x {size} matrix" if size > 1 else ""
+        raise DesignError(f"{what} must be a positive number{several}; got {given}")
     return matrix
 
 

@@ -157,7 +157,7 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
 
     Args:
         modes: of the full plant; those that the law does not control are residual.
-        controller: from `filtered`, `luenberger` or `kalman`.
+        controller: from `filtered`, `luenberger_controller` or `kalman_controller`.
 
     Raises:
         DesignError: a law alone, which reads no sensor and so shifts no residual mode, or one that has no gain.
@@ -165,7 +165,7 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
     if not isinstance(controller, Controller):
         raise DesignError(
             f"{linear(controller).name} alone reads exact modal coordinates, so it shifts no residual mode; put it on"
-            " an observer (luenberger, kalman) or through a modal filter, and give the controller"
+            " an observer (luenberger_controller, kalman_controller) or through a modal filter, and give the controller"
         )
     loop = close_with(modes, controller)
     residual = [r for r in range(modes.n_modes) if r not in controller.law.controlled]

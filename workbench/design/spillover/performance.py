@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import Controller, filtered
 from workbench.design.estimation.modal_filter import filter_on
-from workbench.design.estimation.observers import luenberger, usual_poles
+from workbench.design.estimation.observers import luenberger_controller, usual_poles
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices, numbered
@@ -225,7 +225,7 @@ def through_sensors(
                 if by_filter:
                     controller = filtered(law, filter_on(structure, modes, law.controlled, sensor_places))
                 else:
-                    controller = luenberger(modes, law, sensors, poles=usual_poles(modes, law.controlled))
+                    controller = luenberger_controller(modes, law, sensors, poles=usual_poles(modes, law.controlled))
                 tried.append((controller, explain_spillover(modes, controller), ""))
             except ValueError as error:
                 tried.append((None, None, f"{law.name}: {error}"))
