@@ -224,7 +224,7 @@ def report_motion(outcome, truth, modes, laws, x) -> None:
         "through modal filters": close_loop(truth, laws["IMSC"], filter_),
         "exact modal coordinates": close_loop(truth, laws["IMSC"]),
     }
-    responses = {name: initial_response(loop, state, time) for name, loop in loops.items()}
+    responses = {name: initial_response(loop, time, state) for name, loop in loops.items()}
     energy = {name: r.energy[:N_CONTROLLED].sum(0) for name, r in responses.items()}
     left = energy["through modal filters"][-1] / energy["no control"][-1]
     apart = np.abs(

@@ -124,7 +124,7 @@ def study(outcome, data=None):
     time = np.linspace(0.0, 60.0 / truth.omega[0], 1500)
     nothing = Law(np.zeros_like(law.gain), law.controlled, law.actuators, "none")
     loops = {"uncontrolled": nothing, "controlled": law, "designed on the plate itself": exact}
-    responses = {name: initial_response(close_loop(truth, each), struck, time) for name, each in loops.items()}
+    responses = {name: initial_response(close_loop(truth, each), time, struck) for name, each in loops.items()}
     outcome.check(
         "stability margin of the plate under the identified law, 1/s", close_loop(truth, law).margin, 0.0, True
     )

@@ -112,7 +112,7 @@ def robust(outcome):
 def closed_loop_record(truth, law, through, seed):
     """Modal coordinates that the sensors' filter reads in the loop of all modes, after an impulse, noise 1 %."""
     time = 0.1 * np.arange(400)
-    motion = initial_response(close_loop(truth, law, through), impulse_state(truth, 6.3), time).displacement(SENSORS)
+    motion = initial_response(close_loop(truth, law, through), time, impulse_state(truth, 6.3)).displacement(SENSORS)
     noise = 0.01 * motion.std(axis=1, keepdims=True)
     readings = through(motion + noise * np.random.default_rng(seed).standard_normal(motion.shape))
     channels = [Channel(f"q{r + 1}") for r in range(CONTROLLED)]

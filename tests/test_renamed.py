@@ -4,10 +4,15 @@ import importlib
 import pkgutil
 from dataclasses import fields, is_dataclass
 
+import numpy as np
 import pytest
 
 import workbench
+from workbench.design.laws.imsc import imsc
+from workbench.design.loop.closed_loop import close_loop, initial_response
 from workbench.renamed import Renamed, former_arguments
+from workbench.rig.actuators import Actuator
+from workbench.structure.member import Beam
 
 
 def former_names():
@@ -48,3 +53,17 @@ def test_a_former_argument_is_taken_for_the_new_one_with_a_warning():
     assert area(2.0, width=3.0) == 6.0
     with pytest.warns(DeprecationWarning, match=r"area\(span=...\) is now .*area\(length=...\)"):
         assert area(span=2.0, width=3.0) == 6.0
+
+
+def test_a_response_in_the_former_order_of_arguments_is_the_same_and_warns():
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(2)
+    loop, time, state = close_loop(modes, imsc(modes, 1, [Actuator("F1", 3.0)], weight=1.0)), [0.0, 0.5], np.ones(4)
+    expected = initial_response(loop, time, state).modal
+    for args, names in (((state, time), {}), ((state,), {"time": time}), ((), {"time": time, "state": state})):
+        with pytest.warns(DeprecationWarning, match=r"is now initial_response\(loop, timepts, initial_state\)"):
+            np.testing.assert_array_equal(initial_response(loop, *args, **names).modal, expected)
+    rising = np.arange(4.0)  # may be instants or a state
+    with pytest.raises(ValueError, match="name them"):
+        initial_response(loop, rising, rising + 1.0)
+    named = initial_response(loop, timepts=rising + 1.0, initial_state=rising).modal
+    np.testing.assert_array_equal(named[:, :1], initial_response(loop, [1.0], rising).modal)

@@ -60,7 +60,7 @@ def test_little_difference_between_placements_holds_for_spread_ones_only():
     """Section 5.8: displacements differ little. Of the controlled modes they do not differ; of the residual, by 10²."""
     time = np.linspace(0.0, 60.0, 7)[1:]
     motions = [
-        initial_response(close_loop(modes(), imsc(modes(), 4, actuators(p), weight=20.0)), state(), time)
+        initial_response(close_loop(modes(), imsc(modes(), 4, actuators(p), weight=20.0)), time, state())
         for p in PLACES
     ]
     for motion in motions[1:]:
@@ -72,11 +72,11 @@ def test_little_difference_between_placements_holds_for_spread_ones_only():
 def test_filters_cure_observation_spillover_at_the_fourth_power():
     """With nine sensors the filter's motion is that of exact coordinates to a few thousandths, not identical."""
     law, time = imsc(modes(), 4, actuators(PLACES[0]), weight=20.0), np.linspace(0.0, 60.0, 121)
-    exact = initial_response(close_loop(modes(), law), state(), time).modal[:4]
+    exact = initial_response(close_loop(modes(), law), time, state()).modal[:4]
 
     def error(count):
         filter_ = hermite_filter(modes(4), np.linspace(0.0, 10.0, count), 1.0)
-        return np.abs(initial_response(close_loop(modes(), law, filter_), state(), time).modal[:4] - exact).max()
+        return np.abs(initial_response(close_loop(modes(), law, filter_), time, state()).modal[:4] - exact).max()
 
     errors = np.array([error(k) for k in (9, 17, 33)]) / np.abs(exact).max()
     assert errors[0] < 5e-3 and (np.log2(errors[:-1] / errors[1:]) > 3.5).all()

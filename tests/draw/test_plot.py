@@ -67,7 +67,7 @@ def test_a_response_at_many_points_shows_those_that_move_most():
     points = wb.NamedPoints(tuple(f"S{i}" for i in range(n)), None, ("x",) * n)
     modes = wb.FiniteElements(np.eye(n), np.diag(np.arange(1.0, n + 1)), nodes=points).modes(n)
     law = wb.imsc(modes, 1, [wb.Actuator("F1", "S0")], weight=1.0)
-    response = wb.initial_response(wb.close_loop(modes, law), np.r_[np.arange(n), np.zeros(n)], np.linspace(0, 9, 50))
+    response = wb.initial_response(wb.close_loop(modes, law), np.linspace(0, 9, 50), np.r_[np.arange(n), np.zeros(n)])
     figure = plot(response)
     assert [ax.get_ylabel() for ax in figure.axes] == [f"S{i}" for i in range(8, n)]
     assert "of the 12 points of 20 that move most" in figure.axes[0].get_title("left")

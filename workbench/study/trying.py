@@ -209,7 +209,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
     state = impulse_state(modes, design.impulse_at)
     at_rest = state.copy()
     at_rest[modes.n_modes + design.controlled :] = 0.0  # so that W_r is the energy that control adds to the mode
-    response = initial_response(loop, state, np.linspace(0.0, design.final_time, N_TIMES))
+    response = initial_response(loop, np.linspace(0.0, design.final_time, N_TIMES), state)
     effort = float(simpson((response.forces**2).sum(axis=0), x=response.time))
     return Tried(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
 

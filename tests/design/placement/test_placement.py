@@ -130,7 +130,7 @@ def test_finite_time_and_peak_force_are_those_of_the_motion(task):
     loop = close_loop(task.modes, law)
     found = short.placed(places, "")
     np.testing.assert_allclose(found.by_mode, finite_spillover(loop, state, 25.0).residual_work, rtol=1e-8)
-    forces = initial_response(loop, state, np.linspace(0.0, 25.0, 20001)).forces
+    forces = initial_response(loop, np.linspace(0.0, 25.0, 20001), state).forces
     assert np.abs(forces).max() <= found.peak_force <= np.abs(forces).max() * (1 + 1e-5)
     assert found.effort == pytest.approx(np.trapezoid((forces**2).sum(axis=0), dx=25.0 / 20000), rel=1e-5)
 

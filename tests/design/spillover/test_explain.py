@@ -97,11 +97,11 @@ def test_an_observer_in_the_loop_against_python_control():
     observer = control.ss(a - b @ controller.law.gain - controller.reads @ c, controller.reads, -controller.law.gain, 0)
     loop = control.feedback(plant, observer, sign=1)
     peer = control.initial_response(loop, time, np.r_[state, np.zeros(2 * m)]).states[: 2 * n]
-    mine = initial_response(close_with(modes, controller), state, time)
+    mine = initial_response(close_with(modes, controller), time, state)
     np.testing.assert_allclose(mine.modal, peer, atol=1e-9)
     # the work counts the same motion
     loss = np.diag(modes.damping)
-    fine = initial_response(close_with(modes, controller), state, np.linspace(0.0, 30.0, 6001))
+    fine = initial_response(close_with(modes, controller), np.linspace(0.0, 30.0, 6001), state)
     gained = fine.energy[:, -1] - fine.energy[:, 0]
     work = finite_spillover(close_with(modes, controller), state, 30.0).by_mode
     np.testing.assert_allclose(work, gained + np.trapezoid(loss[:, None] * fine.modal[n:] ** 2, fine.time), atol=1e-6)
@@ -317,7 +317,7 @@ def test_the_filter_cures_it_with_sensors_enough():
             lambda m: kalman_controller(
                 m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], disturbance=[1.0, -1.0, 1.0], noise=1.0
             ),
-            "the disturbance intensity must be a positive number, 3 positive numbers or a positive definite 3 x 3",
+            "the disturbance intensity must be a positive number, 3 positive numbers or a symmetric positive definite",
         ),
         (
             lambda m: luenberger_controller(
@@ -393,7 +393,7 @@ def test_a_slow_actuator_counts_in_work_and_effort():
     loop, state = close_loop(modes, law), impulse_state(modes, 6.3)
     np.testing.assert_allclose(finite_spillover(loop, state, 30.0).by_mode, energy_gained(loop, state, 30.0), atol=1e-9)
     time = np.linspace(0.0, 300.0, 60_001)
-    squares = (initial_response(loop, state, time).forces ** 2).sum(axis=0)
+    squares = (initial_response(loop, time, state).forces ** 2).sum(axis=0)
     assert effort(modes, law, state) == pytest.approx(np.trapezoid(squares, time), rel=1e-4)
 
 

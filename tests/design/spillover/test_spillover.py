@@ -63,7 +63,7 @@ def test_work_with_damping_against_quadrature():
     b = damped.phi([2.0, 4.0, 6.0, 8.5]).T
 
     def power(t):
-        x = initial_response(loop, state, [t]).modal[:, 0]
+        x = initial_response(loop, [t], state).modal[:, 0]
         return (b @ (loop.feedback @ x)) * x[6:]
 
     work = quad_vec(power, 0.0, 12.0, epsabs=1e-11)[0]
@@ -79,7 +79,7 @@ def test_the_limit_needs_undamped_modes():
 def test_effort_and_cost_against_the_response():
     state, chosen = impulse_state(modes(), 6.3), law()
     time = np.linspace(0.0, 400.0, 40001)
-    response = initial_response(close_loop(modes(), chosen), state, time)
+    response = initial_response(close_loop(modes(), chosen), time, state)
     power = (response.forces**2).sum(axis=0)
     assert effort(modes(), chosen, state) == pytest.approx(np.trapezoid(power, time), rel=1e-4)
     q, v = response.modal[:4], response.modal[9:13]

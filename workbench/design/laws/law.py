@@ -105,7 +105,9 @@ def positive_definite(value: ArrayLike, size: int, what: str) -> np.ndarray:
     matrix = given * np.eye(size) if given.ndim == 0 else np.diag(given) if given.ndim == 1 else given
     fits = matrix.shape == (size, size) and np.isfinite(matrix).all()
     if not fits or not np.allclose(matrix, matrix.T) or not (np.linalg.eigvalsh(matrix) > 0).all():
-        several = f", {size} positive numbers or a positive definite {size} x {size} matrix" if size > 1 else ""
+        several = (
+            f", {size} positive numbers or a symmetric positive definite {size} x {size} matrix" if size > 1 else ""
+        )
         raise DesignError(f"{what} must be a positive number{several}; got {given}")
     return matrix
 

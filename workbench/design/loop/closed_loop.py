@@ -1,8 +1,10 @@
 """The closed loop of all modes, controlled and residual, propagated exactly."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, wraps
+from typing import Any, ParamSpec
+from warnings import warn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +25,8 @@ WELL_CONDITIONED = 1e6  # condition number of eigenvectors up to which the close
 RESONANT = 1e-6  # of the fastest pole: poles nearer to each other have no closed form by partial fractions
 EVEN = 1e-15  # of the last instant: instants count as uniform if they deviate by no more
 ON_AXIS = 1e-9  # of the fastest pole: rounding of real parts
+
+P = ParamSpec("P")
 
 
 def stability(poles: np.ndarray) -> str:
@@ -188,21 +192,61 @@ def impulse_state(modes: Modes, at: Place, impulse: float = 1.0) -> Floats:
     return np.concatenate([np.zeros(modes.n_modes), impulse * modes.phi(at)[0]])
 
 
-def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
+def _in_former_order(function: Callable[P, Response]) -> Callable[P, Response]:
+    """`initial_response` that takes the former order and names too, (loop, state, time), with a warning."""
+
+    def former(loop: ClosedLoop, state: Any, time: Any) -> tuple[ClosedLoop, Any, Any]:
+        return loop, time, state
+
+    def is_former(loop: ClosedLoop, timepts: Any, initial_state: Any) -> bool:
+        """Whether the arguments are (loop, state, time): they make sense in that order alone."""
+        sizes = ((2 * loop.modes.n_modes,), loop.matrix.shape[:1])
+
+        def fits(times: Any, state: Any) -> bool:
+            rise = np.ndim(times) == 1 and np.size(times) and np.min(times) >= 0 and (np.diff(times) > 0).all()
+            return bool(rise and np.shape(state) in sizes)
+
+        if fits(timepts, initial_state) and fits(initial_state, timepts):
+            raise ValueError(
+                "either argument may be the instants and either the state, and their order has changed; name them:"
+                " initial_response(loop, timepts=..., initial_state=...)"
+            )
+        return fits(initial_state, timepts)
+
+    @wraps(function)
+    def with_former(*args: Any, **kwargs: Any) -> Response:
+        if kwargs.keys() & {"state", "time"} or (len(args) == 3 and not kwargs and is_former(*args)):
+            now = "initial_response(loop, state, time) is now initial_response(loop, timepts, initial_state)"
+            warn(f"{now}; the old order goes with the next version", DeprecationWarning, 2)
+            args, kwargs = former(*args, **kwargs), {}
+        return function(*args, **kwargs)
+
+    return with_former
+
+
+@_in_former_order
+def initial_response(
+    loop: ClosedLoop, timepts: Sequence[float] | np.ndarray, initial_state: Sequence[float] | np.ndarray
+) -> Response:
     """Free response from a state at t = 0, exact at every instant: x(t) = e^{At} x0.
 
-    A state (2 n_modes,) of the modes alone starts an observer from zero. With exact modal coordinates the response has
-    a closed form; otherwise uniform instants share one matrix exponential, and others need one each.
+    With exact modal coordinates it has a closed form; otherwise uniform instants share one matrix exponential, and
+    others need one each. The arguments are those of python-control's `initial_response`.
+
+    Args:
+        loop: from `close_loop` or `explain_spillover`.
+        timepts: (n_times,) instants, s.
+        initial_state: x0, (2 n_modes,) of the modes alone, an observer starting from zero, or (n_states,).
 
     Raises:
         ValueError: times that do not increase from zero or later, a state of another size or not finite.
     """
-    time = checked_times(time)
+    time = checked_times(timepts)
     sizes = (2 * loop.modes.n_modes, loop.matrix.shape[0])
-    if np.shape(state) not in ((sizes[0],), (sizes[1],)) or not np.isfinite(state).all():
+    if np.shape(initial_state) not in ((sizes[0],), (sizes[1],)) or not np.isfinite(initial_state).all():
         more = f", or ({sizes[1]},) with the controller" if sizes[1] > sizes[0] else ""
-        raise ValueError(f"the state must be finite, ({sizes[0]},) of the modes{more}; got {np.shape(state)}")
-    state = loop.start(state)
+        raise ValueError(f"the state must be finite, ({sizes[0]},) of the modes{more}; got {np.shape(initial_state)}")
+    state = loop.start(initial_state)
     modal = _cascade(loop, state, time)
     if modal is None:
         modal = _stepped(loop.matrix, state, time)
