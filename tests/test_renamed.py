@@ -12,6 +12,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, initial_response
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
+from workbench.structure.damping import ProportionalDamping
 from workbench.structure.member import Beam
 
 
@@ -67,3 +68,21 @@ def test_a_response_in_the_former_order_of_arguments_is_the_same_and_warns():
         initial_response(loop, rising, rising + 1.0)
     named = initial_response(loop, timepts=rising + 1.0, initial_state=rising).modal
     np.testing.assert_array_equal(named[:, :1], initial_response(loop, [1.0], rising).modal)
+
+
+def test_an_actuator_takes_the_kind_of_earlier_versions_for_its_quantity():
+    with pytest.warns(DeprecationWarning, match=r"Actuator\(kind=...\) is now Actuator\(quantity=...\)"):
+        moment = Actuator("M", 1.0, kind="moment")
+    assert moment == Actuator("M", 1.0, "moment") == Actuator("M", 1.0, quantity="moment")
+    with pytest.warns(DeprecationWarning, match="Actuator.kind is now quantity"):
+        assert moment.kind == "moment"
+
+
+def test_damping_takes_the_coefficients_of_earlier_versions():
+    with pytest.warns(DeprecationWarning, match=r"ProportionalDamping\(g\d=...\) is now"):
+        damping = ProportionalDamping(g1=0.002, g2=0.1)
+    assert damping == ProportionalDamping(0.002, 0.1) == ProportionalDamping(mass=0.1, stiffness=0.002)
+    with pytest.warns(DeprecationWarning, match="ProportionalDamping.g1 is now stiffness"):
+        assert damping.g1 == 0.002
+    with pytest.warns(DeprecationWarning, match="ProportionalDamping.g2 is now mass"):
+        assert damping.g2 == 0.1

@@ -39,7 +39,7 @@ def exact_shape(x, derivative):
 
 
 def test_matrices_are_those_built_by_hand(modes):
-    actuators = [Actuator("F", 0.4, gain=2.0), Actuator("M", 1.3, kind="moment")]
+    actuators = [Actuator("F", 0.4, gain=2.0), Actuator("M", 1.3, quantity="moment")]
     model = state_space(modes, actuators, [Sensor("w", 0.7), Sensor("v", 1.1, "velocity", gain=0.5)])
     omega = np.sqrt(5.0 / 3.0) * (np.arange(1, 4) * np.pi / 2.0) ** 2
     c = 2 * np.array([0.02, 0.01, 0.03]) * omega
@@ -78,7 +78,7 @@ def test_frequency_response_is_the_modal_sum(modes, quantity, lags):
 def test_an_actuator_on_a_support_is_refused_by_name(modes):
     with pytest.raises(ValueError, match="actuator F stands on the support at x = 2"):
         input_matrix(modes, [Actuator("F", 2.0)])
-    assert np.abs(input_matrix(modes, [Actuator("M", 2.0, kind="moment")])).min() > 0.1
+    assert np.abs(input_matrix(modes, [Actuator("M", 2.0, quantity="moment")])).min() > 0.1
 
 
 @pytest.mark.parametrize(

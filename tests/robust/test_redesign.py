@@ -460,7 +460,7 @@ def silent(rig):
 
 def test_a_motor_at_a_support_is_tested_by_an_impulse_that_moves_the_modes():
     beam = wb.Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
-    motor, sensor = wb.Actuator("motor", 0.0, kind="moment"), wb.Sensor("tip", 0.6, "displacement")
+    motor, sensor = wb.Actuator("motor", 0.0, quantity="moment"), wb.Sensor("tip", 0.6, "displacement")
     modes = beam.modes(4)
     test = impulse_test(wb.Rig(modes, (motor,), (sensor,)), (0, 1), 0.01)
     shape = np.abs(modes.phi([test.impulse_at])[0, :2]) / np.sqrt(2.0)
@@ -469,7 +469,7 @@ def test_a_motor_at_a_support_is_tested_by_an_impulse_that_moves_the_modes():
     plate = wb.Plate(
         length=(1.0, 0.8), mass_per_area=1.0, bending_stiffness=1.0, poisson_ratio=0.3, edges="simply supported"
     )
-    patch = wb.Actuator("patch", Patch(0.3, 0.3, 0.2, 0.2), kind="moment")
+    patch = wb.Actuator("patch", Patch(0.3, 0.3, 0.2, 0.2), quantity="moment")
     rig = wb.Rig(plate.modes(4), (patch,), (wb.Sensor("a", (0.6, 0.3), "displacement"),))
     impulse_input = impulse_test(rig, (0, 1), 0.001).impulse_at
     assert np.abs(rig.modes.phi([impulse_input])[0, :2]).min() > 0.5

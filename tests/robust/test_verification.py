@@ -88,7 +88,7 @@ def patched_plate():
     plate = Plate(
         length=(1.0, 0.8), mass_per_area=5.0, bending_stiffness=60.0, poisson_ratio=0.3, edges="simply supported"
     )
-    patches = [Actuator(f"P{i}", Patch(x, 0.3, 0.1, 0.1), kind="moment") for i, x in enumerate((0.25, 0.6))]
+    patches = [Actuator(f"P{i}", Patch(x, 0.3, 0.1, 0.1), quantity="moment") for i, x in enumerate((0.25, 0.6))]
     return plate.modes(4), patches, [(0.25, 0.3), (0.6, 0.3)]
 
 

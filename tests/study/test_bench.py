@@ -158,7 +158,7 @@ def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
     assert design.actuators == ((0.3, 0.24), (0.84, 0.52)) and design.impulse_at == (0.5, 0.46)
     moved = replace(design, actuators=((0.35, 0.3), (0.8, 0.5)))
     found = results_of(rig, design_from(plain(moved)))
-    sizes = {"length": (0.2, 0.12)} if rig.actuators[0].kind == "moment" else None
+    sizes = {"length": (0.2, 0.12)} if rig.actuators[0].quantity == "moment" else None
     actuators = [piezo_patch("P", at, **sizes) if sizes else Actuator("F", at) for at in moved.actuators]
     law = imsc(rig.modes, 2, [replace(a, name=f"F{i}") for i, a in enumerate(actuators)], weight=design.weight)
     state = impulse_state(rig.modes, (0.5, 0.46)) * np.r_[np.ones(6), 1, 1, 0, 0, 0, 0]
@@ -311,7 +311,7 @@ def test_actuators_are_dragged_over_a_plate(plate, opened, until, width, tmp_pat
         residual = browser.find_element("id", "residual")
         until(lambda: float(residual.text.replace("−", "-")) == pytest.approx(moved, rel=0.02))
         ActionChains(browser).click_and_hold(grip).move_by_offset(0, round(-0.5 * scale)).release().perform()
-        highest = 0.74 if rig.actuators[0].kind == "moment" else 0.8
+        highest = 0.74 if rig.actuators[0].quantity == "moment" else 0.8
         until(lambda: float(second.get_attribute("aria-valuetext").split(",")[1]) == pytest.approx(highest, abs=1e-3))
         assert [entry for entry in browser.get_log("browser") if "422" not in entry["message"]] == []
 

@@ -48,7 +48,7 @@ def read_structure_rig(path: Path) -> "tuple[Rig, Units]":
             " describe a beam, a rod or a plate"
         )
     actuators = [
-        replace(a, at=domain.slope(a.at, int(a.kind == "moment"), a.direction)[0][0], direction=None)
+        replace(a, at=domain.slope(a.at, int(a.quantity == "moment"), a.direction)[0][0], direction=None)
         if isinstance(a.at, str)
         else a
         for a in found.actuators

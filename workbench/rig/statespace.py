@@ -23,7 +23,7 @@ def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     columns = []
     for actuator in actuators:
         shape = shape_of(modes, actuator)
-        if modes.is_held(actuator.at, int(actuator.kind == "moment"), direction=actuator.direction):
+        if modes.is_held(actuator.at, int(actuator.quantity == "moment"), direction=actuator.direction):
             raise ValueError(
                 f"actuator {actuator.name} stands on the support at {modes.domain.text(actuator.at)}, where it moves"
                 " no mode; move it inside"

@@ -139,14 +139,14 @@ def _design_damping(modes: Modes, law: Law) -> np.ndarray:
 
 def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
     """The rig's actuator of the same kind at the same place, by preference of the same name."""
-    near = [a for a in rig.actuators if a.kind == wanted.kind and separation(rig.modes, a, wanted) < SAME_PLACE]
+    near = [a for a in rig.actuators if a.quantity == wanted.quantity and separation(rig.modes, a, wanted) < SAME_PLACE]
     # an actuator of the same name at another place does not do: the gains are for their places
     match = next((a for a in near if a.name == wanted.name), next((a for a in near if not a.direct), None))
     if match is not None:
         return match
-    names = ", ".join(f"{a.name} ({a.kind}) at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
+    names = ", ".join(f"{a.name} ({a.quantity}) at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
     raise DesignError(
-        f"the law drives {wanted.name} ({wanted.kind}) at {rig.modes.domain.text(wanted.at)}, where the rig has no"
+        f"the law drives {wanted.name} ({wanted.quantity}) at {rig.modes.domain.text(wanted.at)}, where the rig has no"
         f" actuator: it has {names}; design the law for these"
     )
 

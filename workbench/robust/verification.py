@@ -309,7 +309,7 @@ def settling(energy: np.ndarray, sample_time: float) -> float:
 
 def displacement_at(modes: Modes, actuator: Actuator) -> np.ndarray:
     """Displacement (n_modes,) of each mode at an actuator: at the middle of a patch; at named points its own motion."""
-    if actuator.kind == "force" or isinstance(modes.domain, NamedPoints):
+    if actuator.quantity == "force" or isinstance(modes.domain, NamedPoints):
         return shape_of(modes, actuator)
     return np.asarray(modes.phi(middle(actuator.at))[0])
 

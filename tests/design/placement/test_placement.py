@@ -182,7 +182,7 @@ def test_the_tail_bound_holds_and_is_not_idle(task, hinged_modes):
     assert left_out < bound < 100 * left_out
 
 
-@pytest.mark.parametrize("actuator", [Actuator("M", 3.0, kind="moment"), piezo_patch("P", 4.0, length=0.5)])
+@pytest.mark.parametrize("actuator", [Actuator("M", 3.0, quantity="moment"), piezo_patch("P", 4.0, length=0.5)])
 def test_the_tail_bound_holds_for_what_acts_by_slopes(hinged_modes, actuator):
     """sup |φ_r'| = √(2/L) rπ/L grows with the mode; a short patch's part grows as its square at first."""
     many = hinged_modes(200)
@@ -409,7 +409,7 @@ def test_all_of_a_patch_keeps_out_of_a_forbidden_stretch():
 
 def test_both_orders_of_a_pair_stay_on_the_beam(hinged_modes):
     for pair in (Between(5.5, 4.5), Between(4.5, 5.5)):
-        actuator = Actuator("P", pair, kind="moment")
+        actuator = Actuator("P", pair, quantity="moment")
         assert placement_task(hinged_modes(5), 2, impulse_at=6.3, weight=1.0, actuator=actuator).reach == (0.5, 9.5)
 
 

@@ -55,7 +55,7 @@ class Controller(Printed):
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         line = f"{self.name}: {counted(len(self.sensors), 'channel')} to {counted(len(self.law.actuators), 'actuator')}"
         rows = [(sensor.name, sensor.quantity, place_text(sensor.at)) for sensor in self.sensors]
-        rows += [(actuator.name, actuator.kind, place_text(actuator.at)) for actuator in self.law.actuators]
+        rows += [(actuator.name, actuator.quantity, place_text(actuator.at)) for actuator in self.law.actuators]
         return f"{line}, {counted(len(self.state), 'state')}", ("name", "quantity", "at"), rows, ()
 
     @property

@@ -130,7 +130,7 @@ def reading_words(domain: Domain, sensors: Sequence[Sensor], units: Units = SI) 
 def command_words(domain: Domain, actuators: Sequence[Actuator], units: Units = SI) -> tuple[str, ...]:
     """What each command is: actuator, kind, place and unit; with a gain, the force per unit of the command."""
     return tuple(
-        f"{a.name}: {a.kind} at {domain.text(a.at, DIGITS)}, {unit}"
+        f"{a.name}: {a.quantity} at {domain.text(a.at, DIGITS)}, {unit}"
         if a.gain == 1
         else f"{a.name}: command at {domain.text(a.at, DIGITS)}, {a.gain:.{DIGITS}g} {unit} per unit"
         for a, unit in ((a, units.named(force_unit(a))) for a in actuators)

@@ -160,7 +160,7 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     text = modes.domain.text
     for i, first in enumerate(actuators):
         for second in actuators[i + 1 :]:
-            alike = (first.kind, first.direction) == (second.kind, second.direction)
+            alike = (first.quantity, first.direction) == (second.quantity, second.direction)
             if alike and separation(modes, first, second) <= 1e-6:
                 raise DesignError(
                     f"actuators {first.name} and {second.name} both stand at {text(first.at)}, so B is singular;"
@@ -210,7 +210,7 @@ def _inputs(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuato
 
 def _largest_participation(modes: Modes, actuator: Actuator) -> Floats:
     """The largest participation of each mode (n_modes,) in an actuator's command, over all places."""
-    moment = actuator.kind == "moment"
+    moment = actuator.quantity == "moment"
     if isinstance(modes.domain, NamedPoints):
         shapes = modes.phi(modes.domain.rotations() if moment else modes.domain.grid())
     elif isinstance(modes.domain, Rectangle) and isinstance(actuator.at, Patch):

@@ -149,7 +149,7 @@ class PlacementTask(Printed):
             patches = np.hstack([flat, np.broadcast_to(actuator.at[2:], flat.shape)])
             values = actuator.gain * self.modes.edge_slopes(patches, direction=actuator.direction)
         else:
-            order = int(actuator.kind == "moment")
+            order = int(actuator.quantity == "moment")
             values = actuator.gain * self.modes.phi(list(flat), order, direction=actuator.direction)
         return values.reshape(*shape, self.modes.n_modes)
 
@@ -220,7 +220,7 @@ class PlacementTask(Printed):
             DesignError: frequencies that grow too slowly for a bounded sum, a finite time, or modes that are not along
                 an interval.
         """
-        domain, moment = self.modes.domain, int(self.actuator.kind == "moment")
+        domain, moment = self.modes.domain, int(self.actuator.quantity == "moment")
         if not isinstance(domain, Interval):
             raise DesignError(f"the bound of higher modes is for an interval; these modes are of {domain}")
         power = 2 * (growth - moment)
@@ -375,12 +375,12 @@ def patch_of(rig: Rig) -> Actuator | None:
         DesignError: actuators that differ in more than their place.
     """
     own, domain = [a for a in rig.actuators if not a.direct], rig.modes.domain
-    patch = next((a for a in own if a.kind == "moment"), None)
+    patch = next((a for a in own if a.quantity == "moment"), None)
     if patch is None or isinstance(domain, NamedPoints):
         return None
     half = reach(domain, patch.at)[0]
     for other in own:
-        alike = (other.kind, other.direction) == (patch.kind, patch.direction)
+        alike = (other.quantity, other.direction) == (patch.quantity, patch.direction)
         if not (alike and np.allclose(reach(domain, other.at)[0], half)):
             raise DesignError(
                 f"placement is of identical actuators, and {other.name} is not a patch like {patch.name}: give all the"
@@ -411,7 +411,7 @@ def reach_along(modes: Modes, actuator: Actuator) -> tuple[float, float]:
 
 def participation_along(modes: Modes, actuator: Actuator, x: Floats, derivative: int = 0) -> Floats:
     """Participation (..., n_modes) of an actuator with its middle at x (...), m, or its derivative in x."""
-    half, order = 0.5 * extent(actuator), derivative + (actuator.kind == "moment")
+    half, order = 0.5 * extent(actuator), derivative + (actuator.quantity == "moment")
     at = x.ravel()
     values = modes.phi(at, order) if half == 0 else modes.phi(at + half, order) - modes.phi(at - half, order)
     return actuator.gain * values.reshape(*x.shape, modes.n_modes)
