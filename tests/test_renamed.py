@@ -2,18 +2,24 @@
 
 import importlib
 import pkgutil
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
 
 import workbench
+from workbench.design.estimation.digital import sampled
+from workbench.design.estimation.observers import luenberger_controller
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, initial_response
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ProportionalDamping
 from workbench.structure.member import Beam
+
+MODES = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(2)
+LAW = imsc(MODES, 1, [Actuator("F1", 3.0)], weight=1.0)
 
 
 def former_names():
@@ -57,8 +63,7 @@ def test_a_former_argument_is_taken_for_the_new_one_with_a_warning():
 
 
 def test_a_response_in_the_former_order_of_arguments_is_the_same_and_warns():
-    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(2)
-    loop, time, state = close_loop(modes, imsc(modes, 1, [Actuator("F1", 3.0)], weight=1.0)), [0.0, 0.5], np.ones(4)
+    loop, time, state = close_loop(MODES, LAW), [0.0, 0.5], np.ones(4)
     expected = initial_response(loop, time, state).modal
     for args, names in (((state, time), {}), ((state,), {"time": time}), ((), {"time": time, "state": state})):
         with pytest.warns(DeprecationWarning, match=r"is now initial_response\(loop, timepts, initial_state\)"):
@@ -86,3 +91,15 @@ def test_damping_takes_the_coefficients_of_earlier_versions():
         assert damping.g1 == 0.002
     with pytest.warns(DeprecationWarning, match="ProportionalDamping.g2 is now mass"):
         assert damping.g2 == 0.1
+
+
+def test_the_matrices_of_a_controller_have_their_former_names_too():
+    controller = luenberger_controller(MODES, LAW, [Sensor("y", 4.0)], poles=[-0.1 + 0.1j])
+    former = {"state": "A", "reads": "B", "commands": "C", "direct": "D", "estimator": "L"}
+    for one, names in ((controller, former), (sampled(controller, 0.1), {x.lower(): x for x in "ABCDE"})):
+        for old, new in names.items():
+            with pytest.warns(DeprecationWarning, match=f"Controller.{old} is now {new}"):
+                assert getattr(one, old) is getattr(one, new)
+            with pytest.warns(DeprecationWarning, match=rf"Controller\({old}=...\) is now"):
+                changed = replace(one, **{old: 2.0 * getattr(one, new)})
+            np.testing.assert_array_equal(getattr(changed, new), 2.0 * getattr(one, new))

@@ -158,7 +158,7 @@ def test_a_filter_through_which_residual_modes_diverge_is_made_slower(rig):
         assert not control_plant(plant, found.present, n_samples=1500, impulse_input="F1").stable
         assert control_plant(plant, found.redesigned, n_samples=1500, impulse_input="F1").stable
         chosen.append(found.redesigned)
-    np.testing.assert_allclose(chosen[0].a, chosen[1].a, rtol=1e-6)
+    np.testing.assert_allclose(chosen[0].A, chosen[1].A, rtol=1e-6)
 
 
 def test_where_neither_controller_is_stable_neither_is_advised(rig, controller):
@@ -625,6 +625,6 @@ def test_more_damping_does_more_work(rig):
     energy = 0.5 * modes.phi_at(1.0)[0] ** 2
     for ratio in (0.02, 0.1):
         feeding = np.array([[-gain * (ratio - own)]])
-        none = {"a": np.zeros((0, 0)), "b": np.zeros((0, 1)), "c": np.zeros((1, 0)), "e": np.zeros((0, 1))}
-        run = run_loop(one, DigitalController(1e-3, ("v",), ("F",), d=feeding, **none), test)
+        none = {"A": np.zeros((0, 0)), "B": np.zeros((0, 1)), "C": np.zeros((1, 0)), "E": np.zeros((0, 1))}
+        run = run_loop(one, DigitalController(1e-3, ("v",), ("F",), D=feeding, **none), test)
         assert run.work[0] / energy == pytest.approx(own / ratio - 1.0, rel=0.01)

@@ -81,10 +81,10 @@ def test_what_is_read_is_what_the_sensors_read(rig):
     names = tuple(s.name for s in real.sensors)
     mute = replace(real, actuators=(*real.actuators, *(Actuator(f"M{j}", 2.0 - 1e-12) for j in range(n))))
     shaken = restless(rig, 0.0)
-    d = np.vstack([shaken.d, np.eye(n)])
-    c = np.vstack([shaken.c, np.zeros((n, 2))])
+    d = np.vstack([shaken.D, np.eye(n)])
+    c = np.vstack([shaken.C, np.zeros((n, 2))])
     telling = DigitalController(
-        DT, names, tuple(a.name for a in mute.actuators), shaken.a, shaken.b * 0.0, c, d, np.zeros((2, n + 2))
+        DT, names, tuple(a.name for a in mute.actuators), shaken.A, shaken.B * 0.0, c, d, np.zeros((2, n + 2))
     )
     forces = np.random.default_rng(0).normal(size=(1, 300)).cumsum(axis=1)
     test = LoopTest(300, DT, forces=forces, ports=rig.actuators[:1])
@@ -117,7 +117,7 @@ def test_the_compiled_controller_is_its_own_step(rig):
     friction = FrictionForward(*(rng.normal(size=s) for s in ((2, 1), (1, 2), (1, n))), np.ones(1), np.full(1, 0.5))
     base = restless(rig, 3.0)
     one = replace(
-        base, a=0.9 * base.a, e=rng.normal(size=(2, 2)), scale=1 + 0.1 * rng.normal(size=n), limit=np.full(2, 4.0),
+        base, A=0.9 * base.A, E=rng.normal(size=(2, 2)), scale=1 + 0.1 * rng.normal(size=n), limit=np.full(2, 4.0),
         rate=np.full(2, 1.5), dead_zone=np.array([0.0, 0.4]), bias=np.full(2, 0.2), friction=friction,
     )  # fmt: skip
     run = run_loop(rig, one, LoopTest(200, DT))
@@ -150,7 +150,7 @@ def test_the_linear_part_is_pythons_control(rig):
     controller = kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-4)
     import control
 
-    continuous = control.ss(controller.state, controller.reads, controller.commands, controller.direct)
+    continuous = controller.state_space()
     expected = control.c2d(continuous, DT)
     found = sampled(controller, DT).state_space()
     assert isinstance(controller, Controller) and found.dt == DT

@@ -110,6 +110,6 @@ def test_rigid_modes_take_as_many_displacements_and_actuators(modes):
             DesignError, match=r"2 rigid-body modes need as many independent displacement sensors; there are 1"
         ):
             one(pair)
-        assert one([pair[0], Sensor("y2", 1.2)]).state.shape == (4, 4)
+        assert one([pair[0], Sensor("y2", 1.2)]).A.shape == (4, 4)
     with pytest.raises(DesignError, match="2 rigid-body modes are controlled, and 1 actuator cannot control them"):
         place_coupled(modes, 3, 1, impulse_at=0.6, weight=0.5, limits=Limits(effort=5.0, spacing=0.1))

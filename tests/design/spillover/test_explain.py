@@ -64,7 +64,7 @@ def test_kalman_gain_is_that_of_the_dual_regulator():
     modes = beam(3)
     law = coupled_lqr(modes, 3, ACTUATORS, weight=1.0)
     sensors = [Sensor("y", 3.1), Sensor("v", 4.4, "velocity")]
-    gain = kalman_controller(modes, law, sensors, disturbance=0.5, noise=[1e-2, 1e-3]).reads
+    gain = kalman_controller(modes, law, sensors, disturbance=0.5, noise=[1e-2, 1e-3]).B
     a, _ = controlled_plant(modes, range(3), ACTUATORS)
     shapes = modes.phi([3.1, 4.4])
     c = np.block([[shapes[:1], np.zeros((1, 3))], [np.zeros((1, 3)), shapes[1:]]])
@@ -94,7 +94,7 @@ def test_an_observer_in_the_loop_against_python_control():
     )
     a, b = controlled_plant(modes, range(m), ACTUATORS)
     c = np.c_[modes.phi(3.1)[:, :m], np.zeros((1, m))]
-    observer = control.ss(a - b @ controller.law.gain - controller.reads @ c, controller.reads, -controller.law.gain, 0)
+    observer = control.ss(a - b @ controller.law.gain - controller.B @ c, controller.B, -controller.law.gain, 0)
     loop = control.feedback(plant, observer, sign=1)
     peer = control.initial_response(loop, time, np.r_[state, np.zeros(2 * m)]).states[: 2 * n]
     mine = initial_response(close_with(modes, controller), time, state)
@@ -140,7 +140,7 @@ def test_paths_add_up_to_the_movement_of_the_pole(controller):
 
 def poles_by_python_control(modes, controller):
     plant = state_space(modes, controller.law.actuators, controller.sensors)
-    own = control.ss(controller.state, controller.reads, controller.commands, controller.direct)
+    own = controller.state_space()
     return control.feedback(plant, own, sign=1).poles()
 
 
@@ -377,7 +377,7 @@ def test_lags_and_delays_are_in_the_loop(late):
     delay = acts.get("delay", 0.0) + reads.get("delay", 0.0)
     if delay:
         plant = plant * control.tf2ss(control.tf(*control.pade(delay, 8)))
-    parts = (controller.state, controller.reads, controller.commands, controller.direct)
+    parts = (controller.A, controller.B, controller.C, controller.D)
     true = control.feedback(plant, control.ss(*parts), sign=1).poles()
     slow = true[np.abs(true) < 1.2 * modes.omega[-1]]
     assert all(np.abs(found.poles - pole).min() < 1e-6 * abs(pole) for pole in slow)

@@ -42,11 +42,11 @@ def test_figures_of_a_loop_with_an_observer_are_those_of_its_motion():
     seen = np.hstack([MODES.phi([s.at for s in sensors]), np.zeros((2, 6))])
     plant = np.block([[np.zeros((6, 6)), np.eye(6)], [-np.diag(MODES.omega**2), -MODES.damping]])
     push = np.vstack([np.zeros((6, 2)), shapes])
-    loop = np.block([[plant, push @ controller.commands], [controller.reads @ seen, controller.state]])
+    loop = np.block([[plant, push @ controller.C], [controller.B @ seen, controller.A]])
     time = np.linspace(0.0, 40.0, 40_001)
     start = np.r_[STATE, np.zeros(4)]
     motion = control.initial_response(control.ss(loop, np.zeros((16, 1)), np.eye(16), 0), time, start).outputs
-    forces = controller.commands @ motion[12:]
+    forces = controller.C @ motion[12:]
     energy = (MODES.omega[:2, None] * motion[:2]) ** 2 + motion[6:8] ** 2
     spent = simpson((forces**2).sum(axis=0), x=time)
     assert told.effort == pytest.approx(spent, rel=1e-6)

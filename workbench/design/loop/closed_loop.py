@@ -6,6 +6,7 @@ from functools import cached_property, wraps
 from typing import Any, ParamSpec
 from warnings import warn
 
+import control
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
@@ -15,7 +16,7 @@ from workbench.design.estimation.controller import Controller, check_readable
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import DesignError, Law, linear
 from workbench.design.loop.peak import largest
-from workbench.rig.statespace import modal_plant
+from workbench.rig.statespace import modal_plant, signal_names
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import counted, place_text
@@ -81,6 +82,19 @@ class ClosedLoop:
     def stable(self) -> bool:
         """Whether no pole is to the right of the axis; those of undamped residual modes lie on it."""
         return self.stability != "unstable"
+
+    def state_space(self) -> control.StateSpace:
+        """The loop as python-control's `StateSpace`, from modal forces to (q, q') and the actuator forces."""
+        n, size = self.modes.n_modes, len(self.matrix)
+        modal = [f"{what}{r + 1}" for what in ("q", "dq") for r in range(n)]
+        return control.ss(
+            self.matrix,
+            np.eye(size, n, k=-n),
+            np.vstack([np.eye(2 * n, size), self.feedback]),
+            np.zeros((2 * n + len(self.feedback), n)),
+            inputs=[f"f{r + 1}" for r in range(n)],
+            outputs=modal + signal_names(actuator.name for actuator in self.law.actuators),
+        )
 
     def start(self, state: ArrayLike) -> Floats:
         """The state (n_states,) at t = 0 from that of the modes, (2 n_modes,), or more; the others start from zero."""
@@ -180,10 +194,10 @@ def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
     a, b, c, d, _ = modal_plant(modes, controller.law.actuators, controller.sensors)
     count = len(controller.sensors)
     reads, forces, feedthrough = c[:count], c[count:], d[count:]
-    commands = np.hstack([controller.direct @ reads, controller.commands])
-    plant = np.block([[a, np.zeros((len(a), len(controller.state)))], [controller.reads @ reads, controller.state]])
-    matrix = plant + np.vstack([b @ commands, np.zeros((len(controller.state), len(plant)))])
-    forces = np.hstack([forces, np.zeros((len(forces), len(controller.state)))])
+    commands = np.hstack([controller.D @ reads, controller.C])
+    plant = np.block([[a, np.zeros((len(a), len(controller.A)))], [controller.B @ reads, controller.A]])
+    matrix = plant + np.vstack([b @ commands, np.zeros((len(controller.A), len(plant)))])
+    forces = np.hstack([forces, np.zeros((len(forces), len(controller.A)))])
     return ClosedLoop(modes, controller.law, matrix, forces + feedthrough @ commands)
 
 

@@ -277,7 +277,7 @@ class _ResidualMode:
     def _forces(self, s: complex, plant: Complexes) -> Complexes:
         """T(s) (n_actuators, n_channels), with the plant G(s) of the other modes."""
         c = self._controller
-        own = c.direct + c.commands @ np.linalg.solve(s * np.eye(len(c.state)) - c.state, c.reads)
+        own = c.D + c.C @ np.linalg.solve(s * np.eye(len(c.A)) - c.A, c.B)
         own = self._lags(c.law.actuators, s)[:, None] * own * self._lags(c.sensors, s)
         # least squares, because the matrix is singular where the loop without mode r has the pole s too, as with
         # several rigid modes that one sensor reads
