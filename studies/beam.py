@@ -189,10 +189,10 @@ def report_designs(outcome, truth, modes, laws) -> None:
                 "places": [a.at for a in law.actuators],
                 "cost": quadratic_cost(truth, law, state, FORCE_WEIGHT),
                 "effort": effort(truth, law, state),
-                "W_C": work.controlled_total,
-                "W_r": work.residual_work,
-                "W_R": work.residual_total,
-                "W_R_expected": expected.residual_total,
+                "W_C": work.controlled_work,
+                "W_r": work.residual_work_by_mode,
+                "W_R": work.residual_work,
+                "W_R_expected": expected.residual_work,
             }
         )
     outcome.table("designs", rows)

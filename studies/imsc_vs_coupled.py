@@ -273,7 +273,7 @@ def study(outcome, data=None):
                 "cost": quadratic_cost(modes, law, state, FORCE_WEIGHT),
                 "modal_cost": modal_cost(modes, law, state, MODAL_WEIGHT),
                 "effort": effort(modes, law, state),
-                "W_R": spillover(modes, law, state).residual_total,
+                "W_R": spillover(modes, law, state).residual_work,
             }
             for label, law in laws.items()
         ]
@@ -284,7 +284,7 @@ def study(outcome, data=None):
             {
                 "law": "IMSC on-off",
                 "effort": np.trapezoid((forces**2).sum(axis=0), time),
-                "W_R": on_off_work(modes, relay, state, 120.0).residual_total,
+                "W_R": on_off_work(modes, relay, state, 120.0).residual_work,
             }
         )
         a, b = controlled_plant(modes, range(4), actuators)

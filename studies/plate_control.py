@@ -140,7 +140,7 @@ def study(outcome, data=None):
     undamped = Modes(truth.omega, np.zeros(N_MODES), truth.shapes, truth.domain)
     at_rest = struck * np.tile(np.arange(N_MODES) < N_CONTROLLED, 2)
     ideal = imsc(undamped, N_CONTROLLED, law.actuators, weight=weight)
-    closed = spillover(undamped, ideal, at_rest).residual_work
+    closed = spillover(undamped, ideal, at_rest).residual_work_by_mode
     by_quadrature = quadrature_work(undamped, ideal, at_rest)
     outcome.table("W_r", closed)
     difference = np.abs(by_quadrature - closed).max() / closed.sum()
@@ -169,7 +169,7 @@ def study(outcome, data=None):
         "The panel after an impulse at the star, left alone and controlled from the four crosses.",
     )
     works = {
-        "design on identified modes": spillover(undamped, law, at_rest).residual_work,
+        "design on identified modes": spillover(undamped, law, at_rest).residual_work_by_mode,
         "on the plate itself": closed,
     }
     outcome.figure(

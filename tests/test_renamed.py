@@ -11,7 +11,9 @@ import workbench
 from workbench.design.estimation.digital import sampled
 from workbench.design.estimation.observers import luenberger_controller
 from workbench.design.laws.imsc import imsc
-from workbench.design.loop.closed_loop import close_loop, initial_response
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
+from workbench.design.placement.task import placement_task
+from workbench.design.spillover.spillover import spillover
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -103,3 +105,19 @@ def test_the_matrices_of_a_controller_have_their_former_names_too():
             with pytest.warns(DeprecationWarning, match=rf"Controller\({old}=...\) is now"):
                 changed = replace(one, **{old: 2.0 * getattr(one, new)})
             np.testing.assert_array_equal(getattr(changed, new), 2.0 * getattr(one, new))
+
+
+def test_the_work_of_a_design_has_its_former_names_too():
+    found = spillover(MODES, LAW, impulse_state(MODES, 4.0))
+    names = {"by_mode": "work_by_mode", "residual": "residual_modes"}
+    names |= {"controlled_total": "controlled_work", "residual_total": "residual_work"}
+    for old, new in names.items():
+        with pytest.warns(DeprecationWarning, match=f"Spillover.{old} is now {new}"):
+            np.testing.assert_array_equal(getattr(found, old), getattr(found, new))
+    assert found.residual_modes == (1,) and found.residual_work == found.work_by_mode[1]
+    placed = placement_task(MODES, 1, impulse_at=4.0, weight=1.0).placed([3.0], "")
+    with pytest.warns(DeprecationWarning, match="Placement.by_mode is now residual_work_by_mode"):
+        np.testing.assert_array_equal(placed.by_mode, placed.residual_work_by_mode)
+    for one, new in ((found, "work_by_mode"), (placed, "residual_work_by_mode")):
+        with pytest.warns(DeprecationWarning, match=rf"\(by_mode=...\) is now .*\({new}=...\)"):
+            assert getattr(replace(one, by_mode=[1.0, 2.0]), new)[1] == 2.0

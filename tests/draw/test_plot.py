@@ -90,10 +90,10 @@ def test_work_that_residual_modes_lose_is_drawn_below_zero():
     for struck in (0.3, 1.3):  # residual modes move when control starts; most of the work, or a part, is taken out
         found = wb.spillover(modes, law, wb.impulse_state(modes, struck))
         (ax,) = plot(found).axes
-        assert min(found.residual_work) < 0
-        assert [bar.get_height() for bar in ax.patches] == pytest.approx(found.residual_work)
+        assert min(found.residual_work_by_mode) < 0
+        assert [bar.get_height() for bar in ax.patches] == pytest.approx(found.residual_work_by_mode)
         low, high = ax.get_ylim()
-        assert low < min(found.residual_work) and max(found.residual_work) < high
+        assert low < min(found.residual_work_by_mode) and max(found.residual_work_by_mode) < high
 
 
 @pytest.mark.filterwarnings("error")

@@ -230,7 +230,7 @@ def energy_balance(drawn, at, seed):
     loop, state = close_loop(modes, law), impulse_state(modes, 0.37 * structure.length)
     end = 20.0 / modes.omega[0]
     before, after = initial_response(loop, [0.0, end], state).energy.T
-    gained = finite_spillover(loop, state, end).by_mode
+    gained = finite_spillover(loop, state, end).work_by_mode
     np.testing.assert_allclose(after - before, gained, rtol=0, atol=EXACT * max(before.sum(), after.sum()))
 
 

@@ -162,7 +162,7 @@ def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
     actuators = [piezo_patch("P", at, **sizes) if sizes else Actuator("F", at) for at in moved.actuators]
     law = imsc(rig.modes, 2, [replace(a, name=f"F{i}") for i, a in enumerate(actuators)], weight=design.weight)
     state = impulse_state(rig.modes, (0.5, 0.46)) * np.r_[np.ones(6), 1, 1, 0, 0, 0, 0]
-    exact = finite_spillover(close_loop(rig.modes, law), state, design.final_time).by_mode
+    exact = finite_spillover(close_loop(rig.modes, law), state, design.final_time).work_by_mode
     np.testing.assert_allclose(found["by_mode"], exact, rtol=1e-5, atol=1e-9)
     many = tuple((x, y) for x in np.linspace(0.1, 1.1, 9) for y in np.linspace(0.1, 0.7, 6))
     assert results_of(rig, replace(moved, sensors=many))["residual"] == pytest.approx(found["residual"], rel=0.05)
@@ -359,11 +359,11 @@ def test_a_design_on_a_frame_is_what_the_library_makes_of_it(frame):
     loop = close_loop(rig.modes, law)
     at_rest = impulse_state(rig.modes, "m.y")
     at_rest[rig.modes.n_modes + 2 :] = 0.0
-    expected = finite_spillover(loop, at_rest, design.final_time).residual_total
+    expected = finite_spillover(loop, at_rest, design.final_time).residual_work
     assert results_of(rig, moved)["residual"] == pytest.approx(expected, rel=1e-5)
     sensors = ["l.x", "R.x", "m.y"]
     through = close_loop(rig.modes, law, point_filter(rig.modes, sensors, [0, 1]))
-    expected = finite_spillover(through, at_rest, design.final_time).residual_total
+    expected = finite_spillover(through, at_rest, design.final_time).residual_work
     seen = results_of(rig, design_from({**plain(moved), "sensors": sensors}))
     assert seen["residual"] == pytest.approx(expected, rel=1e-5)
     for change, words in (

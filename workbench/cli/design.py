@@ -62,7 +62,7 @@ def design(
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     shown = []
     for row in rows:
-        numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
+        numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_work, row.work.residual_work)
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
         shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, row.stability))
     where, unit = modes.domain.text(at, 6), command_unit(actuators)
@@ -103,7 +103,7 @@ def design(
                     "cost": row.cost,
                     "effort": row.effort,
                     "peak_force": row.peak_force,
-                    "work": row.work.by_mode,
+                    "work": row.work.work_by_mode,
                     "poles_real": row.poles.real,
                     "poles_imag": row.poles.imag,
                 }

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from workbench.rig.rig import Rig
 
 LEAST_SPACING = 1 / 20  # default least spacing, over the size of the structure
-WRITTEN = ("positions", "residual_work", "by_mode", "effort", "peak_force", "condition", "status")
+# names in JSON, and in `Placement`
+WRITTEN = {key: key for key in ("positions", "residual_work", "by_mode", "effort", "peak_force", "condition", "status")}
+WRITTEN["by_mode"] = "residual_work_by_mode"
 
 
 @guarded
@@ -151,7 +153,7 @@ def place(
             "command_unit": unit,
             "units": asdict(units),
             "controlled": list(range(1, control + 1)),
-            "placements": [{key: getattr(row, key) for key in WRITTEN} for row in rows],
+            "placements": [{key: getattr(row, name) for key, name in WRITTEN.items()} for row in rows],
             "lower_bound": None if certificate is None else certificate.lower_bound,
         },
     )

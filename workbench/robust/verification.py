@@ -93,12 +93,12 @@ class Verification:
 
     @property
     def controlled_work(self) -> np.ndarray:
-        """W_C (n_draws,)."""
+        """W_C of each draw (n_draws,)."""
         return np.asarray(self.work[:, list(self.controlled)].sum(axis=1))
 
     @property
     def residual_work(self) -> np.ndarray:
-        """W_R (n_draws,)."""
+        """W_R of each draw (n_draws,)."""
         return np.asarray(self.work.sum(axis=1) - self.controlled_work)
 
     def to_json(self) -> dict[str, Any]:

@@ -28,7 +28,7 @@ SHOWN, STABLE = {shown}, {stable}  # on the bench
 def study(outcome, data=None):
     rig = read_rig(Path(__file__).with_suffix(".toml"))
     tried = try_out(rig, DESIGN)
-    found = {{"W_R": tried.work.residual_total, "effort": tried.effort}}
+    found = {{"W_R": tried.work.residual_work, "effort": tried.effort}}
     outcome.table("design", found)
     for name, value in SHOWN.items():
         outcome.check(f"{{name}}: against the bench, relative", abs(found[name] / value - 1.0) if value else 0.0, 1e-6)
@@ -77,7 +77,7 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
     """
     path = free_path(name, folder)
     tried = try_out(rig, design)
-    found = {"W_R": tried.work.residual_total, "effort": tried.effort}
+    found = {"W_R": tried.work.residual_work, "effort": tried.effort}
     domain = rig.modes.domain
     imports, motion = MEMBER
     if isinstance(domain, Rectangle):

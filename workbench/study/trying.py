@@ -221,8 +221,8 @@ def results_of(rig: Rig, design: Design) -> dict[str, Any]:
     poles = tried.loop.poles
     energy = tried.response.energy[:, ::step].sum(axis=0)
     return {
-        "residual": _plain(tried.work.residual_total),
-        "by_mode": _plain(tried.work.by_mode),
+        "residual": _plain(tried.work.residual_work),
+        "by_mode": _plain(tried.work.work_by_mode),
         "effort": _plain(tried.effort),
         "peak_force": _plain(np.abs(tried.response.forces).max()),
         "stable": tried.loop.stable,

@@ -104,7 +104,7 @@ def test_a_fast_loop_comes_to_the_exact_continuous_one(rig):
         dt = 0.002 / refined
         run = run_loop(rig, sampled(controller, dt), LoopTest(1000 * refined, dt, impulse_at=0.8))
         exact = initial_response(loop, run.response.time, state)
-        work = finite_spillover(loop, state, run.response.time[-1]).by_mode
+        work = finite_spillover(loop, state, run.response.time[-1]).work_by_mode
         motion = np.abs(run.response.modal[:5] - exact.modal[:5]).max() / np.abs(exact.modal[:5]).max()
         errors.append((motion, np.abs(run.work - work).max() / np.abs(work).max()))
     coarse, fine = np.array(errors)

@@ -54,7 +54,7 @@ def test_one_rigid_mode_takes_the_momentum_of_the_impulse(modes):
     found = placement_task(modes, 1, impulse_at=AT, weight=20.0).placed([x], "")
     assert found.peak_force == pytest.approx(abs(g2 * v / at[0]), rel=2e-6)
     assert found.effort == pytest.approx(g2 * v**2 / at[0] ** 2 / 2.0, rel=1e-12)
-    assert found.by_mode[0] == pytest.approx(0.5 * (at[1] * v / at[0]) ** 2, rel=1e-12)
+    assert found.residual_work_by_mode[0] == pytest.approx(0.5 * (at[1] * v / at[0]) ** 2, rel=1e-12)
 
 
 def test_figures_are_those_of_the_motion(modes, task):
@@ -65,7 +65,9 @@ def test_figures_are_those_of_the_motion(modes, task):
     assert found.peak_force == pytest.approx(peak, rel=1e-5)
     state = impulse_state(modes, AT)
     state[8 + 3 :] = 0.0
-    np.testing.assert_allclose(spillover(modes, found.law, state).residual_work, found.by_mode, rtol=1e-9)
+    np.testing.assert_allclose(
+        spillover(modes, found.law, state).residual_work_by_mode, found.residual_work_by_mode, rtol=1e-9
+    )
     assert effort(modes, found.law, state) == pytest.approx(found.effort, rel=1e-9)
     assert modal_cost(modes, found.law, state, 20.0) == pytest.approx(distributed_cost(modes, 3, state, 20.0), rel=1e-9)
 

@@ -103,7 +103,7 @@ def test_an_observer_in_the_loop_against_python_control():
     loss = np.diag(modes.damping)
     fine = initial_response(close_with(modes, controller), np.linspace(0.0, 30.0, 6001), state)
     gained = fine.energy[:, -1] - fine.energy[:, 0]
-    work = finite_spillover(close_with(modes, controller), state, 30.0).by_mode
+    work = finite_spillover(close_with(modes, controller), state, 30.0).work_by_mode
     np.testing.assert_allclose(work, gained + np.trapezoid(loss[:, None] * fine.modal[n:] ** 2, fine.time), atol=1e-6)
 
 
@@ -391,7 +391,9 @@ def test_a_slow_actuator_counts_in_work_and_effort():
     modes = beam(4, zeta=0.0)
     law = coupled_lqr(modes, 1, [Actuator("F", 3.0, time_constant=0.5)], weight=0.1)
     loop, state = close_loop(modes, law), impulse_state(modes, 6.3)
-    np.testing.assert_allclose(finite_spillover(loop, state, 30.0).by_mode, energy_gained(loop, state, 30.0), atol=1e-9)
+    np.testing.assert_allclose(
+        finite_spillover(loop, state, 30.0).work_by_mode, energy_gained(loop, state, 30.0), atol=1e-9
+    )
     time = np.linspace(0.0, 300.0, 60_001)
     squares = (initial_response(loop, time, state).forces ** 2).sum(axis=0)
     assert effort(modes, law, state) == pytest.approx(np.trapezoid(squares, time), rel=1e-4)

@@ -19,7 +19,7 @@ from workbench.design.laws.law import DesignError, Law, weighed_states
 from workbench.design.loop.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.design.spillover.spillover import settled_moments
-from workbench.renamed import former_arguments
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.structure.domain import (
@@ -54,7 +54,7 @@ class Placement(Printed):
             a rectangle (n_actuators, 2) m; at named points (n_actuators,) names.
         law: with the actuators there; None where B is singular.
         residual_work: W_R.
-        by_mode: (n_residual,) W_r.
+        residual_work_by_mode: (n_residual,) W_r.
         effort: ∫ FᵀF dt.
         peak_force: largest force of any actuator in continuous time, to a millionth.
         condition: of B in the Frobenius norm, ‖B‖‖B⁻¹‖, an upper bound of the spectral condition number.
@@ -67,7 +67,7 @@ class Placement(Printed):
     positions: np.ndarray
     law: Law | None
     residual_work: float
-    by_mode: np.ndarray
+    residual_work_by_mode: np.ndarray
     effort: float
     peak_force: float
     condition: float
@@ -76,9 +76,11 @@ class Placement(Printed):
     spacing: float = np.inf
     overlapping: bool = False
 
+    by_mode = Renamed("residual_work_by_mode")
+
     def __post_init__(self) -> None:
         freeze(self, "positions", dtype=None)
-        freeze(self, "by_mode")
+        freeze(self, "residual_work_by_mode")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         count = len(self.positions)
@@ -88,15 +90,18 @@ class Placement(Printed):
         n_controlled = count if self.law is None else self.law.n_controlled
         line = f"{count} actuator{'s' * (count > 1)} placed: W_R = {self.residual_work:.4g}, effort {self.effort:.4g}"
         rows = [(name, place_text(x)) for name, x in zip(names, listed(self.positions), strict=True)]
-        most = int(np.argmax(self.by_mode))
+        most = int(np.argmax(self.residual_work_by_mode))
         remarks = (
-            f"largest W_r = {self.by_mode[most]:.4g}, in mode {n_controlled + most + 1}; peak force"
+            f"largest W_r = {self.residual_work_by_mode[most]:.4g}, in mode {n_controlled + most + 1}; peak force"
             f" {self.peak_force:.4g}; condition of B {self.condition:.3g}",
             *((f"search: {self.status}",) if self.status else ()),
             *((f"patches overlap; {SPREAD}",) if self.overlapping else ()),
         )
         named = self.positions.dtype == object
         return line, ("actuator", "at" if named else "x [m]" if self.positions.ndim == 1 else "x, y [m]"), rows, remarks
+
+
+Placement.__init__ = former_arguments(by_mode="residual_work_by_mode")(Placement.__init__)  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -197,7 +202,7 @@ class PlacementTask(Printed):
             positions=positions,
             law=law,
             residual_work=float(costs.work[0]),
-            by_mode=costs.by_mode[0],
+            residual_work_by_mode=costs.by_mode[0],
             effort=float(costs.effort[0]),
             peak_force=peak,
             condition=float(costs.condition[0]),

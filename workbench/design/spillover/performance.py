@@ -128,8 +128,8 @@ class Compared:
     @property
     def most_excited(self) -> int | None:
         """Zero-based index of the residual mode that takes the most work; None where no mode is residual."""
-        residual = self.work.residual
-        return residual[int(np.argmax(self.work.residual_work))] if residual else None
+        residual = self.work.residual_modes
+        return residual[int(np.argmax(self.work.residual_work_by_mode))] if residual else None
 
 
 def laws_of(

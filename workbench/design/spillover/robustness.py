@@ -151,6 +151,6 @@ def robustness(
             loop = close_with(modes, controller)
             margins[i] = loop.margin
             if loop.stable:
-                work[i] = finite_spillover(loop, state, final_time).residual_total
+                work[i] = finite_spillover(loop, state, final_time).residual_work
         results[name] = Robustness(margins, work)
     return results
