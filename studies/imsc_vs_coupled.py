@@ -146,7 +146,7 @@ def every_design(places):
                 {
                     "law": law_name,
                     "state": way_name,
-                    **asdict(measures),
+                    **_written(measures),
                     "stable_share": stable_share(possible, design),
                     "seconds": law_seconds + (0.0 if design is law else seconds),
                 }
@@ -155,12 +155,18 @@ def every_design(places):
     measures = on_off_performance(modes, relay, state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
     rows.append(
         {
-            "law": "IMSC, on-off", "state": "exact coordinates", **asdict(measures), "margin": None,
+            "law": "IMSC, on-off", "state": "exact coordinates", **_written(measures), "margin": None,
             "stable_share": None, "seconds": seconds,
         }
     )  # fmt: skip
     first = rows[0]["seconds"]
     return [{**row, "design_time": row.pop("seconds") / first} for row in rows]
+
+
+def _written(measures):
+    """A performance as a row of the results, whose column of the decay rate is called margin."""
+    row = asdict(measures)
+    return {**row, "margin": row.pop("decay_rate")}
 
 
 def plot_comparison(rows, title):

@@ -10,9 +10,14 @@ import pytest
 import workbench
 from workbench.design.estimation.digital import sampled
 from workbench.design.estimation.observers import luenberger_controller
+from workbench.design.export.export import export
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.placement.task import placement_task
+from workbench.design.spillover.explain import explain_spillover
+from workbench.design.spillover.performance import Performance
+from workbench.design.spillover.remedies import Remedy, spillover_remedies
+from workbench.design.spillover.robustness import Robustness
 from workbench.design.spillover.spillover import spillover
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
@@ -121,3 +126,26 @@ def test_the_work_of_a_design_has_its_former_names_too():
     for one, new in ((found, "work_by_mode"), (placed, "residual_work_by_mode")):
         with pytest.warns(DeprecationWarning, match=rf"\(by_mode=...\) is now .*\({new}=...\)"):
             assert getattr(replace(one, by_mode=[1.0, 2.0]), new)[1] == 2.0
+
+
+def test_the_decay_rate_was_called_margin():
+    controller = luenberger_controller(MODES, LAW, [Sensor("y", 3.0)], poles=[-0.1 + 0.1j])
+    explained = explain_spillover(MODES, controller)
+    sampled_design = export(MODES, controller, sample_rate_hz=100.0)
+    with pytest.warns(DeprecationWarning, match=r"\(margins?=...\) is now"):
+        remedy, share = (
+            Remedy("gain", "", 0.5, margin=0.2, controller=controller),
+            Robustness(margins=[1.0], work=[1.0]),
+        )
+        found = Performance(1.0, 1.0, 1.0, margin=0.1)
+    for one in (explained, explained.loop, sampled_design, remedy, found):
+        with pytest.warns(DeprecationWarning, match=f"{type(one).__name__}.margin is now decay_rate"):
+            assert one.margin == one.decay_rate
+    with pytest.warns(DeprecationWarning, match="margins is now decay_rates"):
+        assert share.margins is share.decay_rates
+    with pytest.warns(DeprecationWarning, match="reduced_margin is now reduced_decay_rate"):
+        assert explained.reduced_margin == explained.reduced_decay_rate
+    with pytest.warns(DeprecationWarning, match=r"reduced_margin=...\) is now"):
+        assert replace(explained, reduced_margin=2.0).reduced_decay_rate == 2.0
+    with pytest.warns(DeprecationWarning, match=r"spillover_remedies\(margin=...\) is now .*\(decay_rate=...\)"):
+        spillover_remedies(MODES, lambda *_: controller, LAW.actuators, [3.0], margin=-1e9)

@@ -84,7 +84,7 @@ def design(
         else:
             share = None if perturbed is None else stable_share(perturbed, controller)
             sensed.append(_sensed(controller.name, explained, share))
-    heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
+    heads = ["controller", "decay rate [1/s]", "residual mode that limits it", "path"]
     heads += [] if errors is None else [f"stable share, {errors:.2g} model error"]
     show_table(heads, [row for row, _ in sensed])
     write_json(
@@ -116,12 +116,12 @@ def design(
 
 def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[list[str], dict[str, Any]]:
     """A controller that works through sensors, as a row of the table and as JSON; `share` is its robustness."""
-    margin, stability = f"{explained.margin:.3g}", explained.loop.stability
+    rate, stability = f"{explained.decay_rate:.3g}", explained.loop.stability
     limiting, path = _limit(explained)
-    row = [name, {"stable": margin, "unstable": f"{margin} unstable"}.get(stability, stability), limiting, path]
+    row = [name, {"stable": rate, "unstable": f"{rate} unstable"}.get(stability, stability), limiting, path]
     return row + ([] if share is None else [f"{share:.0%}"]), {
         "design": name,
-        "margin": explained.margin,
+        "margin": explained.decay_rate,  # the key of earlier files
         "stable": explained.loop.stable,
         "limited_by": limiting,
         "path": path,
@@ -132,12 +132,12 @@ def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[l
 
 
 def _limit(explained: "Explanation") -> tuple[str, str]:
-    """The residual mode that limits the stability margin, and the path through which it does, as text."""
+    """The residual mode that limits the decay rate, and the path through which it does, as text."""
     worst = explained.limiting if explained.loop.stable else explained.destabilising
     if worst is None and explained.loop.stable:
         return "none", ""
     if worst is None:
-        return "none: unstable without residual modes" if explained.reduced_margin <= 0 else "no single mode", ""
+        return "none: unstable without residual modes" if explained.reduced_decay_rate <= 0 else "no single mode", ""
     grows = explained.loop.stable or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without this mode"
     return f"mode {worst.mode + 1}: {pole}", f"sensor at {worst.dominant.text}"

@@ -220,7 +220,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         ]
         for one in through
     ]
-    heads = ("controller", "margin [1/s]", "loop", "residual mode that limits it", "path", ROBUSTNESS)
+    heads = ("controller", "decay rate [1/s]", "loop", "residual mode that limits it", "path", ROBUSTNESS)
     filled = [i for i in range(len(heads)) if i < 3 or any(row[i] != "" for row in sensed)]
     sensed = [[row[i] for i in filled] for row in sensed]
     seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}

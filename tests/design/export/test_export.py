@@ -244,7 +244,7 @@ def test_a_rate_too_slow_is_refused_with_one_that_holds(modes, observer):
     with pytest.raises(DesignError, match=r"sample at [0-9.]+ Hz or more") as refused:
         export(modes, observer, sample_rate_hz=25.0, computing_delay=0.055)
     rate = float(str(refused.value).split("sample at ")[1].split()[0])
-    assert export(modes, observer, sample_rate_hz=rate, computing_delay=0.055).margin > 0
+    assert export(modes, observer, sample_rate_hz=rate, computing_delay=0.055).decay_rate > 0
 
 
 def test_what_cannot_be_handed_over_is_refused_with_the_remedy(modes, observer, tmp_path):

@@ -21,7 +21,7 @@ def test_crowded_actuators_cost_the_coupled_regulator_less(hinged_modes):
     independent, coupled = compare(modes, laws, state, weight=10.0, final_time=600.0)
 
     assert coupled.cost < independent.cost and coupled.effort < independent.effort
-    assert independent.work.residual_work == pytest.approx(
+    assert independent.work.residual_work_by_mode == pytest.approx(
         [8.418221e-3, 1.258416e-1, 4.698541e-2, 6.875917e-3, 3.450264e-2], rel=1e-5
     )
     assert independent.most_excited == 5

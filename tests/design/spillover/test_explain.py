@@ -111,19 +111,21 @@ def test_a_residual_mode_is_named_that_stays_stable_and_destabilises_a_controlle
     modes = beam(5, 0.01)
     controller = observed(modes, 3.3)
     told = explain_spillover(modes, controller)
-    assert told.margin < 0 and told.reduced_margin > 0 and told.shifts[0].closed_pole.real < 0
-    assert told.destabilising.mode == 3 and close_with(modes.select([0, 1, 2, 4]), controller).margin > 0
-    assert close_with(modes.select([0, 1, 2, 3]), controller).margin < 0
+    assert told.decay_rate < 0 and told.reduced_decay_rate > 0 and told.shifts[0].closed_pole.real < 0
+    assert told.destabilising.mode == 3 and close_with(modes.select([0, 1, 2, 4]), controller).decay_rate > 0
+    assert close_with(modes.select([0, 1, 2, 3]), controller).decay_rate < 0
 
 
 def test_balas_one_sensor_stabilises_here_and_destabilises_there():
     modes = beam()
     good, bad = explain_spillover(modes, observed(modes, 10 / 6)), explain_spillover(modes, observed(modes, 50 / 6))
-    assert good.margin > 0 and good.destabilising is None
-    assert bad.margin < 0 and bad.destabilising.mode == 3
-    assert bad.reduced_margin == pytest.approx(close_with(modes.select(range(3)), observed(modes, 50 / 6)).margin)
+    assert good.decay_rate > 0 and good.destabilising is None
+    assert bad.decay_rate < 0 and bad.destabilising.mode == 3
+    assert bad.reduced_decay_rate == pytest.approx(
+        close_with(modes.select(range(3)), observed(modes, 50 / 6)).decay_rate
+    )
     # without either spillover the same mode would stay
-    assert close_with(modes.select(range(3)), observed(modes, 50 / 6)).margin > 0
+    assert close_with(modes.select(range(3)), observed(modes, 50 / 6)).decay_rate > 0
 
 
 @pytest.mark.parametrize(
@@ -163,7 +165,7 @@ def test_rigid_and_overdamped_residual_modes_have_their_poles_too(ends, zeta, co
         modes, luenberger_controller(modes, law, sensors, poles=usual_poles(modes, controlled))
     )
     assert {moved.mode for moved in told.shifts} == set(range(6)) - set(controlled)
-    assert told.margin == pytest.approx(-peer.real.max(), rel=1e-6)
+    assert told.decay_rate == pytest.approx(-peer.real.max(), rel=1e-6)
     for moved in told.shifts:
         assert np.abs(peer - moved.closed_pole).min() < 1e-5 * abs(modes.omega[-1])
         assert sum(path.shift for path in moved.paths) == pytest.approx(moved.shift, abs=1e-7 * modes.omega[-1])
@@ -195,8 +197,8 @@ def test_no_residual_mode_is_blamed_for_what_a_controlled_one_does():
     law = coupled_poles(modes, 3, [Actuator("F1", 0.3), Actuator("F2", 0.7)], poles=poles)
     controller = filtered(law, displacement_filter(modes.select(range(3)), [0.35, 0.95], 0.62))
     told = explain_spillover(modes, controller)
-    assert told.reduced_margin < 0 and told.shifts[0].closed_pole.real > 0
-    assert all(close_with(modes.select(np.delete(range(6), r)), controller).margin < 0 for r in (3, 4, 5))
+    assert told.reduced_decay_rate < 0 and told.shifts[0].closed_pole.real > 0
+    assert all(close_with(modes.select(np.delete(range(6), r)), controller).decay_rate < 0 for r in (3, 4, 5))
     assert told.destabilising is None and told.limiting is None
 
 
@@ -232,11 +234,11 @@ def test_every_remedy_stabilises_the_loop_and_less_does_not():
     found = {r.kind: r for r in spillover_remedies(modes, redesign, ACTUATORS, [50 / 6])}
     assert set(found) == {"gain", "actuator", "sensor", "sensors added"}
     assert all(
-        explain_spillover(modes, r.controller).margin == pytest.approx(r.margin) and r.margin > 0
+        explain_spillover(modes, r.controller).decay_rate == pytest.approx(r.decay_rate) and r.decay_rate > 0
         for r in found.values()
     )
     share = 1 - found["gain"].size
-    assert explain_spillover(modes, redesign(ACTUATORS, [50 / 6], min(share * 1.01, 1.0))).margin < 0
+    assert explain_spillover(modes, redesign(ACTUATORS, [50 / 6], min(share * 1.01, 1.0))).decay_rate < 0
     assert found["sensors added"].size == 1
 
 
@@ -277,7 +279,7 @@ def test_remedies_move_whatever_stands_anywhere(kind):
             modes, replace(law, gain=share * law.gain), sensors, poles=usual_poles(modes, range(count))
         )
 
-    assert close_with(modes, redesign(actuators, places, 1.0)).margin < 0
+    assert close_with(modes, redesign(actuators, places, 1.0)).decay_rate < 0
     found = {r.kind: r for r in spillover_remedies(modes, redesign, actuators, places)}
     assert {"actuator", "sensors added"} <= set(found)
     assert all(-poles_by_python_control(modes, r.controller).real.max() > 0 for r in found.values())
@@ -287,7 +289,7 @@ def test_remedies_move_whatever_stands_anywhere(kind):
     if kind == "frame":  # of the points nearer than the nearest that will do none does
         assert moved[0].at == "S3" and found["actuator"].size == pytest.approx(15.0)
         nearer = [redesign([replace(actuators[0], at=f"S{i}")], places, 1.0) for i in (4, 5, 6, 7)]
-        assert all(close_with(modes, one).margin <= 0 for one in nearer)
+        assert all(close_with(modes, one).decay_rate <= 0 for one in nearer)
     cured = found["sensors added"].controller
     assert spillover_remedies(modes, redesign, actuators, cured.places) == ()
 
@@ -298,8 +300,8 @@ def test_the_filter_cures_it_with_sensors_enough():
     def redesign(actuators, sensors, share):
         return through_filter(modes, actuators, sensors, share)
 
-    count, margins = sufficient_sensors(modes, redesign, ACTUATORS)
-    assert margins[0] < 0 and count is not None and (margins[count - 1 :] > 0).all() and margins[count - 2] <= 0
+    count, rates = sufficient_sensors(modes, redesign, ACTUATORS)
+    assert rates[0] < 0 and count is not None and (rates[count - 1 :] > 0).all() and rates[count - 2] <= 0
 
 
 @pytest.mark.parametrize(
@@ -381,7 +383,7 @@ def test_lags_and_delays_are_in_the_loop(late):
     true = control.feedback(plant, control.ss(*parts), sign=1).poles()
     slow = true[np.abs(true) < 1.2 * modes.omega[-1]]
     assert all(np.abs(found.poles - pole).min() < 1e-6 * abs(pole) for pole in slow)
-    assert found.margin == pytest.approx(-true.real.max(), rel=1e-5)
+    assert found.decay_rate == pytest.approx(-true.real.max(), rel=1e-5)
     for shift in found.shifts:
         assert sum(path.shift for path in shift.paths) == pytest.approx(shift.shift, abs=1e-8 * abs(shift.pole))
 

@@ -54,7 +54,7 @@ def test_figures_of_a_loop_with_an_observer_are_those_of_its_motion():
     assert told.spillover == pytest.approx(
         simpson(((shapes @ forces)[2:] * motion[8:12]).sum(axis=0), x=time), rel=1e-5
     )
-    assert told.margin == pytest.approx(-np.linalg.eigvals(loop).real.max())
+    assert told.decay_rate == pytest.approx(-np.linalg.eigvals(loop).real.max())
 
 
 def test_in_the_long_run_the_figures_are_those_of_the_lyapunov_equation():
@@ -71,7 +71,7 @@ def test_a_loop_that_is_unstable_has_no_figures():
         weight=1.0,
         final_time=10.0,
     )
-    assert told.margin < 0 and np.isinf([told.cost, told.effort, told.spillover]).all()
+    assert told.decay_rate < 0 and np.isinf([told.cost, told.effort, told.spillover]).all()
     with pytest.raises(DesignError, match="final time must be positive and finite; got inf"):
         performance(close_loop(MODES, LAW), STATE, weight=1.0, final_time=np.inf)
 

@@ -16,6 +16,7 @@ from workbench.design.estimation.controller import Controller, check_readable
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import DesignError, Law, linear
 from workbench.design.loop.peak import largest
+from workbench.renamed import Renamed
 from workbench.rig.statespace import modal_plant, signal_names
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze, frozen
@@ -69,9 +70,11 @@ class ClosedLoop:
         return frozen(np.linalg.eigvals(self.matrix), complex)
 
     @property
-    def margin(self) -> float:
-        """Stability margin, -max Re of the poles, 1/s; negative where the loop is unstable."""
+    def decay_rate(self) -> float:
+        """Decay rate of the slowest pole (degree of stability), -max Re λ, 1/s; negative where the loop is unstable."""
         return float(-self.poles.real.max())
+
+    margin = Renamed("decay_rate")
 
     @property
     def stability(self) -> str:

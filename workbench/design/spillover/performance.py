@@ -24,7 +24,7 @@ from workbench.design.spillover.spillover import (
     second_moments,
     work_by_mode,
 )
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix
@@ -43,15 +43,18 @@ class Performance:
         cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt, Σ over the controlled modes, by their true coordinates.
         effort: ∫ FᵀF dt.
         spillover: W_R, work in the residual modes.
-        margin: distance of the rightmost pole from the axis, 1/s; nan for on-off control, which has no poles.
+        decay_rate: of the slowest pole, 1/s; nan for on-off control, which has no poles.
     """
 
     cost: float
     effort: float
     spillover: float
-    margin: float
+    decay_rate: float
 
-    spilled = Renamed("spillover")
+    spilled, margin = Renamed("spillover"), Renamed("decay_rate")
+
+
+Performance.__init__ = former_arguments(margin="decay_rate")(Performance.__init__)  # type: ignore[method-assign]
 
 
 def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: float) -> Performance:
@@ -66,15 +69,15 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
     _check_weight(weight)
     check_final_time(final_time)
     modes, n = loop.modes, loop.modes.n_modes
-    margin = loop.margin
+    rate = loop.decay_rate
     if not loop.stable:
-        return Performance(np.inf, np.inf, np.inf, margin)
+        return Performance(np.inf, np.inf, np.inf, rate)
     moments = second_moments(loop.matrix, loop.start(state), final_time)
     own = list(loop.law.controlled)
     energy = modes.omega[own] ** 2 @ np.diag(moments)[own] + np.diag(moments)[[n + r for r in own]].sum()
     used = float(np.trace(loop.feedback @ moments @ loop.feedback.T))
     spillover = float(np.delete(work_by_mode(loop, moments), own).sum())
-    return Performance(float(energy) + weight * used, used, spillover, margin)
+    return Performance(float(energy) + weight * used, used, spillover, rate)
 
 
 def on_off_performance(
