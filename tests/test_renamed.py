@@ -149,3 +149,9 @@ def test_the_decay_rate_was_called_margin():
         assert replace(explained, reduced_margin=2.0).reduced_decay_rate == 2.0
     with pytest.warns(DeprecationWarning, match=r"spillover_remedies\(margin=...\) is now .*\(decay_rate=...\)"):
         spillover_remedies(MODES, lambda *_: controller, LAW.actuators, [3.0], margin=-1e9)
+
+
+@pytest.mark.parametrize("port", [Actuator("F1", 2.0, delay=0.1), Sensor("d", 1.0)])
+def test_whether_a_port_has_a_state_space_was_called_linear(port):
+    with pytest.warns(DeprecationWarning, match="linear is now has_state_space"):
+        assert port.linear is port.has_state_space

@@ -51,7 +51,7 @@ class Actuator:
     direction: str | None = None
     shape_error: tuple[float, ...] = ()
 
-    kind = Renamed("quantity")
+    kind, linear = Renamed("quantity"), Renamed("has_state_space")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "at", same_place(self.at))
@@ -69,7 +69,7 @@ class Actuator:
                 raise ValueError(f"actuator {self.name}: {name} must be positive; got {getattr(self, name)}")
 
     @property
-    def linear(self) -> bool:
+    def has_state_space(self) -> bool:
         """Whether the force is a linear function of the command with finitely many states, so without a delay."""
         unbounded = np.isinf(self.limit) and np.isinf(self.rate_limit)
         return bool(unbounded and not (self.dead_zone or self.delay or self.hysteresis_share or self.bias))
