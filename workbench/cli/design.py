@@ -106,6 +106,7 @@ def design(
                     "work": row.work.work_by_mode,
                     "poles_real": row.poles.real,
                     "poles_imag": row.poles.imag,
+                    "stability": row.stability,
                 }
                 for row in rows
             ],
@@ -122,7 +123,8 @@ def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[l
     return row + ([] if share is None else [f"{share:.0%}"]), {
         "design": name,
         "margin": explained.decay_rate,  # the key of earlier files
-        "stable": explained.loop.stable,
+        "stable": not explained.loop.unstable_poles.size,
+        "stability": stability,
         "limited_by": limiting,
         "path": path,
         "robustness": share,
@@ -133,11 +135,12 @@ def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[l
 
 def _limit(explained: "Explanation") -> tuple[str, str]:
     """The residual mode that limits the decay rate, and the path through which it does, as text."""
-    worst = explained.limiting if explained.loop.stable else explained.destabilising
-    if worst is None and explained.loop.stable:
+    no_growth = not explained.loop.unstable_poles.size
+    worst = explained.limiting if no_growth else explained.destabilising
+    if worst is None and no_growth:
         return "none", ""
     if worst is None:
         return "none: unstable without residual modes" if explained.reduced_decay_rate <= 0 else "no single mode", ""
-    grows = explained.loop.stable or worst.closed_pole.real > 0
+    grows = no_growth or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without this mode"
     return f"mode {worst.mode + 1}: {pole}", f"sensor at {worst.dominant.text}"

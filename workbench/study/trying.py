@@ -225,7 +225,7 @@ def results_of(rig: Rig, design: Design) -> dict[str, Any]:
         "by_mode": _plain(tried.work.work_by_mode),
         "effort": _plain(tried.effort),
         "peak_force": _plain(np.abs(tried.response.forces).max()),
-        "stable": tried.loop.stable,
+        "stable": not tried.loop.unstable_poles.size,
         "undamped": int(np.sum(np.abs(poles.real) <= ON_AXIS * np.abs(poles)) // 2),
         "rightmost": _plain(poles.real.max()),
         "poles": [[_plain(p.real), _plain(p.imag)] for p in poles if p.imag >= 0],

@@ -12,7 +12,7 @@ from workbench.design.export.sampled_loop import MOST_PAST, sampled_loop
 from workbench.design.export.source import command_words, reading_words
 from workbench.design.laws.law import DesignError, Law, numbered
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.loop.closed_loop import close_with
+from workbench.design.loop.closed_loop import close_with, stability
 from workbench.records.units import SI, Units
 from workbench.renamed import Renamed
 from workbench.structure.modes import Modes, freeze
@@ -100,7 +100,7 @@ class SampledDesign(Printed):
             delay = f"delay margin beyond {MOST_LATE} samples"
         # a decay rate within rounding is stated as zero
         own = 0.0 if abs(self.decay_rate) * self.controller.sample_time < ON_CIRCLE else self.decay_rate
-        continuous = 0.0 if before.stability == "marginally stable" else before.decay_rate
+        continuous = 0.0 if stability(before.poles) == "marginally stable" else before.decay_rate
         remarks = [f"decay rate {own:.3g} 1/s, {continuous:.3g} 1/s in continuous time; {delay}"]
         rate, law = self.sample_rate_hz, self.source.law
         free = [r for i, r in enumerate(law.controlled) if self.modes.omega[r] == 0 and not law.gain[:, i].any()]
@@ -159,7 +159,7 @@ def sample_design(
     if not (np.isfinite(number(sample_rate_hz, "sample_rate_hz", "Hz")) and sample_rate_hz > 0):
         raise DesignError(f"the sampling rate must be positive; got {sample_rate_hz:g} Hz")
     before = close_with(modes, controller)
-    if not before.stable:
+    if before.unstable_poles.size:
         raise DesignError(
             f"{controller.name}: the loop of all {modes.n_modes} modes is unstable in continuous time, a pole at"
             f" {-before.decay_rate:+.3g} 1/s: make the observer slower (a Kalman filter by less disturbance), ask for"

@@ -9,7 +9,7 @@ from warnings import warn
 import control
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import expm
+from scipy.linalg import expm, matrix_balance
 
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.design.estimation.controller import Controller, check_readable
@@ -27,12 +27,14 @@ WELL_CONDITIONED = 1e6  # condition number of eigenvectors up to which the close
 RESONANT = 1e-6  # of the fastest pole: poles nearer to each other have no closed form by partial fractions
 EVEN = 1e-15  # of the last instant: instants count as uniform if they deviate by no more
 ON_AXIS = 1e-9  # of the fastest pole: rounding of real parts
+NULL = 1e-12  # of the largest singular value of the balanced A: one that counts as zero
+DRIFTS = "unstable: a rigid-body mode drifts"
 
 P = ParamSpec("P")
 
 
 def stability(poles: np.ndarray) -> str:
-    """Stability of a loop: stable, unstable, or marginally stable where its rightmost pole is on the imaginary axis."""
+    """Stability by the poles: stable, unstable, or marginally stable where the rightmost is on the imaginary axis."""
     rightmost, tolerance = poles.real.max(), rounding(poles)
     return "stable" if rightmost < -tolerance else "unstable" if rightmost > tolerance else "marginally stable"
 
@@ -77,14 +79,35 @@ class ClosedLoop:
     margin = Renamed("decay_rate")
 
     @property
+    def unstable_poles(self) -> np.ndarray:
+        """Poles to the right of the imaginary axis beyond rounding, rad/s; those of undamped modes lie on it."""
+        return self.poles[self.poles.real > rounding(self.poles)]
+
+    @property
     def stability(self) -> str:
-        """Stable, marginally stable or unstable, as of `stability`."""
-        return stability(self.poles)
+        """Stable, marginally stable or unstable, as of `stability`, and unstable where a rigid-body mode drifts.
+
+        A rigid-body mode without control and damping is a double pole at zero with one eigenvector: its displacement
+        grows as t, so it is not marginally stable, which takes as many eigenvectors as poles.
+        """
+        by_poles = stability(self.poles)
+        return DRIFTS if by_poles != "unstable" and self._drifts() else by_poles
 
     @property
     def stable(self) -> bool:
-        """Whether no pole is to the right of the axis; those of undamped residual modes lie on it."""
-        return self.stability != "unstable"
+        """Whether the loop is asymptotically stable; for undamped modes see `unstable_poles` and `stability`."""
+        return self.stability == "stable"
+
+    def _drifts(self) -> bool:
+        """Whether zero is a defective pole: with left and right null vectors W and V of A, WᵀV is singular."""
+        if self.modes.omega.all():
+            return False
+        balanced, _ = matrix_balance(self.matrix, permute=False, separate=True)
+        left, strength, right = np.linalg.svd(balanced)
+        still = strength <= NULL * strength[0]
+        if not still.any():
+            return False
+        return bool(np.linalg.svd(left[:, still].T @ right[still].T, compute_uv=False)[-1] <= ON_AXIS)
 
     def state_space(self) -> control.StateSpace:
         """The loop as python-control's `StateSpace`, from modal forces to (q, q') and the actuator forces."""

@@ -100,8 +100,8 @@ class Explanation(Printed):
         shifts: of every residual mode, the least stable first.
         reduced_decay_rate: of the slowest pole of the loop of the controlled modes alone, 1/s.
         destabilising: the residual mode that makes the loop unstable: one whose pole is unstable, else the one without
-            which the loop is stable (a stable residual mode can destabilise a controlled one). None where the loop is
-            stable, and where no single mode accounts for it, as when the loop of the controlled modes is unstable.
+            which the loop is stable (a stable residual mode can destabilise a controlled one). None where no pole is
+            unstable, and where no single mode accounts for it, as when the loop of the controlled modes is unstable.
     """
 
     loop: ClosedLoop
@@ -191,7 +191,7 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
     ]
     shifts.sort(key=lambda m: -m.closed_pole.real)
     reduced = close_with(modes.select(controller.law.controlled), controller)
-    cause = _destabilising(modes, controller, loop, shifts, reduced.stable)
+    cause = _destabilising(modes, controller, loop, shifts, not reduced.unstable_poles.size)
     return Explanation(loop, tuple(shifts), reduced.decay_rate, cause)
 
 
@@ -229,7 +229,7 @@ def _destabilising(
     modes: Modes, controller: Controller, loop: ClosedLoop, shifts: list[PoleShift], reduced_stable: bool
 ) -> PoleShift | None:
     """The residual mode that destabilises a loop: an unstable one, else one without which the loop is stable."""
-    if loop.stable or not shifts:
+    if not loop.unstable_poles.size or not shifts:
         return None
     if reduced_stable and shifts[0].closed_pole.real > rounding(loop.poles):
         return shifts[0]
@@ -240,7 +240,7 @@ def _destabilising(
     suspects = sorted(shifts, key=lambda m: -abs(m.shift))[:SUSPECTS]
     loops = [without(one) for one in suspects]
     best = int(np.argmax([each.decay_rate for each in loops]))
-    return suspects[best] if loops[best].stable else None
+    return suspects[best] if not loops[best].unstable_poles.size else None
 
 
 class _ResidualMode:

@@ -37,7 +37,7 @@ from workbench.threads import one_blas_thread
 
 @dataclass(frozen=True)
 class Performance:
-    """Performance of a design up to the final time; cost, effort and W_R are infinite where the loop is unstable.
+    """Performance of a design up to the final time; cost, effort and W_R are infinite where a pole is unstable.
 
     Attributes:
         cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt, Σ over the controlled modes, by their true coordinates.
@@ -70,7 +70,7 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
     check_final_time(final_time)
     modes, n = loop.modes, loop.modes.n_modes
     rate = loop.decay_rate
-    if not loop.stable:
+    if loop.unstable_poles.size:
         return Performance(np.inf, np.inf, np.inf, rate)
     moments = second_moments(loop.matrix, loop.start(state), final_time)
     own = list(loop.law.controlled)

@@ -42,7 +42,7 @@ class Robustness:
 
     @property
     def share(self) -> float:
-        """Share of the perturbed models on which the loop of all modes is stable."""
+        """Share of the perturbed models on which no pole of the loop of all modes is unstable."""
         return float(np.mean(np.isfinite(self.work)))
 
     @property
@@ -136,7 +136,7 @@ def perturbed_modes(modes: Modes, error: float, *, count: int = 100, seed: int =
 
 def stable_share(possible: list[Modes], design: Controller | Law) -> float:
     """Share of the models on which a design is stable."""
-    return float(np.mean([close_with(modes, design).stable for modes in possible]))
+    return float(np.mean([not close_with(modes, design).unstable_poles.size for modes in possible]))
 
 
 @one_blas_thread
@@ -157,7 +157,7 @@ def robustness(
         for i, modes in enumerate(possible):
             loop = close_with(modes, controller)
             rates[i] = loop.decay_rate
-            if loop.stable:
+            if not loop.unstable_poles.size:
                 work[i] = finite_spillover(loop, state, final_time).residual_work
         results[name] = Robustness(rates, work)
     return results
