@@ -165,8 +165,7 @@ def every_design(places):
 
 def _written(measures):
     """A performance as a row of the results, whose column of the decay rate is called margin."""
-    row = asdict(measures)
-    return {**row, "margin": row.pop("decay_rate")}
+    return {"margin" if name == "decay_rate" else name: value for name, value in asdict(measures).items()}
 
 
 def plot_comparison(rows, title):
