@@ -122,7 +122,7 @@ def study(outcome, data: Path | None = None) -> None:
         axial_stiffness=taper,
         left="fixed",
         right="free",
-        damping=ProportionalDamping(g1=0.002, g2=0.1),
+        damping=ProportionalDamping(stiffness=0.002, mass=0.1),
     )
     exact = bar.modes(20)
     records = {m: ring_down(exact, m) for m in (6, *SENSORS)}

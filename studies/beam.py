@@ -189,10 +189,10 @@ def report_designs(outcome, truth, modes, laws) -> None:
                 "places": [a.at for a in law.actuators],
                 "cost": quadratic_cost(truth, law, state, FORCE_WEIGHT),
                 "effort": effort(truth, law, state),
-                "W_C": work.controlled_total,
-                "W_r": work.residual_work,
-                "W_R": work.residual_total,
-                "W_R_expected": expected.residual_total,
+                "W_C": work.controlled_work,
+                "W_r": work.residual_work_by_mode,
+                "W_R": work.residual_work,
+                "W_R_expected": expected.residual_work,
             }
         )
     outcome.table("designs", rows)
@@ -224,7 +224,7 @@ def report_motion(outcome, truth, modes, laws, x) -> None:
         "through modal filters": close_loop(truth, laws["IMSC"], filter_),
         "exact modal coordinates": close_loop(truth, laws["IMSC"]),
     }
-    responses = {name: initial_response(loop, state, time) for name, loop in loops.items()}
+    responses = {name: initial_response(loop, time, state) for name, loop in loops.items()}
     energy = {name: r.energy[:N_CONTROLLED].sum(0) for name, r in responses.items()}
     left = energy["through modal filters"][-1] / energy["no control"][-1]
     apart = np.abs(

@@ -63,12 +63,12 @@ def study(outcome, data=None):
     late = finite_spillover(close_loop(modes, law), rest, 2000.0)
     outcome.check(
         "spillover work of the recommended number, against the work up to 2000 s, relative",
-        abs(late.residual_total / gentle.spillover[n - 1] - 1.0),
+        abs(late.residual_work / gentle.spillover[n - 1] - 1.0),
         1e-6,
     )
     outcome.check(
         "work of control on its modes (5.27) against the energy that the force gave them, relative",
-        abs(-late.controlled_total / gentle.energy[:n].sum() - 1.0),
+        abs(-late.controlled_work / gentle.energy[:n].sum() - 1.0),
         1e-9,
     )
     outcome.check("modes recommended for a force of 4 s", n, 6)

@@ -198,7 +198,7 @@ def simulated(modes, steps, sensors=None):
     """The loop of all modes through four actuators, at even instants; the state as it is, or as sensors tell it."""
     law = placement_task(modes, 4, impulse_at=6.3, weight=20.0).law([2.0, 4.0, 6.0, 8.0])
     through = None if sensors is None else displacement_filter(modes.select(range(4)), sensors, 1.0)
-    return initial_response(close_loop(modes, law, through), impulse_state(modes, 6.3), np.linspace(0.0, 1000.0, steps))
+    return initial_response(close_loop(modes, law, through), np.linspace(0.0, 1000.0, steps), impulse_state(modes, 6.3))
 
 
 def evolved(task, effort_limit, seed):

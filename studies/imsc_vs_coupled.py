@@ -10,7 +10,7 @@ from matplotlib.ticker import NullFormatter
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.laws.coupled import controlled_plant, coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles, riccati_gains, riccati_matrices
 from workbench.design.laws.on_off import on_off
@@ -126,8 +126,8 @@ def every_design(places):
     ways = {
         "exact coordinates": lambda law: law,
         "modal filter": lambda law: filtered(law, displacement_filter(own, SENSORS, 1.0)),
-        "Luenberger": lambda law: luenberger(modes, law, readings, poles=(-0.3 + 1j) * own.omega),
-        "Kalman": lambda law: kalman(modes, law, readings, disturbance=1.0, noise=1e-2),
+        "Luenberger": lambda law: luenberger_controller(modes, law, readings, poles=(-0.3 + 1j) * own.omega),
+        "Kalman": lambda law: kalman_controller(modes, law, readings, disturbance=1.0, noise=1e-2),
     }
     laws = {
         "IMSC, Riccati": lambda: imsc(modes, 4, actuators, weight=MODAL_WEIGHT),
@@ -146,7 +146,7 @@ def every_design(places):
                 {
                     "law": law_name,
                     "state": way_name,
-                    **asdict(measures),
+                    **_written(measures),
                     "stable_share": stable_share(possible, design),
                     "seconds": law_seconds + (0.0 if design is law else seconds),
                 }
@@ -155,12 +155,17 @@ def every_design(places):
     measures = on_off_performance(modes, relay, state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
     rows.append(
         {
-            "law": "IMSC, on-off", "state": "exact coordinates", **asdict(measures), "margin": None,
+            "law": "IMSC, on-off", "state": "exact coordinates", **_written(measures), "margin": None,
             "stable_share": None, "seconds": seconds,
         }
     )  # fmt: skip
     first = rows[0]["seconds"]
     return [{**row, "design_time": row.pop("seconds") / first} for row in rows]
+
+
+def _written(measures):
+    """A performance as a row of the results, whose column of the decay rate is called margin."""
+    return {"margin" if name == "decay_rate" else name: value for name, value in asdict(measures).items()}
 
 
 def plot_comparison(rows, title):
@@ -273,7 +278,7 @@ def study(outcome, data=None):
                 "cost": quadratic_cost(modes, law, state, FORCE_WEIGHT),
                 "modal_cost": modal_cost(modes, law, state, MODAL_WEIGHT),
                 "effort": effort(modes, law, state),
-                "W_R": spillover(modes, law, state).residual_total,
+                "W_R": spillover(modes, law, state).residual_work,
             }
             for label, law in laws.items()
         ]
@@ -284,7 +289,7 @@ def study(outcome, data=None):
             {
                 "law": "IMSC on-off",
                 "effort": np.trapezoid((forces**2).sum(axis=0), time),
-                "W_R": on_off_work(modes, relay, state, 120.0).residual_total,
+                "W_R": on_off_work(modes, relay, state, 120.0).residual_work,
             }
         )
         a, b = controlled_plant(modes, range(4), actuators)

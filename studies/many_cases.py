@@ -33,7 +33,7 @@ def spilled(weight, shift):
     law = imsc(modes, 4, [Actuator(f"F{i + 1}", x) for i, x in enumerate(places)], weight=weight)
     state = impulse_state(modes, 6.3)
     state[9 + 4 :] = 0.0
-    return {"W_R": spillover(modes, law, state).residual_total, "effort": effort(modes, law, state)}
+    return {"W_R": spillover(modes, law, state).residual_work, "effort": effort(modes, law, state)}
 
 
 def busy(number):

@@ -59,7 +59,7 @@ def study(outcome, data=None):
     outcome.check("CasADi's W_R against the closed form, relative", abs(float(work) / best.residual_work - 1.0), 1e-8)
     outcome.check("CasADi's effort against the closed form, relative", abs(float(effort) / best.effort - 1.0), 1e-8)
     outcome.check("W_R of the optimum over the best of a full grid", best.residual_work / on_grid.residual_work, 1.0)
-    outcome.check("nodes of mode 5 spill nothing into mode 5", nodes.by_mode[0], 1e-20)
+    outcome.check("nodes of mode 5 spill nothing into mode 5", nodes.residual_work_by_mode[0], 1e-20)
     outcome.say(
         f"the nodes of mode 5 leave W_R = {nodes.residual_work:.3e}; half as much effort again brings"
         f" {best.residual_work:.3e} at x = {', '.join(f'{x:.2f}' for x in best.positions)}"

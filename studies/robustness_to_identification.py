@@ -4,7 +4,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
@@ -65,8 +65,10 @@ def designs(modes):
     return {
         "IMSC, modal filter, 11 sensors": filtered(laws["IMSC"], displacement_filter(own, SENSORS, 1.0)),
         "coupled LQR, modal filter, 11 sensors": filtered(laws["coupled LQR"], displacement_filter(own, SENSORS, 1.0)),
-        "coupled LQR, Luenberger, 3 sensors": luenberger(modes, laws["coupled LQR"], few, poles=poles),
-        "coupled LQR, Kalman, 6 sensors": kalman(modes, laws["coupled LQR"], more, disturbance=1.0, noise=1e-2),
+        "coupled LQR, Luenberger, 3 sensors": luenberger_controller(modes, laws["coupled LQR"], few, poles=poles),
+        "coupled LQR, Kalman, 6 sensors": kalman_controller(
+            modes, laws["coupled LQR"], more, disturbance=1.0, noise=1e-2
+        ),
     }
 
 
@@ -110,7 +112,7 @@ def robust(outcome):
 def closed_loop_record(truth, law, through, seed):
     """Modal coordinates that the sensors' filter reads in the loop of all modes, after an impulse, noise 1 %."""
     time = 0.1 * np.arange(400)
-    motion = initial_response(close_loop(truth, law, through), impulse_state(truth, 6.3), time).displacement(SENSORS)
+    motion = initial_response(close_loop(truth, law, through), time, impulse_state(truth, 6.3)).displacement(SENSORS)
     noise = 0.01 * motion.std(axis=1, keepdims=True)
     readings = through(motion + noise * np.random.default_rng(seed).standard_normal(motion.shape))
     channels = [Channel(f"q{r + 1}") for r in range(CONTROLLED)]

@@ -88,7 +88,7 @@ def placement_on_shapes(modes, placements, *, n_controlled):
         left.plot(placement.positions, np.full(len(placement.positions), level), "^", color=colour, ms=9)
         label = f"{name}: W_R = {placement.residual_work:.2e}, effort {placement.effort:.3g}"
         number = np.arange(n_controlled + 1, modes.n_modes + 1)
-        work = np.maximum(placement.by_mode, 1e-12)
+        work = np.maximum(placement.residual_work_by_mode, 1e-12)
         right.bar(number + (i - 1) * width, work, width, bottom=1e-12, color=colour, label=label)
     left.set(xlabel="x / length", ylabel="mode shape; triangles: actuators")
     left.legend(loc="upper center", ncols=2)
@@ -214,7 +214,7 @@ def compare_placements(outcome, bending) -> None:
     outcome.table(
         "placements",
         {
-            name: {"positions": p.positions, "W_R": p.residual_work, "W_r": p.by_mode, "effort": p.effort}
+            name: {"positions": p.positions, "W_R": p.residual_work, "W_r": p.residual_work_by_mode, "effort": p.effort}
             for name, p in named.items()
         },
     )

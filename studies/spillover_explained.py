@@ -4,7 +4,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.law import Law
 from workbench.design.loop.closed_loop import close_loop, close_with
@@ -25,7 +25,7 @@ BESIDE, ACROSS = 10.0 / 6.0, 50.0 / 6.0
 
 def margins_of_filter(modes, way, actuators, count=24):
     places = modes.length * np.arange(1, count + 1) / (count + 1)
-    return close_with(modes, way(actuators, places)).margin
+    return close_with(modes, way(actuators, places)).decay_rate
 
 
 def plot_sensor_counts(margins, counts):
@@ -63,28 +63,30 @@ def study(outcome, data=None):
 
     def observed(actuators, sensors, share=1.0):
         sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensors)]
-        return luenberger(modes, law(actuators, share), sensors, poles=(-0.3 + 1j) * modes.omega[:CONTROLLED])
+        return luenberger_controller(
+            modes, law(actuators, share), sensors, poles=(-0.3 + 1j) * modes.omega[:CONTROLLED]
+        )
 
     def estimated(actuators, sensors, share=1.0):
         sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensors)]
-        return kalman(modes, law(actuators, share), sensors, disturbance=1.0, noise=1e-2)
+        return kalman_controller(modes, law(actuators, share), sensors, disturbance=1.0, noise=1e-2)
 
     def through_filter(actuators, sensors, share=1.0):
         return filtered(law(actuators, share), displacement_filter(modes.select(range(CONTROLLED)), sensors, 1.0))
 
     def reduced(controller):
-        return close_with(modes.select(range(CONTROLLED)), controller).margin
+        return close_with(modes.select(range(CONTROLLED)), controller).decay_rate
 
     one = ACTUATORS[:1]
     stable, unstable = (explain_spillover(modes, observed(one, [place])) for place in (BESIDE, ACROSS))
     outcome.check("margin on the reduced model, sensor across", reduced(observed(one, [ACROSS])), 0.01, at_least=True)
-    outcome.check("margin on the full model, sensor beside the actuator", stable.margin, 0.0, at_least=True)
-    outcome.check("margin on the full model, sensor across", unstable.margin, 0.0)
+    outcome.check("margin on the full model, sensor beside the actuator", stable.decay_rate, 0.0, at_least=True)
+    outcome.check("margin on the full model, sensor across", unstable.decay_rate, 0.0)
     worst = unstable.destabilising
     outcome.say(
-        f"one sensor at x = {BESIDE:.2f}, beside the actuator: stable, margin {stable.margin:.2g} 1/s; at {ACROSS:.2f}:"
-        f" mode {worst.mode + 1} grows at {worst.closed_pole.real:.2g} 1/s, though the reduced model's margin is"
-        f" {reduced(observed(one, [ACROSS])):.2g}"
+        f"one sensor at x = {BESIDE:.2f}, beside the actuator: stable, margin {stable.decay_rate:.2g} 1/s; at"
+        f" {ACROSS:.2f}: mode {worst.mode + 1} grows at {worst.closed_pole.real:.2g} 1/s, though the reduced model's"
+        f" margin is {reduced(observed(one, [ACROSS])):.2g}"
     )
 
     # two actuators and two sensors: by which path?
@@ -104,8 +106,8 @@ def study(outcome, data=None):
 
     found = spillover_remedies(modes, observed, one, [ACROSS])
     for remedy in found:
-        outcome.say(f"settled by: {remedy.change}; margin then {remedy.margin:.2g} 1/s")
-    checked = [explain_spillover(modes, remedy.controller).margin for remedy in found]
+        outcome.say(f"settled by: {remedy.change}; margin then {remedy.decay_rate:.2g} 1/s")
+    checked = [explain_spillover(modes, remedy.controller).decay_rate for remedy in found]
     outcome.check("every remedy, recomputed on the full plant: least margin", min(checked), 0.0, at_least=True)
     outcome.check("kinds of remedy found", len(found), 4, at_least=True)
 
@@ -118,7 +120,7 @@ def study(outcome, data=None):
         "an even grid of k sensors takes mode 2(k + 1) - r for mode r, so a filter of displacements alone is cured only"
         " once the alias of its highest mode lies beyond the plant's"
     )
-    perfect = close_loop(modes, law(one)).margin
+    perfect = close_loop(modes, law(one)).decay_rate
     outcome.check("number of sensors that suffices for the modal filter", counts["modal filter"] or np.inf, 24)
     outcome.check(
         "its margin with 24 sensors over that with exact modal coordinates",
@@ -131,7 +133,7 @@ def study(outcome, data=None):
         [
             {
                 "sensor": place,
-                "margin": e.margin,
+                "margin": e.decay_rate,
                 "mode": e.shifts[0].mode + 1,
                 "shift": e.shifts[0].shift.real,
                 "first_order": e.shifts[0].first_order.real,
@@ -143,7 +145,9 @@ def study(outcome, data=None):
         "paths",
         [{"actuator": p.actuator, "sensor": p.sensor_at, "growth": p.shift.real} for p in worst.paths],
     )
-    outcome.table("remedies", [{"kind": r.kind, "change": r.change, "size": r.size, "margin": r.margin} for r in found])
+    outcome.table(
+        "remedies", [{"kind": r.kind, "change": r.change, "size": r.size, "margin": r.decay_rate} for r in found]
+    )
     outcome.table("sufficient_sensors", counts)
     outcome.figure(
         "paths",

@@ -83,6 +83,8 @@ RENAMED = {
     "impulse_record": "records.transfer_functions.impulse_record",
     "judge": "design.spillover.performance.performance",
     "judge_on_off": "design.spillover.performance.on_off_performance",
+    "kalman": "kalman_controller",
+    "luenberger": "luenberger_controller",
     "modal_cost": "design.spillover.spillover.modal_cost",
     "nodes_of_mode": "design.placement.placement.nodes_of_mode",
     "on_off_work": "design.spillover.spillover.on_off_work",

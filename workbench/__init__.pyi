@@ -2,8 +2,8 @@
 # name is first used. Everything else comes from its room: `from workbench.rig.elements import CubicSpring`.
 
 from .cases.case import read_case as read_case
-from .design.estimation.observers import kalman as kalman
-from .design.estimation.observers import luenberger as luenberger
+from .design.estimation.observers import kalman_controller as kalman_controller
+from .design.estimation.observers import luenberger_controller as luenberger_controller
 from .design.export.export import export as export
 from .design.laws.coupled import coupled_lqr as coupled_lqr
 from .design.laws.coupled import coupled_poles as coupled_poles

@@ -205,7 +205,7 @@ def test_a_written_beam_with_a_patch_is_read_as_it_was(tmp_path):
     rig = Rig(beam.modes(4), (piezo_patch("P", 0.3, length=0.2),), sensors, structure=beam)
     read = again(rig, tmp_path)
     np.testing.assert_allclose(input_matrix(read.modes, read.actuators), input_matrix(rig.modes, rig.actuators))
-    assert read.actuators[0].kind == "moment"
+    assert read.actuators[0].quantity == "moment"
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["positions known", "not known"])

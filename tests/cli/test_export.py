@@ -42,20 +42,20 @@ def rig(tmp_path):
 def test_a_controller_of_a_case_is_written(run, rig, tmp_path, estimator):
     result = run("export", rig, "--rate-hz", 100, "--estimator", estimator, "--to", tmp_path / "one.py")
     assert result.exit_code == 0, result.output
-    assert "phase lag" in result.output and "stability margin" in result.output
+    assert "phase lag" in result.output and "decay rate" in result.output
     assert "not read, as accelerations: a1" in result.output
     one = runpy.run_path(str(tmp_path / "one.py"))["Controller"]()
     assert [one.step([1.0]), one.step([0.0])] != [[0.0], [0.0]]
 
 
 def test_a_rigid_mode_that_nothing_holds_is_told(run, rig, tmp_path):
-    """Rounding of its pole is no margin."""
+    """Rounding of its pole is no decay rate."""
     rig.write_text(
         RIG.replace('right = "hinged"', 'right = "free"').replace("damping_ratio = 0.01", "damping_ratio = 0.1")
     )
     result = run("export", rig, "--weight", 1e4, "--rate-hz", 100, "--to", tmp_path / "one.py")
     said = " ".join(result.output.split())
-    assert "stability margin 0 1/s, 0 1/s in continuous time" in said, said
+    assert "decay rate 0 1/s, 0 1/s in continuous time" in said, said
     assert "no gain acts on the displacement of the rigid mode(s) 1" in said and "none of rigid modes" in said
 
 

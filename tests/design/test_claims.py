@@ -39,7 +39,9 @@ def state(n=9, controlled=4):
 def test_w_c_does_not_depend_on_the_places_with_imsc():
     """(5.27), at any time and not only in the limit."""
     works = [
-        finite_spillover(close_loop(modes(), imsc(modes(), 4, actuators(p), weight=20.0)), state(), 7.0).by_mode[:4]
+        finite_spillover(close_loop(modes(), imsc(modes(), 4, actuators(p), weight=20.0)), state(), 7.0).work_by_mode[
+            :4
+        ]
         for p in PLACES
     ]
     np.testing.assert_allclose(works[1:], [works[0]] * 2, rtol=1e-10)
@@ -50,7 +52,7 @@ def test_but_it_does_with_coupled_control_and_the_forces_do_with_either():
         finite_spillover(close_loop(modes(), coupled_lqr(modes(), 4, actuators(p), weight=10.0)), state(), 7.0)
         for p in PLACES
     ]
-    assert np.ptp([w.controlled_total for w in works]) > 0.01 * abs(works[0].controlled_total)
+    assert np.ptp([w.controlled_work for w in works]) > 0.01 * abs(works[0].controlled_work)
     # W_C tells nothing of what the actuators must do: crowded on one side they spend hundreds of times the effort
     spent = [effort(modes(), imsc(modes(), 4, actuators(p), weight=20.0), state()) for p in PLACES]
     assert spent[1] < 1.2 * spent[0] and spent[2] > 200 * spent[0]
@@ -60,23 +62,23 @@ def test_little_difference_between_placements_holds_for_spread_ones_only():
     """Section 5.8: displacements differ little. Of the controlled modes they do not differ; of the residual, by 10²."""
     time = np.linspace(0.0, 60.0, 7)[1:]
     motions = [
-        initial_response(close_loop(modes(), imsc(modes(), 4, actuators(p), weight=20.0)), state(), time)
+        initial_response(close_loop(modes(), imsc(modes(), 4, actuators(p), weight=20.0)), time, state())
         for p in PLACES
     ]
     for motion in motions[1:]:
         np.testing.assert_allclose(motion.modal[:4], motions[0].modal[:4], atol=1e-12)
-    spilled = [spillover(modes(), imsc(modes(), 4, actuators(p), weight=20.0), state()).residual_total for p in PLACES]
+    spilled = [spillover(modes(), imsc(modes(), 4, actuators(p), weight=20.0), state()).residual_work for p in PLACES]
     assert spilled[1] < 1.3 * spilled[0] and spilled[2] > 100 * spilled[0]
 
 
 def test_filters_cure_observation_spillover_at_the_fourth_power():
     """With nine sensors the filter's motion is that of exact coordinates to a few thousandths, not identical."""
     law, time = imsc(modes(), 4, actuators(PLACES[0]), weight=20.0), np.linspace(0.0, 60.0, 121)
-    exact = initial_response(close_loop(modes(), law), state(), time).modal[:4]
+    exact = initial_response(close_loop(modes(), law), time, state()).modal[:4]
 
     def error(count):
         filter_ = hermite_filter(modes(4), np.linspace(0.0, 10.0, count), 1.0)
-        return np.abs(initial_response(close_loop(modes(), law, filter_), state(), time).modal[:4] - exact).max()
+        return np.abs(initial_response(close_loop(modes(), law, filter_), time, state()).modal[:4] - exact).max()
 
     errors = np.array([error(k) for k in (9, 17, 33)]) / np.abs(exact).max()
     assert errors[0] < 5e-3 and (np.log2(errors[:-1] / errors[1:]) > 3.5).all()

@@ -67,7 +67,7 @@ def test_a_response_at_many_points_shows_those_that_move_most():
     points = wb.NamedPoints(tuple(f"S{i}" for i in range(n)), None, ("x",) * n)
     modes = wb.FiniteElements(np.eye(n), np.diag(np.arange(1.0, n + 1)), nodes=points).modes(n)
     law = wb.imsc(modes, 1, [wb.Actuator("F1", "S0")], weight=1.0)
-    response = wb.initial_response(wb.close_loop(modes, law), np.r_[np.arange(n), np.zeros(n)], np.linspace(0, 9, 50))
+    response = wb.initial_response(wb.close_loop(modes, law), np.linspace(0, 9, 50), np.r_[np.arange(n), np.zeros(n)])
     figure = plot(response)
     assert [ax.get_ylabel() for ax in figure.axes] == [f"S{i}" for i in range(8, n)]
     assert "of the 12 points of 20 that move most" in figure.axes[0].get_title("left")
@@ -75,7 +75,9 @@ def test_a_response_at_many_points_shows_those_that_move_most():
 
 def test_an_explanation_at_named_points_is_printed_and_drawn():
     law = wb.imsc(FRAME, 1, [wb.Actuator("F1", "S3")], weight=1.0)
-    explained = wb.explain_spillover(FRAME, wb.kalman(FRAME, law, [wb.Sensor("y", "S3")], disturbance=1.0, noise=0.1))
+    explained = wb.explain_spillover(
+        FRAME, wb.kalman_controller(FRAME, law, [wb.Sensor("y", "S3")], disturbance=1.0, noise=0.1)
+    )
     assert "S3 to F1" in str(explained) and str(explained).startswith("closed loop of 3 modes: ")
     assert "sensor at S3 → F1" in [label.get_text() for label in plot(explained).axes[1].get_yticklabels()]
     assert "place [m]" not in str(law)
@@ -88,16 +90,18 @@ def test_work_that_residual_modes_lose_is_drawn_below_zero():
     for struck in (0.3, 1.3):  # residual modes move when control starts; most of the work, or a part, is taken out
         found = wb.spillover(modes, law, wb.impulse_state(modes, struck))
         (ax,) = plot(found).axes
-        assert min(found.residual_work) < 0
-        assert [bar.get_height() for bar in ax.patches] == pytest.approx(found.residual_work)
+        assert min(found.residual_work_by_mode) < 0
+        assert [bar.get_height() for bar in ax.patches] == pytest.approx(found.residual_work_by_mode)
         low, high = ax.get_ylim()
-        assert low < min(found.residual_work) and max(found.residual_work) < high
+        assert low < min(found.residual_work_by_mode) and max(found.residual_work_by_mode) < high
 
 
 @pytest.mark.filterwarnings("error")
 def test_without_residual_modes_a_figure_says_so():
     law = wb.imsc(BEAM, 3, [wb.Actuator(f"F{i}", at) for i, at in enumerate((0.3, 0.6, 0.9))], weight=1.0)
-    explained = wb.explain_spillover(BEAM, wb.kalman(BEAM, law, [wb.Sensor("y", 0.8)], disturbance=1.0, noise=0.1))
+    explained = wb.explain_spillover(
+        BEAM, wb.kalman_controller(BEAM, law, [wb.Sensor("y", 0.8)], disturbance=1.0, noise=0.1)
+    )
     for result in (explained, wb.spillover(BEAM, law, wb.impulse_state(BEAM, 0.8))):
         assert "no mode is residual" in plot(result).axes[0].texts[0].get_text()
 

@@ -62,7 +62,7 @@ def test_a_placement_is_drawn_over_the_nodal_lines_of_the_next_mode(size):
     boxes = [np.ptp(polygon.get_xy(), axis=0) for polygon in left.patches]
     np.testing.assert_allclose(boxes, [(0.2, 0.2), *([size] * 4 if size else [])])
     heights = [[bar.get_height() for bar in bars] for bars in right.containers]
-    np.testing.assert_allclose(heights, [placement.by_mode for placement in placed.values()])
+    np.testing.assert_allclose(heights, [placement.residual_work_by_mode for placement in placed.values()])
 
 
 def test_a_placement_on_a_plate_is_drawn_in_the_units_of_the_case():

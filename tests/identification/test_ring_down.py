@@ -190,7 +190,7 @@ def test_proportional_damping_is_told():
     shapes = np.random.default_rng(0).standard_normal((5, 4))
     modes = SampledModes(omega, 0.5 * (0.002 * omega + 0.1 / omega), shapes, np.linspace(0, 1, 5))
     fit = ring_down(free_decay(modes, sample_time=0.05, n_samples=600, noise_std=0.02, seed=1)).proportional
-    error = np.array([fit.damping.g1 - 0.002, fit.damping.g2 - 0.1])
+    error = np.array([fit.damping.stiffness - 0.002, fit.damping.mass - 0.1])
     assert fit.probability > 0.01 and (np.abs(error) < 3.5 * fit.standard_errors).all()
 
 

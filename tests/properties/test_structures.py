@@ -229,8 +229,8 @@ def energy_balance(drawn, at, seed):
     law = imsc(modes, 1, actuators[:1], weight=float(np.exp(rng.uniform(-3, 3))) / modes.omega[0] ** 2)
     loop, state = close_loop(modes, law), impulse_state(modes, 0.37 * structure.length)
     end = 20.0 / modes.omega[0]
-    before, after = initial_response(loop, state, [0.0, end]).energy.T
-    gained = finite_spillover(loop, state, end).by_mode
+    before, after = initial_response(loop, [0.0, end], state).energy.T
+    gained = finite_spillover(loop, state, end).work_by_mode
     np.testing.assert_allclose(after - before, gained, rtol=0, atol=EXACT * max(before.sum(), after.sum()))
 
 

@@ -99,7 +99,7 @@ def test_a_misplaced_patch_keeps_its_size_and_stays_on_the_structure(on_plate):
         (lambda: piezo_patch("P", 0.4, length=(0.2, 0.1)), "P: a patch on a beam has one"),
         (lambda: piezo_patch("P", MIDDLE, length=(0.2, 0.0)), r"must be positive, m; got \(0.2, 0.0\)"),
         (lambda: piezo_patch("P", "N1", length=0.2), "its middle is x along a beam"),
-        (lambda: Actuator("P", Patch(*MIDDLE, *SIDES)), "give kind='moment'"),
+        (lambda: Actuator("P", Patch(*MIDDLE, *SIDES)), "give quantity='moment'"),
         (
             lambda: of("P", (1.15, 0.3)),
             r"0.2 m by 0.12 m at \(x, y\) = \(1.15, 0.3\) does not lie on .* 0 to 1.2 by 0 to 0.8",

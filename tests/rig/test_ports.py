@@ -170,9 +170,11 @@ def test_limits_that_are_not_positive_are_refused(field):
 
 
 def test_a_late_or_biased_port_has_no_state_space():
-    assert Actuator("F1", 2.0).linear and Sensor("d", 1.0).linear
-    assert not Actuator("F1", 2.0, bias=1.0).linear and not Actuator("F1", 2.0, rate_limit=1.0).linear
-    assert not Actuator("F1", 2.0, hysteresis_share=0.1).linear and not Sensor("d", 1.0, delay=0.1).linear
+    assert Actuator("F1", 2.0).has_state_space and Sensor("d", 1.0, crosstalk=(("v", 0.1),)).has_state_space
+    assert not Actuator("F1", 2.0, bias=1.0).has_state_space
+    assert not Actuator("F1", 2.0, rate_limit=1.0).has_state_space
+    assert not Actuator("F1", 2.0, hysteresis_share=0.1).has_state_space
+    assert not Sensor("d", 1.0, delay=0.1).has_state_space
 
 
 def test_a_rig_is_refused_whose_actuator_or_sensor_stands_outside_the_structure(square_plate):

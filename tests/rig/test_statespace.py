@@ -1,11 +1,15 @@
 """The linear model against one built by hand, and its frequency response against the modal sum."""
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
 
 from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
 from workbench.rig.statespace import input_matrix, state_space
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
@@ -39,7 +43,7 @@ def exact_shape(x, derivative):
 
 
 def test_matrices_are_those_built_by_hand(modes):
-    actuators = [Actuator("F", 0.4, gain=2.0), Actuator("M", 1.3, kind="moment")]
+    actuators = [Actuator("F", 0.4, gain=2.0), Actuator("M", 1.3, quantity="moment")]
     model = state_space(modes, actuators, [Sensor("w", 0.7), Sensor("v", 1.1, "velocity", gain=0.5)])
     omega = np.sqrt(5.0 / 3.0) * (np.arange(1, 4) * np.pi / 2.0) ** 2
     c = 2 * np.array([0.02, 0.01, 0.03]) * omega
@@ -78,20 +82,41 @@ def test_frequency_response_is_the_modal_sum(modes, quantity, lags):
 def test_an_actuator_on_a_support_is_refused_by_name(modes):
     with pytest.raises(ValueError, match="actuator F stands on the support at x = 2"):
         input_matrix(modes, [Actuator("F", 2.0)])
-    assert np.abs(input_matrix(modes, [Actuator("M", 2.0, kind="moment")])).min() > 0.1
+    assert np.abs(input_matrix(modes, [Actuator("M", 2.0, quantity="moment")])).min() > 0.1
 
 
 @pytest.mark.parametrize(
-    ("actuator", "sensor"),
+    ("actuator", "sensor", "said"),
     [
-        (Actuator("F", 0.4, limit=1.0), Sensor("y", 0.9)),
-        (Actuator("F", 0.4, delay=0.1), Sensor("y", 0.9)),
-        (Actuator("F", 0.4), Sensor("y", 0.9, step=0.1)),
+        (Actuator("F", 0.4, limit=1.0, delay=0.1), Sensor("y", 0.9), "actuator F has a limit, so it is not linear"),
+        (Actuator("F", 0.4, delay=0.1), Sensor("y", 0.9), "actuator F has a delay, which no finite .* control.pade"),
+        (Actuator("F", 0.4), Sensor("y", 0.9, step=0.1, bias=1.0), "sensor y has a bias and rounding, so it is not"),
+        (Actuator("F", 0.4), Sensor("y", 0.9, delay=-0.1), "sensor y has a delay, which no finite .* control.pade"),
+        (Actuator("F", 0.4), Sensor("y", 0.9, crosstalk=(("x", 0.1),)), "sensor y reads a share of 'x', which is no"),
     ],
 )
-def test_what_is_not_linear_has_no_state_space(modes, actuator, sensor):
-    with pytest.raises(ValueError, match="simulate it instead"):
+def test_what_no_finite_linear_model_represents_is_refused(modes, actuator, sensor, said):
+    with pytest.raises(ValueError, match=said):
         state_space(modes, [actuator], [sensor])
+
+
+def test_crosstalk_is_a_matrix_product(modes):
+    """A share of the quantity itself is added, before the gain: as the simulation has it, of a dead sensor too."""
+    sensors = (
+        Sensor("y", 0.9, gain=2.0, crosstalk=(("v", 0.1), ("a", -0.02))),
+        Sensor("v", 0.4, "velocity", gain=0.0, crosstalk=(("y", 0.3),)),
+        Sensor("a", 1.1, "acceleration", gain=0.5, crosstalk=(("v", 0.2), ("y", 0.7))),
+    )
+    drive, dt = (Actuator("F", 0.4),), 0.002
+    inputs = np.random.default_rng(1).standard_normal((1, 200))
+    system = control.c2d(state_space(modes, drive, sensors), dt)
+    peer = control.forced_response(system, inputs=inputs, timepts=dt * np.arange(200)).outputs
+    mine = simulate(Rig(modes, drive, sensors), inputs, sample_time=dt).outputs
+    np.testing.assert_allclose(mine, peer, atol=1e-9 * np.abs(peer).max())
+    lagged = state_space(modes, drive, (sensors[0], *(replace(s, time_constant=0.05) for s in sensors[1:])))
+    s = 20j
+    ratio = lagged(s)[[0, 2], 0] / state_space(modes, drive, sensors)(s)[[0, 2], 0]
+    np.testing.assert_allclose(ratio, [1.0, 1.0 / (1.0 + 0.05 * s)], rtol=1e-9)
 
 
 def test_names_with_a_point_are_such_as_python_control_allows(modes):

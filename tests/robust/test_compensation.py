@@ -7,7 +7,7 @@ import pytest
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.rig.elements import CoulombFriction
@@ -22,7 +22,7 @@ def test_friction_is_opposed_so_that_the_controlled_modes_move_as_without_it(rig
     rig = replace(rig, modes=rig.modes.select(slice(2)), structure=None)
     test = LoopTest(round(6.0 / sample_time), sample_time, impulse_at=0.8)
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
-    loop = loop_on_rig(rig, kalman(rig.modes, law, rig.sensors[4:], disturbance=1.0, noise=1e-6), test)
+    loop = loop_on_rig(rig, kalman_controller(rig.modes, law, rig.sensors[4:], disturbance=1.0, noise=1e-6), test)
     rough = replace(rig, elements=(CoulombFriction(0.9, 0.2, 0.05),))
 
     def moved(on, *steps):

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from workbench.design.estimation.digital import sampled
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.rig_loop import LoopTest
 from workbench.draw.plot import plot
@@ -75,7 +75,7 @@ def test_bands_of_a_controlled_test_hold_plants_of_another_numerical_route(plain
     """The gain of the actuator is in the loop: the feedback itself is uncertain."""
     rng = np.random.default_rng(7)
     law = imsc(plain.modes, 1, plain.actuators, weight=0.05)
-    controller = sampled(kalman(plain.modes, law, plain.sensors, disturbance=1.0, noise=1e-4), 0.01)
+    controller = sampled(kalman_controller(plain.modes, law, plain.sensors, disturbance=1.0, noise=1e-4), 0.01)
     test = LoopTest(250, 0.01, impulse_at=plain.actuators[0].at, impulse=0.05)
     told = predict_loop(uncertain(plain), controller, test, draws=100, seed=2)
     shares = []

@@ -9,7 +9,7 @@ import pytest
 
 import workbench as wb
 from workbench.design.estimation.digital import DigitalController
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import on_off
@@ -47,7 +47,7 @@ def effect(kind: str, target=None, **values) -> Effect:
 @pytest.fixture(scope="module")
 def controller(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
-    return kalman(rig.modes, law, rig.sensors[:4], disturbance=1.0, noise=1e-6)
+    return kalman_controller(rig.modes, law, rig.sensors[:4], disturbance=1.0, noise=1e-6)
 
 
 FAULTS = {
@@ -96,7 +96,7 @@ def test_at_least_half_of_what_a_fault_costs_is_won_back(rig, controller, fault)
 def test_a_dead_zone_is_made_up_for_though_it_spills_less(rig):
     """Less force excites the residual modes less: all modes together vibrate less, the controlled ones more."""
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
-    spilling = kalman(rig.modes, law, rig.sensors[:2], disturbance=1.0, noise=1e-5)
+    spilling = kalman_controller(rig.modes, law, rig.sensors[:2], disturbance=1.0, noise=1e-5)
     told = {"sample_time": DT, "impulse_at": 0.8, "draws": 1, "placement": False}
     free = redesign(uncertain(rig), spilling, **told).after.response.energy
     found = redesign(uncertain(rig, FAULTS["dead zone"]), spilling, **told)
@@ -151,14 +151,14 @@ def test_a_filter_through_which_residual_modes_diverge_is_made_slower(rig):
     law, chosen = imsc(rig.modes, 2, rig.actuators, weight=0.02), []
     plant = Plant(rig, rig.actuators, rig.sensors, rig.modes.n_modes).solved()
     for noise in (1e-7, 1e-9):
-        fast = kalman(rig.modes, law, rig.sensors[:2], disturbance=1.0, noise=noise)
+        fast = kalman_controller(rig.modes, law, rig.sensors[:2], disturbance=1.0, noise=noise)
         found = redesign(uncertain(rig), fast, sample_time=DT, impulse_at=0.8, draws=2, placement=False)
         assert found.improves and found.safe and "the present one on 0" in found.advice
         assert "otherwise unstable" in found.steps[1].what and found.steps[0].lost == "diverges"
         assert not control_plant(plant, found.present, n_samples=1500, impulse_input="F1").stable
         assert control_plant(plant, found.redesigned, n_samples=1500, impulse_input="F1").stable
         chosen.append(found.redesigned)
-    np.testing.assert_allclose(chosen[0].a, chosen[1].a, rtol=1e-6)
+    np.testing.assert_allclose(chosen[0].A, chosen[1].A, rtol=1e-6)
 
 
 def test_where_neither_controller_is_stable_neither_is_advised(rig, controller):
@@ -251,7 +251,7 @@ def test_settling_and_effort_cost_least_where_the_poles_are_asked_for(rig):
     one = replace(rig, modes=replace(modes, damping=np.zeros(1)), actuators=(Actuator("F", 1.0),))
     one = replace(one, sensors=(Sensor("v", 1.0, "velocity"),))
     law = imsc_poles(one.modes, 1, one.actuators, poles=modes.omega[:1] * (-0.05 + 1j))
-    speedy = kalman(one.modes, law, one.sensors, disturbance=1.0, noise=1e-9)
+    speedy = kalman_controller(one.modes, law, one.sensors, disturbance=1.0, noise=1e-9)
     asked = redesign(uncertain(one), speedy, sample_time=DT, impulse_at=1.0, draws=1, placement=False)
     cost = {}
     for gain in (0.7, 1.0, 1.4):
@@ -266,7 +266,9 @@ def test_the_gain_of_a_law_by_poles_is_tuned_as_that_of_a_weight(rig):
     """A weight k⁻² times as large raises the gain of a lightly damped mode k times."""
     modes = rig.modes
     law = imsc_poles(modes, 2, rig.actuators, poles=modes.omega[:2] * (-0.1 + 1.02j))
-    loop = loop_on_rig(rig, kalman(modes, law, rig.sensors, disturbance=1.0, noise=1e-6), LoopTest(100, DT, 0.8))
+    loop = loop_on_rig(
+        rig, kalman_controller(modes, law, rig.sensors, disturbance=1.0, noise=1e-6), LoopTest(100, DT, 0.8)
+    )
     np.testing.assert_allclose(tuned(loop, rig, weight=0.25).law.gain, 2.0 * law.gain, rtol=1e-9)
     with pytest.raises(DesignError, match="20 times the gain leaves a mode that does not oscillate"):
         tuned(loop, rig, weight=1.0 / 400.0)
@@ -308,12 +310,12 @@ def test_a_controller_for_other_places_does_not_fit_the_rig(rig, controller):
     with pytest.raises(DesignError, match=r"drives F1 \(force\) at x = 0.8, .*: it has F1 \(force\) at x = 0.45"):
         redesign(uncertain(rig), law, sample_time=DT)
     sensors = [replace(rig.sensors[0], at=0.5), *rig.sensors[1:4]]
-    estimator = kalman(rig.modes, controller.law, sensors, disturbance=1.0, noise=1e-6)
+    estimator = kalman_controller(rig.modes, controller.law, sensors, disturbance=1.0, noise=1e-6)
     with pytest.raises(DesignError, match=r"at x = 0.5, .*: it has d1 \(displacement at x = 0.3\)"):
         redesign(uncertain(rig), estimator, sample_time=DT)
     between = wb.Between(0.3, 0.7)
     stretched = replace(rig, sensors=[*rig.sensors, Sensor("d9", between)])
-    reads = kalman(
+    reads = kalman_controller(
         rig.modes, controller.law, stretched.sensors[:2] + stretched.sensors[-1:], disturbance=1.0, noise=1e-6
     )
     loop = loop_on_rig(stretched, reads, LoopTest(100, DT, 0.8))
@@ -458,7 +460,7 @@ def silent(rig):
 
 def test_a_motor_at_a_support_is_tested_by_an_impulse_that_moves_the_modes():
     beam = wb.Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
-    motor, sensor = wb.Actuator("motor", 0.0, kind="moment"), wb.Sensor("tip", 0.6, "displacement")
+    motor, sensor = wb.Actuator("motor", 0.0, quantity="moment"), wb.Sensor("tip", 0.6, "displacement")
     modes = beam.modes(4)
     test = impulse_test(wb.Rig(modes, (motor,), (sensor,)), (0, 1), 0.01)
     shape = np.abs(modes.phi([test.impulse_at])[0, :2]) / np.sqrt(2.0)
@@ -467,7 +469,7 @@ def test_a_motor_at_a_support_is_tested_by_an_impulse_that_moves_the_modes():
     plate = wb.Plate(
         length=(1.0, 0.8), mass_per_area=1.0, bending_stiffness=1.0, poisson_ratio=0.3, edges="simply supported"
     )
-    patch = wb.Actuator("patch", Patch(0.3, 0.3, 0.2, 0.2), kind="moment")
+    patch = wb.Actuator("patch", Patch(0.3, 0.3, 0.2, 0.2), quantity="moment")
     rig = wb.Rig(plate.modes(4), (patch,), (wb.Sensor("a", (0.6, 0.3), "displacement"),))
     impulse_input = impulse_test(rig, (0, 1), 0.001).impulse_at
     assert np.abs(rig.modes.phi([impulse_input])[0, :2]).min() > 0.5
@@ -496,7 +498,7 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
     by_hand = Law(controller.law.gain, controller.law.controlled, controller.law.actuators)
     with pytest.raises(DesignError, match="given by its gain"):
         redesign(plain, by_hand, sample_time=DT)
-    elsewhere = kalman(rig.modes, controller.law, [Sensor("s", 0.5)], disturbance=1.0, noise=1e-4)
+    elsewhere = kalman_controller(rig.modes, controller.law, [Sensor("s", 0.5)], disturbance=1.0, noise=1e-4)
     with pytest.raises(DesignError, match=r"displacement at x = 0.5.*has no such sensor: it has d1"):
         redesign(plain, elsewhere, sample_time=DT)
     high = replace(controller.law, controlled=(0, 6))
@@ -543,7 +545,7 @@ def test_an_estimator_that_is_too_slow_for_a_late_loop_is_made_faster(rig, contr
 def test_the_speed_of_the_estimator_is_stated_against_the_design(rig):
     """Of a filter first made a hundred times faster and then ten times slower it was said that it is slower."""
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
-    designed = kalman(rig.modes, law, rig.sensors[:4], disturbance=1.0, noise=1e-5)
+    designed = kalman_controller(rig.modes, law, rig.sensors[:4], disturbance=1.0, noise=1e-5)
     late = uncertain(rig, effect("actuator_delay", "all", delay=6.0 * DT))
     found = redesign(late, designed, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
     times = found.loop.controller.designed_by.keywords["noise"] / 1e-5
@@ -557,7 +559,9 @@ def test_more_gain_wins_back_nearly_all_that_a_limit_leaves_to_be_won(rig):
     κ (g r - m) = a², r = 2 <F sin φ>, m = <F²>; κ is such that the effort is that without the limit.
     """
     one = replace(rig, modes=rig.modes.select(slice(1)), actuators=rig.actuators[:1])
-    quick = kalman(one.modes, imsc(one.modes, 1, one.actuators, weight=2.0), one.sensors, disturbance=1.0, noise=1e-9)
+    quick = kalman_controller(
+        one.modes, imsc(one.modes, 1, one.actuators, weight=2.0), one.sensors, disturbance=1.0, noise=1e-9
+    )
     free = redesign(uncertain(one), quick, sample_time=DT, impulse_at=0.45, draws=1, placement=False)
     peak = float(np.abs(free.after.response.forces).max())
     held = uncertain(one, effect("actuator_saturation", "all", limit=0.5 * peak))
@@ -621,6 +625,6 @@ def test_more_damping_does_more_work(rig):
     energy = 0.5 * modes.phi_at(1.0)[0] ** 2
     for ratio in (0.02, 0.1):
         feeding = np.array([[-gain * (ratio - own)]])
-        none = {"a": np.zeros((0, 0)), "b": np.zeros((0, 1)), "c": np.zeros((1, 0)), "e": np.zeros((0, 1))}
-        run = run_loop(one, DigitalController(1e-3, ("v",), ("F",), d=feeding, **none), test)
+        none = {"A": np.zeros((0, 0)), "B": np.zeros((0, 1)), "C": np.zeros((1, 0)), "E": np.zeros((0, 1))}
+        run = run_loop(one, DigitalController(1e-3, ("v",), ("F",), D=feeding, **none), test)
         assert run.work[0] / energy == pytest.approx(own / ratio - 1.0, rel=0.01)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.design.estimation.digital import sampled
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.rig.actuators import Actuator
@@ -24,7 +24,7 @@ from workbench.structure.plate import Plate
 
 def test_what_no_loop_can_be_made_of_is_refused(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.05)
-    controller = sampled(kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-2), 0.01)
+    controller = sampled(kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-2), 0.01)
     certain, test = UncertainRig(rig, (), np.zeros((0, 0))), LoopTest(50, 0.01, impulse_at=0.8)
     for wrong, match in (
         ((rig, controller, test), "on an UncertainRig, or on rigs drawn from it; got Rig"),
@@ -65,7 +65,7 @@ def test_what_no_loop_can_be_made_of_is_refused(rig):
 def test_forces_neither_hide_growth_nor_pass_for_it(rig):
     """A spring below zero that limited forces hold near rest alone; and a stable loop under forces of many kinds."""
     law = imsc(rig.modes, 2, rig.actuators, weight=0.01)
-    controller = sampled(kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-4), 0.01)
+    controller = sampled(kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-4), 0.01)
     held = replace(
         rig,
         actuators=tuple(replace(a, limit=0.2) for a in rig.actuators),
@@ -88,7 +88,7 @@ def patched_plate():
     plate = Plate(
         length=(1.0, 0.8), mass_per_area=5.0, bending_stiffness=60.0, poisson_ratio=0.3, edges="simply supported"
     )
-    patches = [Actuator(f"P{i}", Patch(x, 0.3, 0.1, 0.1), kind="moment") for i, x in enumerate((0.25, 0.6))]
+    patches = [Actuator(f"P{i}", Patch(x, 0.3, 0.1, 0.1), quantity="moment") for i, x in enumerate((0.25, 0.6))]
     return plate.modes(4), patches, [(0.25, 0.3), (0.6, 0.3)]
 
 
@@ -112,7 +112,7 @@ def test_patches_and_directions_are_controlled_and_their_stroke_is_that_of_the_p
     if kind == "on-off":
         assert all(relay.force > 0 for relay in law.relays)
         return
-    controller = sampled(kalman(modes, law, sensors, disturbance=1.0, noise=1e-8), dt)
+    controller = sampled(kalman_controller(modes, law, sensors, disturbance=1.0, noise=1e-8), dt)
     found = verify([rig], controller, test)
     run = run_loop(rig, controller, test)
     moved = modes.phi(places) @ run.response.modal[: modes.n_modes]

@@ -68,7 +68,7 @@ def test_a_slope_about_an_axis_of_a_plate_is_right_handed():
     by_x = (modes.phi((at[0] + h, at[1])) - modes.phi((at[0] - h, at[1]))) / (2 * h)
     np.testing.assert_allclose(modes.phi(at, 1, direction="x"), by_y, rtol=1e-7)
     np.testing.assert_allclose(modes.phi(at, 1, direction="y"), -by_x, rtol=1e-7)
-    moment = Actuator("M", at, kind="moment", direction="y")
+    moment = Actuator("M", at, quantity="moment", direction="y")
     np.testing.assert_allclose(input_matrix(modes, [moment])[:, 0], -by_x[0], rtol=1e-7)
     tilt = Sensor("tilt", at, "slope", direction="x")
     np.testing.assert_allclose(output_matrix(modes, [tilt])[0], by_y[0], rtol=1e-7)

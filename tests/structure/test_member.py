@@ -221,7 +221,7 @@ def test_modes_are_orthonormal(ends):
 
 
 def test_damping_coefficients():
-    modes = uniform("hinged", "hinged", damping=ProportionalDamping(0.002, 0.1)).modes(5)
+    modes = uniform("hinged", "hinged", damping=ProportionalDamping(stiffness=0.002, mass=0.1)).modes(5)
     np.testing.assert_allclose(2 * modes.zeta * modes.omega, 0.002 * modes.omega**2 + 0.1, rtol=1e-12)
     assert modes.proportional
     coupled = uniform("hinged", "hinged", attachments=(PointDamper(3.0, 0.4),)).modes(5)

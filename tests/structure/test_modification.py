@@ -56,7 +56,9 @@ def test_springs_and_inertias_of_rotation_act_on_the_few_modes_kept():
     assert abs(few.omega[0] / attach(many, (PointMass(0.7, 0.5),)).omega[0] - 1.0) > 0.1
 
 
-@pytest.mark.parametrize("damping", [ProportionalDamping(1e-4, 0.3), ViscousDamping(lambda x: 6.0 * x**2)])
+@pytest.mark.parametrize(
+    "damping", [ProportionalDamping(stiffness=1e-4, mass=0.3), ViscousDamping(lambda x: 6.0 * x**2)]
+)
 @pytest.mark.parametrize("parts", [(), (PointMass(1.3, 0.5),)])
 def test_the_damping_of_rigid_modes_and_between_modes_stays_with_the_few_kept(parts, damping):
     """It was left out there: rigid modes had none, and of a coupled matrix the diagonal remained."""

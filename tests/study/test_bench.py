@@ -158,11 +158,11 @@ def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
     assert design.actuators == ((0.3, 0.24), (0.84, 0.52)) and design.impulse_at == (0.5, 0.46)
     moved = replace(design, actuators=((0.35, 0.3), (0.8, 0.5)))
     found = results_of(rig, design_from(plain(moved)))
-    sizes = {"length": (0.2, 0.12)} if rig.actuators[0].kind == "moment" else None
+    sizes = {"length": (0.2, 0.12)} if rig.actuators[0].quantity == "moment" else None
     actuators = [piezo_patch("P", at, **sizes) if sizes else Actuator("F", at) for at in moved.actuators]
     law = imsc(rig.modes, 2, [replace(a, name=f"F{i}") for i, a in enumerate(actuators)], weight=design.weight)
     state = impulse_state(rig.modes, (0.5, 0.46)) * np.r_[np.ones(6), 1, 1, 0, 0, 0, 0]
-    exact = finite_spillover(close_loop(rig.modes, law), state, design.final_time).by_mode
+    exact = finite_spillover(close_loop(rig.modes, law), state, design.final_time).work_by_mode
     np.testing.assert_allclose(found["by_mode"], exact, rtol=1e-5, atol=1e-9)
     many = tuple((x, y) for x in np.linspace(0.1, 1.1, 9) for y in np.linspace(0.1, 0.7, 6))
     assert results_of(rig, replace(moved, sensors=many))["residual"] == pytest.approx(found["residual"], rel=0.05)
@@ -311,7 +311,7 @@ def test_actuators_are_dragged_over_a_plate(plate, opened, until, width, tmp_pat
         residual = browser.find_element("id", "residual")
         until(lambda: float(residual.text.replace("−", "-")) == pytest.approx(moved, rel=0.02))
         ActionChains(browser).click_and_hold(grip).move_by_offset(0, round(-0.5 * scale)).release().perform()
-        highest = 0.74 if rig.actuators[0].kind == "moment" else 0.8
+        highest = 0.74 if rig.actuators[0].quantity == "moment" else 0.8
         until(lambda: float(second.get_attribute("aria-valuetext").split(",")[1]) == pytest.approx(highest, abs=1e-3))
         assert [entry for entry in browser.get_log("browser") if "422" not in entry["message"]] == []
 
@@ -359,11 +359,11 @@ def test_a_design_on_a_frame_is_what_the_library_makes_of_it(frame):
     loop = close_loop(rig.modes, law)
     at_rest = impulse_state(rig.modes, "m.y")
     at_rest[rig.modes.n_modes + 2 :] = 0.0
-    expected = finite_spillover(loop, at_rest, design.final_time).residual_total
+    expected = finite_spillover(loop, at_rest, design.final_time).residual_work
     assert results_of(rig, moved)["residual"] == pytest.approx(expected, rel=1e-5)
     sensors = ["l.x", "R.x", "m.y"]
     through = close_loop(rig.modes, law, point_filter(rig.modes, sensors, [0, 1]))
-    expected = finite_spillover(through, at_rest, design.final_time).residual_total
+    expected = finite_spillover(through, at_rest, design.final_time).residual_work
     seen = results_of(rig, design_from({**plain(moved), "sensors": sensors}))
     assert seen["residual"] == pytest.approx(expected, rel=1e-5)
     for change, words in (

@@ -55,7 +55,7 @@ def page(tmp_path_factory):
     modes = beam_modes()
     actuators = [Actuator(f"F{i + 1}", x) for i, x in enumerate((3.0, 7.0))]
     law = imsc(modes, 2, actuators, weight=5.0)
-    response = initial_response(close_loop(modes, law), impulse_state(modes, 6.3), np.linspace(0.0, 20.0, 201))
+    response = initial_response(close_loop(modes, law), np.linspace(0.0, 20.0, 201), impulse_state(modes, 6.3))
     sensors = [Sensor("y1", 4.0, "displacement")]
     sampled = SampledModes(modes.omega, modes.zeta, modes.phi([2.0, 5.0, 8.0]) * (1 + 0.3j), [2.0, 5.0, 8.0])
     page_content = PageContent(

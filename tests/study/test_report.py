@@ -93,6 +93,28 @@ def test_a_design_says_which_loops_are_unstable(tmp_path):
     assert [(m["x"], m["y"]) for m in marks if m["kind"] == "line"] == [([0.2], [3.0])]
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("stable", "stable"), "Every closed loop is stable on the full plant."),
+        (("stable", "marginally stable"), "Every closed loop has no pole right of the imaginary axis; undamped modes"),
+        (
+            ("unstable: a rigid-body mode drifts", "stable"),
+            "Unstable on the full plant: first. The other 2 loops are st",
+        ),
+        (
+            ("unstable", "marginally stable"),
+            "Unstable on the full plant: first. The other 2 loops have no pole right of",
+        ),
+    ],
+)
+def test_what_is_said_of_the_stability_of_all_loops_is_true(tmp_path, words, said):
+    sensed = [{"design": name, "margin": 0.0, "stable": True, "robustness": None, "stability": word}
+              for name, word in zip(("first", "second"), words, strict=True)]  # fmt: skip
+    shown = page_content_in(written(tmp_path, {**DESIGNED, "through_sensors": sensed}))
+    assert shown.lead.startswith(said) and [row[2] for row in shown.tables[1][2]] == list(words)
+
+
 def test_a_placement_shows_where_and_how_surely(tmp_path):
     shown = page_content_in(written(tmp_path, PLACED))
     assert shown.lead.startswith("Actuators at 2, 6 m leave spillover work W_R = 0.25 J. ")

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from workbench.design.estimation.digital import sampled
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.rig.actuators import Actuator
@@ -34,7 +34,7 @@ def test_two_numerical_routes_agree_on_a_controlled_structure(hinged_beam, drive
         structure=hinged_beam,
     )
     law = imsc(rig.modes, 2, inputs[:2], weight=0.05)
-    controller = sampled(kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-3), DT)
+    controller = sampled(kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-3), DT)
     real = replace(rig, sensors=sensors, actuators=(*(replace(a, **DRIVES[drive]) for a in inputs[:2]), inputs[2]))
     expected = run_loop(real, controller, LoopTest(300, DT, impulse_at=0.8), substeps=20)
     plant = Plant(rig, real.actuators, sensors, 4).solved()

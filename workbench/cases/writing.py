@@ -172,8 +172,8 @@ def _check_ports(rig: Rig) -> None:
     moments = isinstance(rig.structure, Beam | Plate) or isinstance(rig.modes.domain, NamedPoints)
     ports: tuple[Port, ...] = (*rig.actuators, *rig.sensors)
     for port in ports:
-        moment = isinstance(port, Actuator) and port.kind == "moment"
-        plain = Sensor(port.name, port.at) if isinstance(port, Sensor) else Actuator(port.name, port.at, port.kind)
+        moment = isinstance(port, Actuator) and port.quantity == "moment"
+        plain = Sensor(port.name, port.at) if isinstance(port, Sensor) else Actuator(port.name, port.at, port.quantity)
         kept = ["direct"] if isinstance(port, Actuator) else ["quantity", "noise_std"]
         kept += ["direction"] * (not isinstance(rig.structure, Structure))
         other = [f.name for f in fields(port) if f.name not in kept and getattr(port, f.name) != getattr(plain, f.name)]
@@ -191,7 +191,7 @@ def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
     for a in rig.actuators:
         kind = "hammer" if a.direct else "actuator"
         at_point = not isinstance(a.at, Patch | Between)
-        quantity = {"quantity": "moment"} if a.kind == "moment" and at_point else {}
+        quantity = {"quantity": "moment"} if a.quantity == "moment" and at_point else {}
         blocks.append(_table("[[input]]", name=a.name, kind=kind, **quantity, **at(a), **_direction(a)))
     for s in rig.sensors:
         noise = {"noise_std": s.noise_std} if s.noise_std else {}
@@ -201,7 +201,7 @@ def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
 
 def _direction(port: Port) -> dict[str, str]:
     """The key of the direction of a force or motion, or of the axis of a moment or rotation; none if it has none."""
-    turning = port.kind == "moment" if isinstance(port, Actuator) else MEASURED[port.quantity][0] == 1
+    turning = port.quantity == "moment" if isinstance(port, Actuator) else MEASURED[port.quantity][0] == 1
     if port.direction is None or (not turning and not isinstance(port.at, str)):  # a plate moves along its normal
         return {}
     return {"axis" if turning else "direction": port.direction}

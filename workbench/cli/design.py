@@ -62,7 +62,7 @@ def design(
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     shown = []
     for row in rows:
-        numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
+        numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_work, row.work.residual_work)
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
         shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, row.stability))
     where, unit = modes.domain.text(at, 6), command_unit(actuators)
@@ -84,7 +84,7 @@ def design(
         else:
             share = None if perturbed is None else stable_share(perturbed, controller)
             sensed.append(_sensed(controller.name, explained, share))
-    heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
+    heads = ["controller", "decay rate [1/s]", "residual mode that limits it", "path"]
     heads += [] if errors is None else [f"stable share, {errors:.2g} model error"]
     show_table(heads, [row for row, _ in sensed])
     write_json(
@@ -103,9 +103,10 @@ def design(
                     "cost": row.cost,
                     "effort": row.effort,
                     "peak_force": row.peak_force,
-                    "work": row.work.by_mode,
+                    "work": row.work.work_by_mode,
                     "poles_real": row.poles.real,
                     "poles_imag": row.poles.imag,
+                    "stability": row.stability,
                 }
                 for row in rows
             ],
@@ -116,13 +117,14 @@ def design(
 
 def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[list[str], dict[str, Any]]:
     """A controller that works through sensors, as a row of the table and as JSON; `share` is its robustness."""
-    margin, stability = f"{explained.margin:.3g}", explained.loop.stability
+    rate, stability = f"{explained.decay_rate:.3g}", explained.loop.stability
     limiting, path = _limit(explained)
-    row = [name, {"stable": margin, "unstable": f"{margin} unstable"}.get(stability, stability), limiting, path]
+    row = [name, {"stable": rate, "unstable": f"{rate} unstable"}.get(stability, stability), limiting, path]
     return row + ([] if share is None else [f"{share:.0%}"]), {
         "design": name,
-        "margin": explained.margin,
-        "stable": explained.loop.stable,
+        "margin": explained.decay_rate,  # the key of earlier files
+        "stable": not explained.loop.unstable_poles.size,
+        "stability": stability,
         "limited_by": limiting,
         "path": path,
         "robustness": share,
@@ -132,12 +134,13 @@ def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[l
 
 
 def _limit(explained: "Explanation") -> tuple[str, str]:
-    """The residual mode that limits the stability margin, and the path through which it does, as text."""
-    worst = explained.limiting if explained.loop.stable else explained.destabilising
-    if worst is None and explained.loop.stable:
+    """The residual mode that limits the decay rate, and the path through which it does, as text."""
+    no_growth = not explained.loop.unstable_poles.size
+    worst = explained.limiting if no_growth else explained.destabilising
+    if worst is None and no_growth:
         return "none", ""
     if worst is None:
-        return "none: unstable without residual modes" if explained.reduced_margin <= 0 else "no single mode", ""
-    grows = explained.loop.stable or worst.closed_pole.real > 0
+        return "none: unstable without residual modes" if explained.reduced_decay_rate <= 0 else "no single mode", ""
+    grows = no_growth or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without this mode"
     return f"mode {worst.mode + 1}: {pole}", f"sensor at {worst.dominant.text}"

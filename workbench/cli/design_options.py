@@ -48,7 +48,7 @@ def read_structure_rig(path: Path) -> "tuple[Rig, Units]":
             " describe a beam, a rod or a plate"
         )
     actuators = [
-        replace(a, at=domain.slope(a.at, int(a.kind == "moment"), a.direction)[0][0], direction=None)
+        replace(a, at=domain.slope(a.at, int(a.quantity == "moment"), a.direction)[0][0], direction=None)
         if isinstance(a.at, str)
         else a
         for a in found.actuators
@@ -179,7 +179,7 @@ def observed(
     """
     from workbench.design.estimation.controller import filtered
     from workbench.design.estimation.modal_filter import filter_on
-    from workbench.design.estimation.observers import kalman, luenberger, usual_poles
+    from workbench.design.estimation.observers import kalman_controller, luenberger_controller, usual_poles
     from workbench.design.laws.law import Law
     from workbench.rig.sensors import MEASURED
 
@@ -204,7 +204,7 @@ def observed(
         own = [next(s for s in sensors if (s.at, s.quantity) == (one.at, one.quantity)) for one in found.sensors]
         return replace(found, sensors=tuple(own))
     if estimator == "luenberger":
-        return luenberger(rig.modes, law, sensors, poles=usual_poles(rig.modes, law.controlled))
+        return luenberger_controller(rig.modes, law, sensors, poles=usual_poles(rig.modes, law.controlled))
     # a noise of variance σ² held over each sample has the intensity σ² T
     silent = [s.name for s in sensors if s.noise_std == 0]
     if silent:
@@ -213,4 +213,4 @@ def observed(
             " case file, or choose --estimator luenberger"
         )
     noise = [s.noise_std**2 * sample_time for s in sensors]
-    return kalman(rig.modes, law, sensors, disturbance=disturbance, noise=noise)
+    return kalman_controller(rig.modes, law, sensors, disturbance=disturbance, noise=noise)

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from workbench.rig.rig import Rig
 
 LEAST_SPACING = 1 / 20  # default least spacing, over the size of the structure
-WRITTEN = ("positions", "residual_work", "by_mode", "effort", "peak_force", "condition", "status")
+WRITTEN = ("positions", "residual_work", "residual_work_by_mode", "effort", "peak_force", "condition", "status")
+IN_JSON = {"residual_work_by_mode": "by_mode"}  # other names there
 
 
 @guarded
@@ -151,7 +152,7 @@ def place(
             "command_unit": unit,
             "units": asdict(units),
             "controlled": list(range(1, control + 1)),
-            "placements": [{key: getattr(row, key) for key in WRITTEN} for row in rows],
+            "placements": [{IN_JSON.get(name, name): getattr(row, name) for name in WRITTEN} for row in rows],
             "lower_bound": None if certificate is None else certificate.lower_bound,
         },
     )

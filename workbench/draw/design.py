@@ -52,18 +52,18 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int, units: Units 
 def plot_work(spillovers: dict[str, Spillover]) -> Figure:
     """Work in each residual mode, one colour of bars per design, on a logarithmic scale; negative if energy is lost."""
     first = next(iter(spillovers.values()))
-    if not first.residual:
+    if not first.residual_modes:
         return _without_residual_modes()
     figure, ax = new_figure(1, 1, width=9, height=4)
-    modes = np.array(first.residual) + 1
+    modes = np.array(first.residual_modes) + 1
     shifts, width = grouped_bars(len(spillovers))
-    total = max(float(np.abs(work.residual_work).sum()) for work in spillovers.values()) or 1.0
-    least, lowest = SHOWN_SHARE * total, min(float(work.residual_work.min()) for work in spillovers.values())
+    total = max(float(np.abs(work.residual_work_by_mode).sum()) for work in spillovers.values()) or 1.0
+    least, lowest = SHOWN_SHARE * total, min(float(work.residual_work_by_mode.min()) for work in spillovers.values())
     signed = lowest <= -least  # a residual mode in motion may lose energy
     for shift, (name, work) in zip(shifts, spillovers.items(), strict=True):
-        at, small = modes + shift, np.abs(work.residual_work) < least
-        values = np.where(small, 0.0 if signed else 0.1 * least, work.residual_work)
-        bars = ax.bar(at, values, width, label=f"{name}: W_R = {work.residual_total:.3g} J")
+        at, small = modes + shift, np.abs(work.residual_work_by_mode) < least
+        values = np.where(small, 0.0 if signed else 0.1 * least, work.residual_work_by_mode)
+        bars = ax.bar(at, values, width, label=f"{name}: W_R = {work.residual_work:.3g} J")
         for x in at[small] if modes.size <= MOST_TICKS else ():
             ax.text(x, 1.3 * least, "≈ 0", ha="center", color=bars.patches[0].get_facecolor())
     if signed:

@@ -50,8 +50,8 @@ SENSOR: Any = {
 def plot_placement(placement: Placement, *, units: Units = SI) -> Figure:
     """Spillover work in each residual mode with actuators at given places."""
     figure, ax = new_figure(width=9, height=3.5)
-    numbers = len(placement.positions) + 1 + np.arange(placement.by_mode.size)
-    ax.bar(numbers, placement.by_mode)
+    numbers = len(placement.positions) + 1 + np.arange(placement.residual_work_by_mode.size)
+    ax.bar(numbers, placement.residual_work_by_mode)
     where = "; ".join(place_text(place) for place in listed(placement.positions))
     ax.set(xlabel="residual mode", ylabel=units.named("spillover work, W_r [J]"), xticks=few_ticks(numbers))
     ax.set_title(f"actuators at {where}: W_R = {placement.residual_work:.3g}, effort {placement.effort:.3g}")
@@ -189,10 +189,10 @@ def _draw_works(
     numbers = np.arange(task.n_controlled, task.modes.n_modes) + 1
     shifts, width = grouped_bars(len(placements))
     for i, placement in enumerate(placements.values()):
-        ax.bar(numbers + shifts[i], placement.by_mode, width, color=COLOURS[i])
+        ax.bar(numbers + shifts[i], placement.residual_work_by_mode, width, color=COLOURS[i])
     ax.set(xlabel="residual mode", ylabel=units.named("spillover work, W_r [J]"), xticks=few_ticks(numbers))
     ax.set_yscale("log")
-    work = np.concatenate([placement.by_mode for placement in placements.values()])
+    work = np.concatenate([placement.residual_work_by_mode for placement in placements.values()])
     return float(work.max()), float(work.min())
 
 

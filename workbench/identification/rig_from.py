@@ -85,7 +85,7 @@ def rig_from(
         shapes = _shapes_of_residues(identified, out_channels, in_channels, driving_point, modal_masses)
         delays = identified.delays if isinstance(identified, Driven) else np.zeros(len(in_channels))
         actuators = tuple(
-            Actuator(c.name, c.name, kind="moment" if c.quantity == "moment" else "force", delay=float(delay))
+            Actuator(c.name, c.name, quantity="moment" if c.quantity == "moment" else "force", delay=float(delay))
             for c, delay in zip(in_channels, delays, strict=True)
         )
     else:

@@ -79,7 +79,7 @@ class RingDown(OfRefined):
         noise_statistic: (n_noise,) test statistics of these, below `threshold`.
         threshold: least test statistic of a mode.
         by_amplitude: the modes of each segment of the decay.
-        proportional: g1 and g2 of the modes without remark; None where they are fewer than two.
+        proportional: Rayleigh damping of the modes without remark; None where they are fewer than two.
         notes: how the records were prepared, and where the model does not explain them.
     """
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.renamed import Renamed, former_arguments
 from workbench.structure.domain import Between, Patch, Place, PlaceError, Where, centred_at, same_place
 
 
@@ -18,7 +19,7 @@ class Actuator:
         name: of the input.
         at: place on the structure: x (m), (x, y), the name of a point; `Between` two of these, to act on the first and
             in the opposite direction on the second; or a `Patch` of a plate, to act along its edges.
-        kind: "force" (N) or "moment" (N m; of a patch, N m/m).
+        quantity: "force" (N) or "moment" (N m; of a patch, N m/m).
         hysteresis_share: part of u replaced by z: (1 - share) u + share z, z' = u' - (|u'| z + u' |z|) / (2 width).
         hysteresis_width: limit of |z| for large commands.
         gain: force per command.
@@ -36,7 +37,7 @@ class Actuator:
 
     name: str
     at: Where
-    kind: str = "force"
+    quantity: str = "force"
     gain: float = 1.0
     dead_zone: float = 0.0
     limit: float = np.inf
@@ -50,29 +51,36 @@ class Actuator:
     direction: str | None = None
     shape_error: tuple[float, ...] = ()
 
+    kind, linear = Renamed("quantity"), Renamed("has_state_space")
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "at", same_place(self.at))
-        if self.kind not in ("force", "moment"):
-            raise ValueError(f"actuator {self.name}: kind is force or moment; got {self.kind!r}")
-        if isinstance(self.at, Patch) and self.kind != "moment":
-            raise ValueError(f"actuator {self.name} acts by moments along the edges of its patch; give kind='moment'")
-        for quantity in ("dead_zone", "delay", "time_constant"):
-            if not (np.isfinite(getattr(self, quantity)) and getattr(self, quantity) >= 0):
-                raise ValueError(f"actuator {self.name}: {quantity} must be 0 or more; got {getattr(self, quantity)}")
-        for quantity in ("limit", "rate_limit", "hysteresis_width"):
-            if not getattr(self, quantity) > 0:
-                raise ValueError(f"actuator {self.name}: {quantity} must be positive; got {getattr(self, quantity)}")
+        if self.quantity not in ("force", "moment"):
+            raise ValueError(f"actuator {self.name}: quantity is force or moment; got {self.quantity!r}")
+        if isinstance(self.at, Patch) and self.quantity != "moment":
+            raise ValueError(
+                f"actuator {self.name} acts by moments along the edges of its patch; give quantity='moment'"
+            )
+        for name in ("dead_zone", "delay", "time_constant"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise ValueError(f"actuator {self.name}: {name} must be 0 or more; got {getattr(self, name)}")
+        for name in ("limit", "rate_limit", "hysteresis_width"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"actuator {self.name}: {name} must be positive; got {getattr(self, name)}")
 
     @property
-    def linear(self) -> bool:
+    def has_state_space(self) -> bool:
         """Whether the force is a linear function of the command with finitely many states, so without a delay."""
         unbounded = np.isinf(self.limit) and np.isinf(self.rate_limit)
         return bool(unbounded and not (self.dead_zone or self.delay or self.hysteresis_share or self.bias))
 
 
+Actuator.__init__ = former_arguments(kind="quantity")(Actuator.__init__)  # type: ignore[method-assign]
+
+
 def force_unit(actuator: Actuator) -> str:
     """Unit of an actuator's force: N, N m, or N m/m of a patch on a plate."""
-    return "N" if actuator.kind == "force" else "N m/m" if isinstance(actuator.at, Patch) else "N m"
+    return "N" if actuator.quantity == "force" else "N m/m" if isinstance(actuator.at, Patch) else "N m"
 
 
 def command_unit(actuators: Sequence[Actuator]) -> str:
@@ -115,4 +123,4 @@ def piezo_patch(
             f"piezo patch {name}: its middle is x along a beam, or (x, y) on a plate; got {at!r}"
         ) from None
     where: Where = Patch(x, *y, *sides.tolist()) if on_plate else centred_at(Between(sides[0], 0.0), x)
-    return Actuator(name, where, kind="moment", gain=gain, direction=direction)
+    return Actuator(name, where, quantity="moment", gain=gain, direction=direction)

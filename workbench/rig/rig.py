@@ -22,7 +22,7 @@ KEPT = 8  # rigs in a cache of arrays that all records share
 
 def derivative_of(port: Actuator | Sensor) -> int:
     """Order of the shapes' spatial derivative at a port: 0 for a force or a displacement, 1 for a moment or a slope."""
-    return int(port.kind == "moment") if isinstance(port, Actuator) else MEASURED[port.quantity][0]
+    return int(port.quantity == "moment") if isinstance(port, Actuator) else MEASURED[port.quantity][0]
 
 
 def shape_of(modes: Modes, port: Actuator | Sensor) -> Floats:
@@ -46,8 +46,7 @@ def shapes_at(modes: Modes, ports: Sequence[Actuator | Sensor]) -> Floats:
         if isinstance(port.at, Between | Patch):
             shapes[j] = modes.phi_at(port.at, derivative_of(port), direction=port.direction)
         else:
-            kind = port.kind if isinstance(port, Actuator) else port.quantity
-            at_points.setdefault((kind, port.direction), []).append(j)
+            at_points.setdefault((port.quantity, port.direction), []).append(j)
     for (_, direction), here in at_points.items():
         shapes[here] = modes.phi([ports[j].at for j in here], derivative_of(ports[here[0]]), direction=direction)
     for j, port in enumerate(ports):
@@ -129,7 +128,7 @@ class Rig(Printed):
             outputs=outputs,
             output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in self.sensors),
             inputs=inputs,
-            input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in self.actuators),
+            input_channels=tuple(Channel(a.name, a.quantity, at=a.at) for a in self.actuators),
             input_hold=input_hold,
             name=name,
         )
@@ -148,7 +147,7 @@ class Rig(Printed):
         return rig if change is None else change(rig)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        rows = [(a.name, "actuator", a.kind, place_text(a.at)) for a in self.actuators]
+        rows = [(a.name, "actuator", a.quantity, place_text(a.at)) for a in self.actuators]
         rows += [(s.name, "sensor", s.quantity, place_text(s.at)) for s in self.sensors]
         rows += [("", "element", type(e).__name__, place_text(getattr(e, "at", None))) for e in self.elements]
         parts = ((self.actuators, "actuator"), (self.sensors, "sensor"), (self.elements, "element"))

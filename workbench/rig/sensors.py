@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.renamed import Renamed
 from workbench.structure.domain import Place, same_place
 
 # quantity: (derivative along x, derivative in time)
@@ -58,6 +59,8 @@ class Sensor:
     shape_error: tuple[float, ...] = ()
     interpolated: bool = False
 
+    linear = Renamed("has_state_space")
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "at", same_place(self.at))
         if self.quantity not in MEASURED:
@@ -71,6 +74,6 @@ class Sensor:
             raise ValueError(f"sensor {self.name}: limit must be positive; got {self.limit}")
 
     @property
-    def linear(self) -> bool:
-        """Whether the reading is a linear function of the measured quantity (a time constant adds a state)."""
-        return bool(np.isinf(self.limit) and not (self.bias or self.drift or self.step or self.delay or self.crosstalk))
+    def has_state_space(self) -> bool:
+        """Whether the reading is linear in the measured quantities with finitely many states, so without a delay."""
+        return bool(np.isinf(self.limit) and not (self.bias or self.drift or self.step or self.delay))

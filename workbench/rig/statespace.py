@@ -1,6 +1,7 @@
 """Modes with actuators and sensors as python-control's `StateSpace`."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -10,7 +11,17 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import shape_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
+from workbench.structure.printed import joined_in_words
 
+NONLINEAR = {
+    "dead_zone": "a dead zone",
+    "limit": "a limit",
+    "rate_limit": "a rate limit",
+    "hysteresis_share": "hysteresis",
+    "bias": "a bias",
+    "drift": "a drift",
+    "step": "rounding",
+}
 DELAY_ORDER = 0.7  # order of a delay line per radian of the fastest mode within the delay
 
 
@@ -23,7 +34,7 @@ def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     columns = []
     for actuator in actuators:
         shape = shape_of(modes, actuator)
-        if modes.is_held(actuator.at, int(actuator.kind == "moment"), direction=actuator.direction):
+        if modes.is_held(actuator.at, int(actuator.quantity == "moment"), direction=actuator.direction):
             raise ValueError(
                 f"actuator {actuator.name} stands on the support at {modes.domain.text(actuator.at)}, where it moves"
                 " no mode; move it inside"
@@ -42,16 +53,17 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     """The linear model from commands to sensor outputs, states (q_1..q_n, q_1'..q_n'), named signals.
 
     x' = [0 I; -Ω² -C] x + [0; B] u, and y a displacement, slope, velocity, angular velocity or acceleration. For an
-    acceleration D is not zero. Lags of actuators, then of sensors, add one state each after the modal ones.
+    acceleration D is not zero. Cross-talk of sensors is included. Lags of actuators, then of sensors, add one state
+    each after the modal ones.
 
     Raises:
-        ValueError: an actuator or sensor that is not linear (delay, dead zone, limit, bias, rounding).
+        ValueError: an actuator or sensor that is not linear (dead zone, limit, bias, rounding) or has a delay, and
+            cross-talk from a sensor that is not among these.
     """
     parts: tuple[Actuator | Sensor, ...] = (*actuators, *sensors)
     for part in parts:
-        if not part.linear:
-            raise ValueError(f"{part} is not linear, so the rig has no StateSpace; simulate it instead")
-    a, b, c, d, states = modal_plant(modes, actuators, sensors)
+        _check_finite_linear(part)
+    a, b, c, d, states = modal_plant(modes, actuators, sensors, with_crosstalk=True)
     return control.ss(
         a,
         b,
@@ -64,27 +76,60 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     )
 
 
+def _check_finite_linear(part: Actuator | Sensor) -> None:
+    """Refuse an actuator or a sensor that no finite `StateSpace` represents.
+
+    Raises:
+        ValueError: with what it has, and the remedy.
+    """
+    if part.has_state_space:
+        return
+    channel = f"{'actuator' if isinstance(part, Actuator) else 'sensor'} {part.name}"
+    ideal = replace(part, delay=0.0)
+    if ideal.has_state_space:
+        raise ValueError(
+            f"{channel} has a delay, which no finite StateSpace represents exactly; leave it out and connect an"
+            " approximation by control.pade in series, or simulate the rig"
+        )
+    nonlinear = [what for name, what in NONLINEAR.items() if getattr(part, name, 0.0) not in (0.0, np.inf)]
+    raise ValueError(
+        f"{channel} has {joined_in_words(nonlinear)}, so it is not linear and the rig has no StateSpace; simulate it"
+        " instead"
+    )
+
+
 def modal_plant(
-    modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[Sensor]
+    modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[Sensor], *, with_crosstalk: bool = False
 ) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
     """A, B, C, D and the names of the states, from commands to readings and to the delayed and lagged commands.
 
-    Lags and delays are included, a delay as of `delay_line`; nonlinear imperfections are not. The last n_actuators rows
-    of C and D give the delayed and lagged commands, before the gains.
+    Lags and delays are included, a delay as of `delay_line`; nonlinear imperfections are not, and cross-talk of sensors
+    where it is asked for. The last n_actuators rows of C and D give the delayed and lagged commands, before the gains.
+
+    Raises:
+        ValueError: cross-talk from a sensor that is not among these.
     """
     n, m = modes.n_modes, len(actuators)
     force = input_matrix(modes, actuators)
-    shapes = output_matrix(modes, sensors)
     a, b = modes.state_matrix, np.vstack([np.zeros_like(force), force])
-    c, d = np.zeros((len(sensors) + m, 2 * n)), np.zeros((len(sensors) + m, m))
-    for j, sensor in enumerate(sensors):
-        order = MEASURED[sensor.quantity][1]
-        if order < 2:
-            c[j, order * n : (order + 1) * n] = shapes[j]
-        else:
-            c[j] = shapes[j] @ a[n:]
-            d[j] = shapes[j] @ force
-    d[len(sensors) :] = np.eye(m)
+
+    def read(sensors: Sequence[Sensor]) -> tuple[Floats, Floats]:
+        """C and D of the sensors without cross-talk, lags and delays."""
+        c, d = np.zeros((len(sensors), 2 * n)), np.zeros((len(sensors), m))
+        for j, (sensor, shape) in enumerate(zip(sensors, output_matrix(modes, sensors), strict=True)):
+            order = MEASURED[sensor.quantity][1]
+            if order < 2:
+                c[j, order * n : (order + 1) * n] = shape
+            else:
+                c[j], d[j] = shape @ a[n:], shape @ force
+        return c, d
+
+    c, d = read(sensors)
+    if with_crosstalk and any(sensor.crosstalk for sensor in sensors):
+        share = _shares(sensors)
+        more = read([replace(sensor, gain=1.0) for sensor in sensors])
+        c, d = c + share @ more[0], d + share @ more[1]
+    c, d = np.vstack([c, np.zeros((m, 2 * n))]), np.vstack([d, np.eye(m)])
     states = [f"q{r + 1}" for r in range(n)] + [f"dq{r + 1}" for r in range(n)]
     for j, actuator in enumerate(actuators):
         for what, (pa, pb, pc) in lateness(actuator, modes):
@@ -101,6 +146,21 @@ def modal_plant(
             c[j], d[j] = np.r_[np.zeros(len(a) - size), pc], 0.0
             states += _named(f"{sensor.name}_{what}", size)
     return a, b, c, d, states
+
+
+def _shares(sensors: Sequence[Sensor]) -> Floats:
+    """Cross-talk as a matrix (n_sensors, n_sensors): the reading of each sensor per quantity that another measures.
+
+    Raises:
+        ValueError: a share of a sensor that is not among these.
+    """
+    names, shares = [sensor.name for sensor in sensors], np.zeros((len(sensors), len(sensors)))
+    for j, sensor in enumerate(sensors):
+        for name, share in sensor.crosstalk:
+            if name not in names:
+                raise ValueError(f"sensor {sensor.name} reads a share of {name!r}, which is no sensor of the rig")
+            shares[j, names.index(name)] += sensor.gain * share
+    return shares
 
 
 def _named(name: str, size: int) -> list[str]:

@@ -114,9 +114,12 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
     sensors = [named(rig.sensors, s.name) for s in loop.controller.sensors]
     own, forced, reads = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
     model = _model(own, forced, actuators, sample_time, "delay" in steps)
-    estimator = loop.controller.estimator
+    estimator = loop.controller.L
     if estimator is None:
-        raise DesignError("the controller does not name its estimator; make it by luenberger, kalman or filtered")
+        raise DesignError(
+            "the controller does not name its estimator; make it by luenberger_controller, kalman_controller or"
+            " filtered"
+        )
     output = _output(loop, reads, sensors, model.hold, "sensors" in steps)
     a, b, c, d, e = _matrices(model, loop, estimator, output)
     gain, dead_zone = _values(actuators, "gain"), _values(actuators, "dead_zone")
@@ -252,7 +255,7 @@ def _output(loop: Loop, reads: Floats, sensors: Sequence[Sensor], hold: float, r
     delays, lags = (recalibrated * _values(sensors, name) for name in ("delay", "time_constant"))
     if not loop.controller.static:
         return late_output(reads, omega, delays + hold, lags)
-    q, v = np.split(np.array(loop.controller.estimator), 2)
+    q, v = np.split(np.array(loop.controller.L), 2)
     inverse = 1.0 / lag_response(omega, delays, lags).T  # (n, n_channels)
     # the part in quadrature of a displacement adds to q' / ω, and that of a velocity to -ω q
     safe = np.maximum(omega, 1e-12)[:, None]

@@ -95,7 +95,7 @@ def _place_of(domain: Domain, port: Actuator) -> Where:
     if not isinstance(domain, NamedPoints) or port.direction is None:
         return port.at
     places = port.at if isinstance(port.at, Between) else (port.at,)
-    names, _, _ = domain.slope(list(places), int(port.kind == "moment"), port.direction)
+    names, _, _ = domain.slope(list(places), int(port.quantity == "moment"), port.direction)
     return Between(*names) if isinstance(port.at, Between) else names[0]
 
 

@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import sampled
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import imsc, pole_gains
 from workbench.design.laws.law import DesignError, Law, separation
@@ -47,7 +47,8 @@ def controlled_by(design: Design) -> tuple[int, ...]:
     if not isinstance(design, Design):
         raise TypeError(
             f"the controller in use is a law, a controller or a placement task; got {type(design).__name__}: make one"
-            " by imsc, coupled_lqr, coupled_poles or on_off, with an estimator by luenberger or kalman"
+            " by imsc, coupled_lqr, coupled_poles or on_off, with an estimator by luenberger_controller or"
+            " kalman_controller"
         )
     return tuple(range(design.n_controlled)) if isinstance(design, PlacementTask) else law_of(design).controlled
 
@@ -71,8 +72,8 @@ def loop_on_rig(rig: Rig, design: Design, test: LoopTest) -> Loop:
     if isinstance(design, Controller):
         if design.designed_by is None:
             raise DesignError(
-                f"{design.name} does not say how its estimator was designed: make it by luenberger, kalman or"
-                " filtered(law, hermite_filter(...))"
+                f"{design.name} does not say how its estimator was designed: make it by luenberger_controller,"
+                " kalman_controller or filtered(law, hermite_filter(...))"
             )
         sensors = tuple(_same_sensor(rig, s) for s in design.sensors)
         return Loop(rig.modes, law, replace(design, law=_linear(law), sensors=sensors))
@@ -110,7 +111,7 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
     best, least = None, -np.inf
     for factor in SPEEDS:
         try:
-            controller = kalman(rig.modes, law, sensors, disturbance=disturbance, noise=factor * noise)
+            controller = kalman_controller(rig.modes, law, sensors, disturbance=disturbance, noise=factor * noise)
         except DesignError:
             continue
         loop = loop_poles(rig, sampled(controller, test.sample_time))
@@ -138,14 +139,14 @@ def _design_damping(modes: Modes, law: Law) -> np.ndarray:
 
 def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
     """The rig's actuator of the same kind at the same place, by preference of the same name."""
-    near = [a for a in rig.actuators if a.kind == wanted.kind and separation(rig.modes, a, wanted) < SAME_PLACE]
+    near = [a for a in rig.actuators if a.quantity == wanted.quantity and separation(rig.modes, a, wanted) < SAME_PLACE]
     # an actuator of the same name at another place does not do: the gains are for their places
     match = next((a for a in near if a.name == wanted.name), next((a for a in near if not a.direct), None))
     if match is not None:
         return match
-    names = ", ".join(f"{a.name} ({a.kind}) at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
+    names = ", ".join(f"{a.name} ({a.quantity}) at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
     raise DesignError(
-        f"the law drives {wanted.name} ({wanted.kind}) at {rig.modes.domain.text(wanted.at)}, where the rig has no"
+        f"the law drives {wanted.name} ({wanted.quantity}) at {rig.modes.domain.text(wanted.at)}, where the rig has no"
         f" actuator: it has {names}; design the law for these"
     )
 

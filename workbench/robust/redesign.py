@@ -57,8 +57,9 @@ def redesign(
 
     Args:
         verdict: of the diagnosis, or the corrected rig with its uncertainty.
-        design: in use: a `Controller` from `luenberger`, `kalman` or a modal filter; a law, which gets a Kalman filter
-            on the rig's sensors; or a `PlacementTask`, whose IMSC law gets the rig's actuators.
+        design: in use: a `Controller` from `luenberger_controller`, `kalman_controller` or a modal filter; a law,
+            which gets a Kalman filter on the rig's sensors; or a `PlacementTask`, whose IMSC law gets the rig's
+            actuators.
         sample_time: of the controller, s; by default that of the records.
         impulse_at: place of the test's impulse; by default that of the hammer, or of the first actuator.
         test: instead of the impulse.

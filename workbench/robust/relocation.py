@@ -71,7 +71,7 @@ def relocated(loop: Loop, test: LoopTest, units: Units = SI) -> Relocation | Non
         return None
     if not isinstance(modes.domain, Interval) or law.controlled != tuple(range(n)) or len(law.actuators) != n:
         return None
-    if not all(isinstance(a.at, float) and a.kind == "force" for a in law.actuators):
+    if not all(isinstance(a.at, float) and a.quantity == "force" for a in law.actuators):
         return None
     try:
         task = placement_task(modes, n, impulse_at=position(at), weight=settings(law)["weight"], impulse=test.impulse)

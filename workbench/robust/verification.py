@@ -93,12 +93,12 @@ class Verification:
 
     @property
     def controlled_work(self) -> np.ndarray:
-        """W_C (n_draws,)."""
+        """W_C of each draw (n_draws,)."""
         return np.asarray(self.work[:, list(self.controlled)].sum(axis=1))
 
     @property
     def residual_work(self) -> np.ndarray:
-        """W_R (n_draws,)."""
+        """W_R of each draw (n_draws,)."""
         return np.asarray(self.work.sum(axis=1) - self.controlled_work)
 
     def to_json(self) -> dict[str, Any]:
@@ -238,7 +238,7 @@ def check_loop_kinds(controller: object, test: object) -> None:
     if not isinstance(controller, DigitalController):
         raise TypeError(
             f"the controller must be a DigitalController; got {type(controller).__name__}: make one of a law and an"
-            " estimator by sampled(kalman(...), sample_time)"
+            " estimator by sampled(kalman_controller(...), sample_time)"
         )
     check_test(test)
 
@@ -309,7 +309,7 @@ def settling(energy: np.ndarray, sample_time: float) -> float:
 
 def displacement_at(modes: Modes, actuator: Actuator) -> np.ndarray:
     """Displacement (n_modes,) of each mode at an actuator: at the middle of a patch; at named points its own motion."""
-    if actuator.kind == "force" or isinstance(modes.domain, NamedPoints):
+    if actuator.quantity == "force" or isinstance(modes.domain, NamedPoints):
         return shape_of(modes, actuator)
     return np.asarray(modes.phi(middle(actuator.at))[0])
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.renamed import Renamed, former_arguments
 from workbench.structure.profile import ProfileLike
 
 
@@ -25,14 +26,26 @@ class ModalDamping:
 
 @dataclass(frozen=True)
 class ProportionalDamping:
-    """C = g1 L + g2 M (2.13): c_r = g1 ω_r² + g2, g1 in s and g2 in 1/s."""
+    """Rayleigh damping C = α M + β K: c_r = α + β ω_r², ζ_r = (α/ω_r + β ω_r)/2; g2 and g1 of (2.13).
 
-    g1: float = 0.0
-    g2: float = 0.0
+    Attributes:
+        stiffness: β, s.
+        mass: α, 1/s.
+    """
+
+    stiffness: float = 0.0
+    mass: float = 0.0
+
+    g1, g2 = Renamed("stiffness"), Renamed("mass")
 
     def matrix(self, omega: np.ndarray) -> np.ndarray:
-        """c_rs = (g1 ω_r² + g2) δ_rs, (n_modes, n_modes)."""
-        return np.diag(self.g1 * omega**2 + self.g2)
+        """c_rs = (α + β ω_r²) δ_rs, (n_modes, n_modes)."""
+        return np.diag(self.stiffness * omega**2 + self.mass)
+
+
+ProportionalDamping.__init__ = former_arguments(  # type: ignore[method-assign]
+    g1="stiffness", g2="mass"
+)(ProportionalDamping.__init__)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from workbench.cases.case import read_case
-from workbench.design.loop.closed_loop import stability
+from workbench.design.loop.closed_loop import DRIFTS, stability
 from workbench.draw.design import plot_poles, plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.identification import plot_deviations, plot_mac, stabilisation_diagram
@@ -205,7 +205,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
             law["law"],
             *(short(law[key]) for key in ("cost", "effort", "peak_force")),
             short(works[law["law"]].sum()),
-            stability(poles[law["law"]]),
+            law.get("stability", stability(poles[law["law"]])),
         ]
         for law in laws
     ]
@@ -214,18 +214,18 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         [
             one["design"],
             short(one["margin"]),
-            "stable" if one["stable"] else "unstable",
+            _stability_of(one),
             *_words([one.get("limited_by", ""), one.get("path", "")]),
             "" if one.get("robustness") is None else one["robustness"],
         ]
         for one in through
     ]
-    heads = ("controller", "margin [1/s]", "loop", "residual mode that limits it", "path", ROBUSTNESS)
+    heads = ("controller", "decay rate [1/s]", "loop", "residual mode that limits it", "path", ROBUSTNESS)
     filled = [i for i in range(len(heads)) if i < 3 or any(row[i] != "" for row in sensed)]
     sensed = [[row[i] for i in filled] for row in sensed]
     seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}
-    unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if row[2] == "unstable"]
-    loops = [row[0] for row in (*rows, *sensed)]
+    loops = [(str(row[0]), str(row[-1])) for row in rows] + [(str(row[0]), str(row[2])) for row in sensed]
+    unstable = [name for name, found in loops if found.startswith("unstable")]
     work = plot_two_works(works, first=len(controlled), units=units)
     blocks = [
         block(work, "Spillover work of each law in each residual mode."),
@@ -240,7 +240,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         tables.append(("With sensors", tuple(heads[i] for i in filled), sensed))
     return {
         "title": "Control design",
-        "lead": "" if not sensed else _stability(loops, unstable),
+        "lead": "" if not sensed else _stability(loops),
         "standing": "" if not sensed else "bad" if len(unstable) == len(loops) else "part" if unstable else "good",
         "blocks": blocks,
         "tables": tables,
@@ -251,14 +251,26 @@ def _poles_of(row: Mapping[str, Any]) -> np.ndarray:
     return np.array(row["poles_real"], float) + 1j * np.array(row["poles_imag"], float)
 
 
-def _stability(loops: list[str], unstable: list[str]) -> str:
+def _stability_of(loop: Mapping[str, Any]) -> str:
+    """The stability of a loop with sensors, in words; files of earlier versions have its poles at most."""
+    by_poles = stability(_poles_of(loop)) if "poles_real" in loop else "stable" if loop["stable"] else "unstable"
+    return str(loop.get("stability", by_poles))
+
+
+def _stability(loops: Sequence[tuple[str, str]]) -> str:
+    """The sentence on the stability of loops, (name, stability) each."""
+    unstable = [name for name, found in loops if found.startswith("unstable")]
+    rest = len(loops) - len(unstable)
+    stable = sum(found == "stable" for _, found in loops)
+    undamped = "has no pole right of the imaginary axis; undamped modes leave poles on it"
     if not unstable:
-        return "Every closed loop is stable on the full plant."
-    if len(unstable) == len(loops):
-        return "Every closed loop is unstable on the full plant: spillover destabilises residual modes."
-    return (
-        f"Unstable on the full plant: {', '.join(unstable)}. The other {len(loops) - len(unstable)} loops are stable."
-    )
+        return "Every closed loop is stable on the full plant." if stable == rest else f"Every closed loop {undamped}."
+    if not rest:
+        drifts = all(found == DRIFTS for _, found in loops)
+        why = "a rigid-body mode drifts" if drifts else "spillover destabilises residual modes"
+        return f"Every closed loop is unstable on the full plant: {why}."
+    others = "are stable" if stable == rest else "have no pole right of the imaginary axis"
+    return f"Unstable on the full plant: {', '.join(unstable)}. The other {rest} loops {others}."
 
 
 def _placed(content: dict[str, Any]) -> dict[str, Any]:

@@ -28,12 +28,12 @@ SHOWN, STABLE = {shown}, {stable}  # on the bench
 def study(outcome, data=None):
     rig = read_rig(Path(__file__).with_suffix(".toml"))
     tried = try_out(rig, DESIGN)
-    found = {{"W_R": tried.work.residual_total, "effort": tried.effort}}
+    found = {{"W_R": tried.work.residual_work, "effort": tried.effort}}
     outcome.table("design", found)
     for name, value in SHOWN.items():
         outcome.check(f"{{name}}: against the bench, relative", abs(found[name] / value - 1.0) if value else 0.0, 1e-6)
-    outcome.check("stable or not, against the bench", float(tried.loop.stable is not STABLE), 0.0)
-    outcome.say(f"The closed loop is {{'stable' if tried.loop.stable else 'unstable'}}.")
+    outcome.check("stable or not, against the bench", float((not tried.loop.unstable_poles.size) is not STABLE), 0.0)
+    outcome.say(f"The closed loop is {{tried.loop.stability}}.")
     outcome.say("W_R = {{W_R:.3e}} for an effort of {{effort:.3e}}.".format(**found))
     outcome.figure("work", plot_work({{"this design": tried.work}}), "Spillover work by residual mode.")
 {motion}'''
@@ -77,7 +77,7 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
     """
     path = free_path(name, folder)
     tried = try_out(rig, design)
-    found = {"W_R": tried.work.residual_total, "effort": tried.effort}
+    found = {"W_R": tried.work.residual_work, "effort": tried.effort}
     domain = rig.modes.domain
     imports, motion = MEMBER
     if isinstance(domain, Rectangle):
@@ -86,7 +86,7 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
         imports, motion = FRAME
         structure = TABLE.sub(rf'\1points = "{path.with_suffix(".csv").name}"', structure)
     script = SCRIPT.format(
-        design=_written(design), shown=found, stable=tried.loop.stable, imports=imports, motion=motion
+        design=_written(design), shown=found, stable=not tried.loop.unstable_poles.size, imports=imports, motion=motion
     )
     write_whole(path.with_suffix(".toml"), structure)
     if isinstance(domain, NamedPoints):

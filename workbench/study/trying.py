@@ -209,7 +209,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
     state = impulse_state(modes, design.impulse_at)
     at_rest = state.copy()
     at_rest[modes.n_modes + design.controlled :] = 0.0  # so that W_r is the energy that control adds to the mode
-    response = initial_response(loop, state, np.linspace(0.0, design.final_time, N_TIMES))
+    response = initial_response(loop, np.linspace(0.0, design.final_time, N_TIMES), state)
     effort = float(simpson((response.forces**2).sum(axis=0), x=response.time))
     return Tried(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
 
@@ -221,11 +221,11 @@ def results_of(rig: Rig, design: Design) -> dict[str, Any]:
     poles = tried.loop.poles
     energy = tried.response.energy[:, ::step].sum(axis=0)
     return {
-        "residual": _plain(tried.work.residual_total),
-        "by_mode": _plain(tried.work.by_mode),
+        "residual": _plain(tried.work.residual_work),
+        "by_mode": _plain(tried.work.work_by_mode),
         "effort": _plain(tried.effort),
         "peak_force": _plain(np.abs(tried.response.forces).max()),
-        "stable": tried.loop.stable,
+        "stable": not tried.loop.unstable_poles.size,
         "undamped": int(np.sum(np.abs(poles.real) <= ON_AXIS * np.abs(poles)) // 2),
         "rightmost": _plain(poles.real.max()),
         "poles": [[_plain(p.real), _plain(p.imag)] for p in poles if p.imag >= 0],

@@ -93,7 +93,7 @@ def control_plant(
     given = 0.5 * float(velocity @ velocity)
     moved = np.zeros((n_samples, 3, pieces.edges.size, n))
     sums = motion.Sums(squares=np.zeros(m), work=np.zeros(n), peaks=np.zeros(m))
-    z, followed = np.zeros(controller.a.shape[0]), np.zeros(len(commanded))
+    z, followed = np.zeros(controller.A.shape[0]), np.zeros(len(commanded))
     energy, outputs, bounded = np.zeros((n, n_samples)), np.zeros((len(controller.sensors), n_samples)), True
     for k in range(n_samples):
         energy[:, k] = 0.5 * (velocity**2 + system.omega2 * displacement**2)

@@ -75,7 +75,7 @@ def test_its_design_can_be_repeated_for_other_modes():
     law = imsc(modes(), 2, [Actuator("F1", "P3"), Actuator("F2", "P7")], weight=1e-4)
     controller, other = filtered(law, point_filter(modes(), points, law.controlled)), modes(4)
     again = controller.designed_by(other, law, controller.sensors)
-    np.testing.assert_array_equal(again.direct, filtered(law, point_filter(other, points, law.controlled)).direct)
+    np.testing.assert_array_equal(again.D, filtered(law, point_filter(other, points, law.controlled)).D)
     sent = pickle.loads(pickle.dumps(point_filter(modes(), points, law.controlled)))  # to another process
     np.testing.assert_array_equal(
         sent.designed_by(other, law.controlled).displacement, point_filter(other, points, law.controlled).displacement

@@ -14,7 +14,7 @@ from scipy.signal import cont2discrete
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays, sampled
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.export.export import export, write_controller
 from workbench.design.export.sampled import sample_design
 from workbench.design.export.sampled_loop import sampled_loop
@@ -45,7 +45,7 @@ def modes(hinged_beam):
 @pytest.fixture(scope="module")
 def observer(modes):
     law = imsc(modes, 2, ACTUATORS, weight=1.0)
-    return luenberger(modes, law, SENSORS, poles=modes.omega[:2] * (-0.3 + 1j))
+    return luenberger_controller(modes, law, SENSORS, poles=modes.omega[:2] * (-0.3 + 1j))
 
 
 def everything(rng) -> DigitalController:
@@ -92,7 +92,7 @@ def test_a_command_has_the_unit_of_what_it_does():
 
 
 def stepped(controller: DigitalController, readings: np.ndarray) -> np.ndarray:
-    z, before, commands = np.zeros(controller.a.shape[0]), np.zeros(len(controller.actuators)), []
+    z, before, commands = np.zeros(controller.A.shape[0]), np.zeros(len(controller.actuators)), []
     for reading in readings.T:
         command, before, z = controller.step(z, before, reading)
         commands.append(command)
@@ -188,7 +188,7 @@ def test_names_cannot_end_a_comment(tmp_path):
 
 def test_the_controller_is_held_over_each_sample_as_scipy_does_it(modes, observer, tmp_path):
     design = export(modes, observer, tmp_path / "arm.mat", sample_rate_hz=RATE)
-    a, b, c, d, _ = cont2discrete((observer.state, observer.reads, observer.commands, observer.direct), 1 / RATE)
+    a, b, c, d, _ = cont2discrete((observer.A, observer.B, observer.C, observer.D), 1 / RATE)
     written = loadmat(tmp_path / "arm.mat", squeeze_me=True)
     for found in (design.controller.state_space(), control.ss(*(written[k] for k in "ABCD"), written["sample_time"])):
         for matrix, true in zip((found.A, found.B, found.C, found.D), (a, b, c, d)):
@@ -210,7 +210,7 @@ def test_the_sampled_loop_is_that_of_the_differential_equation(modes, observer, 
     past = [np.zeros(2)] * 4
     for _ in range(6):
         y = plant.C @ x
-        command, z = digital.c @ z + digital.d @ y, digital.a @ z + digital.b @ y
+        command, z = digital.C @ z + digital.D @ y, digital.A @ z + digital.B @ y
         past = [command, *past]
         for held, span in ((past[whole + 1], rest * period), (past[whole], (1 - rest) * period)):
             if span > 0:
@@ -244,7 +244,7 @@ def test_a_rate_too_slow_is_refused_with_one_that_holds(modes, observer):
     with pytest.raises(DesignError, match=r"sample at [0-9.]+ Hz or more") as refused:
         export(modes, observer, sample_rate_hz=25.0, computing_delay=0.055)
     rate = float(str(refused.value).split("sample at ")[1].split()[0])
-    assert export(modes, observer, sample_rate_hz=rate, computing_delay=0.055).margin > 0
+    assert export(modes, observer, sample_rate_hz=rate, computing_delay=0.055).decay_rate > 0
 
 
 def test_what_cannot_be_handed_over_is_refused_with_the_remedy(modes, observer, tmp_path):
@@ -277,7 +277,7 @@ def test_what_cannot_be_handed_over_is_refused_with_the_remedy(modes, observer, 
     with pytest.raises(ValueError, match=r"above 0; got -0\.01"):
         sampled(observer, -0.01)
     fierce = imsc(modes, 2, ACTUATORS, weight=1e-4)
-    unstable = luenberger(modes, fierce, SENSORS, poles=20 * modes.omega[:2] * (-0.3 + 1j))
+    unstable = luenberger_controller(modes, fierce, SENSORS, poles=20 * modes.omega[:2] * (-0.3 + 1j))
     with pytest.raises(DesignError, match=r"unstable in continuous time.*Kalman filter by less disturbance"):
         export(modes, unstable, sample_rate_hz=1e4)
 
@@ -291,8 +291,8 @@ def test_a_slow_actuator_is_in_the_margin_of_continuous_time():
     modes, drive = beam.modes(6), Actuator("a", 0.80816, time_constant=0.076105)
     law = coupled_lqr(modes, 1, [drive], weight=0.0014165)
     sensors = [Sensor("y", 1.46274)]
-    controller = kalman(modes, law, sensors, disturbance=1.0, noise=1.0374e-6)
-    parts = (controller.state, controller.reads, controller.commands, controller.direct)
+    controller = kalman_controller(modes, law, sensors, disturbance=1.0, noise=1.0374e-6)
+    parts = (controller.A, controller.B, controller.C, controller.D)
     true = control.feedback(state_space(modes, [drive], sensors), control.ss(*parts), sign=1).poles().real.max()
     found = sample_design(modes, controller, sample_rate_hz=2000.0)
     assert true < 0 and f"{-true:.3g} 1/s in continuous time" in found.remarks[0]

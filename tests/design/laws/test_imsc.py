@@ -8,7 +8,7 @@ import pytest
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import hermite_filter
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.export.export import export
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc, imsc_poles, pole_gains, riccati_gains, riccati_matrices
@@ -88,19 +88,19 @@ def test_response_against_python_control():
     loop, state, time = close_loop(modes(), law), impulse_state(modes(), 6.3), np.linspace(0, 40, 81)
     system = control.ss(loop.matrix, np.zeros((18, 1)), np.eye(18), np.zeros((18, 1)))
     peer = control.initial_response(system, time, state).outputs
-    assert np.abs(initial_response(loop, state, time).modal - peer).max() < 1e-9
+    assert np.abs(initial_response(loop, time, state).modal - peer).max() < 1e-9
 
 
 def test_response_at_uneven_times_is_the_same_response():
     law = imsc(modes(), 4, actuators(2.0, 4.0, 6.0, 8.0), weight=20.0)
     loop, state = close_loop(modes(), law), impulse_state(modes(), 6.3)
     even, uneven = (
-        initial_response(loop, state, [0.0, 1.0, 2.0, 3.0]),
-        initial_response(loop, state, [0.0, 0.7, 2.0, 3.0]),
+        initial_response(loop, [0.0, 1.0, 2.0, 3.0], state),
+        initial_response(loop, [0.0, 0.7, 2.0, 3.0], state),
     )
     np.testing.assert_allclose(even.modal[:, 2:], uneven.modal[:, 2:], atol=1e-12)
     many = np.linspace(2.0, 40.0, 317)
-    many, some = initial_response(loop, state, many), initial_response(loop, state, many[[0, 3, 90, 316]])
+    many, some = initial_response(loop, many, state), initial_response(loop, many[[0, 3, 90, 316]], state)
     np.testing.assert_allclose(many.modal[:, [0, 3, 90, 316]], some.modal, atol=1e-12)
     assert not many.modal.flags.writeable and state.flags.writeable
 
@@ -109,7 +109,7 @@ def test_a_state_of_another_size_starts_no_response():
     loop = close_loop(modes(), imsc(modes(), 2, actuators(2.0, 4.0), weight=1.0))
     for state in (np.zeros(3), np.full(18, np.nan)):
         with pytest.raises(ValueError, match=r"the state must be finite, \(18,\) of the modes; got"):
-            initial_response(loop, state, [0.0, 1.0])
+            initial_response(loop, [0.0, 1.0], state)
 
 
 @pytest.mark.parametrize(
@@ -132,8 +132,14 @@ def test_a_state_of_another_size_starts_no_response():
             lambda: on_off(modes(), 2, actuators(2.0, 3.0), force=[1, 2, 3], dead_band=0.1),
             "force is one .*mode, 2; got 3",
         ),
-        (lambda: kalman(modes(), relay(), [Sensor("y", 3.0)], disturbance=1, noise=1), "on-off, which has no gain"),
-        (lambda: luenberger(modes(), relay(), [Sensor("y", 3.0)], poles=[-1 + 1j]), "on-off, which has no gain"),
+        (
+            lambda: kalman_controller(modes(), relay(), [Sensor("y", 3.0)], disturbance=1, noise=1),
+            "on-off, which has no gain",
+        ),
+        (
+            lambda: luenberger_controller(modes(), relay(), [Sensor("y", 3.0)], poles=[-1 + 1j]),
+            "on-off, which has no gain",
+        ),
         (lambda: filtered(relay(), hermite_filter(modes(1), [1.0, 8.0], 1.0)), "on-off, which has no gain"),
         (lambda: close_loop(modes(), relay()), "on-off, which has no gain"),
         (lambda: explain_spillover(modes(), relay()), "on-off, which has no gain"),

@@ -33,8 +33,8 @@ def test_spillover_prints_the_work_in_every_mode():
     state[7:] = 0.0
     found = spillover(MODES, LAW, state)
     lines = str(found).splitlines()
-    assert f"W_R = {found.residual_total:.4g}" in lines[0] and len(lines) == 2 + 5
-    assert lines[-1].split() == ["5", "residual", f"{found.by_mode[4]:.4g}"]
+    assert f"W_R = {found.residual_work:.4g}" in lines[0] and len(lines) == 2 + 5
+    assert lines[-1].split() == ["5", "residual", f"{found.work_by_mode[4]:.4g}"]
 
 
 def test_a_placement_prints_its_places_and_what_they_cost():

@@ -7,7 +7,7 @@ import pytest
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, FrictionForward, sampled
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_with, impulse_state, initial_response
 from workbench.design.loop.rig_loop import LoopTest, run_loop
@@ -81,10 +81,10 @@ def test_what_is_read_is_what_the_sensors_read(rig):
     names = tuple(s.name for s in real.sensors)
     mute = replace(real, actuators=(*real.actuators, *(Actuator(f"M{j}", 2.0 - 1e-12) for j in range(n))))
     shaken = restless(rig, 0.0)
-    d = np.vstack([shaken.d, np.eye(n)])
-    c = np.vstack([shaken.c, np.zeros((n, 2))])
+    d = np.vstack([shaken.D, np.eye(n)])
+    c = np.vstack([shaken.C, np.zeros((n, 2))])
     telling = DigitalController(
-        DT, names, tuple(a.name for a in mute.actuators), shaken.a, shaken.b * 0.0, c, d, np.zeros((2, n + 2))
+        DT, names, tuple(a.name for a in mute.actuators), shaken.A, shaken.B * 0.0, c, d, np.zeros((2, n + 2))
     )
     forces = np.random.default_rng(0).normal(size=(1, 300)).cumsum(axis=1)
     test = LoopTest(300, DT, forces=forces, ports=rig.actuators[:1])
@@ -96,15 +96,15 @@ def test_what_is_read_is_what_the_sensors_read(rig):
 
 def test_a_fast_loop_comes_to_the_exact_continuous_one(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
-    controller = kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-2)
+    controller = kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-2)
     loop = close_with(rig.modes, controller)
     state = impulse_state(rig.modes, 0.8)
     errors = []
     for refined in (1, 2):
         dt = 0.002 / refined
         run = run_loop(rig, sampled(controller, dt), LoopTest(1000 * refined, dt, impulse_at=0.8))
-        exact = initial_response(loop, state, run.response.time)
-        work = finite_spillover(loop, state, run.response.time[-1]).by_mode
+        exact = initial_response(loop, run.response.time, state)
+        work = finite_spillover(loop, state, run.response.time[-1]).work_by_mode
         motion = np.abs(run.response.modal[:5] - exact.modal[:5]).max() / np.abs(exact.modal[:5]).max()
         errors.append((motion, np.abs(run.work - work).max() / np.abs(work).max()))
     coarse, fine = np.array(errors)
@@ -117,7 +117,7 @@ def test_the_compiled_controller_is_its_own_step(rig):
     friction = FrictionForward(*(rng.normal(size=s) for s in ((2, 1), (1, 2), (1, n))), np.ones(1), np.full(1, 0.5))
     base = restless(rig, 3.0)
     one = replace(
-        base, a=0.9 * base.a, e=rng.normal(size=(2, 2)), scale=1 + 0.1 * rng.normal(size=n), limit=np.full(2, 4.0),
+        base, A=0.9 * base.A, E=rng.normal(size=(2, 2)), scale=1 + 0.1 * rng.normal(size=n), limit=np.full(2, 4.0),
         rate=np.full(2, 1.5), dead_zone=np.array([0.0, 0.4]), bias=np.full(2, 0.2), friction=friction,
     )  # fmt: skip
     run = run_loop(rig, one, LoopTest(200, DT))
@@ -147,10 +147,10 @@ def test_what_does_not_fit_is_named(rig):
 
 def test_the_linear_part_is_pythons_control(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
-    controller = kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-4)
+    controller = kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-4)
     import control
 
-    continuous = control.ss(controller.state, controller.reads, controller.commands, controller.direct)
+    continuous = controller.state_space()
     expected = control.c2d(continuous, DT)
     found = sampled(controller, DT).state_space()
     assert isinstance(controller, Controller) and found.dt == DT

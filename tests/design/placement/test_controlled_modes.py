@@ -24,7 +24,7 @@ def test_what_is_left_is_what_the_motion_shows():
     places = [Actuator(f"F{i}", x) for i, x in enumerate((10 / 4, 5.0, 7.5))]
     rest = state.copy()
     rest[3:12] = rest[15:] = 0.0
-    late = initial_response(close_loop(found, imsc(found, 3, places, weight=5.0)), rest, [1500.0]).energy[:, 0]
+    late = initial_response(close_loop(found, imsc(found, 3, places, weight=5.0)), [1500.0], rest).energy[:, 0]
     assert result.spillover[2] == pytest.approx(late[3:].sum(), rel=1e-6)
     assert result.uncontrolled[2] == pytest.approx(0.5 * (state[15:] ** 2).sum())
 

@@ -27,9 +27,11 @@ def test_figures_are_those_of_the_law(modes):
     state = impulse_state(modes, 6.3)
     state[13:] = 0.0
     found = coupled_costs(modes, 4, places, impulse_at=6.3, weight=10.0)
-    np.testing.assert_allclose(found.by_mode, spillover(modes, law, state).residual_work, rtol=1e-7)
+    np.testing.assert_allclose(
+        found.residual_work_by_mode, spillover(modes, law, state).residual_work_by_mode, rtol=1e-7
+    )
     assert found.effort == pytest.approx(effort(modes, law, state), rel=1e-8)
-    forces = initial_response(close_loop(modes, law), state, np.linspace(0.0, 40.0, 8001)).forces
+    forces = initial_response(close_loop(modes, law), np.linspace(0.0, 40.0, 8001), state).forces
     assert found.peak_force == pytest.approx(np.abs(forces).max(), rel=1e-2)
 
 

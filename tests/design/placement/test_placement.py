@@ -49,8 +49,8 @@ def test_the_task_agrees_with_the_law(task):
     state = impulse_state(task.modes, 6.3)
     state[13:] = 0.0
     at = task.placed(places, "")
-    total, by_mode, spent = at.residual_work, at.by_mode, at.effort
-    np.testing.assert_allclose(by_mode, spillover(task.modes, law, state).residual_work, rtol=1e-9)
+    total, by_mode, spent = at.residual_work, at.residual_work_by_mode, at.effort
+    np.testing.assert_allclose(by_mode, spillover(task.modes, law, state).residual_work_by_mode, rtol=1e-9)
     assert total == pytest.approx(by_mode.sum()) and spent == pytest.approx(effort(task.modes, law, state), rel=1e-9)
 
 
@@ -129,8 +129,10 @@ def test_finite_time_and_peak_force_are_those_of_the_motion(task):
     law, state = law_and_state(task, places)
     loop = close_loop(task.modes, law)
     found = short.placed(places, "")
-    np.testing.assert_allclose(found.by_mode, finite_spillover(loop, state, 25.0).residual_work, rtol=1e-8)
-    forces = initial_response(loop, state, np.linspace(0.0, 25.0, 20001)).forces
+    np.testing.assert_allclose(
+        found.residual_work_by_mode, finite_spillover(loop, state, 25.0).residual_work_by_mode, rtol=1e-8
+    )
+    forces = initial_response(loop, np.linspace(0.0, 25.0, 20001), state).forces
     assert np.abs(forces).max() <= found.peak_force <= np.abs(forces).max() * (1 + 1e-5)
     assert found.effort == pytest.approx(np.trapezoid((forces**2).sum(axis=0), dx=25.0 / 20000), rel=1e-5)
 
@@ -149,7 +151,9 @@ def test_a_distribution_of_impulses_is_the_mean_over_them(task):
     many = placement_task(task.modes, 4, **given, probabilities=probabilities).placed(places, "")
     each = [placement_task(task.modes, 4, impulse_at=x, weight=20.0).placed(places, "") for x in impulses]
     np.testing.assert_allclose(
-        many.by_mode, np.average([e.by_mode for e in each], axis=0, weights=probabilities), rtol=1e-10
+        many.residual_work_by_mode,
+        np.average([e.residual_work_by_mode for e in each], axis=0, weights=probabilities),
+        rtol=1e-10,
     )
     assert many.effort == pytest.approx(np.average([e.effort for e in each], weights=probabilities), rel=1e-10)
     assert many.peak_force == pytest.approx(max(e.peak_force for e in each), rel=2e-6)
@@ -170,24 +174,28 @@ def test_white_noise_pumps_energy_at_the_rate_of_unit_impulses(hinged_modes):
     push = np.r_[np.zeros(3), modes.phi(6.3)[0, :2], 0.0]
     covariance = solve_continuous_lyapunov(a, -np.outer(push, push))
     # at rest, power in = power lost: W_3 = c E q3'²
-    assert c * covariance[5, 5] == pytest.approx(task.placed([2.5, 6.0], "").by_mode[0], rel=1e-3)
+    assert c * covariance[5, 5] == pytest.approx(task.placed([2.5, 6.0], "").residual_work_by_mode[0], rel=1e-3)
 
 
 def test_the_tail_bound_holds_and_is_not_idle(task, hinged_modes):
     many = hinged_modes(60)
     places = [1.5, 3.5, 6.5, 8.5]
     all_ = placement_task(many, 4, impulse_at=6.3, weight=20.0).placed(places, "")
-    left_out = all_.by_mode[16:].sum()
+    left_out = all_.residual_work_by_mode[16:].sum()
     bound = placement_task(many.select(range(20)), 4, impulse_at=6.3, weight=20.0).tail_bound(places, growth=2.0)
     assert left_out < bound < 100 * left_out
 
 
-@pytest.mark.parametrize("actuator", [Actuator("M", 3.0, kind="moment"), piezo_patch("P", 4.0, length=0.5)])
+@pytest.mark.parametrize("actuator", [Actuator("M", 3.0, quantity="moment"), piezo_patch("P", 4.0, length=0.5)])
 def test_the_tail_bound_holds_for_what_acts_by_slopes(hinged_modes, actuator):
     """sup |φ_r'| = √(2/L) rπ/L grows with the mode; a short patch's part grows as its square at first."""
     many = hinged_modes(200)
     for x in (0.5, 3.7, 8.3):
-        left_out = placement_task(many, 1, impulse_at=3.7, weight=1.0, actuator=actuator).placed([x], "").by_mode[3:]
+        left_out = (
+            placement_task(many, 1, impulse_at=3.7, weight=1.0, actuator=actuator)
+            .placed([x], "")
+            .residual_work_by_mode[3:]
+        )
         few = placement_task(many.select(range(4)), 1, impulse_at=3.7, weight=1.0, actuator=actuator)
         assert left_out.sum() < few.tail_bound([x], growth=2.0)
     with pytest.raises(DesignError, match="and 3/2 for moments; got 1"):
@@ -409,7 +417,7 @@ def test_all_of_a_patch_keeps_out_of_a_forbidden_stretch():
 
 def test_both_orders_of_a_pair_stay_on_the_beam(hinged_modes):
     for pair in (Between(5.5, 4.5), Between(4.5, 5.5)):
-        actuator = Actuator("P", pair, kind="moment")
+        actuator = Actuator("P", pair, quantity="moment")
         assert placement_task(hinged_modes(5), 2, impulse_at=6.3, weight=1.0, actuator=actuator).reach == (0.5, 9.5)
 
 
@@ -450,7 +458,7 @@ def test_a_damped_structure_is_placed_with_the_law_that_it_gets(hinged_modes):
         0.5 * abs(b[:, r] @ gain @ np.linalg.solve(1j * modes.omega[r] * np.eye(4) - loop, start)) ** 2
         for r in range(2, 6)
     ]
-    np.testing.assert_allclose(placed.by_mode, work, rtol=1e-9)
+    np.testing.assert_allclose(placed.residual_work_by_mode, work, rtol=1e-9)
 
 
 def test_as_many_places_as_controlled_modes_are_placed(task):

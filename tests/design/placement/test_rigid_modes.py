@@ -4,7 +4,7 @@ import control
 import numpy as np
 import pytest
 
-from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError
@@ -54,7 +54,7 @@ def test_one_rigid_mode_takes_the_momentum_of_the_impulse(modes):
     found = placement_task(modes, 1, impulse_at=AT, weight=20.0).placed([x], "")
     assert found.peak_force == pytest.approx(abs(g2 * v / at[0]), rel=2e-6)
     assert found.effort == pytest.approx(g2 * v**2 / at[0] ** 2 / 2.0, rel=1e-12)
-    assert found.by_mode[0] == pytest.approx(0.5 * (at[1] * v / at[0]) ** 2, rel=1e-12)
+    assert found.residual_work_by_mode[0] == pytest.approx(0.5 * (at[1] * v / at[0]) ** 2, rel=1e-12)
 
 
 def test_figures_are_those_of_the_motion(modes, task):
@@ -65,7 +65,9 @@ def test_figures_are_those_of_the_motion(modes, task):
     assert found.peak_force == pytest.approx(peak, rel=1e-5)
     state = impulse_state(modes, AT)
     state[8 + 3 :] = 0.0
-    np.testing.assert_allclose(spillover(modes, found.law, state).residual_work, found.by_mode, rtol=1e-9)
+    np.testing.assert_allclose(
+        spillover(modes, found.law, state).residual_work_by_mode, found.residual_work_by_mode, rtol=1e-9
+    )
     assert effort(modes, found.law, state) == pytest.approx(found.effort, rel=1e-9)
     assert modal_cost(modes, found.law, state, 20.0) == pytest.approx(distributed_cost(modes, 3, state, 20.0), rel=1e-9)
 
@@ -102,14 +104,14 @@ def test_rigid_modes_take_as_many_displacements_and_actuators(modes):
     law = imsc(modes, 2, [Actuator("a", 0.4), Actuator("b", 1.1)], weight=1.0)
     pair = [Sensor("y", 0.75), Sensor("v", 1.2, "velocity")]
     design = (
-        lambda sensors: luenberger(modes, law, sensors, poles=[-1 + 3j, -2 + 6j]),
-        lambda sensors: kalman(modes, law, sensors, disturbance=1e-4, noise=1e-8),
+        lambda sensors: luenberger_controller(modes, law, sensors, poles=[-1 + 3j, -2 + 6j]),
+        lambda sensors: kalman_controller(modes, law, sensors, disturbance=1e-4, noise=1e-8),
     )
     for one in design:
         with pytest.raises(
             DesignError, match=r"2 rigid-body modes need as many independent displacement sensors; there are 1"
         ):
             one(pair)
-        assert one([pair[0], Sensor("y2", 1.2)]).state.shape == (4, 4)
+        assert one([pair[0], Sensor("y2", 1.2)]).A.shape == (4, 4)
     with pytest.raises(DesignError, match="2 rigid-body modes are controlled, and 1 actuator cannot control them"):
         place_coupled(modes, 3, 1, impulse_at=0.6, weight=0.5, limits=Limits(effort=5.0, spacing=0.1))

@@ -21,11 +21,11 @@ def test_crowded_actuators_cost_the_coupled_regulator_less(hinged_modes):
     independent, coupled = compare(modes, laws, state, weight=10.0, final_time=600.0)
 
     assert coupled.cost < independent.cost and coupled.effort < independent.effort
-    assert independent.work.residual_work == pytest.approx(
+    assert independent.work.residual_work_by_mode == pytest.approx(
         [8.418221e-3, 1.258416e-1, 4.698541e-2, 6.875917e-3, 3.450264e-2], rel=1e-5
     )
     assert independent.most_excited == 5
-    fine = initial_response(close_loop(modes, laws[0]), state, np.linspace(0.0, 100.0, 100001))
+    fine = initial_response(close_loop(modes, laws[0]), np.linspace(0.0, 100.0, 100001), state)
     assert independent.peak_force == pytest.approx(np.abs(fine.forces).max(), rel=1e-5)
     assert independent.stability == coupled.stability == "marginally stable"  # undamped residual modes
 
@@ -51,5 +51,5 @@ def test_the_peak_force_counts_what_a_damper_between_modes_brings(hinged_modes):
     modes = replace(hinged_modes(2), damping=np.array([[0.02, 0.05], [0.05, 0.2]]))
     loop = close_loop(modes, coupled_lqr(modes, 1, [Actuator("F", 4.0)], weight=20.0))
     state = np.array([0.0, 0.0, 0.0, 1.0])  # the residual mode alone
-    fine = initial_response(loop, state, np.linspace(0.0, 100.0, 100_001)).forces
+    fine = initial_response(loop, np.linspace(0.0, 100.0, 100_001), state).forces
     assert np.abs(fine).max() > 1e-3 and peak_force(loop, state, np.inf) == pytest.approx(np.abs(fine).max(), rel=1e-5)

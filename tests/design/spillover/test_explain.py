@@ -8,7 +8,7 @@ import pytest
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
-from workbench.design.estimation.observers import kalman, luenberger, usual_poles
+from workbench.design.estimation.observers import kalman_controller, luenberger_controller, usual_poles
 from workbench.design.laws.coupled import controlled_plant, coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
@@ -39,7 +39,7 @@ def observed(modes, at, share=1.0, actuators=ACTUATORS):
     law = coupled_lqr(modes, 3, actuators, weight=1.0)
     law = Law(share * law.gain, law.controlled, law.actuators, law.name)
     sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(np.atleast_1d(at))]
-    return luenberger(modes, law, sensors, poles=(-0.3 + 1j) * modes.omega[:3])
+    return luenberger_controller(modes, law, sensors, poles=(-0.3 + 1j) * modes.omega[:3])
 
 
 def through_filter(modes, actuators, places, share=1.0):
@@ -64,7 +64,7 @@ def test_kalman_gain_is_that_of_the_dual_regulator():
     modes = beam(3)
     law = coupled_lqr(modes, 3, ACTUATORS, weight=1.0)
     sensors = [Sensor("y", 3.1), Sensor("v", 4.4, "velocity")]
-    gain = kalman(modes, law, sensors, disturbance=0.5, noise=[1e-2, 1e-3]).reads
+    gain = kalman_controller(modes, law, sensors, disturbance=0.5, noise=[1e-2, 1e-3]).B
     a, _ = controlled_plant(modes, range(3), ACTUATORS)
     shapes = modes.phi([3.1, 4.4])
     c = np.block([[shapes[:1], np.zeros((1, 3))], [np.zeros((1, 3)), shapes[1:]]])
@@ -94,16 +94,16 @@ def test_an_observer_in_the_loop_against_python_control():
     )
     a, b = controlled_plant(modes, range(m), ACTUATORS)
     c = np.c_[modes.phi(3.1)[:, :m], np.zeros((1, m))]
-    observer = control.ss(a - b @ controller.law.gain - controller.reads @ c, controller.reads, -controller.law.gain, 0)
+    observer = control.ss(a - b @ controller.law.gain - controller.B @ c, controller.B, -controller.law.gain, 0)
     loop = control.feedback(plant, observer, sign=1)
     peer = control.initial_response(loop, time, np.r_[state, np.zeros(2 * m)]).states[: 2 * n]
-    mine = initial_response(close_with(modes, controller), state, time)
+    mine = initial_response(close_with(modes, controller), time, state)
     np.testing.assert_allclose(mine.modal, peer, atol=1e-9)
     # the work counts the same motion
     loss = np.diag(modes.damping)
-    fine = initial_response(close_with(modes, controller), state, np.linspace(0.0, 30.0, 6001))
+    fine = initial_response(close_with(modes, controller), np.linspace(0.0, 30.0, 6001), state)
     gained = fine.energy[:, -1] - fine.energy[:, 0]
-    work = finite_spillover(close_with(modes, controller), state, 30.0).by_mode
+    work = finite_spillover(close_with(modes, controller), state, 30.0).work_by_mode
     np.testing.assert_allclose(work, gained + np.trapezoid(loss[:, None] * fine.modal[n:] ** 2, fine.time), atol=1e-6)
 
 
@@ -111,19 +111,21 @@ def test_a_residual_mode_is_named_that_stays_stable_and_destabilises_a_controlle
     modes = beam(5, 0.01)
     controller = observed(modes, 3.3)
     told = explain_spillover(modes, controller)
-    assert told.margin < 0 and told.reduced_margin > 0 and told.shifts[0].closed_pole.real < 0
-    assert told.destabilising.mode == 3 and close_with(modes.select([0, 1, 2, 4]), controller).margin > 0
-    assert close_with(modes.select([0, 1, 2, 3]), controller).margin < 0
+    assert told.decay_rate < 0 and told.reduced_decay_rate > 0 and told.shifts[0].closed_pole.real < 0
+    assert told.destabilising.mode == 3 and close_with(modes.select([0, 1, 2, 4]), controller).decay_rate > 0
+    assert close_with(modes.select([0, 1, 2, 3]), controller).decay_rate < 0
 
 
 def test_balas_one_sensor_stabilises_here_and_destabilises_there():
     modes = beam()
     good, bad = explain_spillover(modes, observed(modes, 10 / 6)), explain_spillover(modes, observed(modes, 50 / 6))
-    assert good.margin > 0 and good.destabilising is None
-    assert bad.margin < 0 and bad.destabilising.mode == 3
-    assert bad.reduced_margin == pytest.approx(close_with(modes.select(range(3)), observed(modes, 50 / 6)).margin)
+    assert good.decay_rate > 0 and good.destabilising is None
+    assert bad.decay_rate < 0 and bad.destabilising.mode == 3
+    assert bad.reduced_decay_rate == pytest.approx(
+        close_with(modes.select(range(3)), observed(modes, 50 / 6)).decay_rate
+    )
     # without either spillover the same mode would stay
-    assert close_with(modes.select(range(3)), observed(modes, 50 / 6)).margin > 0
+    assert close_with(modes.select(range(3)), observed(modes, 50 / 6)).decay_rate > 0
 
 
 @pytest.mark.parametrize(
@@ -140,7 +142,7 @@ def test_paths_add_up_to_the_movement_of_the_pole(controller):
 
 def poles_by_python_control(modes, controller):
     plant = state_space(modes, controller.law.actuators, controller.sensors)
-    own = control.ss(controller.state, controller.reads, controller.commands, controller.direct)
+    own = controller.state_space()
     return control.feedback(plant, own, sign=1).poles()
 
 
@@ -158,10 +160,12 @@ def test_rigid_and_overdamped_residual_modes_have_their_poles_too(ends, zeta, co
     ).modes(6)
     law = imsc(modes, controlled, [Actuator("A", 0.2), Actuator("B", 0.45)], weight=0.1)
     sensors = [Sensor("y1", 0.15), Sensor("y2", 0.4)]
-    told = explain_spillover(modes, luenberger(modes, law, sensors, poles=usual_poles(modes, controlled)))
-    peer = poles_by_python_control(modes, luenberger(modes, law, sensors, poles=usual_poles(modes, controlled)))
+    told = explain_spillover(modes, luenberger_controller(modes, law, sensors, poles=usual_poles(modes, controlled)))
+    peer = poles_by_python_control(
+        modes, luenberger_controller(modes, law, sensors, poles=usual_poles(modes, controlled))
+    )
     assert {moved.mode for moved in told.shifts} == set(range(6)) - set(controlled)
-    assert told.margin == pytest.approx(-peer.real.max(), rel=1e-6)
+    assert told.decay_rate == pytest.approx(-peer.real.max(), rel=1e-6)
     for moved in told.shifts:
         assert np.abs(peer - moved.closed_pole).min() < 1e-5 * abs(modes.omega[-1])
         assert sum(path.shift for path in moved.paths) == pytest.approx(moved.shift, abs=1e-7 * modes.omega[-1])
@@ -181,7 +185,7 @@ def test_the_rigid_displacement_that_no_sensor_reads_stays_where_it_is(quantitie
     ).modes(6)
     law = imsc(free, (2, 3), [Actuator("A", 0.2), Actuator("B", 0.45)], weight=0.1)
     sensors = [Sensor(f"y{at}", at, quantity) for at, quantity in zip((0.15, 0.4), quantities)]
-    told = explain_spillover(free, luenberger(free, law, sensors, poles=usual_poles(free, (2, 3))))
+    told = explain_spillover(free, luenberger_controller(free, law, sensors, poles=usual_poles(free, (2, 3))))
     rigid = [moved for moved in told.shifts if moved.mode in (0, 1)]
     still = [moved for moved in rigid if abs(moved.closed_pole) < 1e-9]
     assert len(still) == quantities.count("velocity") and all(path.shift == 0 for m in still for path in m.paths)
@@ -193,8 +197,8 @@ def test_no_residual_mode_is_blamed_for_what_a_controlled_one_does():
     law = coupled_poles(modes, 3, [Actuator("F1", 0.3), Actuator("F2", 0.7)], poles=poles)
     controller = filtered(law, displacement_filter(modes.select(range(3)), [0.35, 0.95], 0.62))
     told = explain_spillover(modes, controller)
-    assert told.reduced_margin < 0 and told.shifts[0].closed_pole.real > 0
-    assert all(close_with(modes.select(np.delete(range(6), r)), controller).margin < 0 for r in (3, 4, 5))
+    assert told.reduced_decay_rate < 0 and told.shifts[0].closed_pole.real > 0
+    assert all(close_with(modes.select(np.delete(range(6), r)), controller).decay_rate < 0 for r in (3, 4, 5))
     assert told.destabilising is None and told.limiting is None
 
 
@@ -230,11 +234,11 @@ def test_every_remedy_stabilises_the_loop_and_less_does_not():
     found = {r.kind: r for r in spillover_remedies(modes, redesign, ACTUATORS, [50 / 6])}
     assert set(found) == {"gain", "actuator", "sensor", "sensors added"}
     assert all(
-        explain_spillover(modes, r.controller).margin == pytest.approx(r.margin) and r.margin > 0
+        explain_spillover(modes, r.controller).decay_rate == pytest.approx(r.decay_rate) and r.decay_rate > 0
         for r in found.values()
     )
     share = 1 - found["gain"].size
-    assert explain_spillover(modes, redesign(ACTUATORS, [50 / 6], min(share * 1.01, 1.0))).margin < 0
+    assert explain_spillover(modes, redesign(ACTUATORS, [50 / 6], min(share * 1.01, 1.0))).decay_rate < 0
     assert found["sensors added"].size == 1
 
 
@@ -271,9 +275,11 @@ def test_remedies_move_whatever_stands_anywhere(kind):
     def redesign(actuators, sensors, share):
         law = imsc(modes, count, actuators, weight=weight)
         sensors = [Sensor(f"y{i}", at) for i, at in enumerate(sensors)]
-        return luenberger(modes, replace(law, gain=share * law.gain), sensors, poles=usual_poles(modes, range(count)))
+        return luenberger_controller(
+            modes, replace(law, gain=share * law.gain), sensors, poles=usual_poles(modes, range(count))
+        )
 
-    assert close_with(modes, redesign(actuators, places, 1.0)).margin < 0
+    assert close_with(modes, redesign(actuators, places, 1.0)).decay_rate < 0
     found = {r.kind: r for r in spillover_remedies(modes, redesign, actuators, places)}
     assert {"actuator", "sensors added"} <= set(found)
     assert all(-poles_by_python_control(modes, r.controller).real.max() > 0 for r in found.values())
@@ -283,7 +289,7 @@ def test_remedies_move_whatever_stands_anywhere(kind):
     if kind == "frame":  # of the points nearer than the nearest that will do none does
         assert moved[0].at == "S3" and found["actuator"].size == pytest.approx(15.0)
         nearer = [redesign([replace(actuators[0], at=f"S{i}")], places, 1.0) for i in (4, 5, 6, 7)]
-        assert all(close_with(modes, one).margin <= 0 for one in nearer)
+        assert all(close_with(modes, one).decay_rate <= 0 for one in nearer)
     cured = found["sensors added"].controller
     assert spillover_remedies(modes, redesign, actuators, cured.places) == ()
 
@@ -294,8 +300,8 @@ def test_the_filter_cures_it_with_sensors_enough():
     def redesign(actuators, sensors, share):
         return through_filter(modes, actuators, sensors, share)
 
-    count, margins = sufficient_sensors(modes, redesign, ACTUATORS)
-    assert margins[0] < 0 and count is not None and (margins[count - 1 :] > 0).all() and margins[count - 2] <= 0
+    count, rates = sufficient_sensors(modes, redesign, ACTUATORS)
+    assert rates[0] < 0 and count is not None and (rates[count - 1 :] > 0).all() and rates[count - 2] <= 0
 
 
 @pytest.mark.parametrize(
@@ -304,11 +310,21 @@ def test_the_filter_cures_it_with_sensors_enough():
         (lambda m: observed(m, 5.0), "mode 2 is unobservable"),
         (lambda m: observed(m, []), "needs a sensor"),
         (
-            lambda m: kalman(m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], disturbance=1, noise=0),
-            "noise",
+            lambda m: kalman_controller(
+                m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], disturbance=1, noise=0
+            ),
+            "the noise intensity must be a positive number; got 0",
         ),
         (
-            lambda m: luenberger(m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], poles=[1 + 1j] * 3),
+            lambda m: kalman_controller(
+                m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], disturbance=[1.0, -1.0, 1.0], noise=1.0
+            ),
+            "the disturbance intensity must be a positive number, 3 positive numbers or a symmetric positive definite",
+        ),
+        (
+            lambda m: luenberger_controller(
+                m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], poles=[1 + 1j] * 3
+            ),
             "mode 1 of the observer is not stable",
         ),
     ],
@@ -335,7 +351,7 @@ def test_paths_add_up_where_damping_couples_the_modes(damper):
     modes, poles = chain(damper)
     law = imsc(modes, 2, [Actuator("a", "n2"), Actuator("b", "n5")], weight=0.05)
     found = explain_spillover(
-        modes, luenberger(modes, law, [Sensor("y1", "n0"), Sensor("y2", "n4")], poles=[-3 + 5j, -4 + 11j])
+        modes, luenberger_controller(modes, law, [Sensor("y1", "n0"), Sensor("y2", "n4")], poles=[-3 + 5j, -4 + 11j])
     )
     for shift in found.shifts:
         assert np.abs(poles - shift.pole).min() < 1e-9 * abs(shift.pole)
@@ -356,18 +372,18 @@ def test_lags_and_delays_are_in_the_loop(late):
     """Against python-control, which takes a delay by its own Padé approximation; the paths count them too."""
     modes, (acts, reads) = beam(4, zeta=0.02), late
     law = coupled_lqr(modes, 1, [Actuator("F", 3.0, **acts)], weight=0.1)
-    controller = kalman(modes, law, [Sensor("y", 4.2, **reads)], disturbance=1.0, noise=1e-3)
+    controller = kalman_controller(modes, law, [Sensor("y", 4.2, **reads)], disturbance=1.0, noise=1e-3)
     found = explain_spillover(modes, controller)
     prompt = [replace(part, delay=0.0) for part in (*law.actuators, *controller.sensors)]
     plant = state_space(modes, prompt[:1], prompt[1:])
     delay = acts.get("delay", 0.0) + reads.get("delay", 0.0)
     if delay:
         plant = plant * control.tf2ss(control.tf(*control.pade(delay, 8)))
-    parts = (controller.state, controller.reads, controller.commands, controller.direct)
+    parts = (controller.A, controller.B, controller.C, controller.D)
     true = control.feedback(plant, control.ss(*parts), sign=1).poles()
     slow = true[np.abs(true) < 1.2 * modes.omega[-1]]
     assert all(np.abs(found.poles - pole).min() < 1e-6 * abs(pole) for pole in slow)
-    assert found.margin == pytest.approx(-true.real.max(), rel=1e-5)
+    assert found.decay_rate == pytest.approx(-true.real.max(), rel=1e-5)
     for shift in found.shifts:
         assert sum(path.shift for path in shift.paths) == pytest.approx(shift.shift, abs=1e-8 * abs(shift.pole))
 
@@ -377,9 +393,11 @@ def test_a_slow_actuator_counts_in_work_and_effort():
     modes = beam(4, zeta=0.0)
     law = coupled_lqr(modes, 1, [Actuator("F", 3.0, time_constant=0.5)], weight=0.1)
     loop, state = close_loop(modes, law), impulse_state(modes, 6.3)
-    np.testing.assert_allclose(finite_spillover(loop, state, 30.0).by_mode, energy_gained(loop, state, 30.0), atol=1e-9)
+    np.testing.assert_allclose(
+        finite_spillover(loop, state, 30.0).work_by_mode, energy_gained(loop, state, 30.0), atol=1e-9
+    )
     time = np.linspace(0.0, 300.0, 60_001)
-    squares = (initial_response(loop, state, time).forces ** 2).sum(axis=0)
+    squares = (initial_response(loop, time, state).forces ** 2).sum(axis=0)
     assert effort(modes, law, state) == pytest.approx(np.trapezoid(squares, time), rel=1e-4)
 
 
@@ -392,7 +410,9 @@ def test_a_marginally_stable_loop_needs_no_remedy():
     def redesign(actuators, sensors, share):
         law = coupled_lqr(modes, 3, actuators, weight=0.1)
         sensors = [Sensor(f"y{i}", x) for i, x in enumerate(sensors)]
-        return luenberger(modes, replace(law, gain=share * law.gain), sensors, poles=[-1 + 1j, -2 + 2j, -3 + 20j])
+        return luenberger_controller(
+            modes, replace(law, gain=share * law.gain), sensors, poles=[-1 + 1j, -2 + 2j, -3 + 20j]
+        )
 
     actuators = [Actuator("a", 0.1), Actuator("b", 1.3), Actuator("c", 1.9)]
     assert close_with(modes, redesign(actuators, [0.1, 1.3], 1.0)).stability == "marginally stable"
@@ -410,7 +430,7 @@ def test_the_dominant_path_of_a_pole_that_moves_left_is_what_moves_it():
     ).modes(6)
     law = imsc(modes, 2, [Actuator("F1", 0.6575), Actuator("F2", 1.057)], weight=1.0)
     sensors = [Sensor("y", 0.75), Sensor("v", 1.2, "velocity")]
-    controller = luenberger(modes, law, sensors, poles=modes.omega[:2] * (-0.3 + 1j))
+    controller = luenberger_controller(modes, law, sensors, poles=modes.omega[:2] * (-0.3 + 1j))
     third = next(shift for shift in explain_spillover(modes, controller).shifts if shift.mode == 2)
     assert third.shift.real < 0.0
     assert third.dominant.text == "1.2 to F1" and third.dominant.shift.real < 0.7 * third.shift.real

@@ -121,8 +121,8 @@ def test_the_motion_obeys_its_equation_and_work_accounts_for_energy(damping):
     lost = np.trapezoid(np.diag(modes.damping)[:, None] * rate**2, time)
     gained = response.energy[:, -1] - response.energy[:, 0]
     work = on_off_work(modes, law, state, 60.0)
-    np.testing.assert_allclose(work.by_mode, np.trapezoid(power, time), atol=1e-5)
-    np.testing.assert_allclose(work.by_mode - lost, gained, atol=1e-9 if damping == 0 else 1e-7)
+    np.testing.assert_allclose(work.work_by_mode, np.trapezoid(power, time), atol=1e-5)
+    np.testing.assert_allclose(work.work_by_mode - lost, gained, atol=1e-9 if damping == 0 else 1e-7)
 
 
 @pytest.mark.parametrize(
@@ -143,15 +143,15 @@ def test_an_actuator_that_is_not_perfect_is_refused_not_left_out(trait, value):
         with pytest.raises(DesignError, match=f"F has {trait} = {value:g}, which .* cannot include"):
             told()
     wide = on_off(modes, 1, [Actuator("F", 2.0, limit=1.0)], force=0.02, dead_band=0.01)
-    assert on_off_work(modes, wide, state, 1.0).by_mode[0] < 0.0
+    assert on_off_work(modes, wide, state, 1.0).work_by_mode[0] < 0.0
 
 
 def test_a_residual_mode_at_rest_can_only_gain():
     modes, state = beam(), impulse_state(beam(), 6.3)
     state[13:] = 0.0
     work = on_off_work(modes, design(modes), state, 60.0)
-    assert (work.residual_work >= -1e-15).all() and work.by_mode[4] == pytest.approx(0.0, abs=1e-15)
-    assert work.residual_total > 1e-4
+    assert (work.residual_work_by_mode >= -1e-15).all() and work.work_by_mode[4] == pytest.approx(0.0, abs=1e-15)
+    assert work.residual_work > 1e-4
 
 
 def test_the_dead_band_bounds_what_is_left():

@@ -7,7 +7,7 @@ from scipy.integrate import simpson
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
-from workbench.design.estimation.observers import kalman
+from workbench.design.estimation.observers import kalman_controller
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
@@ -36,17 +36,17 @@ STATE = np.r_[np.zeros(6), impulse_state(MODES, 6.3)[6:8], np.zeros(4)]
 
 def test_figures_of_a_loop_with_an_observer_are_those_of_its_motion():
     sensors = [Sensor("a", 2.2), Sensor("b", 7.1)]
-    controller = kalman(MODES, LAW, sensors, disturbance=1.0, noise=0.1)
+    controller = kalman_controller(MODES, LAW, sensors, disturbance=1.0, noise=0.1)
     told = performance(close_with(MODES, controller), STATE, weight=3.0, final_time=40.0)
     shapes = MODES.phi([a.at for a in ACTUATORS]).T
     seen = np.hstack([MODES.phi([s.at for s in sensors]), np.zeros((2, 6))])
     plant = np.block([[np.zeros((6, 6)), np.eye(6)], [-np.diag(MODES.omega**2), -MODES.damping]])
     push = np.vstack([np.zeros((6, 2)), shapes])
-    loop = np.block([[plant, push @ controller.commands], [controller.reads @ seen, controller.state]])
+    loop = np.block([[plant, push @ controller.C], [controller.B @ seen, controller.A]])
     time = np.linspace(0.0, 40.0, 40_001)
     start = np.r_[STATE, np.zeros(4)]
     motion = control.initial_response(control.ss(loop, np.zeros((16, 1)), np.eye(16), 0), time, start).outputs
-    forces = controller.commands @ motion[12:]
+    forces = controller.C @ motion[12:]
     energy = (MODES.omega[:2, None] * motion[:2]) ** 2 + motion[6:8] ** 2
     spent = simpson((forces**2).sum(axis=0), x=time)
     assert told.effort == pytest.approx(spent, rel=1e-6)
@@ -54,7 +54,7 @@ def test_figures_of_a_loop_with_an_observer_are_those_of_its_motion():
     assert told.spillover == pytest.approx(
         simpson(((shapes @ forces)[2:] * motion[8:12]).sum(axis=0), x=time), rel=1e-5
     )
-    assert told.margin == pytest.approx(-np.linalg.eigvals(loop).real.max())
+    assert told.decay_rate == pytest.approx(-np.linalg.eigvals(loop).real.max())
 
 
 def test_in_the_long_run_the_figures_are_those_of_the_lyapunov_equation():
@@ -71,7 +71,7 @@ def test_a_loop_that_is_unstable_has_no_figures():
         weight=1.0,
         final_time=10.0,
     )
-    assert told.margin < 0 and np.isinf([told.cost, told.effort, told.spillover]).all()
+    assert told.decay_rate < 0 and np.isinf([told.cost, told.effort, told.spillover]).all()
     with pytest.raises(DesignError, match="final time must be positive and finite; got inf"):
         performance(close_loop(MODES, LAW), STATE, weight=1.0, final_time=np.inf)
 

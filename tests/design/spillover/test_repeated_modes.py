@@ -17,7 +17,7 @@ def test_any_basis_of_a_repeated_pair_gives_one_spillover_of_a_coupled_law(turne
     for modes in (turned_modes(0.0), turned_modes(angle)):
         law = coupled_lqr(modes, 3, ACTUATORS, weight=1e-4)
         state = impulse_state(modes, (0.42, 0.27)) * np.tile(np.arange(6) < 3, 2)
-        found.append((spillover(modes, law, state).residual_work, effort(modes, law, state)))
+        found.append((spillover(modes, law, state).residual_work_by_mode, effort(modes, law, state)))
     (works, forces), (turned_works, turned_forces) = found
     # modes 5 and 6 are repeated too; both stay as they are
     np.testing.assert_allclose(turned_works, works, rtol=1e-9)

@@ -40,8 +40,8 @@ def test_the_limit_is_the_limit_of_finite_times(design, moving):
     chosen = law(design=design)
     limit = spillover(modes(), chosen, state)
     late = finite_spillover(close_loop(modes(), chosen), state, 3000.0)
-    np.testing.assert_allclose(late.by_mode, limit.by_mode, atol=1e-11)
-    assert limit.total == pytest.approx(limit.controlled_total + limit.residual_total)
+    np.testing.assert_allclose(late.work_by_mode, limit.work_by_mode, atol=1e-11)
+    assert limit.total == pytest.approx(limit.controlled_work + limit.residual_work)
 
 
 @pytest.mark.parametrize("filtered", [False, True])
@@ -52,7 +52,7 @@ def test_work_in_equals_energy_gained(filtered):
     for final in (0.3, 7.0, 60.0):
         gained = energy_gained(loop, state, final)
         np.testing.assert_allclose(
-            finite_spillover(loop, state, final).by_mode, gained, atol=1e-9 * np.abs(gained).max()
+            finite_spillover(loop, state, final).work_by_mode, gained, atol=1e-9 * np.abs(gained).max()
         )
 
 
@@ -63,11 +63,11 @@ def test_work_with_damping_against_quadrature():
     b = damped.phi([2.0, 4.0, 6.0, 8.5]).T
 
     def power(t):
-        x = initial_response(loop, state, [t]).modal[:, 0]
+        x = initial_response(loop, [t], state).modal[:, 0]
         return (b @ (loop.feedback @ x)) * x[6:]
 
     work = quad_vec(power, 0.0, 12.0, epsabs=1e-11)[0]
-    np.testing.assert_allclose(finite_spillover(loop, state, 12.0).by_mode, work, atol=1e-9)
+    np.testing.assert_allclose(finite_spillover(loop, state, 12.0).work_by_mode, work, atol=1e-9)
 
 
 def test_the_limit_needs_undamped_modes():
@@ -79,7 +79,7 @@ def test_the_limit_needs_undamped_modes():
 def test_effort_and_cost_against_the_response():
     state, chosen = impulse_state(modes(), 6.3), law()
     time = np.linspace(0.0, 400.0, 40001)
-    response = initial_response(close_loop(modes(), chosen), state, time)
+    response = initial_response(close_loop(modes(), chosen), time, state)
     power = (response.forces**2).sum(axis=0)
     assert effort(modes(), chosen, state) == pytest.approx(np.trapezoid(power, time), rel=1e-4)
     q, v = response.modal[:4], response.modal[9:13]
@@ -140,7 +140,7 @@ def test_work_on_a_plate_against_quadrature_of_the_closed_loop():
         return (fed @ x)[9:] * x[9:]
 
     work = quad_vec(power, 0.0, 3.0, epsabs=0.0, epsrel=1e-11)[0]
-    np.testing.assert_allclose(finite_spillover(loop, state, 3.0).by_mode[3:], work, rtol=1e-8)
+    np.testing.assert_allclose(finite_spillover(loop, state, 3.0).work_by_mode[3:], work, rtol=1e-8)
 
 
 GYROSCOPIC = np.array([[0.0, 0.3, 0.0], [-0.3, 0.0, 0.2], [0.0, -0.2, 0.0]])

@@ -19,7 +19,7 @@ def bar_modes():
         axial_stiffness=lambda x: 2 * (1 - x),
         left="fixed",
         right="free",
-        damping=ProportionalDamping(g1=0.002, g2=0.1),
+        damping=ProportionalDamping(stiffness=0.002, mass=0.1),
     ).modes(20)
 
 

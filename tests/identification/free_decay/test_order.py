@@ -38,7 +38,7 @@ def test_the_modes_that_are_there_and_no_others(truth, noise):
 def test_without_noise_every_mode_comes_in_and_nothing_else_is_tried():
     """The bar of section 4.4 from six sensors: a pole that seems to split another on its way bars no other."""
     bar = Bar(length=1.0, mass_per_length=taper, axial_stiffness=taper, left="fixed", right="free",
-              damping=ProportionalDamping(g1=0.002, g2=0.1))  # fmt: skip
+              damping=ProportionalDamping(stiffness=0.002, mass=0.1))  # fmt: skip
     exact = bar.modes(20)
     decay = impulse_response_modes(exact, at=0.63, positions=np.arange(1, 7) / 6)
     found = identify(free_decay(decay, sample_time=0.01, n_samples=1500, quantity="acceleration"))

@@ -20,7 +20,7 @@ def identified(zeta):
 
 def test_constants_found_within_their_errors():
     fit = proportional_fit(identified(0.5 * (G1 * OMEGA + G2 / OMEGA)))
-    error = np.array([fit.damping.g1 - G1, fit.damping.g2 - G2])
+    error = np.array([fit.damping.stiffness - G1, fit.damping.mass - G2])
     assert (np.abs(error) < 3.5 * fit.standard_errors).all()
     assert (fit.standard_errors < [0.1 * G1, 0.1 * G2]).all()
     assert fit.probability > 0.01

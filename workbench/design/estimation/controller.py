@@ -1,6 +1,6 @@
 """A controller: the state-space system from the readings of the sensors to the forces of the actuators.
 
-    z' = A_z z + B_z y,   u = C_z z + D_z y,   y = R x
+    z' = A z + B y,   u = C z + D y,   y = R x
 
 z is the state of an observer; a law through a modal filter has none.
 """
@@ -9,12 +9,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import control
 import numpy as np
 
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law, linear
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.statespace import output_matrix
+from workbench.rig.statespace import output_matrix, signal_names
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, counted, place_text
@@ -27,46 +29,60 @@ class Controller(Printed):
     Attributes:
         law: u = -K x̂.
         sensors: one per channel: displacement, slope, velocity or angular velocity.
-        state: (n_states, n_states) A_z, 1/s; empty for a filter.
-        reads: (n_states, n_channels) B_z.
-        commands: (n_actuators, n_states) C_z.
-        direct: (n_actuators, n_channels) D_z.
+        A: (n_states, n_states), 1/s; empty for a filter.
+        B: (n_states, n_channels).
+        C: (n_actuators, n_states).
+        D: (n_actuators, n_channels).
         name: for tables and plots.
-        estimator: (2 n_controlled, n_channels) L of an observer; of a filter, x̂ = estimator y; None where not known.
+        L: (2 n_controlled, n_channels) gain of an observer; of a modal filter, x̂ = L y; None where not known.
         designed_by: repeats the design with the same settings for other modes, law and sensors; None where not known.
     """
 
     law: Law
     sensors: tuple[Sensor, ...]
-    state: np.ndarray
-    reads: np.ndarray
-    commands: np.ndarray
-    direct: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
     name: str
-    estimator: np.ndarray | None = None
+    L: np.ndarray | None = None
     designed_by: Callable[[Modes, Law, Sequence[Sensor]], "Controller"] | None = None
+
+    state, reads, commands, direct = Renamed("A"), Renamed("B"), Renamed("C"), Renamed("D")
+    estimator = Renamed("L")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sensors", tuple(self.sensors))
-        freeze(self, "state", "reads", "commands", "direct")
-        if self.estimator is not None:
-            freeze(self, "estimator")
+        freeze(self, *"ABCD")
+        if self.L is not None:
+            freeze(self, "L")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         line = f"{self.name}: {counted(len(self.sensors), 'channel')} to {counted(len(self.law.actuators), 'actuator')}"
         rows = [(sensor.name, sensor.quantity, place_text(sensor.at)) for sensor in self.sensors]
-        rows += [(actuator.name, actuator.kind, place_text(actuator.at)) for actuator in self.law.actuators]
-        return f"{line}, {counted(len(self.state), 'state')}", ("name", "quantity", "at"), rows, ()
+        rows += [(actuator.name, actuator.quantity, place_text(actuator.at)) for actuator in self.law.actuators]
+        return f"{line}, {counted(len(self.A), 'state')}", ("name", "quantity", "at"), rows, ()
 
     @property
     def static(self) -> bool:
         """Whether it has no state, as a law through a modal filter."""
-        return self.state.size == 0
+        return self.A.size == 0
 
     @property
     def places(self) -> tuple[Place, ...]:
         """Distinct places of the sensors, in order."""
         return tuple(sorted({sensor.at for sensor in self.sensors}))
+
+    def state_space(self) -> control.StateSpace:
+        """The controller as python-control's `StateSpace` from readings to commands, the sign of u = -K x̂ included."""
+        names = {"inputs": signal_names(s.name for s in self.sensors)}
+        names["outputs"] = signal_names(a.name for a in self.law.actuators)
+        return control.ss(self.A, self.B, self.C, self.D, **names)
+
+
+Controller.__init__ = former_arguments(  # type: ignore[method-assign]
+    state="A", reads="B", commands="C", direct="D", estimator="L"
+)(Controller.__init__)
 
 
 def check_readable(sensors: Sequence[Sensor]) -> None:

@@ -19,6 +19,7 @@ from scipy.signal import cont2discrete
 from workbench.arguments import number
 from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import freeze, frozen
 
@@ -67,7 +68,7 @@ class DigitalController:
         sample_time: s.
         sensors: (n_sensors,) names of the channels that it reads.
         actuators: (n_actuators,) names of those that it commands.
-        a, b, c, d, e: (n_states, n_states), (n_states, n_sensors), (n_outputs, n_states), (n_outputs, n_sensors) and
+        A, B, C, D, E: (n_states, n_states), (n_states, n_sensors), (n_outputs, n_states), (n_outputs, n_sensors) and
             (n_states, n_actuators); n_outputs is n_actuators, or the number of relays.
         offset, scale: (n_sensors,) y = scale (reading - offset).
         limit, rate, dead_zone, bias: (n_actuators,) in units of the command; the rate per sample.
@@ -80,11 +81,11 @@ class DigitalController:
     sample_time: float
     sensors: tuple[str, ...]
     actuators: tuple[str, ...]
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    d: np.ndarray
-    e: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    E: np.ndarray
     offset: np.ndarray = field(default_factory=lambda: np.zeros(0))
     scale: np.ndarray = field(default_factory=lambda: np.zeros(0))
     limit: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -96,6 +97,8 @@ class DigitalController:
     name: str = "controller"
     states: tuple[str, ...] = ()
 
+    a, b, c, d, e = (Renamed(letter) for letter in "ABCDE")
+
     def __post_init__(self) -> None:
         n_sensors, n_actuators = len(self.sensors), len(self.actuators)
         rest = {"offset": 0.0, "scale": 1.0, "limit": np.inf, "rate": np.inf, "dead_zone": 0.0, "bias": 0.0}
@@ -103,13 +106,13 @@ class DigitalController:
             size = n_sensors if name in ("offset", "scale") else n_actuators
             value = getattr(self, name)
             object.__setattr__(self, name, frozen(value if np.size(value) else np.full(size, neutral)))
-        freeze(self, *"abcde")
-        n = self.a.shape[0]
+        freeze(self, *"ABCDE")
+        n = self.A.shape[0]
         n_outputs = n_actuators if self.relays is None else self.relays.force.size
         if len(self.states) not in (0, n):
             raise ValueError(f"DigitalController.states must name all {n} states, or none; got {len(self.states)}")
-        expected = {"a": (n, n), "b": (n, n_sensors), "c": (n_outputs, n), "d": (n_outputs, n_sensors)}
-        for name, shape in (expected | {"e": (n, n_actuators)}).items():
+        expected = {"A": (n, n), "B": (n, n_sensors), "C": (n_outputs, n), "D": (n_outputs, n_sensors)}
+        for name, shape in (expected | {"E": (n, n_actuators)}).items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"DigitalController.{name} must have shape {shape}; got {getattr(self, name).shape}")
 
@@ -122,7 +125,7 @@ class DigitalController:
             reading: (n_sensors,).
         """
         y = self.scale * (reading - self.offset)
-        w = self.c @ z + self.d @ y
+        w = self.C @ z + self.D @ y
         if self.relays is not None:
             sign = np.where(np.abs(w) > self.relays.dead_band, np.sign(w), 0.0)
             w = -self.relays.spread @ (self.relays.force * sign)
@@ -131,7 +134,7 @@ class DigitalController:
             w = w + self.friction.push @ (self.friction.force * np.tanh(speed / self.friction.smoothing))
         v = np.clip(np.clip(w, -self.limit, self.limit), before - self.rate, before + self.rate)
         command = v + self.dead_zone * np.clip(v / self.onset, -1.0, 1.0) - self.bias
-        return command, v, self.a @ z + self.b @ y + self.e @ v
+        return command, v, self.A @ z + self.B @ y + self.E @ v
 
     @property
     def onset(self) -> np.ndarray:
@@ -152,9 +155,14 @@ class DigitalController:
         """
         if self.relays is not None:
             raise ValueError(f"{self.name} switches, so it has no StateSpace; simulate it instead")
-        a, b = self.a + self.e @ self.c, (self.b + self.e @ self.d) * self.scale
+        a, b = self.A + self.E @ self.C, (self.B + self.E @ self.D) * self.scale
         names = {"inputs": signal_names(self.sensors), "outputs": signal_names(self.actuators)}
-        return control.ss(a, b, self.c, self.d * self.scale, self.sample_time, **names)
+        return control.ss(a, b, self.C, self.D * self.scale, self.sample_time, **names)
+
+
+DigitalController.__init__ = former_arguments(  # type: ignore[method-assign]
+    **{letter.lower(): letter for letter in "ABCDE"}
+)(DigitalController.__init__)
 
 
 def modal_states(modes: Sequence[int]) -> tuple[str, ...]:
@@ -166,7 +174,7 @@ def modal_states(modes: Sequence[int]) -> tuple[str, ...]:
 def sampled(controller: Controller, sample_time: float) -> DigitalController:
     """A continuous controller discretised, each reading held until the next sample (zero-order hold).
 
-    z' = A_z z + B_z y becomes z ← e^{A_z T} z + ∫ e^{A_z t} dt B_z y.
+    z' = A z + B y becomes z ← e^{A T} z + ∫ e^{A t} dt B y.
 
     Args:
         controller: a law through a modal filter, or on an observer.
@@ -178,21 +186,21 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
     """
     if not isinstance(controller, Controller):
         raise TypeError(
-            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by kalman,"
-            " luenberger or filtered"
+            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by"
+            " kalman_controller, luenberger_controller or filtered"
         )
     if not 0 < number(sample_time, "sample_time", "s") < np.inf:
         raise ValueError(f"sample_time must be above 0; got {sample_time:g} s")
-    a, b = zero_order_hold(controller.state, controller.reads, sample_time)
+    a, b = zero_order_hold(controller.A, controller.B, sample_time)
     return DigitalController(
         sample_time,
         tuple(sensor.name for sensor in controller.sensors),
         tuple(actuator.name for actuator in controller.law.actuators),
         a,
         b,
-        controller.commands,
-        controller.direct,
-        np.zeros(controller.commands.T.shape),
+        controller.C,
+        controller.D,
+        np.zeros(controller.C.T.shape),
         name=controller.name,
         states=() if controller.static else modal_states(controller.law.controlled),
     )

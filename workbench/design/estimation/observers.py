@@ -25,7 +25,7 @@ UNSEEN = 1e-9  # of a mode's largest displacement: a smaller reading does not ob
 USUAL = -0.3 + 1j
 
 
-def luenberger(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: ArrayLike) -> Controller:
+def luenberger_controller(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: ArrayLike) -> Controller:
     """The controller of a law on the state of a Luenberger observer.
 
     Args:
@@ -43,7 +43,7 @@ def luenberger(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: Arra
     # of the motion (q_r, q_r' = λ q_r) of mode r the sensors read c_q + λ c_v
     outputs = c[:, :n] + 1j * modes.omega[list(law.controlled)] * c[:, n:]
     gain = assign(a.T, c.T, poles, outputs.conj(), names).T
-    return _controller(law, sensors, a, b, c, gain, "Luenberger observer", partial(luenberger, poles=poles))
+    return _controller(law, sensors, a, b, c, gain, "Luenberger observer", partial(luenberger_controller, poles=poles))
 
 
 def usual_poles(modes: Modes, controlled: Sequence[int]) -> Complexes:
@@ -58,40 +58,40 @@ def usual_poles(modes: Modes, controlled: Sequence[int]) -> Complexes:
     rigid, elastic = omega == 0, modes.omega[modes.omega > 0]
     if rigid.any() and not elastic.size:
         raise DesignError(
-            "rigid modes alone have no frequency that sets the observer's poles; give luenberger its poles, or use"
-            " kalman"
+            "rigid modes alone have no frequency that sets the observer's poles; give luenberger_controller its"
+            " poles, or use kalman_controller"
         )
     omega[rigid] = elastic[:1] * np.arange(1, rigid.sum() + 1) / (rigid.sum() + 1)
     poles: Complexes = USUAL * omega
     return poles
 
 
-def kalman(
+def kalman_controller(
     modes: Modes, law: Law, sensors: Sequence[Sensor], *, disturbance: ArrayLike, noise: ArrayLike
 ) -> Controller:
     """The controller of a law on the state of a steady-state Kalman filter (python-control's `lqe`).
 
     Args:
-        modes, law, sensors: as for `luenberger`.
-        disturbance: intensity of white modal forces, scalar, (n_controlled,) or (n_controlled, n_controlled).
-        noise: intensity of the readings' white noise, scalar, (n_channels,) or (n_channels, n_channels); positive.
+        modes, law, sensors: as for `luenberger_controller`.
+        disturbance: intensity W of white modal forces, E w(t) w(t')ᵀ = W δ(t - t'), in modal force² s, N² s/kg: a
+            number, (n_controlled,) or (n_controlled, n_controlled), positive definite.
+        noise: intensity of the readings' white noise, in reading² s: a number, (n_channels,) or (n_channels,
+            n_channels), positive definite. Noise of standard deviation σ, held over each sample T, has σ² T.
 
     Raises:
         DesignError: a mode that no sensor observes, intensities that are not positive.
     """
     a, b, c = observed_plant(modes, law, sensors)
     n = law.n_controlled
-    process = positive_definite(disturbance, n, f"the disturbance intensity must be positive, one number or {n}")
-    measurement = positive_definite(
-        noise, len(sensors), f"the noise intensity must be positive, one number or {len(sensors)}"
-    )
+    process = positive_definite(disturbance, n, "the disturbance intensity")
+    measurement = positive_definite(noise, len(sensors), "the noise intensity")
     try:
         gain, _, _ = control.lqe(a, np.vstack([np.zeros((n, n)), np.eye(n)]), c, process, measurement)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(
             f"the Kalman filter's Riccati equation has no stabilising solution: {error}; move or add a sensor"
         ) from error
-    again = partial(kalman, disturbance=disturbance, noise=noise)
+    again = partial(kalman_controller, disturbance=disturbance, noise=noise)
     return _controller(law, sensors, a, b, c, np.asarray(gain), "Kalman filter", again)
 
 

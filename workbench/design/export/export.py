@@ -97,7 +97,7 @@ def _mat(controller: DigitalController, readings: tuple[str, ...], commands: tup
     content = {
         "name": one.name,
         "sample_time": one.sample_time,
-        **{letter.upper(): getattr(one, letter) for letter in "abcde"},
+        **{letter: getattr(one, letter) for letter in "ABCDE"},
         **{name: getattr(one, name) for name in ("offset", "scale", "limit", "rate", "dead_zone", "onset", "bias")},
         "readings": np.array(readings or one.sensors, object),
         "commands": np.array(commands or one.actuators, object),

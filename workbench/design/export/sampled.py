@@ -1,4 +1,4 @@
-"""A design at a sampling rate: its stability margin, phase lag and delay margin."""
+"""A design at a sampling rate: its decay rate, phase lag and delay margin."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from workbench.design.export.sampled_loop import MOST_PAST, sampled_loop
 from workbench.design.export.source import command_words, reading_words
 from workbench.design.laws.law import DesignError, Law, numbered
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.loop.closed_loop import close_with
+from workbench.design.loop.closed_loop import close_with, stability
 from workbench.records.units import SI, Units
 from workbench.renamed import Renamed
 from workbench.structure.modes import Modes, freeze
@@ -54,8 +54,8 @@ class SampledDesign(Printed):
         return 1.0 / self.controller.sample_time
 
     @property
-    def margin(self) -> float:
-        """Stability margin of the sampled loop, -ln|z| / T of its slowest pole, 1/s."""
+    def decay_rate(self) -> float:
+        """Decay rate of the slowest pole of the sampled loop, -ln|z| / T, 1/s; negative where it is unstable."""
         return float(-np.log(np.abs(self.poles).max()) / self.controller.sample_time)
 
     @property
@@ -64,7 +64,7 @@ class SampledDesign(Printed):
         own = self.modes.omega[list(self.source.law.controlled)]
         return np.asarray(own * (0.5 * self.controller.sample_time + self.computing_delay))
 
-    phase_lost = Renamed("phase_lag")
+    phase_lost, margin = Renamed("phase_lag"), Renamed("decay_rate")
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -98,10 +98,10 @@ class SampledDesign(Printed):
         delay = f"delay margin {1e3 * self.delay_margin:.3g} ms"
         if not np.isfinite(self.delay_margin):
             delay = f"delay margin beyond {MOST_LATE} samples"
-        # a margin within rounding is stated as zero
-        own = 0.0 if abs(self.margin) * self.controller.sample_time < ON_CIRCLE else self.margin
-        continuous = 0.0 if before.stability == "marginally stable" else before.margin
-        remarks = [f"stability margin {own:.3g} 1/s, {continuous:.3g} 1/s in continuous time; {delay}"]
+        # a decay rate within rounding is stated as zero
+        own = 0.0 if abs(self.decay_rate) * self.controller.sample_time < ON_CIRCLE else self.decay_rate
+        continuous = 0.0 if stability(before.poles) == "marginally stable" else before.decay_rate
+        remarks = [f"decay rate {own:.3g} 1/s, {continuous:.3g} 1/s in continuous time; {delay}"]
         rate, law = self.sample_rate_hz, self.source.law
         free = [r for i, r in enumerate(law.controlled) if self.modes.omega[r] == 0 and not law.gain[:, i].any()]
         if free:
@@ -141,8 +141,9 @@ def sample_design(
         )
     if not isinstance(controller, Controller | Law | OnOffLaw):
         raise TypeError(
-            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by kalman,"
-            " luenberger or filtered; a DigitalController is sampled already, write_controller writes it"
+            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by"
+            " kalman_controller, luenberger_controller or filtered; a DigitalController is sampled already,"
+            " write_controller writes it"
         )
     if isinstance(controller, OnOffLaw):
         raise DesignError(
@@ -151,18 +152,18 @@ def sample_design(
         )
     if not isinstance(controller, Controller):
         raise DesignError(
-            f"{controller.name} acts on modal coordinates, which no sensor reads; put it on an observer (luenberger,"
-            " kalman) or through a modal filter first"
+            f"{controller.name} acts on modal coordinates, which no sensor reads; put it on an observer"
+            " (luenberger_controller, kalman_controller) or through a modal filter first"
         )
     number(computing_delay, "computing_delay", "s")
     if not (np.isfinite(number(sample_rate_hz, "sample_rate_hz", "Hz")) and sample_rate_hz > 0):
         raise DesignError(f"the sampling rate must be positive; got {sample_rate_hz:g} Hz")
     before = close_with(modes, controller)
-    if not before.stable:
+    if before.unstable_poles.size:
         raise DesignError(
             f"{controller.name}: the loop of all {modes.n_modes} modes is unstable in continuous time, a pole at"
-            f" {-before.margin:+.3g} 1/s: make the observer slower (a Kalman filter by less disturbance), ask for less"
-            " damping, or control that mode too; explain_spillover or `workbench design` names the path"
+            f" {-before.decay_rate:+.3g} 1/s: make the observer slower (a Kalman filter by less disturbance), ask for"
+            " less damping, or control that mode too; explain_spillover or `workbench design` names the path"
         )
     highest = max(controller.law.controlled, key=lambda r: float(modes.omega[r]))
     fastest = float(modes.frequencies_hz[highest])

@@ -114,12 +114,12 @@ def closed_by(
     a: np.ndarray, b: np.ndarray, c: np.ndarray, controller: DigitalController
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A, B and C of the closed loop, without relays: z ← A z + B e, reading C z + e, e the error of the readings."""
-    n_c, n_u = len(controller.a), len(controller.actuators)
-    rows, direct = controller.c, controller.d * controller.scale
+    n_c, n_u = len(controller.A), len(controller.actuators)
+    rows, direct = controller.C, controller.D * controller.scale
     if controller.relays is not None:
         rows, direct = np.zeros((n_u, n_c)), np.zeros((n_u, len(controller.sensors)))
-    a_c = controller.a + controller.e @ rows
-    b_c = controller.b * controller.scale + controller.e @ direct
+    a_c = controller.A + controller.E @ rows
+    b_c = controller.B * controller.scale + controller.E @ direct
     closed = np.block([[a + b @ direct @ c, b @ rows], [b_c @ c, a_c]])
     return closed, np.vstack([b @ direct, b_c]), np.hstack([c, np.zeros((len(c), n_c))])
 

@@ -40,7 +40,7 @@ def source(
     """
     infinite = "INFINITY" if language == "c" else "inf"
     matrices, vectors = _numbers(controller)
-    n_states, n_readings, n_commands = len(controller.a), len(controller.sensors), len(controller.actuators)
+    n_states, n_readings, n_commands = len(controller.A), len(controller.sensors), len(controller.actuators)
     words = {
         "name": name,
         "title": fill(f"{_plain(controller.name)}, at {1 / controller.sample_time:.6g} Hz", WIDTH),
@@ -60,7 +60,7 @@ def source(
         "n_states": n_states,
         "n_readings": n_readings,
         "n_commands": n_commands,
-        "n_outputs": len(controller.d),
+        "n_outputs": len(controller.D),
     }
     environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True)
     texts = {end: (HERE / f"step.{end}.jinja").read_text(encoding="utf-8") for end in TEMPLATES[language]}
@@ -70,12 +70,12 @@ def source(
 def _numbers(controller: DigitalController) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """The matrices and the vectors of a controller, without those that have no effect."""
     one, relays, friction = controller, controller.relays, controller.friction
-    matrices: dict[str, Floats] = {"D": one.d}
+    matrices: dict[str, Floats] = {"D": one.D}
     vectors: dict[str, Floats] = {}
-    if len(one.a):
-        matrices |= {"A": one.a, "B": one.b, "C": one.c}
-        if one.e.any():
-            matrices["E"] = one.e
+    if len(one.A):
+        matrices |= {"A": one.A, "B": one.B, "C": one.C}
+        if one.E.any():
+            matrices["E"] = one.E
     if one.offset.any() or (one.scale != 1).any():
         vectors |= {"SCALE": one.scale, "OFFSET": one.offset}
     if relays is not None:
@@ -83,7 +83,7 @@ def _numbers(controller: DigitalController) -> tuple[dict[str, Floats], dict[str
         vectors |= {"FORCE": relays.force, "DEAD_BAND": relays.dead_band}
     if friction is not None:
         matrices |= {"PUSH": friction.push, "SPEED_Y": friction.of_reading}
-        if len(one.a):
+        if len(one.A):
             matrices["SPEED_Z"] = friction.of_state
         vectors |= {"FRICTION": friction.force, "SMOOTHING": friction.smoothing}
     vectors |= {name: limit for name, limit in (("LIMIT", one.limit), ("RATE", one.rate)) if np.isfinite(limit).any()}
@@ -130,7 +130,7 @@ def reading_words(domain: Domain, sensors: Sequence[Sensor], units: Units = SI) 
 def command_words(domain: Domain, actuators: Sequence[Actuator], units: Units = SI) -> tuple[str, ...]:
     """What each command is: actuator, kind, place and unit; with a gain, the force per unit of the command."""
     return tuple(
-        f"{a.name}: {a.kind} at {domain.text(a.at, DIGITS)}, {unit}"
+        f"{a.name}: {a.quantity} at {domain.text(a.at, DIGITS)}, {unit}"
         if a.gain == 1
         else f"{a.name}: command at {domain.text(a.at, DIGITS)}, {a.gain:.{DIGITS}g} {unit} per unit"
         for a, unit in ((a, units.named(force_unit(a))) for a in actuators)

@@ -56,7 +56,7 @@ def coupled_lqr(
     # states ω q and q': their squares are the cost, and they are of one order of magnitude at any frequency
     scale = np.r_[omega, np.ones(omega.size)][states]
     a = a[np.ix_(states, states)] * scale[:, None] / scale
-    r = positive_definite(weight, size, f"the control weight must be symmetric and positive definite, {size} by {size}")
+    r = positive_definite(weight, size, "the control weight")
     # commands scaled to equal cost: one in other units would make R look singular
     unit = np.sqrt(np.diag(r).max() / np.diag(r))
     try:

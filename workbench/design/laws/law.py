@@ -95,17 +95,20 @@ def linear(law: object) -> Law:
     return law
 
 
-def positive_definite(value: ArrayLike, size: int, refusal: str) -> np.ndarray:
+def positive_definite(value: ArrayLike, size: int, what: str) -> np.ndarray:
     """A number, a diagonal (size,) or a matrix (size, size) as a matrix.
 
     Raises:
-        DesignError: a value that is not symmetric and positive definite; `refusal` begins the message.
+        DesignError: a value that is not symmetric and positive definite; the message says what it is, `what`.
     """
     given = np.asarray(value, float)
     matrix = given * np.eye(size) if given.ndim == 0 else np.diag(given) if given.ndim == 1 else given
     fits = matrix.shape == (size, size) and np.isfinite(matrix).all()
     if not fits or not np.allclose(matrix, matrix.T) or not (np.linalg.eigvalsh(matrix) > 0).all():
-        raise DesignError(f"{refusal}; got {given}")
+        several = (
+            f", {size} positive numbers or a symmetric positive definite {size} x {size} matrix" if size > 1 else ""
+        )
+        raise DesignError(f"{what} must be a positive number{several}; got {given}")
     return matrix
 
 
@@ -157,7 +160,7 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     text = modes.domain.text
     for i, first in enumerate(actuators):
         for second in actuators[i + 1 :]:
-            alike = (first.kind, first.direction) == (second.kind, second.direction)
+            alike = (first.quantity, first.direction) == (second.quantity, second.direction)
             if alike and separation(modes, first, second) <= 1e-6:
                 raise DesignError(
                     f"actuators {first.name} and {second.name} both stand at {text(first.at)}, so B is singular;"
@@ -208,7 +211,7 @@ def _inputs(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuato
 
 def _largest_participation(modes: Modes, actuator: Actuator) -> Floats:
     """The largest participation of each mode (n_modes,) in an actuator's command, over all places."""
-    moment = actuator.kind == "moment"
+    moment = actuator.quantity == "moment"
     if isinstance(modes.domain, NamedPoints):
         shapes = modes.phi(modes.domain.rotations() if moment else modes.domain.grid())
     elif isinstance(modes.domain, Rectangle) and isinstance(actuator.at, Patch):

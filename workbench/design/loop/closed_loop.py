@@ -1,19 +1,23 @@
 """The closed loop of all modes, controlled and residual, propagated exactly."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, wraps
+from typing import Any, ParamSpec
+from warnings import warn
 
+import control
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import expm
+from scipy.linalg import expm, matrix_balance
 
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.design.estimation.controller import Controller, check_readable
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import DesignError, Law, linear
 from workbench.design.loop.peak import largest
-from workbench.rig.statespace import modal_plant
+from workbench.renamed import Renamed
+from workbench.rig.statespace import modal_plant, signal_names
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import counted, place_text
@@ -23,10 +27,14 @@ WELL_CONDITIONED = 1e6  # condition number of eigenvectors up to which the close
 RESONANT = 1e-6  # of the fastest pole: poles nearer to each other have no closed form by partial fractions
 EVEN = 1e-15  # of the last instant: instants count as uniform if they deviate by no more
 ON_AXIS = 1e-9  # of the fastest pole: rounding of real parts
+NULL = 1e-12  # of the largest singular value of the balanced A: one that counts as zero
+DRIFTS = "unstable: a rigid-body mode drifts"
+
+P = ParamSpec("P")
 
 
 def stability(poles: np.ndarray) -> str:
-    """Stability of a loop: stable, unstable, or marginally stable where its rightmost pole is on the imaginary axis."""
+    """Stability by the poles: stable, unstable, or marginally stable where the rightmost is on the imaginary axis."""
     rightmost, tolerance = poles.real.max(), rounding(poles)
     return "stable" if rightmost < -tolerance else "unstable" if rightmost > tolerance else "marginally stable"
 
@@ -64,19 +72,55 @@ class ClosedLoop:
         return frozen(np.linalg.eigvals(self.matrix), complex)
 
     @property
-    def margin(self) -> float:
-        """Stability margin, -max Re of the poles, 1/s; negative where the loop is unstable."""
+    def decay_rate(self) -> float:
+        """Decay rate of the slowest pole (degree of stability), -max Re λ, 1/s; negative where the loop is unstable."""
         return float(-self.poles.real.max())
+
+    margin = Renamed("decay_rate")
+
+    @property
+    def unstable_poles(self) -> np.ndarray:
+        """Poles to the right of the imaginary axis beyond rounding, rad/s; those of undamped modes lie on it."""
+        return self.poles[self.poles.real > rounding(self.poles)]
 
     @property
     def stability(self) -> str:
-        """Stable, marginally stable or unstable, as of `stability`."""
-        return stability(self.poles)
+        """Stable, marginally stable or unstable, as of `stability`, and unstable where a rigid-body mode drifts.
+
+        A rigid-body mode without control and damping is a double pole at zero with one eigenvector: its displacement
+        grows as t, so it is not marginally stable, which takes as many eigenvectors as poles.
+        """
+        by_poles = stability(self.poles)
+        return DRIFTS if by_poles != "unstable" and self._drifts() else by_poles
 
     @property
     def stable(self) -> bool:
-        """Whether no pole is to the right of the axis; those of undamped residual modes lie on it."""
-        return self.stability != "unstable"
+        """Whether the loop is asymptotically stable; for undamped modes see `unstable_poles` and `stability`."""
+        return self.stability == "stable"
+
+    def _drifts(self) -> bool:
+        """Whether zero is a defective pole: with left and right null vectors W and V of A, WᵀV is singular."""
+        if self.modes.omega.all():
+            return False
+        balanced, _ = matrix_balance(self.matrix, permute=False, separate=True)
+        left, strength, right = np.linalg.svd(balanced)
+        still = strength <= NULL * strength[0]
+        if not still.any():
+            return False
+        return bool(np.linalg.svd(left[:, still].T @ right[still].T, compute_uv=False)[-1] <= ON_AXIS)
+
+    def state_space(self) -> control.StateSpace:
+        """The loop as python-control's `StateSpace`, from modal forces to (q, q') and the actuator forces."""
+        n, size = self.modes.n_modes, len(self.matrix)
+        modal = [f"{what}{r + 1}" for what in ("q", "dq") for r in range(n)]
+        return control.ss(
+            self.matrix,
+            np.eye(size, n, k=-n),
+            np.vstack([np.eye(2 * n, size), self.feedback]),
+            np.zeros((2 * n + len(self.feedback), n)),
+            inputs=[f"f{r + 1}" for r in range(n)],
+            outputs=modal + signal_names(actuator.name for actuator in self.law.actuators),
+        )
 
     def start(self, state: ArrayLike) -> Floats:
         """The state (n_states,) at t = 0 from that of the modes, (2 n_modes,), or more; the others start from zero."""
@@ -176,10 +220,10 @@ def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
     a, b, c, d, _ = modal_plant(modes, controller.law.actuators, controller.sensors)
     count = len(controller.sensors)
     reads, forces, feedthrough = c[:count], c[count:], d[count:]
-    commands = np.hstack([controller.direct @ reads, controller.commands])
-    plant = np.block([[a, np.zeros((len(a), len(controller.state)))], [controller.reads @ reads, controller.state]])
-    matrix = plant + np.vstack([b @ commands, np.zeros((len(controller.state), len(plant)))])
-    forces = np.hstack([forces, np.zeros((len(forces), len(controller.state)))])
+    commands = np.hstack([controller.D @ reads, controller.C])
+    plant = np.block([[a, np.zeros((len(a), len(controller.A)))], [controller.B @ reads, controller.A]])
+    matrix = plant + np.vstack([b @ commands, np.zeros((len(controller.A), len(plant)))])
+    forces = np.hstack([forces, np.zeros((len(forces), len(controller.A)))])
     return ClosedLoop(modes, controller.law, matrix, forces + feedthrough @ commands)
 
 
@@ -188,21 +232,61 @@ def impulse_state(modes: Modes, at: Place, impulse: float = 1.0) -> Floats:
     return np.concatenate([np.zeros(modes.n_modes), impulse * modes.phi(at)[0]])
 
 
-def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
+def _in_former_order(function: Callable[P, Response]) -> Callable[P, Response]:
+    """`initial_response` that takes the former order and names too, (loop, state, time), with a warning."""
+
+    def former(loop: ClosedLoop, state: Any, time: Any) -> tuple[ClosedLoop, Any, Any]:
+        return loop, time, state
+
+    def is_former(loop: ClosedLoop, timepts: Any, initial_state: Any) -> bool:
+        """Whether the arguments are (loop, state, time): they make sense in that order alone."""
+        sizes = ((2 * loop.modes.n_modes,), loop.matrix.shape[:1])
+
+        def fits(times: Any, state: Any) -> bool:
+            rise = np.ndim(times) == 1 and np.size(times) and np.min(times) >= 0 and (np.diff(times) > 0).all()
+            return bool(rise and np.shape(state) in sizes)
+
+        if fits(timepts, initial_state) and fits(initial_state, timepts):
+            raise ValueError(
+                "either argument may be the instants and either the state, and their order has changed; name them:"
+                " initial_response(loop, timepts=..., initial_state=...)"
+            )
+        return fits(initial_state, timepts)
+
+    @wraps(function)
+    def with_former(*args: Any, **kwargs: Any) -> Response:
+        if kwargs.keys() & {"state", "time"} or (len(args) == 3 and not kwargs and is_former(*args)):
+            now = "initial_response(loop, state, time) is now initial_response(loop, timepts, initial_state)"
+            warn(f"{now}; the old order goes with the next version", DeprecationWarning, 2)
+            args, kwargs = former(*args, **kwargs), {}
+        return function(*args, **kwargs)
+
+    return with_former
+
+
+@_in_former_order
+def initial_response(
+    loop: ClosedLoop, timepts: Sequence[float] | np.ndarray, initial_state: Sequence[float] | np.ndarray
+) -> Response:
     """Free response from a state at t = 0, exact at every instant: x(t) = e^{At} x0.
 
-    A state (2 n_modes,) of the modes alone starts an observer from zero. With exact modal coordinates the response has
-    a closed form; otherwise uniform instants share one matrix exponential, and others need one each.
+    With exact modal coordinates it has a closed form; otherwise uniform instants share one matrix exponential, and
+    others need one each. The arguments are those of python-control's `initial_response`.
+
+    Args:
+        loop: from `close_loop` or `explain_spillover`.
+        timepts: (n_times,) instants, s.
+        initial_state: x0, (2 n_modes,) of the modes alone, an observer starting from zero, or (n_states,).
 
     Raises:
         ValueError: times that do not increase from zero or later, a state of another size or not finite.
     """
-    time = checked_times(time)
+    time = checked_times(timepts)
     sizes = (2 * loop.modes.n_modes, loop.matrix.shape[0])
-    if np.shape(state) not in ((sizes[0],), (sizes[1],)) or not np.isfinite(state).all():
+    if np.shape(initial_state) not in ((sizes[0],), (sizes[1],)) or not np.isfinite(initial_state).all():
         more = f", or ({sizes[1]},) with the controller" if sizes[1] > sizes[0] else ""
-        raise ValueError(f"the state must be finite, ({sizes[0]},) of the modes{more}; got {np.shape(state)}")
-    state = loop.start(state)
+        raise ValueError(f"the state must be finite, ({sizes[0]},) of the modes{more}; got {np.shape(initial_state)}")
+    state = loop.start(initial_state)
     modal = _cascade(loop, state, time)
     if modal is None:
         modal = _stepped(loop.matrix, state, time)

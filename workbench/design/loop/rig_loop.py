@@ -238,7 +238,7 @@ def _disturbances(rig: Rig, test: LoopTest, rng: np.random.Generator | None) -> 
 
 
 def _arrays(one: DigitalController) -> ControllerArrays:
-    n, n_sensors, n_actuators = one.a.shape[0], len(one.sensors), len(one.actuators)
+    n, n_sensors, n_actuators = one.A.shape[0], len(one.sensors), len(one.actuators)
     relays, friction = one.relays, one.friction
     switching = (np.zeros((n_actuators, 0)), np.zeros(0), np.zeros(0))
     forward = (np.zeros((n_actuators, 0)), np.zeros((0, n)), np.zeros((0, n_sensors)), np.zeros(0), np.ones(0))
@@ -249,7 +249,7 @@ def _arrays(one: DigitalController) -> ControllerArrays:
     return tuple(
         tuple(np.array(x, float, order="C") for x in group)
         for group in (
-            (one.a, one.b, one.c, one.d, one.e),
+            (one.A, one.B, one.C, one.D, one.E),
             (one.offset, one.scale, one.limit, one.rate, one.dead_zone, one.bias),
             switching,
             forward,

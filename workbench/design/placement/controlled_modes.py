@@ -96,7 +96,7 @@ def controlled_mode_count(
             continue
         start = state.copy()
         start[n:n_modes] = start[n_modes + n :] = 0.0
-        residual_work[i], efforts[i] = spillover(modes, law, start).residual_total, effort(modes, law, start)
+        residual_work[i], efforts[i] = spillover(modes, law, start).residual_work, effort(modes, law, start)
     uncontrolled = energy.sum() - np.cumsum(energy)[: counts.size]
     remaining = uncontrolled + residual_work
     if not np.isfinite(remaining).any():

@@ -136,7 +136,7 @@ def coupled_costs(
         positions=positions,
         law=Law(full_gain, tuple(range(n)), actuators, "coupled LQR"),
         residual_work=float(by_mode.sum()),
-        by_mode=by_mode,
+        residual_work_by_mode=by_mode,
         effort=float(np.trace(gain @ gramian @ gain.T)),
         peak_force=largest(values, (gain @ vectors) * coefficients, np.inf),
         condition=float(np.linalg.norm(np.linalg.pinv(shapes[:n])) * np.linalg.norm(shapes[:n])),

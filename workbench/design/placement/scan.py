@@ -119,7 +119,7 @@ def allowed_places(task: PlacementTask, limits: Limits, n_places: int) -> np.nda
         edge = max(limits.edge_distance, task.reach[0], domain.length / n_places / 2)
         grid = np.linspace(edge, domain.length - edge, n_places)
     elif isinstance(domain, NamedPoints):
-        grid = as_places(domain, domain.rotations() if task.actuator.kind == "moment" else domain.grid())
+        grid = as_places(domain, domain.rotations() if task.actuator.quantity == "moment" else domain.grid())
     else:
         grid = as_places(domain, domain.grid(n_places))
     allowed: np.ndarray = grid[free_places(domain, grid, boxes)]

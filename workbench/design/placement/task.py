@@ -19,7 +19,7 @@ from workbench.design.laws.law import DesignError, Law, weighed_states
 from workbench.design.loop.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.design.spillover.spillover import settled_moments
-from workbench.renamed import former_arguments
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.structure.domain import (
@@ -54,7 +54,7 @@ class Placement(Printed):
             a rectangle (n_actuators, 2) m; at named points (n_actuators,) names.
         law: with the actuators there; None where B is singular.
         residual_work: W_R.
-        by_mode: (n_residual,) W_r.
+        residual_work_by_mode: (n_residual,) W_r.
         effort: ∫ FᵀF dt.
         peak_force: largest force of any actuator in continuous time, to a millionth.
         condition: of B in the Frobenius norm, ‖B‖‖B⁻¹‖, an upper bound of the spectral condition number.
@@ -67,7 +67,7 @@ class Placement(Printed):
     positions: np.ndarray
     law: Law | None
     residual_work: float
-    by_mode: np.ndarray
+    residual_work_by_mode: np.ndarray
     effort: float
     peak_force: float
     condition: float
@@ -76,9 +76,11 @@ class Placement(Printed):
     spacing: float = np.inf
     overlapping: bool = False
 
+    by_mode = Renamed("residual_work_by_mode")
+
     def __post_init__(self) -> None:
         freeze(self, "positions", dtype=None)
-        freeze(self, "by_mode")
+        freeze(self, "residual_work_by_mode")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         count = len(self.positions)
@@ -88,15 +90,18 @@ class Placement(Printed):
         n_controlled = count if self.law is None else self.law.n_controlled
         line = f"{count} actuator{'s' * (count > 1)} placed: W_R = {self.residual_work:.4g}, effort {self.effort:.4g}"
         rows = [(name, place_text(x)) for name, x in zip(names, listed(self.positions), strict=True)]
-        most = int(np.argmax(self.by_mode))
+        most = int(np.argmax(self.residual_work_by_mode))
         remarks = (
-            f"largest W_r = {self.by_mode[most]:.4g}, in mode {n_controlled + most + 1}; peak force"
+            f"largest W_r = {self.residual_work_by_mode[most]:.4g}, in mode {n_controlled + most + 1}; peak force"
             f" {self.peak_force:.4g}; condition of B {self.condition:.3g}",
             *((f"search: {self.status}",) if self.status else ()),
             *((f"patches overlap; {SPREAD}",) if self.overlapping else ()),
         )
         named = self.positions.dtype == object
         return line, ("actuator", "at" if named else "x [m]" if self.positions.ndim == 1 else "x, y [m]"), rows, remarks
+
+
+Placement.__init__ = former_arguments(by_mode="residual_work_by_mode")(Placement.__init__)  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -149,7 +154,7 @@ class PlacementTask(Printed):
             patches = np.hstack([flat, np.broadcast_to(actuator.at[2:], flat.shape)])
             values = actuator.gain * self.modes.edge_slopes(patches, direction=actuator.direction)
         else:
-            order = int(actuator.kind == "moment")
+            order = int(actuator.quantity == "moment")
             values = actuator.gain * self.modes.phi(list(flat), order, direction=actuator.direction)
         return values.reshape(*shape, self.modes.n_modes)
 
@@ -197,7 +202,7 @@ class PlacementTask(Printed):
             positions=positions,
             law=law,
             residual_work=float(costs.work[0]),
-            by_mode=costs.by_mode[0],
+            residual_work_by_mode=costs.by_mode[0],
             effort=float(costs.effort[0]),
             peak_force=peak,
             condition=float(costs.condition[0]),
@@ -220,7 +225,7 @@ class PlacementTask(Printed):
             DesignError: frequencies that grow too slowly for a bounded sum, a finite time, or modes that are not along
                 an interval.
         """
-        domain, moment = self.modes.domain, int(self.actuator.kind == "moment")
+        domain, moment = self.modes.domain, int(self.actuator.quantity == "moment")
         if not isinstance(domain, Interval):
             raise DesignError(f"the bound of higher modes is for an interval; these modes are of {domain}")
         power = 2 * (growth - moment)
@@ -375,12 +380,12 @@ def patch_of(rig: Rig) -> Actuator | None:
         DesignError: actuators that differ in more than their place.
     """
     own, domain = [a for a in rig.actuators if not a.direct], rig.modes.domain
-    patch = next((a for a in own if a.kind == "moment"), None)
+    patch = next((a for a in own if a.quantity == "moment"), None)
     if patch is None or isinstance(domain, NamedPoints):
         return None
     half = reach(domain, patch.at)[0]
     for other in own:
-        alike = (other.kind, other.direction) == (patch.kind, patch.direction)
+        alike = (other.quantity, other.direction) == (patch.quantity, patch.direction)
         if not (alike and np.allclose(reach(domain, other.at)[0], half)):
             raise DesignError(
                 f"placement is of identical actuators, and {other.name} is not a patch like {patch.name}: give all the"
@@ -411,7 +416,7 @@ def reach_along(modes: Modes, actuator: Actuator) -> tuple[float, float]:
 
 def participation_along(modes: Modes, actuator: Actuator, x: Floats, derivative: int = 0) -> Floats:
     """Participation (..., n_modes) of an actuator with its middle at x (...), m, or its derivative in x."""
-    half, order = 0.5 * extent(actuator), derivative + (actuator.kind == "moment")
+    half, order = 0.5 * extent(actuator), derivative + (actuator.quantity == "moment")
     at = x.ravel()
     values = modes.phi(at, order) if half == 0 else modes.phi(at + half, order) - modes.phi(at - half, order)
     return actuator.gain * values.reshape(*x.shape, modes.n_modes)

@@ -24,6 +24,7 @@ from workbench.arrays import Complexes, Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.laws.law import DesignError, linear
 from workbench.design.loop.closed_loop import ClosedLoop, close_with, rounding
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix, lateness
@@ -97,16 +98,18 @@ class Explanation(Printed):
     Attributes:
         loop: of all modes.
         shifts: of every residual mode, the least stable first.
-        reduced_margin: stability margin of the loop of the controlled modes alone, 1/s.
+        reduced_decay_rate: of the slowest pole of the loop of the controlled modes alone, 1/s.
         destabilising: the residual mode that makes the loop unstable: one whose pole is unstable, else the one without
-            which the loop is stable (a stable residual mode can destabilise a controlled one). None where the loop is
-            stable, and where no single mode accounts for it, as when the loop of the controlled modes is unstable.
+            which the loop is stable (a stable residual mode can destabilise a controlled one). None where no pole is
+            unstable, and where no single mode accounts for it, as when the loop of the controlled modes is unstable.
     """
 
     loop: ClosedLoop
     shifts: tuple[PoleShift, ...]
-    reduced_margin: float
+    reduced_decay_rate: float
     destabilising: PoleShift | None
+
+    reduced_margin = Renamed("reduced_decay_rate")
 
     @property
     def limiting(self) -> PoleShift | None:
@@ -115,7 +118,10 @@ class Explanation(Printed):
         return first if first and first.closed_pole.real == self.poles.real.max() else None
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        rate = {"stable": f", margin {self.margin:.3g} 1/s", "unstable": f", growth rate {-self.margin:.3g} 1/s"}
+        rate = {
+            "stable": f", decay rate {self.decay_rate:.3g} 1/s",
+            "unstable": f", growth rate {-self.decay_rate:.3g} 1/s",
+        }
         state = self.loop.stability + rate.get(self.loop.stability, "")
         rows = [
             (
@@ -129,7 +135,7 @@ class Explanation(Printed):
         ]
         cause = self.destabilising
         remarks = (
-            f"controlled modes alone: margin {self.reduced_margin:.3g} 1/s",
+            f"controlled modes alone: decay rate {self.reduced_decay_rate:.3g} 1/s",
             *((f"mode {cause.mode + 1} makes the loop unstable",) if cause else ()),
         )
         headings = (
@@ -147,9 +153,16 @@ class Explanation(Printed):
         return self.loop.poles
 
     @property
-    def margin(self) -> float:
-        """Distance of the rightmost pole from the axis, 1/s; negative where the loop is unstable."""
-        return self.loop.margin
+    def decay_rate(self) -> float:
+        """Decay rate of the slowest pole of the loop, 1/s; negative where the loop is unstable."""
+        return self.loop.decay_rate
+
+    margin = Renamed("decay_rate")
+
+
+Explanation.__init__ = former_arguments(  # type: ignore[method-assign]
+    reduced_margin="reduced_decay_rate"
+)(Explanation.__init__)
 
 
 def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
@@ -157,7 +170,7 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
 
     Args:
         modes: of the full plant; those that the law does not control are residual.
-        controller: from `filtered`, `luenberger` or `kalman`.
+        controller: from `filtered`, `luenberger_controller` or `kalman_controller`.
 
     Raises:
         DesignError: a law alone, which reads no sensor and so shifts no residual mode, or one that has no gain.
@@ -165,7 +178,7 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
     if not isinstance(controller, Controller):
         raise DesignError(
             f"{linear(controller).name} alone reads exact modal coordinates, so it shifts no residual mode; put it on"
-            " an observer (luenberger, kalman) or through a modal filter, and give the controller"
+            " an observer (luenberger_controller, kalman_controller) or through a modal filter, and give the controller"
         )
     loop = close_with(modes, controller)
     residual = [r for r in range(modes.n_modes) if r not in controller.law.controlled]
@@ -178,8 +191,8 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
     ]
     shifts.sort(key=lambda m: -m.closed_pole.real)
     reduced = close_with(modes.select(controller.law.controlled), controller)
-    cause = _destabilising(modes, controller, loop, shifts, reduced.stable)
-    return Explanation(loop, tuple(shifts), reduced.margin, cause)
+    cause = _destabilising(modes, controller, loop, shifts, not reduced.unstable_poles.size)
+    return Explanation(loop, tuple(shifts), reduced.decay_rate, cause)
 
 
 def _open_loop_poles(modes: Modes) -> list[complex]:
@@ -216,7 +229,7 @@ def _destabilising(
     modes: Modes, controller: Controller, loop: ClosedLoop, shifts: list[PoleShift], reduced_stable: bool
 ) -> PoleShift | None:
     """The residual mode that destabilises a loop: an unstable one, else one without which the loop is stable."""
-    if loop.stable or not shifts:
+    if not loop.unstable_poles.size or not shifts:
         return None
     if reduced_stable and shifts[0].closed_pole.real > rounding(loop.poles):
         return shifts[0]
@@ -226,8 +239,8 @@ def _destabilising(
 
     suspects = sorted(shifts, key=lambda m: -abs(m.shift))[:SUSPECTS]
     loops = [without(one) for one in suspects]
-    best = int(np.argmax([each.margin for each in loops]))
-    return suspects[best] if loops[best].stable else None
+    best = int(np.argmax([each.decay_rate for each in loops]))
+    return suspects[best] if not loops[best].unstable_poles.size else None
 
 
 class _ResidualMode:
@@ -277,7 +290,7 @@ class _ResidualMode:
     def _forces(self, s: complex, plant: Complexes) -> Complexes:
         """T(s) (n_actuators, n_channels), with the plant G(s) of the other modes."""
         c = self._controller
-        own = c.direct + c.commands @ np.linalg.solve(s * np.eye(len(c.state)) - c.state, c.reads)
+        own = c.D + c.C @ np.linalg.solve(s * np.eye(len(c.A)) - c.A, c.B)
         own = self._lags(c.law.actuators, s)[:, None] * own * self._lags(c.sensors, s)
         # least squares, because the matrix is singular where the loop without mode r has the pole s too, as with
         # several rigid modes that one sensor reads

@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import Controller, filtered
 from workbench.design.estimation.modal_filter import filter_on
-from workbench.design.estimation.observers import luenberger, usual_poles
+from workbench.design.estimation.observers import luenberger_controller, usual_poles
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices, numbered
@@ -24,7 +24,7 @@ from workbench.design.spillover.spillover import (
     second_moments,
     work_by_mode,
 )
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix
@@ -37,21 +37,24 @@ from workbench.threads import one_blas_thread
 
 @dataclass(frozen=True)
 class Performance:
-    """Performance of a design up to the final time; cost, effort and W_R are infinite where the loop is unstable.
+    """Performance of a design up to the final time; cost, effort and W_R are infinite where a pole is unstable.
 
     Attributes:
         cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt, Σ over the controlled modes, by their true coordinates.
         effort: ∫ FᵀF dt.
         spillover: W_R, work in the residual modes.
-        margin: distance of the rightmost pole from the axis, 1/s; nan for on-off control, which has no poles.
+        decay_rate: of the slowest pole, 1/s; nan for on-off control, which has no poles.
     """
 
     cost: float
     effort: float
     spillover: float
-    margin: float
+    decay_rate: float
 
-    spilled = Renamed("spillover")
+    spilled, margin = Renamed("spillover"), Renamed("decay_rate")
+
+
+Performance.__init__ = former_arguments(margin="decay_rate")(Performance.__init__)  # type: ignore[method-assign]
 
 
 def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: float) -> Performance:
@@ -66,15 +69,15 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
     _check_weight(weight)
     check_final_time(final_time)
     modes, n = loop.modes, loop.modes.n_modes
-    margin = loop.margin
-    if not loop.stable:
-        return Performance(np.inf, np.inf, np.inf, margin)
+    rate = loop.decay_rate
+    if loop.unstable_poles.size:
+        return Performance(np.inf, np.inf, np.inf, rate)
     moments = second_moments(loop.matrix, loop.start(state), final_time)
     own = list(loop.law.controlled)
     energy = modes.omega[own] ** 2 @ np.diag(moments)[own] + np.diag(moments)[[n + r for r in own]].sum()
     used = float(np.trace(loop.feedback @ moments @ loop.feedback.T))
     spillover = float(np.delete(work_by_mode(loop, moments), own).sum())
-    return Performance(float(energy) + weight * used, used, spillover, margin)
+    return Performance(float(energy) + weight * used, used, spillover, rate)
 
 
 def on_off_performance(
@@ -128,8 +131,8 @@ class Compared:
     @property
     def most_excited(self) -> int | None:
         """Zero-based index of the residual mode that takes the most work; None where no mode is residual."""
-        residual = self.work.residual
-        return residual[int(np.argmax(self.work.residual_work))] if residual else None
+        residual = self.work.residual_modes
+        return residual[int(np.argmax(self.work.residual_work_by_mode))] if residual else None
 
 
 def laws_of(
@@ -225,7 +228,7 @@ def through_sensors(
                 if by_filter:
                     controller = filtered(law, filter_on(structure, modes, law.controlled, sensor_places))
                 else:
-                    controller = luenberger(modes, law, sensors, poles=usual_poles(modes, law.controlled))
+                    controller = luenberger_controller(modes, law, sensors, poles=usual_poles(modes, law.controlled))
                 tried.append((controller, explain_spillover(modes, controller), ""))
             except ValueError as error:
                 tried.append((None, None, f"{law.name}: {error}"))

@@ -1,6 +1,6 @@
 """The smallest change that stabilises a loop unstable by spillover: a lower gain, a place moved, or added sensors.
 
-Every change is a new design, and every margin is that of its loop on the full plant.
+Every change is a new design, and every decay rate is that of its loop on the full plant.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -12,7 +12,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.loop.closed_loop import close_with, rounding
-from workbench.renamed import former_arguments
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import (
     Between,
@@ -48,15 +48,20 @@ class Remedy:
         kind: "gain", "actuator", "sensor" or "sensors added".
         change: in words.
         size: relative reduction of the gain, distance moved in m, or number of sensors added.
-        margin: of the loop with the change, 1/s.
+        decay_rate: of the slowest pole of the loop with the change, 1/s.
         controller: with the change.
     """
 
     kind: str
     change: str
     size: float
-    margin: float
+    decay_rate: float
     controller: Controller
+
+    margin = Renamed("decay_rate")
+
+
+Remedy.__init__ = former_arguments(margin="decay_rate")(Remedy.__init__)  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ class _Setting:
     share: float = 1.0
 
 
-@former_arguments(most_added="max_added")
+@former_arguments(most_added="max_added", margin="decay_rate")
 @one_blas_thread
 def spillover_remedies(
     modes: Modes,
@@ -76,10 +81,10 @@ def spillover_remedies(
     actuators: Sequence[Actuator],
     sensors: Sequence[Place],
     *,
-    margin: float = 0.0,
+    decay_rate: float = 0.0,
     max_added: int = 6,
 ) -> tuple[Remedy, ...]:
-    """The smallest remedy of each kind, each verified on the full plant; empty where the loop has the margin already.
+    """The smallest remedy of each kind, each verified on the full plant; empty where the loop decays as fast already.
 
     A place is moved along the structure, on a rectangle along one of its sides, and among named points to another point
     of the same direction. Actuators between two points or pairs, and points of unknown position, are not moved.
@@ -88,7 +93,7 @@ def spillover_remedies(
         modes: of the full plant.
         redesign: repeats the design of the controller for other actuators, sensors and gain.
         actuators, sensors: of the design; sensors by place: x or (x, y) in m, or names of points.
-        margin: wanted distance of the rightmost pole from the axis, 1/s; with 0 marginal stability is enough.
+        decay_rate: wanted of the slowest pole, 1/s; with 0 marginal stability is enough.
         max_added: largest number of sensors to add.
 
     Raises:
@@ -100,16 +105,16 @@ def spillover_remedies(
     start = _Setting(tuple(actuators), tuple(sorted(same_place(at) for at in sensors)))
 
     def excess(setting: _Setting) -> float:
-        """Margin less rounding less the wanted margin, 1/s; -inf where the design fails."""
-        achieved, tolerance = _margin(modes, redesign, setting)
-        return achieved - tolerance - margin
+        """Decay rate less rounding less the wanted one, 1/s; -inf where the design fails."""
+        achieved, tolerance = _decay_rate(modes, redesign, setting)
+        return achieved - tolerance - decay_rate
 
     def remedy(kind: str, change: str, size: float, setting: _Setting) -> Remedy:
         controller = redesign(setting.actuators, setting.sensors, setting.share)
-        return Remedy(kind, change, size, close_with(modes, controller).margin, controller)
+        return Remedy(kind, change, size, close_with(modes, controller).decay_rate, controller)
 
-    # a marginally stable loop needs no remedy where the wanted margin is 0
-    if sum(_margin(modes, redesign, start)) >= margin:
+    # a marginally stable loop needs no remedy where the wanted decay rate is 0
+    if sum(_decay_rate(modes, redesign, start)) >= decay_rate:
         return ()
     remedies = []
     reduction = _smallest(lambda size: excess(replace(start, share=1.0 - size)), 1.0)
@@ -144,26 +149,26 @@ def sufficient_sensors(
     *,
     most: int = 60,
 ) -> tuple[int | None, np.ndarray]:
-    """The least number of evenly spaced sensors that stabilises the loop, and the margins with 1, 2, … sensors, 1/s.
+    """The least number of evenly spaced sensors that stabilises the loop, and the decay rates of 1, 2, … sensors, 1/s.
 
     The next three numbers of sensors must stabilise it too. The number is None where up to `most` sensors do not.
     """
-    margins, tolerances = np.full(most, -np.inf), np.zeros(most)
+    rates, tolerances = np.full(most, -np.inf), np.zeros(most)
     for k in range(1, most + 1):
         places = modes.length * np.arange(1, k + 1) / (k + 1)
-        margins[k - 1], tolerances[k - 1] = _margin(modes, redesign, _Setting(tuple(actuators), tuple(places)))
-        if k > 3 and (margins[k - 4 : k] > tolerances[k - 4 : k]).all():
-            return k - 3, margins[:k]
-    return None, margins
+        rates[k - 1], tolerances[k - 1] = _decay_rate(modes, redesign, _Setting(tuple(actuators), tuple(places)))
+        if k > 3 and (rates[k - 4 : k] > tolerances[k - 4 : k]).all():
+            return k - 3, rates[:k]
+    return None, rates
 
 
-def _margin(modes: Modes, redesign: Redesign, setting: _Setting) -> tuple[float, float]:
-    """The margin of a design and its rounding error, 1/s; -inf where the design fails."""
+def _decay_rate(modes: Modes, redesign: Redesign, setting: _Setting) -> tuple[float, float]:
+    """The decay rate of a design and its rounding error, 1/s; -inf where the design fails."""
     try:
         loop = close_with(modes, redesign(setting.actuators, setting.sensors, setting.share))
     except ValueError:
         return -np.inf, 0.0
-    return loop.margin, rounding(loop.poles)
+    return loop.decay_rate, rounding(loop.poles)
 
 
 def _smallest(excess: Callable[[float], float], most: float) -> float | None:
@@ -240,7 +245,7 @@ def _sensors(start: _Setting, domain: Domain) -> Iterator[tuple[str, Where, Call
 
 
 def _added(start: _Setting, excess: Callable[[_Setting], float], domain: Domain, most: int) -> _Setting | None:
-    """The setting with sensors added one by one, each at the place of the largest margin; None where `most` fail."""
+    """The setting with sensors added one by one, each where the decay rate is largest; None where `most` fail."""
     setting = start
     grid = domain.grid(STEPS if len(domain.coordinates) == 1 else PER_SIDE)
     for _ in range(most):

@@ -15,6 +15,7 @@ from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_with
 from workbench.design.spillover.spillover import finite_spillover
+from workbench.renamed import Renamed, former_arguments
 from workbench.structure.modes import Modes, freeze
 from workbench.threads import one_blas_thread
 
@@ -23,28 +24,31 @@ LEAST_OMEGA = 1e-3  # of the frequency: lower bound of a drawn one
 
 @dataclass(frozen=True, eq=False)
 class Robustness:
-    """Stability margins and spillover of a design on many perturbed models.
+    """Decay rates and spillover of a design on many perturbed models.
 
     Attributes:
-        margins: (n_draws,) stability margin of each, 1/s; ± rounding where the loop is marginally stable.
+        decay_rates: (n_draws,) of the slowest pole of each, 1/s; negative where unstable, ± rounding where marginally
+            stable.
         work: (n_draws,) W_R up to the final time; nan where unstable.
     """
 
-    margins: np.ndarray
+    decay_rates: np.ndarray
     work: np.ndarray
 
+    margins = Renamed("decay_rates")
+
     def __post_init__(self) -> None:
-        freeze(self, "margins", "work")
+        freeze(self, "decay_rates", "work")
 
     @property
     def share(self) -> float:
-        """Share of the perturbed models on which the loop of all modes is stable."""
+        """Share of the perturbed models on which no pole of the loop of all modes is unstable."""
         return float(np.mean(np.isfinite(self.work)))
 
     @property
     def standard_error(self) -> float:
         """Standard error of the share, for the number of draws."""
-        return float(np.sqrt(self.share * (1 - self.share) / self.margins.size))
+        return float(np.sqrt(self.share * (1 - self.share) / self.decay_rates.size))
 
     def spread(self, level: float = 0.9) -> tuple[float, float, float]:
         """W_R of the stable draws: lower end of the central interval, median, upper end; nan where none is stable."""
@@ -53,6 +57,9 @@ class Robustness:
             return np.nan, np.nan, np.nan
         low, median, high = np.quantile(stable, (0.5 - 0.5 * level, 0.5, 0.5 + 0.5 * level))
         return float(low), float(median), float(high)
+
+
+Robustness.__init__ = former_arguments(margins="decay_rates")(Robustness.__init__)  # type: ignore[method-assign]
 
 
 def draw_modes(
@@ -129,7 +136,7 @@ def perturbed_modes(modes: Modes, error: float, *, count: int = 100, seed: int =
 
 def stable_share(possible: list[Modes], design: Controller | Law) -> float:
     """Share of the models on which a design is stable."""
-    return float(np.mean([close_with(modes, design).stable for modes in possible]))
+    return float(np.mean([not close_with(modes, design).unstable_poles.size for modes in possible]))
 
 
 @one_blas_thread
@@ -146,11 +153,11 @@ def robustness(
     """
     results = {}
     for name, controller in designs.items():
-        margins, work = np.empty(len(possible)), np.full(len(possible), np.nan)
+        rates, work = np.empty(len(possible)), np.full(len(possible), np.nan)
         for i, modes in enumerate(possible):
             loop = close_with(modes, controller)
-            margins[i] = loop.margin
-            if loop.stable:
-                work[i] = finite_spillover(loop, state, final_time).residual_total
-        results[name] = Robustness(margins, work)
+            rates[i] = loop.decay_rate
+            if not loop.unstable_poles.size:
+                work[i] = finite_spillover(loop, state, final_time).residual_work
+        results[name] = Robustness(rates, work)
     return results

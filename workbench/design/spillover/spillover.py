@@ -22,6 +22,7 @@ from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop
 from workbench.design.loop.on_off_response import motion, switchings
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.linear import integrated
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import gauss_between
@@ -36,50 +37,57 @@ class Spillover(Printed):
     """Work of the actuators by mode, J (or the consistent unit).
 
     Attributes:
-        by_mode: (n_modes,) W of every mode.
+        work_by_mode: (n_modes,) W_r of every mode, controlled or residual.
         controlled: zero-based indices of the controlled modes.
         final_time: s; inf for the limit.
     """
 
-    by_mode: np.ndarray
+    work_by_mode: np.ndarray
     controlled: tuple[int, ...]
     final_time: float
 
+    by_mode, residual = Renamed("work_by_mode"), Renamed("residual_modes")
+    controlled_total, residual_total = Renamed("controlled_work"), Renamed("residual_work")
+
     def __post_init__(self) -> None:
-        freeze(self, "by_mode")
+        freeze(self, "work_by_mode")
 
     @property
-    def residual(self) -> tuple[int, ...]:
-        return tuple(r for r in range(self.by_mode.size) if r not in self.controlled)
+    def residual_modes(self) -> tuple[int, ...]:
+        """Zero-based indices of the residual modes (n_residual,)."""
+        return tuple(r for r in range(self.work_by_mode.size) if r not in self.controlled)
 
     @property
-    def residual_work(self) -> np.ndarray:
+    def residual_work_by_mode(self) -> np.ndarray:
         """W_r of the residual modes, (n_residual,)."""
-        return self.by_mode[list(self.residual)]
+        return self.work_by_mode[list(self.residual_modes)]
 
     @property
-    def controlled_total(self) -> float:
-        """W_C."""
-        return float(self.by_mode[list(self.controlled)].sum())
+    def controlled_work(self) -> float:
+        """W_C = Σ W_r of the controlled modes."""
+        return float(self.work_by_mode[list(self.controlled)].sum())
 
     @property
-    def residual_total(self) -> float:
-        """W_R."""
-        return float(self.residual_work.sum())
+    def residual_work(self) -> float:
+        """W_R = Σ W_r of the residual modes."""
+        return float(self.residual_work_by_mode.sum())
 
     @property
     def total(self) -> float:
         """W = W_C + W_R (5.27)."""
-        return float(self.by_mode.sum())
+        return float(self.work_by_mode.sum())
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         until = "for all time" if np.isinf(self.final_time) else f"until {self.final_time:g} s"
-        line = f"work of the actuators {until}: W_C = {self.controlled_total:.4g}, W_R = {self.residual_total:.4g}"
+        line = f"work of the actuators {until}: W_C = {self.controlled_work:.4g}, W_R = {self.residual_work:.4g}"
         rows = [
             (str(r + 1), "controlled" if r in self.controlled else "residual", f"{work:.4g}")
-            for r, work in enumerate(self.by_mode)
+            for r, work in enumerate(self.work_by_mode)
         ]
         return line, ("mode", "", "W_r"), rows, ()
+
+
+Spillover.__init__ = former_arguments(by_mode="work_by_mode")(Spillover.__init__)  # type: ignore[method-assign]
 
 
 def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:

@@ -2,7 +2,7 @@
 
 Amplitude: the record is divided into segments, each twice as long as the one before, and the modes that are still
 significant are refined in each. In a linear structure all segments agree within their errors: Σ_w ((ω_w - ω̄) / s_w)²
-is chi-square. Damping: the constants g1 and g2 of (3.32), and whether they explain the damping ratios.
+is chi-square. Damping: the constants α and β of Rayleigh damping (3.32), and whether they explain the damping ratios.
 """
 
 from collections.abc import Sequence
@@ -195,11 +195,11 @@ def _equality(values: np.ndarray, std: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class ProportionalFit:
-    """The least squares g1 and g2 of proportional damping, and their goodness of fit.
+    """The least squares α and β of proportional damping C = α M + β K, and their goodness of fit.
 
     Attributes:
-        damping: g1 in s and g2 in 1/s.
-        standard_errors: (2,) of g1 and g2.
+        damping: β, its `stiffness`, in s and α, its `mass`, in 1/s.
+        standard_errors: (2,) of β and α.
         standardised_residuals: (n_modes,) ζ_r minus the fit, in standard errors of ζ_r.
         probability: of so large a misfit if the damping is proportional; below 0.01 it hardly is.
     """
@@ -213,7 +213,7 @@ class ProportionalFit:
 
 
 def proportional_fit(refined: Refined, only: Sequence[int] | slice = slice(None)) -> ProportionalFit:
-    """Weighted least squares of ζ_r = (g1 ω_r + g2 / ω_r) / 2 (3.32), weights from the covariance of ζ.
+    """Weighted least squares of ζ_r = (β ω_r + α / ω_r) / 2 (3.32), weights from the covariance of ζ.
 
     Args:
         refined: modes with the errors of their damping.
@@ -225,7 +225,7 @@ def proportional_fit(refined: Refined, only: Sequence[int] | slice = slice(None)
     modes = refined.modes.select(only)
     n = modes.n_modes
     if n < 2:
-        raise ValueError(f"g1 and g2 take at least two modes; there are {n}: identify more")
+        raise ValueError(f"α and β of Rayleigh damping take at least two modes; there are {n}: identify more")
     columns = 0.5 * np.column_stack([modes.omega, 1.0 / modes.omega])
     which = refined.modes.n_modes + np.arange(refined.modes.n_modes)[only]
     covariance = refined.covariance[np.ix_(which, which)]
@@ -234,7 +234,7 @@ def proportional_fit(refined: Refined, only: Sequence[int] | slice = slice(None)
     g = np.linalg.lstsq(a, b, rcond=None)[0]
     misfit = float(((b - a @ g) ** 2).sum())
     return ProportionalFit(
-        damping=ProportionalDamping(float(g[0]), float(g[1])),
+        damping=ProportionalDamping(stiffness=float(g[0]), mass=float(g[1])),
         standard_errors=frozen(np.sqrt(np.diag(np.linalg.inv(a.T @ a)))),
         standardised_residuals=frozen((modes.zeta - columns @ g) / np.sqrt(np.diag(covariance))),
         probability=float(chi2.sf(misfit, n - 2)) if n > 2 else 1.0,

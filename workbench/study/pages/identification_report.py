@@ -121,8 +121,8 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
         "remarks": decay.remarks,
         "depends_on_amplitude": _by_amplitude(decay.by_amplitude),
         "proportional_damping": None if damping is None else {
-            "g1": damping.damping.g1,
-            "g2": damping.damping.g2,
+            "g1": damping.damping.stiffness,
+            "g2": damping.damping.mass,
             "standard_errors": damping.standard_errors,
             "standardised_residuals": damping.standardised_residuals,
             "probability": damping.probability,
@@ -262,14 +262,12 @@ def _proportional(fit: ProportionalFit | None) -> list[str]:
         return []
     if fit.probability < UNLIKELY:
         worst = float(np.abs(fit.standardised_residuals).max())
-        return [
-            f"damping is not Rayleigh damping: ζ deviates from (g1 ω + g2/ω)/2 by up to {worst:.0f} standard errors"
-        ]
-    (g1, g1_std), (g2, g2_std) = (
+        return [f"damping is not Rayleigh damping: ζ deviates from (α/ω + β ω)/2 by up to {worst:.0f} standard errors"]
+    (beta, beta_std), (alpha, alpha_std) = (
         rounded(value, error)
-        for value, error in zip((fit.damping.g1, fit.damping.g2), fit.standard_errors, strict=True)
+        for value, error in zip((fit.damping.stiffness, fit.damping.mass), fit.standard_errors, strict=True)
     )
-    return [f"damping may be Rayleigh damping: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
+    return [f"damping may be Rayleigh damping: α = {alpha} ± {alpha_std} 1/s, β = {beta} ± {beta_std} s"]
 
 
 def _by_amplitude(segments: AmplitudeDependence) -> dict[str, Any]:
