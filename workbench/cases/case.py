@@ -126,7 +126,7 @@ def _renamed(table: dict[str, Any], path: Path, rig: Rig) -> dict[str, str]:
     entries, where = table.get("channels", {}), f"{path}: [channels]"
     if not isinstance(entries, dict):
         raise CaseError(f'{where} must be a table of "name in a file" = "input or output"; got {shown(entries)}')
-    known = [port.name for port in (*rig.actuators, *rig.sensors)]
+    known = [*(actuator.name for actuator in rig.actuators), *(sensor.name for sensor in rig.sensors)]
     renamed = {name: one_of(entries, name, known, where) for name in entries}
     for name in renamed:
         if name in ("t", *known):
