@@ -218,6 +218,12 @@ class Stepwise:
         sets = [f.effects for f in self._linear_singles[: STEPWISE.finalists]]
         tried = [s for s in self._from_zero(sets) if s.is_plausible and not may_be_port_errors(self.search, s)]
         shorter = [s for s in tried if s.description(noise) < length_limit]
+        if not shorter:
+            return
+        # iterated as far as the effects, the errors alone may describe the records as briefly
+        errors_only = fit_jointly(self.search, (), errors_only.errors, rounds=3, until_convergence=True)
+        length_limit = errors_only.description(noise) - STEPWISE.fewer_words
+        shorter = [s for s in shorter if s.description(noise) < length_limit]
         found = [s for s in shorter if is_likelier(self.search, s, errors_only, least=SEARCH.trifle)]
         if found:
             best = min(found, key=lambda s: s.description(noise))
