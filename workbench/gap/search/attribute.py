@@ -12,11 +12,7 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out,
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION, clipped_level, exchanged_last, step_of
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.noise import (
-    LEAST_LOGGED,
-    logging_noise,
-    shows_input_noise,
-)
+from workbench.gap.prediction.noise import LEAST_LOGGED, logging_noise, shows_input_noise
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
@@ -24,9 +20,7 @@ from workbench.gap.search.finish import best_of_each, widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import with_all_errors
-from workbench.gap.search.plain import (
-    uniform_as_nominal_errors,
-)
+from workbench.gap.search.plain import uniform_as_nominal_errors
 from workbench.gap.search.search import Search, best_of_each_kind, most_informative
 from workbench.gap.search.settings import ATTRIBUTION, SELECTION
 from workbench.gap.search.stages import Stages
@@ -159,7 +153,7 @@ def baseline(
     _ = evidence.at_peaks  # computed once, before processes are forked
     if not seen:
         return seen, evidence, evidence
-    nominal = replace(Evidence.of(rig, data, workers=workers), given_size=evidence.size)
+    nominal = evidence.of_rig(rig)
     _ = nominal.at_peaks
     return seen, nominal, evidence
 
