@@ -16,11 +16,11 @@ from workbench.gap.prediction.noise import LEAST_LOGGED, logging_noise, shows_in
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
+from workbench.gap.search.errors_as_effects import uniform_as_nominal_errors
 from workbench.gap.search.finish import best_of_each, widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import with_all_errors
-from workbench.gap.search.plain import uniform_as_nominal_errors
 from workbench.gap.search.search import Search, best_of_each_kind, most_informative
 from workbench.gap.search.settings import ATTRIBUTION, SELECTION
 from workbench.gap.search.stages import Stages
@@ -202,8 +202,9 @@ def attribute(
     rig, data, workers = evidence.rig, evidence.data, evidence.workers
     of_nominal = data.by_channel(data.residual(nominal.rig))
     start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0)
-    search = Search(rig, data, *most_informative(data, start.cost_by_channel), catalogue, report, workers, of_nominal)
-    stages = Stages(search, start, evidence, nominal, tolerance, uncertain_nominal)
+    quick, first = most_informative(data, start.cost_by_channel)
+    search = Search(rig, data, quick, first, catalogue, report, workers, of_nominal, tolerance=tolerance)
+    stages = Stages(search, start, evidence, nominal, uncertain_nominal)
     outcome, best, random, rivals, noise, own_search = stages.decision()
     is_cut = search.is_over
     final_search = own_search or search

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.gap.effects.effect import Effect, apply_all, names_in, place_values
+from workbench.gap.effects.effect import Effect, names_in, place_values
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NominalPrior
 from workbench.gap.localisation.evidence import Evidence
@@ -80,8 +80,7 @@ def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None
     """
     tried, searches = [], []
     for given in best_of_each_kind(found)[: RANDOM.likeliest_sets]:
-        evidence = search.evidence_of(apply_all(search.rig, given.effects))
-        unclipped, evidence = _without_clipped(search, given.effects, evidence)
+        unclipped, evidence = _without_clipped(search, given.effects, search.evidence_with(given.effects))
         evidence = _with_laws_on_measured_motion(unclipped, evidence)
         if looks_random(evidence):
             unclipped_fit = replace(
@@ -148,14 +147,14 @@ def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = Tru
             break
     cost = cost_of(search.rig, step.fit.effects, search.data)
     is_closed = random.left - 1.0 < STEPWISE.explained * cost
-    is_noticeable = cost - 1.0 > STEPWISE.least * float(search.nominal.mean())
+    is_noticeable = cost - 1.0 > SEARCH.negligible * float(search.nominal.mean())
     holds = is_closed and is_noticeable and random.is_steady and looks_random(evidence)
     return Decision("explained", found, random) if holds else None
 
 
 def _evidence_with(search: Search, effects: Sequence[Effect]) -> Evidence:
     """Evidence of the rig with the given effects, nonlinear laws acting on the measured motion."""
-    return _with_laws_on_measured_motion(search, search.evidence_of(apply_all(search.rig, effects)))
+    return _with_laws_on_measured_motion(search, search.evidence_with(effects))
 
 
 def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[Fit]:
@@ -180,13 +179,9 @@ def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evid
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
     rivals = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.rival]
-    return [f for f in rivals if _removes_enough(search, f, given)]
-
-
-def _removes_enough(search: Search, candidate: Fit, given: Sequence[Effect]) -> bool:
-    """Whether a set removes more of what the given effects leave than small errors of gains and places would."""
-    before, after = (cost_of(search.rig, effects, search.data) for effects in (given, candidate.effects))
-    return before - after > STEPWISE.least * before
+    # small errors of gains and places remove a little of what the given effects leave
+    before = cost_of(search.rig, given, search.data)
+    return [f for f in rivals if before - cost_of(search.rig, f.effects, search.data) > SEARCH.negligible * before]
 
 
 def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
@@ -195,7 +190,7 @@ def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Eviden
     clipped = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in unclipped.rig.sensors}
     if not clipped or any(name in clipped for effect in effects for name in names_in(effect.target)):
         return search, evidence
-    return unclipped, unclipped.evidence_of(apply_all(unclipped.rig, effects))
+    return unclipped, unclipped.evidence_with(effects)
 
 
 def _best_decision(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
@@ -203,16 +198,16 @@ def _best_decision(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) 
     holding = [found for found in tried if found[1].holds]
     if not holding:
         return None
-    fewest = min(holding, key=lambda found: (len(found[0].effects), found[0].cost))
-    worth = [f for f in holding if len(f[0].effects) == len(fewest[0].effects) or _pays(search, f[0], fewest[0])]
-    plain = plainest(search, [found[0] for found in worth], worth=SEARCH.significant)
+    fewest = min((found for found, _ in holding), key=lambda found: (len(found.effects), found.cost))
+
+    def is_justified(found: Fit) -> bool:
+        extra = found.n_parameters - fewest.n_parameters
+        return len(found.effects) == len(fewest.effects) or search.surely_better(found, fewest.cost, extra)
+
+    justified = [found for found, _ in holding if is_justified(found)]
+    plain = plainest(search, justified, worth=SEARCH.significant)
     best, rivals = ranked(search, plain)
-    return Decision("explained", best, next(random for found, random in worth if found is best), rivals)
-
-
-def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
-    """Whether a candidate surely improves on a simpler fit."""
-    return search.surely_better(candidate, simpler.cost, candidate.n_parameters - simpler.n_parameters)
+    return Decision("explained", best, next(random for found, random in holding if found is best), rivals)
 
 
 def fitted_with_random(search: Search, given: Fit, evidence: Evidence | None = None) -> tuple[Fit, RandomForceFit]:
@@ -233,9 +228,9 @@ def fitted_with_random(search: Search, given: Fit, evidence: Evidence | None = N
         observer = _observer(search, evidence.rig, found[1])
         data = search.data.through(model_filter(evidence.model, evidence.rig, found[1]), observer)
         refitted = fit(search.rig, given.effects, data, iterations=8)
-        rig = apply_all(search.rig, refitted.effects)
-        given = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
-        evidence = _with_laws_on_measured_motion(search, search.evidence_of(rig), observer)
+        evidence = search.evidence_with(refitted.effects)
+        given = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(evidence.rig)))
+        evidence = _with_laws_on_measured_motion(search, evidence, observer)
         found = _random_given(search, given, evidence)
         if found[1].cost > (1.0 - RANDOM.settled) * before[1].cost:
             break

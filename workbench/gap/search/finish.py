@@ -142,7 +142,7 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
         start = min(strengths, key=lambda s: cost_of(search.rig, s, search.first))
         tried.append(fit(search.rig, start, search.first, iterations=FINISH.tried))
     tried.sort(key=lambda f: f.cost)
-    elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > FINISH.apart]
+    elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > SEARCH.same_place]
     # a mirrored place may be the other minimum even if its cost is high before a fit
     return [*(f.effects for f in elsewhere[:2]), *map(moved, _mirrored(effect.at, domain))]
 
