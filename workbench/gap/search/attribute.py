@@ -17,11 +17,11 @@ from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.errors_as_effects import uniform_as_nominal_errors
-from workbench.gap.search.finish import best_of_each, widened
+from workbench.gap.search.finish import widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import with_all_errors
-from workbench.gap.search.search import Search, best_of_each_kind, most_informative
+from workbench.gap.search.search import Search, best_of_each, best_of_each_kind, most_informative
 from workbench.gap.search.settings import ATTRIBUTION, SELECTION
 from workbench.gap.search.stages import Stages
 from workbench.records.record import Record

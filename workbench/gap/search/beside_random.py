@@ -104,7 +104,6 @@ def _with_one_more(
     """Fits of one effect more with a random force, highest cost first; None if one explains the records without it.
 
     Args:
-        search: records and nominal rig.
         best: effects and a random force, whose whitened residual is not white.
         evidence: of the rig with these effects.
     """
@@ -127,7 +126,6 @@ def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = Tru
     may exceed the noise by a negligible share of the gap, and a force must account for more than that.
 
     Args:
-        search: records and nominal rig.
         step: effects and nominal errors to start from, fitted without the force.
         surely: require that the force at the start looks random already.
     """
@@ -165,7 +163,6 @@ def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evid
     Args:
         search: without the whitening filter of the force.
         whitened: the search with it.
-        given: effects.
         evidence: of the rig with the given effects.
     """
     cost, n_given = cost_of(whitened.rig, given, whitened.data), len(parameters_of(search.rig, given))
@@ -214,8 +211,6 @@ def fitted_with_random(search: Search, given: Fit, evidence: Evidence | None = N
     """The given effects and a random disturbance, fitted in turns.
 
     Args:
-        search: records and nominal rig.
-        given: effects.
         evidence: of the rig with the given effects, if available.
     """
     if evidence is None:

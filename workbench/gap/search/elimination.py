@@ -21,7 +21,6 @@ def simplest_step(search: Search, best: Step, tried: Sequence[Step], ahead: Sequ
     """The best step, or a simpler set (a limiting case, or fewer effects) that fits almost as well.
 
     Args:
-        search: records, nominal rig and candidate kinds.
         best: fitted to all records.
         tried: other sets, likewise.
         ahead: fits of single effects to one-step-ahead predictions, best first.

@@ -85,8 +85,6 @@ def uniform_as_nominal_errors(search: Search, found: Fit, *, alone: bool = False
     An imperfect model has both errors; one of them alone is an effect.
 
     Args:
-        search: records and nominal rig.
-        found: the fit.
         alone: convert one alone too, as a random force may mask the other.
     """
     uniform = {e.kind.name: float(np.log(e.values["factor"])) for e in found.effects if e.kind in UNIFORM}
@@ -223,7 +221,6 @@ def with_delay_as_effect(search: Search, step: Step, least: float) -> Step:
     """The step with sensor delays of one common cause as that effect, if it fits as well.
 
     Args:
-        search: records, nominal rig and candidate kinds.
         step: effects and nominal errors, fitted jointly.
         least: residual power, in units of the noise, that delays must account for; otherwise they stay nominal errors.
     """

@@ -148,8 +148,8 @@ class _Problem:
         self.coarse = data.stepped(min(FIT.slope_substeps, data.substeps))
         self.parameters = parameters_of(rig, self.effects)
         self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
-        each = [(p, z) for (_, p), z in zip(self.parameters, self.start, strict=True)]
-        self.steps, self.longest = np.array([_steps(p, z) for p, z in each]).reshape(-1, 2).T
+        each = zip(self.parameters, self.start, strict=True)
+        self.steps, self.longest = np.array([_steps(p, z) for (_, p), z in each]).reshape(-1, 2).T
         self.scale, self.least, self.most = (
             np.array([getattr(p, name) for _, p in self.parameters]) for name in ("scale", "low", "high")
         )
@@ -194,9 +194,10 @@ class _Problem:
 
     def _perturbed(self, free: np.ndarray, indices: list[int]) -> np.ndarray:
         """The free coordinates with some perturbed by a small step inside their bounds."""
-        moved, here, step = free.copy(), free[indices], self.steps[indices]
-        is_inside = (self.low[indices] <= here + step) & (here + step <= self.high[indices])
-        moved[indices] = np.where(is_inside, here + step, here - step)
+        moved, step = free.copy(), self.steps[indices]
+        there = free[indices] + step
+        is_inside = (self.low[indices] <= there) & (there <= self.high[indices])
+        moved[indices] = np.where(is_inside, there, free[indices] - step)
         return moved
 
     def _groups_of_sensors(self, indices: Sequence[int]) -> list[list[int]]:

@@ -90,12 +90,7 @@ class Step:
         return self.excess(noise_power) < share * float(noise_power.mean())
 
     def description(self, noise_power: np.ndarray, *, of_errors_alone: bool = False) -> float:
-        """Description length, nats, of the residual above a noise power (n_records, n_outputs) and the nominal errors.
-
-        Args:
-            noise_power: as of the class.
-            of_errors_alone: leave out the residual.
-        """
+        """Description length, nats, of the nominal errors, and of the residual above noise unless `of_errors_alone`."""
         left = 0.0
         if not of_errors_alone:
             left = JOINT.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
@@ -154,7 +149,6 @@ def fit_jointly(
     the nominal errors do not over-fit an effect that is still missing.
 
     Args:
-        search: records, nominal rig and candidate kinds.
         effects: with start values.
         errors: nominal errors, with start values.
         rounds: updates of the prior variances; None for `JOINT.rounds`.
@@ -206,12 +200,6 @@ def _at_fixed_point(search: Search, found: Fit, data: FitData, chord: Chord) -> 
     """The fit with the prior standard deviations of the nominal errors at the fixed point of MacKay's update.
 
     The update alone converges slowly where the records hardly distinguish the errors; the cost is then flat.
-
-    Args:
-        search: records, nominal rig and candidate kinds.
-        found: fit of effects and nominal errors.
-        data: all records.
-        chord: sensitivities to the nominal errors.
     """
     for _ in range(JOINT.rests):
         errors = found.effects[-1]
@@ -265,8 +253,6 @@ def evaluated(search: Search, found: Fit, substeps: int | None = None) -> Step:
     """A fit of effects and nominal errors (last) with its residual and noise evaluated on all records of a search.
 
     Args:
-        search: with the records.
-        found: the fit.
         substeps: of a sample; None for those of the search.
     """
     data, rig = search.data.stepped(substeps or search.data.substeps), apply_all(search.rig, found.effects)
@@ -323,14 +309,12 @@ def _limit_of_prior_stds(search: Search, found: Fit) -> dict[str, float]:
     """
     errors, prior = found.effects[-1], found.effects[-1].target
     each = [parameter for _, parameter in parameters_of(search.rig, found.effects)]
-    of_errors = np.arange(len(each) - len(errors.values), len(each))
-    names, free = (
-        [each[j].name for j in of_errors],
-        np.array([each[j].to_free(errors.values[each[j].name]) for j in of_errors]),
-    )
-    groups = np.array([group_of(name) for name in names])
+    own = each[len(each) - len(errors.values) :]
+    of_errors = np.arange(len(each) - len(own), len(each))
+    free = np.array([parameter.to_free(errors.values[parameter.name]) for parameter in own])
+    groups = np.array([group_of(parameter.name) for parameter in own])
     sizes = {group: float(getattr(prior, group)) for group in prior.groups}
-    unit = np.array([each[j].prior_std for j in of_errors], float) / [sizes[g] for g in groups]
+    unit = np.array([parameter.prior_std for parameter in own], float) / [sizes[g] for g in groups]
     widest = dict(_largest_plausible(prior))
 
     def precision() -> Floats:

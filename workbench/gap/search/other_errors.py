@@ -48,7 +48,6 @@ def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviat
     standard errors are those of a linear fit, from the scatter of the gradient over blocks of the record.
 
     Args:
-        search: records and nominal rig.
         effects: nominal errors among them.
         figure: the parameter, of `figures_of`.
     """

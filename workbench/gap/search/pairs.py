@@ -7,10 +7,10 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
+from workbench.gap.search.finish import finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.screening import Screening, fitted_ahead, on_whole_records, one_more
-from workbench.gap.search.search import Decision, Search, in_one_minimum, unexplained
+from workbench.gap.search.search import Decision, Search, best_of_each, in_one_minimum, unexplained
 from workbench.gap.search.settings import PAIRS, RANDOM, SEARCH, SELECTION
 from workbench.structure.domain import Between
 
@@ -20,7 +20,6 @@ class Pairs:
     """State of a search for pairs of effects; a copy proceeds by itself.
 
     Attributes:
-        search: records, nominal rig and candidate kinds.
         ahead: pairs fitted to one-step-ahead predictions, best first.
         continued: those of them that were fitted to whole records too.
         found: pairs fitted to whole records, best first.
@@ -43,12 +42,7 @@ class Pairs:
 
     @classmethod
     def at_once(cls, search: Search, screened: Screening) -> "Pairs":
-        """The likeliest pairs by a screening of all pairs.
-
-        Args:
-            search: records, nominal rig and candidate kinds.
-            screened: the screening with no effect given.
-        """
+        """The likeliest of all pairs, by a screening with no effect given."""
         pairs = cls(search)
         if not search.is_over:
             search.report("all pairs at once", 0.4)
@@ -104,11 +98,7 @@ class Pairs:
         return self._add_and_check(one_more(self.search, (effect,), _evidence_with(self.search, effect)))
 
     def decision(self, start: Fit) -> Decision:
-        """The decision based on the pairs.
-
-        Args:
-            start: the fit without effects.
-        """
+        """The decision based on the pairs; `start` is the fit without effects."""
         likeliest = best_of_each(self.found or [start])[: PAIRS.named]
         explaining = [f for f in likeliest if self.search.explains(f)]
         if explaining:

@@ -26,7 +26,7 @@ from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import Step
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
-from workbench.gap.search.search import Search, promise
+from workbench.gap.search.search import Search, first_of_each, promise
 from workbench.gap.search.settings import ERRORS, PAIRS, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 
@@ -62,8 +62,11 @@ def _with_port_errors(
         if both is not None and {SENSOR_DELAY, *DELAYS_OF_ALL} & {effect.kind for effect in both.effects}:
             return both  # a delay of one sensor, or of all, is an effect even with uniform errors
         # with input noise that an effect made seem louder, uniform errors may explain too much
-        more = _with_one_linear_effect(search, (*common, *kept), (), step) if both is None or search.logged else None
-        return _one_uniform_error(search, common, kept, both, step) if more is None and both is not None else more
+        if both is None or search.logged:
+            found = _with_one_linear_effect(search, (*common, *kept), (), step)
+            if found is not None or both is None:
+                return found
+        return _one_uniform_error(search, common, kept, both, step)
     sets = [(*given, *some) for given in (effects, *rivals) for some in _subsets(common)]
     if len(effects) > 1:  # without nominal errors, an effect may be unnecessary or a limiting case suffice
         fewer = list(each_left_out(effects))
@@ -122,7 +125,7 @@ def _simplest_explaining(search: Search, sets: Sequence[tuple[Effect, ...]], ste
     promising = [f for f in on_quick if f.cost < PLAIN.near and not _is_surely_worse(search, f, step, search.quick)]
     fine_data, best = search.data.finely(SELECTION.fine), None
     for candidate in sorted(promising, key=lambda f: f.n_parameters):
-        if best is not None and _labels(best) <= _labels(candidate):
+        if best is not None and set(best.labels) <= set(candidate.labels):
             continue
         effects = _with_reading_sides(search, candidate.effects)
         found = fit(search.rig, effects, fine_data, iterations=PLAIN.plainly)
@@ -142,11 +145,6 @@ def _is_surely_worse(search: Search, found: Fit, step: Step, data: FitData) -> b
     return search.pays(gain, extra, data.n_values)
 
 
-def _labels(found: Fit) -> set[str]:
-    """Labels of the effects of a fit."""
-    return {effect.label for effect in found.effects}
-
-
 def _with_reading_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
     """The effects, nominal errors among them, with accelerometers assigned anew to a side of the input steps."""
     others = tuple(effect for effect in effects if effect.kind is not NOMINAL_ERRORS)
@@ -159,9 +157,8 @@ def _with_delay_as_effect(search: Search, found: Fit) -> Fit:
     delays = next((e for e in found.effects if e.kind is NOMINAL_ERRORS), None)
     if delays is None or delays.target.groups != ("delay",):
         return found
-    others, fine_data = [e for e in found.effects if e is not delays], search.data.finely(SELECTION.fine)
-    fits = search.workers.map(lambda e: fit(search.rig, (*others, e), fine_data), delay_effects(search.rig, delays))
-    return min((f for f in fits if search.explains(f)), key=lambda f: f.cost, default=found)
+    explaining = _explaining_instead(search, found, delays, delay_effects(search.rig, delays))
+    return min(explaining, key=lambda f: f.cost, default=found)
 
 
 def other_delay_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], ...]:
@@ -171,11 +168,16 @@ def other_delay_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], .
     )
     if late is None:
         return ()
-    others, fine_data = [e for e in found.effects if e is not late], search.data.finely(SELECTION.fine)
     causes = [e for e in common_delays(search.rig, delay_of(late)) if e.kind is not late.kind]
-    fits = search.workers.map(lambda e: fit(search.rig, (*others, e), fine_data), causes)
-    best, rivals = ranked(search, [found, *(f for f in fits if search.explains(f))])
+    best, rivals = ranked(search, [found, *_explaining_instead(search, found, late, causes)])
     return rivals if best is found else ()
+
+
+def _explaining_instead(search: Search, found: Fit, effect: Effect, causes: Sequence[Effect]) -> list[Fit]:
+    """The fits, with an effect replaced by each of some causes, that explain the records."""
+    others, fine_data = [e for e in found.effects if e is not effect], search.data.finely(SELECTION.fine)
+    fits = search.workers.map(lambda cause: fit(search.rig, (*others, cause), fine_data), causes)
+    return [f for f in fits if search.explains(f)]
 
 
 def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None:
@@ -185,9 +187,7 @@ def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None
     port. Nominal errors of every mode or wave would absorb strong effects that are still missing, and cost more time.
 
     Args:
-        search: records, nominal rig and candidate kinds.
         step: nominal errors that do not explain the records, or are implausible.
-        most: largest number of effects.
     """
     best = fit(search.rig, NO_UNIFORM_ERROR, search.data)
     for _ in range(most):
@@ -195,8 +195,10 @@ def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None
             return None
         ahead = one_more(search, best.effects, search.evidence_with(best.effects))
         fits = on_whole_records(search, ahead, PAIRS.more)
-        is_better = bool(fits) and fits[0].cost - 1.0 < PAIRS.nearer * (best.cost - 1.0)
-        if not (is_better or (fits and ahead[0].cost < PAIRS.nearer * cost_of(search.rig, best.effects, search.ahead))):
+        if not fits:
+            return None
+        is_better = fits[0].cost - 1.0 < PAIRS.nearer * (best.cost - 1.0)
+        if not (is_better or ahead[0].cost < PAIRS.nearer * cost_of(search.rig, best.effects, search.ahead)):
             return None
         limiting_cases, cost_limit = contained(fits[0].effects, search.rig), (1.0 + SEARCH.significant) * fits[0].cost
         best = next((f for f in fits if f.key in limiting_cases and f.cost < cost_limit), fits[0])
@@ -228,13 +230,10 @@ def _with_one_linear_effect(
     if not search.logged and start.cost < 1.0 + STEPWISE.no_gap:
         return None
     given = start.effects
-    evidence = search.evidence_with(given)
-    screened = Screening.of(replace(search, catalogue=linear_kinds), given, evidence).likeliest()
-    likeliest = {effect.kind: effect for effect in reversed(screened)}  # the best of each kind
-    candidates = [(*given, effect) for effect in screened if effect is likeliest[effect.kind]][: PLAIN.likeliest]
-    found = _simplest_explaining(
-        search, [set_ for one in candidates for set_ in dict.fromkeys((one, (*one, *common)))], step
-    )
+    screened = Screening.of(replace(search, catalogue=linear_kinds), given, search.evidence_with(given)).likeliest()
+    likeliest = first_of_each(screened, lambda effect: effect.kind)[: PLAIN.likeliest]
+    sets = [(*given, effect, *some) for effect in likeliest for some in dict.fromkeys(((), common))]
+    found = _simplest_explaining(search, sets, step)
     if found is None:
         return None
     others = [e for e in found.effects if e.kind in UNIFORM or any(e.label == other.label for other in given)]

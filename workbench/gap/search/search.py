@@ -1,6 +1,6 @@
 """The data that every step of a search for effects shares, and its criteria of what explains the records."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -292,10 +292,19 @@ def most_informative(data: FitData, by_channel: np.ndarray) -> tuple[FitData, Fi
 
 def best_of_each_kind(fits: Sequence[Fit]) -> list[Fit]:
     """The first fit for each kind of its last effect, in the order of the fits; failed ones are left out."""
-    chosen: dict[str, Fit] = {}
-    for candidate in fits:
-        if candidate.cost < HOPELESS:
-            chosen.setdefault(candidate.effects[-1].kind.name, candidate)
+    return first_of_each((f for f in fits if f.cost < HOPELESS), lambda f: f.effects[-1].kind.name)
+
+
+def best_of_each(fits: Iterable[Fit]) -> list[Fit]:
+    """The first fit of every set, in the order of the fits."""
+    return first_of_each(fits, lambda f: f.key)
+
+
+def first_of_each(items: Iterable[Candidate], key: Callable[[Candidate], Hashable]) -> list[Candidate]:
+    """The first item of every key, in the order of the items."""
+    chosen: dict[Hashable, Candidate] = {}
+    for item in items:
+        chosen.setdefault(key(item), item)
     return list(chosen.values())
 
 

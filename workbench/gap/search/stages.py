@@ -363,7 +363,6 @@ def _unless_other_law(search: Search, decision: Decision, evidence: Evidence) ->
     """The decision, or that for a law beyond the catalogue if the records surely prefer it to one law at a point.
 
     Args:
-        search: records and nominal rig.
         decision: to be compared.
         evidence: of the nominal rig.
     """

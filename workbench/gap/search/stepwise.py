@@ -52,7 +52,6 @@ class Stepwise:
     """Stepwise selection of effects, fitted jointly with nominal errors: forward, with backward elimination.
 
     Attributes:
-        search: records, nominal rig and candidate kinds.
         ahead: fits of single effects to one-step-ahead predictions without nominal errors, best first; candidates for
             the first effect.
         at_first: the search without input noise.
@@ -480,13 +479,7 @@ class Stepwise:
         return self._simplest(whole[0], whole[1:]) if whole else step
 
     def _simplest(self, best: Step, tried: Sequence[Step], others: Sequence[Step] = ()) -> Step:
-        """The best step, or a simpler one that fits almost as well, with the sets that it was selected from.
-
-        Args:
-            best: of the sets tried.
-            tried: the others.
-            others: to compete with it; none for all of these.
-        """
+        """The best step, or a simpler one that fits almost as well; its competitors are `others`, or those tried."""
         found = simplest_step(self.search, best, tried, self.ahead, self._gap)
         return replace(found, others=tuple(others or (best, *tried)))
 
