@@ -347,10 +347,15 @@ def _force_of_other_law(search: Search, evidence: Evidence) -> Fit | None:
     Two effects at one place can fit many laws, so this comes before pairs are accepted. None if there is none.
     """
     search.report("one force of a law beyond the catalogue", 0.35)
-    beyond = replace(search, catalogue=BEYOND)
-    promising = [f for f in one_more(beyond, (), evidence) if f.cost < SELECTION.promising]
-    fits = on_whole_records(beyond, promising, ATTRIBUTION.laws, to_cost=search.cost_limit)
+    fits = _forces_of_other_laws(search, evidence, SELECTION.promising)
     return next((f for f in (_as_catalogue_kind(search, f) for f in fits) if search.explains(f)), None)
+
+
+def _forces_of_other_laws(search: Search, evidence: Evidence, most: float) -> list[Fit]:
+    """Forces at one point of a law beyond the catalogue, best first, that cost less than `most` one step ahead."""
+    beyond = replace(search, catalogue=BEYOND)
+    promising = [f for f in one_more(beyond, (), evidence) if f.cost < most]
+    return on_whole_records(beyond, promising, ATTRIBUTION.laws, to_cost=search.cost_limit)
 
 
 def _as_catalogue_kind(search: Search, law: Fit) -> Fit:
@@ -373,10 +378,8 @@ def _unless_other_law(search: Search, decision: Decision, evidence: Evidence) ->
     if not effect.kind.nonlinear or effect.at is None:
         return decision
     search.report("one force of a law beyond the catalogue", 0.9)
-    beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.at)
     as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
-    promising = [f for f in one_more(beyond, (), there) if f.cost < as_near]
-    fits = on_whole_records(beyond, promising, ATTRIBUTION.laws, to_cost=search.cost_limit)
+    fits = _forces_of_other_laws(search, evidence.of_force_at(effect.at), as_near)
     other = [f for f in fits if in_catalogue(f.effects[0]) is None]
     sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
     law = next(sure, None)
