@@ -363,6 +363,22 @@ def parameters_of(rig: Rig, effects: Sequence[Effect]) -> list[tuple[int, Parame
     return [(i, parameter) for i, effect in enumerate(effects) for parameter in effect.parameters(rig)]
 
 
+def deviations_by_effect(
+    effects: Sequence[Effect], parameters: Sequence[tuple[int, Parameter]], free: Floats
+) -> list[dict[str, float]]:
+    """Standard deviations of the parameters of each effect, by name, from those of the free coordinates.
+
+    Args:
+        parameters: of `parameters_of`.
+        free: (n_parameters,) standard deviations.
+    """
+    found: list[dict[str, float]] = [{} for _ in effects]
+    for (i, parameter), deviation in zip(parameters, free, strict=True):
+        value = effects[i].values[parameter.name]
+        found[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
+    return found
+
+
 def slopes(
     rig: Rig,
     effects: Sequence[Effect],
@@ -502,12 +518,9 @@ def _result(problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: n
         inverse = np.linalg.pinv(normal / np.outer(scaled, scaled), rcond=1e-12)
         deviations = np.sqrt(np.maximum(np.diag(inverse), 0.0)) / scaled * np.sqrt(max(cost, 1.0))
     effects = problem.at(free)
-    spread: list[dict[str, float]] = [{} for _ in effects]
-    for (i, parameter), deviation in zip(problem.parameters, deviations, strict=True):
-        value = effects[i].values[parameter.name]
-        spread[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
+    each = deviations_by_effect(effects, problem.parameters, deviations)
     return Fit(
-        effects=tuple(replace(e, deviations=s) for e, s in zip(effects, spread, strict=True)),
+        effects=tuple(replace(e, deviations=d) for e, d in zip(effects, each, strict=True)),
         normal=normal,
         cost=cost,
         cost_by_channel=problem.data.by_channel(residual),
