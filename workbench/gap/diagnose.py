@@ -12,7 +12,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
 from workbench.gap.effects.nonlinear import any_beyond
-from workbench.gap.localisation.evidence import Evidence, locate_force
+from workbench.gap.localisation.evidence import locate_force
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.noise import LOGGED, noise_guessed
 from workbench.gap.prediction.residuals import lead_of
@@ -138,9 +138,7 @@ def diagnose(
     seen, as_wired, evidence = baseline(
         wired, records, settle=settle, guessed=without_noise, workers=sharing, deadline=deadline
     )
-    nominal, given = as_wired, (*exchanged, *seen)
-    if exchanged:
-        nominal = replace(Evidence.of(rig, as_wired.data, workers=sharing), given_size=evidence.size)
+    nominal, given = evidence.of_rig(rig) if exchanged else as_wired, (*exchanged, *seen)
     with (
         sharing.in_background(lambda: locate_force(nominal.without(_faulty(given)))) as place,
         sharing.in_background(lambda: detectability(nominal, catalogue=catalogue)) as ready,

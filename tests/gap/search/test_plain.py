@@ -12,19 +12,22 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search import jointly
-from workbench.gap.search.fit import Fit, fit
-from workbench.gap.search.intervals import with_intervals
-from workbench.gap.search.jointly import fit_jointly, size_of, surely_late, with_all_errors
-from workbench.gap.search.plain import (
+from workbench.gap.search.candidates import surely_late
+from workbench.gap.search.errors_as_effects import (
     NO_UNIFORM_ERROR,
-    _at_ports,
     delay_effects,
-    few_with_uniform_errors,
-    in_place_of_nominal_errors,
     is_plausible_error,
-    other_delay_causes,
     uniform_as_nominal_errors,
     with_common_delay,
+)
+from workbench.gap.search.fit import Fit, fit
+from workbench.gap.search.intervals import with_intervals
+from workbench.gap.search.jointly import fit_jointly, size_of, with_all_errors
+from workbench.gap.search.plain import (
+    _at_ports,
+    few_with_uniform_errors,
+    in_place_of_nominal_errors,
+    other_delay_causes,
 )
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import JOINT

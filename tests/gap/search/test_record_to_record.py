@@ -13,7 +13,7 @@ from workbench.gap.effects.structural import buckling_load
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.report.budget import RecordToRecord, with_held_out
-from workbench.gap.search.nominal_figures import deviations
+from workbench.gap.search.other_errors import deviations
 from workbench.gap.search.search import Search
 from workbench.records.record import Record
 from workbench.rig.rig import Rig

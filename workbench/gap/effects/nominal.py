@@ -104,6 +104,11 @@ def group_of(parameter: str) -> str:
     return parameter.split("_", 1)[0]
 
 
+def in_group(errors: Effect, group: str) -> dict[str, float]:
+    """The values of the nominal errors of one group, by parameter name."""
+    return {name: value for name, value in errors.values.items() if group_of(name) == group}
+
+
 def weight_of(parameter: str, prior: NominalPrior) -> float:
     """Ratio of the prior standard deviation of a parameter to that of its group."""
     if prior.waves <= EQUAL_WAVES or group_of(parameter) not in ("stiffness", "mass"):

@@ -115,6 +115,10 @@ class Evidence:
         motions = data.motions(rig)
         return cls(rig, data, motions, tuple(data.differences(rig)), n_places, workers=workers, absorbed=absorbed)
 
+    def of_rig(self, rig: Rig) -> "Evidence":
+        """The evidence of another rig on the same records, given the size of the force."""
+        return replace(Evidence.of(rig, self.data, workers=self.workers), given_size=self.size)
+
     def without(self, names: Collection[str]) -> "Evidence":
         """The same evidence without some of the sensors, unless none would be left."""
         kept = [j for j, sensor in enumerate(self.rig.sensors) if sensor.name not in names]

@@ -12,22 +12,16 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out,
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION, clipped_level, exchanged_last, step_of
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.noise import (
-    LEAST_LOGGED,
-    logging_noise,
-    shows_input_noise,
-)
+from workbench.gap.prediction.noise import LEAST_LOGGED, logging_noise, shows_input_noise
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search.finish import best_of_each, widened
+from workbench.gap.search.errors_as_effects import uniform_as_nominal_errors
+from workbench.gap.search.finish import widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import with_all_errors
-from workbench.gap.search.plain import (
-    uniform_as_nominal_errors,
-)
-from workbench.gap.search.search import Search, best_of_each_kind, most_informative
+from workbench.gap.search.search import Search, best_of_each, best_of_each_kind, most_informative
 from workbench.gap.search.settings import ATTRIBUTION, SELECTION
 from workbench.gap.search.stages import Stages
 from workbench.records.record import Record
@@ -159,7 +153,7 @@ def baseline(
     _ = evidence.at_peaks  # computed once, before processes are forked
     if not seen:
         return seen, evidence, evidence
-    nominal = replace(Evidence.of(rig, data, workers=workers), given_size=evidence.size)
+    nominal = evidence.of_rig(rig)
     _ = nominal.at_peaks
     return seen, nominal, evidence
 
@@ -208,8 +202,9 @@ def attribute(
     rig, data, workers = evidence.rig, evidence.data, evidence.workers
     of_nominal = data.by_channel(data.residual(nominal.rig))
     start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0)
-    search = Search(rig, data, *most_informative(data, start.cost_by_channel), catalogue, report, workers, of_nominal)
-    stages = Stages(search, start, evidence, nominal, tolerance, uncertain_nominal)
+    quick, first = most_informative(data, start.cost_by_channel)
+    search = Search(rig, data, quick, first, catalogue, report, workers, of_nominal, tolerance=tolerance)
+    stages = Stages(search, start, evidence, nominal, uncertain_nominal)
     outcome, best, random, rivals, noise, own_search = stages.decision()
     is_cut = search.is_over
     final_search = own_search or search

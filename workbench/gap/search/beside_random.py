@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.gap.effects.effect import Effect, apply_all, names_in, place_values
+from workbench.gap.effects.effect import Effect, names_in, place_values
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NominalPrior
 from workbench.gap.localisation.evidence import Evidence
@@ -21,6 +22,27 @@ from workbench.gap.search.settings import INTERVALS, RANDOM, SEARCH, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, NamedPoints
+
+
+class WithRandom(NamedTuple):
+    """Effects fitted together with a random force.
+
+    Attributes:
+        fit: of the effects and the random disturbance, which comes last.
+        random: statistics of the force.
+    """
+
+    fit: Fit
+    random: RandomForceFit
+
+    @property
+    def given(self) -> tuple[Effect, ...]:
+        """The effects without the random disturbance."""
+        return self.fit.effects[:-1]
+
+    def is_near(self, search: Search) -> bool:
+        """Whether the whitened residual is small, and the force no tone, so that a further effect may be missing."""
+        return search.near(self.fit, RANDOM.near) and not self.random.tonal > TONAL
 
 
 def looks_random(evidence: Evidence) -> bool:
@@ -62,8 +84,8 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     evidence = _with_laws_on_measured_motion(search, evidence)
     if not looks_random(evidence):
         return None, []
-    alone = fitted_with_random(search, search.without_effects(), evidence)
-    if not search.near(alone[0], RANDOM.near) or alone[1].tonal > TONAL:
+    alone = _fitted_with_random(search, search.without_effects(), evidence)
+    if not alone.is_near(search):
         return None, []
     tried = [alone]
     for _ in range(RANDOM.beside):
@@ -74,8 +96,8 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
         found = _best_decision(search, tried)
         if found is not None or not with_one_more or search.is_over:
             break
-        evidence = _evidence_with(search, tried[-1][0].effects[:-1])
-    return found, [each[0] for each in tried]
+        evidence = _evidence_with(search, tried[-1].given)
+    return found, [each.fit for each in tried]
 
 
 def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None:
@@ -85,45 +107,37 @@ def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None
     """
     tried, searches = [], []
     for given in best_of_each_kind(found)[: RANDOM.likeliest_sets]:
-        evidence = search.evidence_of(apply_all(search.rig, given.effects))
-        unclipped, evidence = _without_clipped(search, given.effects, evidence)
+        unclipped, evidence = _without_clipped(search, given.effects, search.evidence_with(given.effects))
         evidence = _with_laws_on_measured_motion(unclipped, evidence)
         if looks_random(evidence):
-            unclipped_fit = replace(
-                given, cost_by_channel=unclipped.data.by_channel(unclipped.data.residual(evidence.rig))
-            )
-            tried.append(fitted_with_random(unclipped, unclipped_fit, evidence))
+            by_channel = unclipped.data.by_channel(unclipped.data.residual(evidence.rig))
+            tried.append(_fitted_with_random(unclipped, replace(given, cost_by_channel=by_channel), evidence))
             searches.append(unclipped)
     decision = _best_decision(search, tried)
     if decision is not None or not tried or search.is_over:
         return decision
-    best, unclipped = min(zip(tried, searches, strict=True), key=lambda each: each[0][1].cost)
-    if not search.near(best[0], RANDOM.near) or best[1].tonal > TONAL:
+    best, unclipped = min(zip(tried, searches, strict=True), key=lambda each: each[0].random.cost)
+    if not best.is_near(search):
         return None
-    evidence = _evidence_with(unclipped, best[0].effects[:-1])
+    evidence = _evidence_with(unclipped, best.given)
     return _best_decision(search, _with_one_more(unclipped, best, evidence) or [])
 
 
-def _with_one_more(
-    search: Search, best: tuple[Fit, RandomForceFit], evidence: Evidence
-) -> list[tuple[Fit, RandomForceFit]] | None:
+def _with_one_more(search: Search, best: WithRandom, evidence: Evidence) -> list[WithRandom] | None:
     """Fits of one effect more with a random force, highest cost first; None if one explains the records without it.
 
     Args:
-        search: records and nominal rig.
         best: effects and a random force, whose whitened residual is not white.
         evidence: of the rig with these effects.
     """
     search.report("effects with a random disturbance", 0.2)
-    (*given, _), random = best[0].effects, best[1]
-    whitened = search.through(
-        model_filter(evidence.model, evidence.rig, random), _observer(search, evidence.rig, random)
-    )
-    gaining = whitened.side_by_side(simplest, _improving(search, whitened, tuple(given), evidence)[: RANDOM.tried])
+    whitener = model_filter(evidence.model, evidence.rig, best.random)
+    whitened = search.through(whitener, _observer(search, evidence.rig, best.random))
+    gaining = whitened.side_by_side(simplest, _improving(search, whitened, best.given, evidence)[: RANDOM.tried])
     if any(search.explains(finished(search, candidate)) for candidate in gaining):
         return None
-    found = [fitted_with_random(search, candidate) for candidate in gaining]
-    return sorted(found, key=lambda each: each[1].cost, reverse=True)
+    found = [_fitted_with_random(search, candidate) for candidate in gaining]
+    return sorted(found, key=lambda each: each.random.cost, reverse=True)
 
 
 def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = True) -> Decision | None:
@@ -133,7 +147,6 @@ def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = Tru
     may exceed the noise by a negligible share of the gap, and a force must account for more than that.
 
     Args:
-        search: records and nominal rig.
         step: effects and nominal errors to start from, fitted without the force.
         surely: require that the force at the start looks random already.
     """
@@ -143,9 +156,8 @@ def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = Tru
     found, random = _random_given(search, step.fit, evidence)
     for _ in range(RANDOM.turns):
         before = random.cost
-        whitened = search.through(
-            model_filter(evidence.model, evidence.rig, random), _observer(search, search.rig, random)
-        )
+        whitener = model_filter(evidence.model, evidence.rig, random)
+        whitened = search.through(whitener, _observer(search, search.rig, random))
         step = fit_jointly(whitened, step.effects, step.errors)
         evidence = _evidence_with(search, step.fit.effects)
         found, random = _random_given(search, step.fit, evidence)
@@ -153,14 +165,14 @@ def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = Tru
             break
     cost = cost_of(search.rig, step.fit.effects, search.data)
     is_closed = random.left - 1.0 < STEPWISE.explained * cost
-    is_noticeable = cost - 1.0 > STEPWISE.least * float(search.nominal.mean())
+    is_noticeable = cost - 1.0 > SEARCH.negligible * float(search.nominal.mean())
     holds = is_closed and is_noticeable and random.is_steady and looks_random(evidence)
     return Decision("explained", found, random) if holds else None
 
 
 def _evidence_with(search: Search, effects: Sequence[Effect]) -> Evidence:
     """Evidence of the rig with the given effects, nonlinear laws acting on the measured motion."""
-    return _with_laws_on_measured_motion(search, search.evidence_of(apply_all(search.rig, effects)))
+    return _with_laws_on_measured_motion(search, search.evidence_with(effects))
 
 
 def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[Fit]:
@@ -171,7 +183,6 @@ def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evid
     Args:
         search: without the whitening filter of the force.
         whitened: the search with it.
-        given: effects.
         evidence: of the rig with the given effects.
     """
     cost, n_given = cost_of(whitened.rig, given, whitened.data), len(parameters_of(search.rig, given))
@@ -185,13 +196,9 @@ def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evid
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
     rivals = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.rival]
-    return [f for f in rivals if _removes_enough(search, f, given)]
-
-
-def _removes_enough(search: Search, candidate: Fit, given: Sequence[Effect]) -> bool:
-    """Whether a set removes more of what the given effects leave than small errors of gains and places would."""
-    before, after = (cost_of(search.rig, effects, search.data) for effects in (given, candidate.effects))
-    return before - after > STEPWISE.least * before
+    # small errors of gains and places remove a little of what the given effects leave
+    before = cost_of(search.rig, given, search.data)
+    return [f for f in rivals if before - cost_of(search.rig, f.effects, search.data) > SEARCH.negligible * before]
 
 
 def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
@@ -200,49 +207,47 @@ def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Eviden
     clipped = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in unclipped.rig.sensors}
     if not clipped or any(name in clipped for effect in effects for name in names_in(effect.target)):
         return search, evidence
-    return unclipped, unclipped.evidence_of(apply_all(unclipped.rig, effects))
+    return unclipped, unclipped.evidence_with(effects)
 
 
-def _best_decision(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
+def _best_decision(search: Search, tried: Sequence[WithRandom]) -> Decision | None:
     """The decision for the best set whose residual is white; more effects or a wider law must be justified."""
-    holding = [found for found in tried if found[1].holds]
+    holding = [found for found in tried if found.random.holds]
     if not holding:
         return None
-    fewest = min(holding, key=lambda found: (len(found[0].effects), found[0].cost))
-    worth = [f for f in holding if len(f[0].effects) == len(fewest[0].effects) or _pays(search, f[0], fewest[0])]
-    plain = plainest(search, [found[0] for found in worth], worth=SEARCH.significant)
+    fewest = min((found for found, _ in holding), key=lambda found: (len(found.effects), found.cost))
+
+    def is_justified(found: Fit) -> bool:
+        extra = found.n_parameters - fewest.n_parameters
+        return len(found.effects) == len(fewest.effects) or search.surely_better(found, fewest.cost, extra)
+
+    justified = [found for found, _ in holding if is_justified(found)]
+    plain = plainest(search, justified, worth=SEARCH.significant)
     best, rivals = ranked(search, plain)
-    return Decision("explained", best, next(random for found, random in worth if found is best), rivals)
+    return Decision("explained", best, next(random for found, random in holding if found is best), rivals)
 
 
-def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
-    """Whether a candidate surely improves on a simpler fit."""
-    return search.surely_better(candidate, simpler.cost, candidate.n_parameters - simpler.n_parameters)
-
-
-def fitted_with_random(search: Search, given: Fit, evidence: Evidence | None = None) -> tuple[Fit, RandomForceFit]:
+def _fitted_with_random(search: Search, given: Fit, evidence: Evidence | None = None) -> WithRandom:
     """The given effects and a random disturbance, fitted in turns.
 
     Args:
-        search: records and nominal rig.
-        given: effects.
         evidence: of the rig with the given effects, if available.
     """
     if evidence is None:
         evidence = _evidence_with(search, given.effects)
     found = _random_given(search, given, evidence)
     for _ in range(RANDOM.turns if given.effects else 0):
-        if found[1].holds or not search.near(found[0], RANDOM.near):
+        if found.random.holds or not search.near(found.fit, RANDOM.near):
             break
-        before = found
-        observer = _observer(search, evidence.rig, found[1])
-        data = search.data.through(model_filter(evidence.model, evidence.rig, found[1]), observer)
+        before = found.random.cost
+        observer = _observer(search, evidence.rig, found.random)
+        data = search.data.through(model_filter(evidence.model, evidence.rig, found.random), observer)
         refitted = fit(search.rig, given.effects, data, iterations=8)
-        rig = apply_all(search.rig, refitted.effects)
-        given = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
-        evidence = _with_laws_on_measured_motion(search, search.evidence_of(rig), observer)
+        evidence = search.evidence_with(refitted.effects)
+        given = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(evidence.rig)))
+        evidence = _with_laws_on_measured_motion(search, evidence, observer)
         found = _random_given(search, given, evidence)
-        if found[1].cost > (1.0 - RANDOM.settled) * before[1].cost:
+        if found.random.cost > (1.0 - RANDOM.settled) * before:
             break
     return found
 
@@ -265,7 +270,7 @@ def _with_laws_on_measured_motion(search: Search, evidence: Evidence, observer: 
     return replace(evidence, residuals=tuple(search.data.residual_on_measured_motion(evidence.rig, observer)))
 
 
-def _random_given(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
+def _random_given(search: Search, given: Fit, evidence: Evidence) -> WithRandom:
     """The given effects with a random force fitted to their residual, and the statistics of that force."""
     domain = evidence.domain
     most = RANDOM.points if isinstance(domain, NamedPoints) else RANDOM.starts
@@ -284,4 +289,4 @@ def _random_given(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, 
     effect = Effect(RANDOM_DISTURBANCE, None, {**place_values(found.at), "rms": rms}, deviations)
     fitted = given.n_parameters + 1 + len(spread)
     combined = Fit((*given.effects, effect), found.cost, given.cost_by_channel, fitted)
-    return combined, found
+    return WithRandom(combined, found)

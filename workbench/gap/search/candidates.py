@@ -1,13 +1,15 @@
-"""Fits of candidate sets of effects with nominal errors, to the most informative records or to all."""
+"""Joint fits of candidate sets with nominal errors, from start values that lead to the global minimum."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
-from workbench.gap.effects.effect import Effect, can_be, nearest_possible
-from workbench.gap.effects.nominal import group_of, nominal_errors
+import numpy as np
+
+from workbench.gap.effects.effect import Effect, apply_all, can_be, nearest_possible
+from workbench.gap.effects.nominal import JUST_LATE, in_group, nominal_errors
 from workbench.gap.effects.ports import SENSOR_DELAY, SENSOR_LAG
 from workbench.gap.search.fit import Chord, Fit, fit, slopes
-from workbench.gap.search.jointly import Step, fit_jointly, with_reading_sides
+from workbench.gap.search.jointly import Step, fit_jointly
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import JOINT, STEPWISE
 
@@ -67,7 +69,7 @@ def fit_from_zero(search: Search, effects: Sequence[Effect]) -> Step:
 def _interpolated(search: Search, ahead: Fit) -> Fit:
     """The one-step-ahead fit, or one with delays by linear interpolation of the readings if its cost is lower."""
     *effects, errors = ahead.effects
-    delays = {name: value for name, value in errors.values.items() if group_of(name) == "delay"}
+    delays = in_group(errors, "delay")
     is_late = any(effect.kind in TIMING for effect in effects)
     may_be_late = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.surely_late
     if not may_be_late and (effects or ahead.cost < JOINT.straight):
@@ -92,3 +94,46 @@ def _fitted_ahead(search: Search, effects: Sequence[Effect], errors: Effect) -> 
             break
         found = on(found.effects)
     return found
+
+
+def surely_late(errors: Effect) -> Effect:
+    """The nominal errors with no accelerometer assigned to a side of the input steps, except the clearly late ones."""
+    late = tuple(name for name in errors.target.late if errors.values[f"delay_{name}"] > JOINT.surely_late)
+    return replace(errors, target=replace(errors.target, late=late, early=()))
+
+
+def with_reading_sides(search: Search, errors: Effect, effects: Sequence[Effect] = ()) -> Effect:
+    """The nominal errors with each accelerometer assigned to the side of the input steps that it reads.
+
+    With held inputs, acceleration jumps at the samples: a late sensor reads the value before the jump, others the one
+    after. Sensors known to be late stay so. One-step-ahead predictions decide, since over whole records a wrong
+    frequency looks like a delay.
+    """
+    known_late = errors.target.late
+    accelerometers = tuple(
+        s.name for s in search.rig.sensors if s.quantity == "acceleration" and s.name not in known_late
+    )
+    if not accelerometers or not errors.target.delay or errors.target.interpolated:
+        return errors
+    zero_delays = {**errors.values, **{f"delay_{name}": 0.0 for name in accelerometers}}
+
+    def residual_with(delay: float) -> np.ndarray:
+        tried = nominal_errors(search.rig, replace(errors.target, late=known_late, early=()), zero_delays)
+        tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in accelerometers}})
+        return search.ahead.residual(apply_all(search.rig, (*effects, tried)))
+
+    # if the motion changes much between samples, a reading well before a jump differs from one just before
+    delays = np.array([*(-delay for delay in JOINT.delays), 0.0, JUST_LATE, *JOINT.delays])
+    residuals = {float(delay): residual_with(float(delay)) for delay in delays}
+    before, at, after = residual_with(-JUST_LATE), residuals[0.0], residuals[JUST_LATE]
+    with np.errstate(invalid="ignore"):  # of a diverging simulation nothing is late
+        step, smooth = (search.ahead.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
+    powers = np.array([search.ahead.by_channel(residual).sum(axis=0) for residual in residuals.values()])
+    rows = [
+        j for j, s in enumerate(search.rig.sensors) if s.name in accelerometers and step[j] > JOINT.jump * smooth[j]
+    ]
+    best_delays = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}
+    late = (*known_late, *(name for name, delay in best_delays.items() if delay > 0))
+    early = tuple(name for name, delay in best_delays.items() if delay <= 0)
+    starts = {**errors.values, **{f"delay_{name}": delay for name, delay in best_delays.items()}}
+    return nominal_errors(search.rig, replace(errors.target, late=late, early=early), starts)

@@ -19,7 +19,7 @@ from workbench.gap.effects.effect import (
 )
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.fit import Chord, Fit, cost_of, finite_residual, fit
-from workbench.gap.search.search import Search, promise
+from workbench.gap.search.search import Search, best_of_each, promise
 from workbench.gap.search.settings import FINISH, SEARCH, SELECTION
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, Domain, Interval, Rectangle, Where
@@ -142,7 +142,7 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
         start = min(strengths, key=lambda s: cost_of(search.rig, s, search.first))
         tried.append(fit(search.rig, start, search.first, iterations=FINISH.tried))
     tried.sort(key=lambda f: f.cost)
-    elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > FINISH.apart]
+    elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > SEARCH.same_place]
     # a mirrored place may be the other minimum even if its cost is high before a fit
     return [*(f.effects for f in elsewhere[:2]), *map(moved, _mirrored(effect.at, domain))]
 
@@ -282,11 +282,3 @@ def _at_other_ports(
                 for values in list(kind.starts(evidence, target))[:1]:
                     other = Effect(kind, target, dict(values))
                     yield tuple(other if e is effect else e for e in best.effects)
-
-
-def best_of_each(fits: Sequence[Fit]) -> list[Fit]:
-    """The first fit of every set, in the order of the fits."""
-    distinct: dict[tuple[str, ...], Fit] = {}
-    for candidate in fits:
-        distinct.setdefault(candidate.key, candidate)
-    return list(distinct.values())

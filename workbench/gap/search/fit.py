@@ -148,11 +148,8 @@ class _Problem:
         self.coarse = data.stepped(min(FIT.slope_substeps, data.substeps))
         self.parameters = parameters_of(rig, self.effects)
         self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
-        floor = [
-            FIT.short if p.prior_std else 1e-2 if p.logarithmic or p.name in COORDINATES else 1e-3 * abs(z) + 1e-9
-            for (_, p), z in zip(self.parameters, self.start, strict=True)
-        ]
-        self.steps = np.array(floor)
+        each = zip(self.parameters, self.start, strict=True)
+        self.steps, self.longest = np.array([_steps(p, z) for (_, p), z in each]).reshape(-1, 2).T
         self.scale, self.least, self.most = (
             np.array([getattr(p, name) for _, p in self.parameters]) for name in ("scale", "low", "high")
         )
@@ -195,14 +192,12 @@ class _Problem:
         on_coarse = self.residual(free, coarsely=True) if self.is_coarsened else None
         return (residual, False) if on_coarse is None else (on_coarse, True)
 
-    def _perturbed(self, free: np.ndarray, indices: Sequence[int]) -> np.ndarray:
+    def _perturbed(self, free: np.ndarray, indices: list[int]) -> np.ndarray:
         """The free coordinates with some perturbed by a small step inside their bounds."""
-        moved = free.copy()
-        for j in indices:
-            parameter = self.parameters[j][1]
-            step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name in COORDINATES else self.steps[j]
-            is_inside = self.low[j] <= free[j] + step <= self.high[j]
-            moved[j] = free[j] + step if is_inside else free[j] - step
+        moved, step = free.copy(), self.steps[indices]
+        there = free[indices] + step
+        is_inside = (self.low[indices] <= there) & (there <= self.high[indices])
+        moved[indices] = np.where(is_inside, there, free[indices] - step)
         return moved
 
     def _groups_of_sensors(self, indices: Sequence[int]) -> list[list[int]]:
@@ -244,11 +239,31 @@ class _Problem:
         free, normal = attempt.free, attempt.normal
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
         damped = normal + attempt.damping * np.diag(diagonal)
-        straight, moving = _damped_step(self, free, attempt.gradient, damped)
+        straight, moving = self._damped_step(free, attempt.gradient, damped)
         if -(2.0 * attempt.gradient + normal @ straight) @ straight < attempt.worth:
             return None
-        to = free + _bounded_step(self, free, straight + self._geodesic_acceleration(attempt, damped, straight, moving))
+        curved = straight + self._geodesic_acceleration(attempt, damped, straight, moving)
+        to = free + self._bounded_step(free, curved)
         return to, self.residual(to)
+
+    def _damped_step(self, free: Floats, gradient: Floats, damped: Floats) -> tuple[Floats, Flags]:
+        """The damped step, and which parameters it moves: those at a bound that they would pass stay fixed."""
+        moving: Flags = np.ones(free.size, bool)
+        step = np.zeros(free.size)
+        for _ in range(free.size):
+            among = np.ix_(moving, moving)
+            step[moving] = -np.linalg.solve(damped[among], gradient[moving])
+            leaving = moving & (((free <= self.low) & (step < 0)) | ((free >= self.high) & (step > 0)))
+            if not leaving.any():
+                break
+            moving &= ~leaving
+            step[leaving] = 0.0
+        return step, moving
+
+    def _bounded_step(self, free: Floats, step: Floats) -> Floats:
+        """The step, limited in length and to the bounds."""
+        ended: Floats = np.clip(free + np.clip(step, -self.longest, self.longest), self.low, self.high)
+        return ended - free
 
     def _geodesic_acceleration(self, attempt: Attempt, damped: Floats, step: Floats, moving: Flags) -> Floats:
         """Geodesic acceleration: second-order correction of a step along a curved valley; zero if it is not small.
@@ -333,9 +348,35 @@ class _Problem:
         return product
 
 
+def _steps(parameter: Parameter, free: float) -> tuple[float, float]:
+    """Finite-difference step and longest step of an iteration, of a free coordinate.
+
+    The longest step is a factor e, a tenth of the length, or the coordinate's own size.
+    """
+    if parameter.logarithmic or parameter.name in COORDINATES:
+        return 1e-4, 1.0 if parameter.logarithmic else 10.0
+    return FIT.short if parameter.prior_std else 1e-3 * abs(free) + 1e-9, 3.0 * abs(free) + 10.0
+
+
 def parameters_of(rig: Rig, effects: Sequence[Effect]) -> list[tuple[int, Parameter]]:
     """The parameters of effects in the order in which they are fitted, each with the index of its effect."""
     return [(i, parameter) for i, effect in enumerate(effects) for parameter in effect.parameters(rig)]
+
+
+def deviations_by_effect(
+    effects: Sequence[Effect], parameters: Sequence[tuple[int, Parameter]], free: Floats
+) -> list[dict[str, float]]:
+    """Standard deviations of the parameters of each effect, by name, from those of the free coordinates.
+
+    Args:
+        parameters: of `parameters_of`.
+        free: (n_parameters,) standard deviations.
+    """
+    found: list[dict[str, float]] = [{} for _ in effects]
+    for (i, parameter), deviation in zip(parameters, free, strict=True):
+        value = effects[i].values[parameter.name]
+        found[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
+    return found
 
 
 def slopes(
@@ -379,7 +420,7 @@ def slopes(
 def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData, workers: Workers = ALONE) -> np.ndarray:
     """Sensitivities (n_values, n_parameters) to parameters with priors, each times its prior standard deviation."""
     along: np.ndarray = slopes(rig, effects, data, workers=workers)[1]
-    scaled: np.ndarray = along * _Problem(rig, effects, data).prior_std
+    scaled: np.ndarray = along * np.array([parameter.prior_std for _, parameter in parameters_of(rig, effects)], float)
     return scaled
 
 
@@ -468,39 +509,6 @@ def _first_descent(
     return None
 
 
-def _damped_step(problem: _Problem, free: Floats, gradient: Floats, damped: Floats) -> tuple[Floats, Flags]:
-    """The damped step, and which parameters it moves: those at a bound that they would pass stay fixed."""
-    moving: Flags = np.ones(free.size, bool)
-    step = np.zeros(free.size)
-    for _ in range(free.size):
-        among = np.ix_(moving, moving)
-        step[moving] = -np.linalg.solve(damped[among], gradient[moving])
-        leaving = moving & (((free <= problem.low) & (step < 0)) | ((free >= problem.high) & (step > 0)))
-        if not leaving.any():
-            break
-        moving &= ~leaving
-        step[leaving] = 0.0
-    return step, moving
-
-
-def _bounded_step(problem: _Problem, free: Floats, step: Floats) -> Floats:
-    """The step, limited in length and to the bounds."""
-    reach = _longest_steps(problem)
-    step = np.clip(step, -reach, reach)
-    ended: Floats = np.clip(free + step, problem.low, problem.high)
-    return ended - free
-
-
-def _longest_steps(problem: _Problem) -> np.ndarray:
-    """Longest step of each free coordinate: a factor e, a tenth of the length, or its own size."""
-    return np.array(
-        [
-            1.0 if p.logarithmic else 10.0 if p.name in COORDINATES else 3.0 * abs(z) + 10.0
-            for (_, p), z in zip(problem.parameters, problem.start, strict=True)
-        ]
-    )
-
-
 def _result(problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: np.ndarray, falling: float) -> Fit:
     residual = residual[: problem.data.n_values]
     cost = float(residual @ residual) / residual.size
@@ -510,12 +518,9 @@ def _result(problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: n
         inverse = np.linalg.pinv(normal / np.outer(scaled, scaled), rcond=1e-12)
         deviations = np.sqrt(np.maximum(np.diag(inverse), 0.0)) / scaled * np.sqrt(max(cost, 1.0))
     effects = problem.at(free)
-    spread: list[dict[str, float]] = [{} for _ in effects]
-    for (i, parameter), deviation in zip(problem.parameters, deviations, strict=True):
-        value = effects[i].values[parameter.name]
-        spread[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
+    each = deviations_by_effect(effects, problem.parameters, deviations)
     return Fit(
-        effects=tuple(replace(e, deviations=s) for e, s in zip(effects, spread, strict=True)),
+        effects=tuple(replace(e, deviations=d) for e, d in zip(effects, each, strict=True)),
         normal=normal,
         cost=cost,
         cost_by_channel=problem.data.by_channel(residual),

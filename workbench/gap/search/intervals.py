@@ -11,7 +11,7 @@ from workbench.gap.effects.nominal import NominalPrior, group_of
 from workbench.gap.prediction.noise import noise_of_inputs
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
-from workbench.gap.search.fit import Fit, finite_residual, parameters_of, slopes
+from workbench.gap.search.fit import Fit, deviations_by_effect, finite_residual, parameters_of, slopes
 from workbench.gap.search.settings import INTERVALS, JOINT, SELECTION
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -98,11 +98,8 @@ class _Linearised:
         by_noise = self.drawn @ jacobian @ inverse
         of_inputs = by_noise.T @ by_noise / INTERVALS.draws
         variances = np.max([np.diag(spread), level * np.diag(inverse), np.diag(of_inputs)], axis=0).clip(0.0)
-        deviations: list[dict[str, float]] = [{} for _ in found.effects]
-        free_deviations = np.sqrt(variances / scale**2 + model_scatter**2)
-        for (i, parameter), deviation in zip(self.parameters, free_deviations, strict=True):
-            value = found.effects[i].values[parameter.name]
-            deviations[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
+        free = np.sqrt(variances / scale**2 + model_scatter**2)
+        deviations = deviations_by_effect(found.effects, self.parameters, free)
         effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
         joint = _no_smaller_sandwich(root, information @ spread @ information, level, len(without))
         joint = _no_smaller(joint, of_inputs) / np.outer(scale, scale) + np.diag(model_scatter**2)

@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.arrays import Floats, scaled_inverse
 from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
+from workbench.gap.effects.nominal import NominalPrior, group_of, in_group, nominal_errors, weight_of
 from workbench.gap.prediction.noise import (
     LEAST_LOGGED,
     are_coloured,
@@ -19,7 +19,7 @@ from workbench.gap.prediction.noise import (
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Chord, Fit, fit, parameters_of
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import FIT, INPUTS, JOINT, SELECTION, STEPWISE
+from workbench.gap.search.settings import FIT, INPUTS, JOINT, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
 
@@ -83,26 +83,54 @@ class Step:
     @property
     def explains(self) -> bool:
         """Whether the residual is at the noise floor of the sensors."""
-        return self.excess(self.sensor_noise) < STEPWISE.no_gap * float(self.sensor_noise.mean())
+        return self.is_near(self.sensor_noise, STEPWISE.no_gap)
+
+    def is_near(self, noise_power: np.ndarray, share: float) -> bool:
+        """Whether the residual power exceeds a noise power by less than this share of it."""
+        return self.excess(noise_power) < share * float(noise_power.mean())
 
     def description(self, noise_power: np.ndarray, *, of_errors_alone: bool = False) -> float:
-        """Description length, nats, of the residual above a noise power (n_records, n_outputs) and the nominal errors.
-
-        Args:
-            noise_power: as of the class.
-            of_errors_alone: leave out the residual.
-        """
+        """Description length, nats, of the nominal errors, and of the residual above noise unless `of_errors_alone`."""
         left = 0.0
         if not of_errors_alone:
             left = JOINT.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
         for group, small in JOINT.small:
-            count = sum(group_of(name) == group for name in self.errors.values)
-            left += count * np.log(max(size_of(self.errors, group), small) / small)
+            left += len(in_group(self.errors, group)) * np.log(max(size_of(self.errors, group), small) / small)
         return float(left)
 
     def excess(self, noise_power: np.ndarray) -> float:
         """Residual power above a noise power (n_records, n_outputs), mean of all channels, in units of the stated."""
         return float(np.maximum(self.fit.cost_by_channel - noise_power, 0.0).mean())
+
+
+def loss(search: Search, step: Step) -> float:
+    """The cost of a step; with input noise minus the log-likelihood, each step with the level that fits its residual.
+
+    Input noise is loud where it masks an effect.
+    """
+    if not search.logged:
+        return step.fit.cost
+    rig = apply_all(search.rig, step.fit.effects)
+    return likeliest_share(rig, search.data, search.data.differences(rig)).loss
+
+
+def _gain(search: Search, best: Step, step: Step) -> float:
+    """Twice the log-likelihood ratio of one step over another, per measured value."""
+    if not search.logged:
+        return float(np.log(step.fit.cost / best.fit.cost))
+    return 2.0 * (loss(search, step) - loss(search, best)) / search.data.n_values
+
+
+def is_likelier(search: Search, best: Step, step: Step, least: float = SEARCH.significant) -> bool:
+    """Whether the likelihood surely prefers a set to a smaller one, beyond the imperfection of any model."""
+    extra, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), _gain(search, best, step)
+    return gain > least and search.pays(gain, extra)
+
+
+def surely_prefers(search: Search, best: Step, simpler: Step) -> bool:
+    """Whether the best step explains the records and its likelihood is surely higher than that of a simpler one."""
+    extra, gain = best.fit.n_parameters - simpler.fit.n_parameters, _gain(search, best, simpler)
+    return best.explains and search.pays(gain, extra)
 
 
 def fit_jointly(
@@ -121,7 +149,6 @@ def fit_jointly(
     the nominal errors do not over-fit an effect that is still missing.
 
     Args:
-        search: records, nominal rig and candidate kinds.
         effects: with start values.
         errors: nominal errors, with start values.
         rounds: updates of the prior variances; None for `JOINT.rounds`.
@@ -135,8 +162,8 @@ def fit_jointly(
         errors = replace(errors, target=replace(errors.target, waves=JOINT.last_waves))
     if known is None:
         errors = with_all_groups(search, errors)
-    i, n_counted, chord = 0, 0, Chord(known)
-    while n_counted < rounds and i < JOINT.most_rounds:
+    n_counted, chord = 0, Chord(known)
+    for i in range(JOINT.most_rounds):
         # the two most informative records come first
         on_quick = known is not None or (i == 0 and not until_convergence)
         data = search.quick.stepped(whole.substeps) if on_quick else whole
@@ -149,20 +176,22 @@ def fit_jointly(
         if known is None and (fell or is_first or until_convergence or len(errors.values) < JOINT.few):
             chord = Chord()
         before = power if known is not None or not on_quick else np.inf
-        i += 1
         found = _fit_at_level(search, (*effects, errors), data, power, chord, is_last=until_convergence)
         *effects, errors = found.effects
         errors = _with_prior_stds(errors, _next_prior_stds(errors))
+        if n_counted == rounds:
+            break
+    updated = replace(found, effects=(*effects, errors))
     if until_convergence:
-        return evaluated(search, replace(found, effects=(*effects, errors)), whole.substeps)
-    last = evaluated(search, replace(found, effects=(*effects, _without_negligible_groups(errors))), whole.substeps)
+        return evaluated(search, updated, whole.substeps)
+    last = evaluated(search, _without_negligible_groups(updated), whole.substeps)
     # far above the noise floor, the prior variances mean little
-    is_near_noise = last.excess(last.noise_power) < JOINT.near * float(last.noise_power.mean())
-    at_limit = _at_fixed_point(search, found, whole, chord) if known is None and is_near_noise else found
+    if known is not None or not last.is_near(last.noise_power, JOINT.near):
+        return last
+    at_limit = _at_fixed_point(search, found, whole, chord)
     if at_limit is found:
         return last
-    *effects, errors = at_limit.effects
-    limit = evaluated(search, replace(at_limit, effects=(*effects, _without_negligible_groups(errors))), whole.substeps)
+    limit = evaluated(search, _without_negligible_groups(at_limit), whole.substeps)
     # large nominal errors at the fixed point have fitted something else
     return min((limit, last), key=lambda step: step.description(limit.noise_power))
 
@@ -171,12 +200,6 @@ def _at_fixed_point(search: Search, found: Fit, data: FitData, chord: Chord) -> 
     """The fit with the prior standard deviations of the nominal errors at the fixed point of MacKay's update.
 
     The update alone converges slowly where the records hardly distinguish the errors; the cost is then flat.
-
-    Args:
-        search: records, nominal rig and candidate kinds.
-        found: fit of effects and nominal errors.
-        data: all records.
-        chord: sensitivities to the nominal errors.
     """
     for _ in range(JOINT.rests):
         errors = found.effects[-1]
@@ -230,8 +253,6 @@ def evaluated(search: Search, found: Fit, substeps: int | None = None) -> Step:
     """A fit of effects and nominal errors (last) with its residual and noise evaluated on all records of a search.
 
     Args:
-        search: with the records.
-        found: the fit.
         substeps: of a sample; None for those of the search.
     """
     data, rig = search.data.stepped(substeps or search.data.substeps), apply_all(search.rig, found.effects)
@@ -288,14 +309,12 @@ def _limit_of_prior_stds(search: Search, found: Fit) -> dict[str, float]:
     """
     errors, prior = found.effects[-1], found.effects[-1].target
     each = [parameter for _, parameter in parameters_of(search.rig, found.effects)]
-    of_errors = np.arange(len(each) - len(errors.values), len(each))
-    names, free = (
-        [each[j].name for j in of_errors],
-        np.array([each[j].to_free(errors.values[each[j].name]) for j in of_errors]),
-    )
-    groups = np.array([group_of(name) for name in names])
+    own = each[len(each) - len(errors.values) :]
+    of_errors = np.arange(len(each) - len(own), len(each))
+    free = np.array([parameter.to_free(errors.values[parameter.name]) for parameter in own])
+    groups = np.array([group_of(parameter.name) for parameter in own])
     sizes = {group: float(getattr(prior, group)) for group in prior.groups}
-    unit = np.array([each[j].prior_std for j in of_errors], float) / [sizes[g] for g in groups]
+    unit = np.array([parameter.prior_std for parameter in own], float) / [sizes[g] for g in groups]
     widest = dict(_largest_plausible(prior))
 
     def precision() -> Floats:
@@ -319,15 +338,16 @@ def _limit_of_prior_stds(search: Search, found: Fit) -> dict[str, float]:
 
 def _scaled_errors(errors: Effect, group: str) -> Floats:
     """Nominal errors of a group and their posterior standard deviations, each over its weight: (2, n_errors)."""
-    names = [name for name in errors.values if group_of(name) == group]
+    names = list(in_group(errors, group))
     weights = [weight_of(name, errors.target) for name in names]
     each = [[found.get(name, 0.0) for name in names] for found in (errors.values, errors.deviations)]
     scaled: Floats = np.array(each).reshape(2, len(names)) / np.array(weights)
     return scaled
 
 
-def _without_negligible_groups(errors: Effect) -> Effect:
-    """The nominal errors without the groups whose prior standard deviation has fallen to its lower bound."""
+def _without_negligible_groups(found: Fit) -> Fit:
+    """The fit without the groups of nominal errors whose prior standard deviation has fallen to its lower bound."""
+    *effects, errors = found.effects
     none = [
         g
         for g, widest in _largest_plausible(errors.target)
@@ -337,7 +357,7 @@ def _without_negligible_groups(errors: Effect) -> Effect:
     kept = {name: value for name, value in errors.values.items() if group_of(name) not in none}
     deviations = {name: errors.deviations[name] for name in kept if name in errors.deviations}
     target = replace(errors.target, **dict.fromkeys(none, 0.0))
-    return replace(errors, target=target, values=kept, deviations=deviations)
+    return replace(found, effects=(*effects, replace(errors, target=target, values=kept, deviations=deviations)))
 
 
 def with_all_groups(search: Search, errors: Effect) -> Effect:
@@ -357,21 +377,17 @@ def with_all_errors(search: Search, found: Fit) -> Fit:
     errors = next((e for e in found.effects if isinstance(e.target, NominalPrior)), None)
     if errors is None:
         return found
-    effects = tuple(_with_every_group(search, e, found.effects) if e is errors else e for e in found.effects)
-    if not errors.target.shape or not _points_of(search.rig, found.effects):
+    points, groups = _points_of(search.rig, found.effects), replace(search, by_mode=errors.target.by_mode).prior.groups
+    closed = {g: JOINT.narrowest * size for g, size in JOINT.widest if g in set(groups) - set(errors.target.groups)}
+    target = replace(errors.target, waves=JOINT.last_waves, points=points, **closed)
+    all_errors = nominal_errors(search.rig, target, errors.values)
+    effects = tuple(all_errors if e is errors else e for e in found.effects)
+    if not errors.target.shape or not points:
         return replace(found, effects=effects)
     data = search.data.finely(SELECTION.fine)
     power = _residual_level(search.rig, effects, data)
     fitted = _fit_at_level(search, effects, data, power, Chord(), is_last=True)
     return evaluated(search, fitted, data.substeps).fit
-
-
-def _with_every_group(search: Search, errors: Effect, effects: Sequence[Effect]) -> Effect:
-    """The nominal errors with values of every group, and of the mode shapes at the points of the effects."""
-    groups = replace(search, by_mode=errors.target.by_mode).prior.groups
-    closed = {g: JOINT.narrowest * size for g, size in JOINT.widest if g in set(groups) - set(errors.target.groups)}
-    target = replace(errors.target, waves=JOINT.last_waves, points=_points_of(search.rig, effects), **closed)
-    return nominal_errors(search.rig, target, errors.values)
 
 
 def _points_of(rig: Rig, effects: Sequence[Effect]) -> tuple[str, ...]:
@@ -380,49 +396,6 @@ def _points_of(rig: Rig, effects: Sequence[Effect]) -> tuple[str, ...]:
         return ()
     each = (e.at if isinstance(e.at, Between) else (e.at,) for e in effects if e.at is not None)
     return tuple(dict.fromkeys(str(point) for points in each for point in points))
-
-
-def surely_late(errors: Effect) -> Effect:
-    """The nominal errors with no accelerometer assigned to a side of the input steps, except the clearly late ones."""
-    late = tuple(name for name in errors.target.late if errors.values[f"delay_{name}"] > JOINT.surely_late)
-    return replace(errors, target=replace(errors.target, late=late, early=()))
-
-
-def with_reading_sides(search: Search, errors: Effect, effects: Sequence[Effect] = ()) -> Effect:
-    """The nominal errors with each accelerometer assigned to the side of the input steps that it reads.
-
-    With held inputs, acceleration jumps at the samples: a late sensor reads the value before the jump, others the one
-    after. Sensors known to be late stay so. One-step-ahead predictions decide, since over whole records a wrong
-    frequency looks like a delay.
-    """
-    known_late = errors.target.late
-    accelerometers = tuple(
-        s.name for s in search.rig.sensors if s.quantity == "acceleration" and s.name not in known_late
-    )
-    if not accelerometers or not errors.target.delay or errors.target.interpolated:
-        return errors
-    zero_delays = {**errors.values, **{f"delay_{name}": 0.0 for name in accelerometers}}
-
-    def residual_with(delay: float) -> np.ndarray:
-        tried = nominal_errors(search.rig, replace(errors.target, late=known_late, early=()), zero_delays)
-        tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in accelerometers}})
-        return search.ahead.residual(apply_all(search.rig, (*effects, tried)))
-
-    # if the motion changes much between samples, a reading well before a jump differs from one just before
-    delays = np.array([*(-delay for delay in JOINT.delays), 0.0, JUST_LATE, *JOINT.delays])
-    residuals = {float(delay): residual_with(float(delay)) for delay in delays}
-    before, at, after = residual_with(-JUST_LATE), residuals[0.0], residuals[JUST_LATE]
-    with np.errstate(invalid="ignore"):  # of a diverging simulation nothing is late
-        step, smooth = (search.ahead.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
-    powers = np.array([search.ahead.by_channel(residual).sum(axis=0) for residual in residuals.values()])
-    rows = [
-        j for j, s in enumerate(search.rig.sensors) if s.name in accelerometers and step[j] > JOINT.jump * smooth[j]
-    ]
-    best_delays = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}
-    late = (*known_late, *(name for name, delay in best_delays.items() if delay > 0))
-    early = tuple(name for name, delay in best_delays.items() if delay <= 0)
-    starts = {**errors.values, **{f"delay_{name}": delay for name, delay in best_delays.items()}}
-    return nominal_errors(search.rig, replace(errors.target, late=late, early=early), starts)
 
 
 def with_input_noise(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Search | None:
@@ -455,8 +428,3 @@ def with_input_noise(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> S
         noisy = best.with_input_noise(rig, likeliest_share(rig, best.data, residuals).share)
         white = evaluated(noisy, fitted).fit
     return noisy
-
-
-def likeliest_loss(search: Search, rig: Rig) -> float:
-    """Minus the log-likelihood of a rig's residual, with input noise of the likeliest level."""
-    return likeliest_share(rig, search.data, search.data.differences(rig)).loss

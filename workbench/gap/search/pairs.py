@@ -1,26 +1,25 @@
 """Search for pairs of effects, both at once and one after the other, until one explains the records."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.effect import Effect
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
+from workbench.gap.search.finish import finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.screening import Screening, fitted_ahead, on_whole_records, one_more
-from workbench.gap.search.search import Decision, Search, in_one_minimum, unexplained
-from workbench.gap.search.settings import PAIRS, RANDOM, SELECTION
+from workbench.gap.search.search import Decision, Search, best_of_each, in_one_minimum, unexplained
+from workbench.gap.search.settings import PAIRS, RANDOM, SEARCH, SELECTION
 from workbench.structure.domain import Between
 
 
 @dataclass(eq=False)
 class Pairs:
-    """State of a search for pairs of effects, filled in as it proceeds.
+    """State of a search for pairs of effects; a copy proceeds by itself.
 
     Attributes:
-        search: records, nominal rig and candidate kinds.
         ahead: pairs fitted to one-step-ahead predictions, best first.
         continued: those of them that were fitted to whole records too.
         found: pairs fitted to whole records, best first.
@@ -32,44 +31,31 @@ class Pairs:
     """
 
     search: Search
-    ahead: list[Fit] = field(default_factory=list)
-    continued: list[Fit] = field(default_factory=list)
-    found: list[Fit] = field(default_factory=list)
-    ended: list[Fit] = field(default_factory=list)
-    given: list[Effect] = field(default_factory=list)
-    near_misses: list[Fit] = field(default_factory=list)
-    relocated_pairs: list[Fit] = field(default_factory=list)
+    ahead: Sequence[Fit] = ()
+    continued: Sequence[Fit] = ()
+    found: Sequence[Fit] = ()
+    ended: Sequence[Fit] = ()
+    given: Sequence[Effect] = ()
+    near_misses: Sequence[Fit] = ()
+    relocated_pairs: Sequence[Fit] = ()
     explain: bool = False
 
     @classmethod
     def at_once(cls, search: Search, screened: Screening) -> "Pairs":
-        """The likeliest pairs by a screening of all pairs.
-
-        Args:
-            search: records, nominal rig and candidate kinds.
-            screened: the screening with no effect given.
-        """
+        """The likeliest of all pairs, by a screening with no effect given."""
         pairs = cls(search)
         if not search.is_over:
             search.report("all pairs at once", 0.4)
             pairs.explain = pairs._add_and_check(fitted_ahead(search, screened.likeliest_pairs(SELECTION.tried)))
         return pairs
 
-    def copy(self) -> "Pairs":
-        """A copy with lists of its own."""
-        both = Pairs(self.search, explain=self.explain)
-        for name, value in vars(self).items():
-            if isinstance(value, list):
-                setattr(both, name, list(value))
-        return both
-
     def with_a_third(self) -> bool:
         """Whether the best pair and a third effect explain the records; tried if the pair's residual allows for one."""
-        search = self.search
-        if not self.found or not search.near(self.found[0], PAIRS.most) or search.near(self.found[0], PAIRS.least):
+        search, found = self.search, self.found
+        if not found or not search.near(found[0], PAIRS.most) or search.near(found[0], SEARCH.negligible):
             return False
         search.report("the best pair and a third effect", 0.45)
-        pair = self.found[0].effects
+        pair = found[0].effects
         if self._explained_with_one_more(pair):
             return True
         best = self.found[0]
@@ -82,8 +68,7 @@ class Pairs:
         """Whether these effects with one more explain the records."""
         if self.search.is_over:
             return False
-        evidence = self.search.evidence_of(apply_all(self.search.rig, given))
-        return self._add_and_check(one_more(self.search, given, evidence))
+        return self._add_and_check(one_more(self.search, given, self.search.evidence_with(given)))
 
     def by_exchange(self) -> bool:
         """Whether a pair with either half of the best one-step-ahead pair explains the records.
@@ -100,20 +85,20 @@ class Pairs:
                 break
         return self._from_other_places()
 
-    def with_effect(self, effect: Effect) -> bool:
+    def with_any(self, halves: Sequence[Effect]) -> bool:
+        """Whether a pair with one of these effects explains the records; effects tried before are skipped."""
+        return any(self._with_effect(h) for h in halves if not any(_are_nearly_equal(h, other) for other in self.given))
+
+    def _with_effect(self, effect: Effect) -> bool:
         """Whether a pair with this effect explains the records."""
         if self.search.is_over:
             return False
         self.search.report(f"{effect.kind.words} and a second effect", 0.55 + 0.05 * min(len(self.given), 8))
-        self.given.append(effect)
+        self.given = [*self.given, effect]
         return self._add_and_check(one_more(self.search, (effect,), _evidence_with(self.search, effect)))
 
     def decision(self, start: Fit) -> Decision:
-        """The decision based on the pairs.
-
-        Args:
-            start: the fit without effects.
-        """
+        """The decision based on the pairs; `start` is the fit without effects."""
         likeliest = best_of_each(self.found or [start])[: PAIRS.named]
         explaining = [f for f in likeliest if self.search.explains(f)]
         if explaining:
@@ -123,10 +108,6 @@ class Pairs:
         best, rivals = ranked(self.search, likeliest)
         return unexplained(start, best, rivals)
 
-    def _is_near(self) -> bool:
-        """Whether the best pair is a near miss."""
-        return bool(self.found) and self.search.near(self.found[0], RANDOM.near)
-
     def _add_and_check(self, ahead: Sequence[Fit]) -> bool:
         """Fit the best one-step-ahead pairs to whole records and refine them; whether one explains the records."""
         self.ahead = sorted((*self.ahead, *ahead), key=lambda f: f.cost)
@@ -135,37 +116,33 @@ class Pairs:
         promising = [f for f in ahead if f.cost < enough]
         fresh = [f for f in promising if not any(in_one_minimum(f, other, domain) for other in self.continued)]
         most = PAIRS.more if self.found else PAIRS.finalists
-        self.continued += fresh[:most]
+        self.continued = [*self.continued, *fresh[:most]]
         self._add(on_whole_records(self.search, fresh, most))
         near = [pair for pair in self.found[: PAIRS.tried_further] if not _was_finished(pair, self.ended)]
         taken = _finished(self.search, near)
-        self.ended += [*near, *taken]
+        self.ended = [*self.ended, *near, *taken]
         self._add(taken)
         return any(self.search.explains(pair) for pair in taken)
 
-    def _with_either_half_kept(self) -> bool:
-        """Whether a pair with either half of the best pair on whole records explains them."""
-        self.near_misses.append(self.found[0])
-        return self.with_any(self.found[0].effects[::-1])
-
-    def with_any(self, halves: Sequence[Effect]) -> bool:
-        """Whether a pair with one of these effects explains the records; effects tried before are skipped."""
-        return any(self.with_effect(h) for h in halves if not any(_are_nearly_equal(h, other) for other in self.given))
-
     def _from_other_places(self) -> bool:
-        """Whether one of the best pairs, fitted from other places, explains the records or leads to one that does."""
+        """Whether one of the best pairs, fitted from other places, explains the records, or a pair with either half."""
         search = self.search
         if search.is_over:
             return False
         likeliest = best_of_each(self.found)[: PAIRS.tried_further]
         fresh = [f for f in likeliest if search.near(f, PAIRS.very_near) and not _was_finished(f, self.relocated_pairs)]
         elsewhere = search.side_by_side(relocated, fresh)
-        self.relocated_pairs += [*fresh, *elsewhere]
+        self.relocated_pairs = [*self.relocated_pairs, *fresh, *elsewhere]
         self._add(elsewhere)
         if any(search.explains(pair) for pair in elsewhere):
             return True
-        nearer = all(self.found[0].cost - 1.0 < PAIRS.nearer * (miss.cost - 1.0) for miss in self.near_misses)
-        return self._is_near() and nearer and self._with_either_half_kept()
+        if not self.found or not search.near(self.found[0], RANDOM.near):
+            return False
+        best = self.found[0]
+        if not all(best.cost - 1.0 < PAIRS.nearer * (miss.cost - 1.0) for miss in self.near_misses):
+            return False
+        self.near_misses = [*self.near_misses, best]
+        return self.with_any(best.effects[::-1])
 
     def _add(self, pairs: Sequence[Fit]) -> None:
         """Merge pairs into those found, best first."""
@@ -175,8 +152,7 @@ class Pairs:
 def _evidence_with(search: Search, effect: Effect) -> Evidence:
     """Evidence of the rig with the effect, or without it if the simulation diverges with this effect alone."""
     astray = cost_of(search.rig, (effect,), search.data) > PAIRS.astray * search.nominal.mean()
-    rig = search.rig if astray else apply_all(search.rig, (effect,))
-    return search.evidence_of(rig)
+    return search.evidence_with(() if astray else (effect,))
 
 
 def _by_contribution(search: Search, found: Fit) -> list[Effect]:

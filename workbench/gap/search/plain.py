@@ -6,99 +6,29 @@ from itertools import combinations
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind, apply_all, contained, each_left_out, simpler_sets
-from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, nominal_errors
-from workbench.gap.effects.ports import ACTUATOR_DELAY, ACTUATOR_LAG, SENSOR_DELAY, SENSOR_LAG
-from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
+from workbench.gap.effects.effect import Effect, contained, each_left_out, simpler_sets
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of
+from workbench.gap.effects.ports import SENSOR_DELAY
 from workbench.gap.prediction.residuals import FitData
+from workbench.gap.search.candidates import surely_late, with_reading_sides
+from workbench.gap.search.errors_as_effects import (
+    DELAYS_OF_ALL,
+    NO_UNIFORM_ERROR,
+    UNIFORM,
+    common_delays,
+    delay_effects,
+    delay_of,
+    is_linear_structural,
+    is_plausible_error,
+)
 from workbench.gap.search.finish import finished, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
-from workbench.gap.search.jointly import Step, surely_late, with_reading_sides
+from workbench.gap.search.jointly import Step
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
-from workbench.gap.search.search import Search, promise
-from workbench.gap.search.settings import JOINT, PAIRS, PLAIN, SEARCH, SELECTION, STEPWISE
+from workbench.gap.search.search import Search, first_of_each, promise
+from workbench.gap.search.settings import ERRORS, PAIRS, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
-from workbench.structure.domain import middle
-from workbench.structure.member import Structure
-
-UNIFORM = (MODULUS_ERROR, MODAL_DAMPING)  # one factor of all stiffness or all damping, which nominal errors include
-NO_UNIFORM_ERROR = tuple(Effect(kind, None, {"factor": 1.0}) for kind in UNIFORM)  # start values
-PORT_GROUPS = ("delay", "gain", "place")  # groups of nominal errors of actuators and sensors
-DELAYS_OF_ALL = (SENSOR_LAG, ACTUATOR_LAG, ACTUATOR_DELAY)  # kinds that delay all sensors equally
-
-
-def are_uniform_errors(effects: Sequence[Effect]) -> bool:
-    """Whether the effects are just the two uniform errors (stiffness, damping), each small enough for a model's."""
-    return {effect.kind for effect in effects} == set(UNIFORM) and all(
-        abs(np.log(effect.values["factor"])) < dict(PLAIN.most_common)[effect.kind.name] for effect in effects
-    )
-
-
-def is_linear_structural(kind: Kind) -> bool:
-    """Whether a kind is linear and acts in the structure, but is no uniform error: nominal errors can mimic it."""
-    return kind.path == "structure" and not kind.nonlinear and kind not in UNIFORM
-
-
-def is_plausible_error(effect: Effect, search: Search) -> bool:
-    """Whether an effect at a port is a plausible error of a careful model: a small delay, gain or shift of place."""
-    return is_plausible_delay(effect, search) or is_plausible_gain_or_place(effect, search.rig)
-
-
-def is_plausible_delay(effect: Effect, search: Search) -> bool:
-    """Whether an effect is a delay that a careful laboratory may have."""
-    return delay_of(effect) < dict(JOINT.widest)["delay"] * search.data.records[0].sample_time
-
-
-def delay_of(effect: Effect) -> float:
-    """Delay or time constant of an effect, s; inf for an effect that has none."""
-    return float(next((effect.values[name] for name in ("delay", "time_constant") if name in effect.values), np.inf))
-
-
-def is_plausible_gain_or_place(effect: Effect, rig: Rig) -> bool:
-    """Whether an effect is a gain error or a shift of place within the accuracy of calibration and tape measure."""
-    if "gain" in effect.values:
-        return bool(abs(np.log(abs(effect.values["gain"]))) < PLAIN.most_gain)
-    places = [a.at for a in rig.actuators if a.name == effect.target]
-    places += [s.at for s in rig.sensors if s.name == effect.target]
-    if effect.at is None or not places:
-        return False
-    return rig.modes.domain.separation(effect.at, middle(places[0])) < PLAIN.most_moved
-
-
-def uniform_as_nominal_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
-    """The fit with small uniform errors of stiffness and damping as nominal errors, if it has other effects too.
-
-    An imperfect model has both errors; one of them alone is an effect.
-
-    Args:
-        search: records and nominal rig.
-        found: the fit.
-        alone: convert one alone too, as a random force may mask the other.
-    """
-    uniform = {e.kind.name: float(np.log(e.values["factor"])) for e in found.effects if e.kind in UNIFORM}
-    others = [e for e in found.effects if e.kind not in UNIFORM]
-    port_errors = next((e for e in others if e.kind is NOMINAL_ERRORS), None)
-    named = [e for e in others if e is not port_errors]
-    largest = dict(PLAIN.most_alone if len(uniform) == 1 else PLAIN.most_common)
-    if (
-        len(uniform) < (1 if alone else len(UNIFORM))
-        or not named
-        or any(abs(size) >= largest[name] for name, size in uniform.items())
-    ):
-        return found
-    if port_errors is not None and not set(port_errors.target.groups) <= set(PORT_GROUPS):
-        return found
-    stiffness, damping = (uniform.get(kind.name, 0.0) for kind in UNIFORM)
-    if isinstance(search.rig.structure, Structure):
-        sizes = {"stiffness": stiffness, "damping": damping}
-    else:  # without known profiles, all frequencies have the same error
-        sizes = {"frequency": 0.5 * stiffness, "damping": damping}
-    prior = NominalPrior(sample_time=search.data.records[0].sample_time) if port_errors is None else port_errors.target
-    errors = nominal_errors(search.rig, replace(prior, **{name: abs(size) for name, size in sizes.items()}, waves=1))
-    values = {name: sizes.get(group_of(name), 0.0) for name in errors.values}
-    values.update({} if port_errors is None else port_errors.values)
-    return replace(found, effects=(*named, replace(errors, values=values)), covariance=None)
 
 
 def in_place_of_nominal_errors(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]] = ()) -> Fit | None:
@@ -132,8 +62,11 @@ def _with_port_errors(
         if both is not None and {SENSOR_DELAY, *DELAYS_OF_ALL} & {effect.kind for effect in both.effects}:
             return both  # a delay of one sensor, or of all, is an effect even with uniform errors
         # with input noise that an effect made seem louder, uniform errors may explain too much
-        more = _with_one_linear_effect(search, (*common, *kept), (), step) if both is None or search.logged else None
-        return _one_uniform_error(search, common, kept, both, step) if more is None and both is not None else more
+        if both is None or search.logged:
+            found = _with_one_linear_effect(search, (*common, *kept), (), step)
+            if found is not None or both is None:
+                return found
+        return _one_uniform_error(search, common, kept, both, step)
     sets = [(*given, *some) for given in (effects, *rivals) for some in _subsets(common)]
     if len(effects) > 1:  # without nominal errors, an effect may be unnecessary or a limiting case suffice
         fewer = list(each_left_out(effects))
@@ -161,7 +94,7 @@ def _at_ports(errors: Effect) -> Iterator[tuple[Effect, ...]]:
     prior = errors.target
     sides = {"late": prior.late, "early": prior.early, "interpolated": prior.interpolated}
     timing = NominalPrior(sample_time=prior.sample_time, waves=prior.waves, **sides)
-    if prior.delay > PLAIN.smallest_delay or prior.late:
+    if prior.delay > ERRORS.smallest_delay or prior.late:
         timing = replace(timing, delay=prior.delay)
     for kept in dict.fromkeys((timing, replace(timing, gain=prior.gain, place=prior.place))):
         values = {name: value for name, value in errors.values.items() if group_of(name) in kept.groups}
@@ -192,7 +125,7 @@ def _simplest_explaining(search: Search, sets: Sequence[tuple[Effect, ...]], ste
     promising = [f for f in on_quick if f.cost < PLAIN.near and not _is_surely_worse(search, f, step, search.quick)]
     fine_data, best = search.data.finely(SELECTION.fine), None
     for candidate in sorted(promising, key=lambda f: f.n_parameters):
-        if best is not None and _labels(best) <= _labels(candidate):
+        if best is not None and set(best.labels) <= set(candidate.labels):
             continue
         effects = _with_reading_sides(search, candidate.effects)
         found = fit(search.rig, effects, fine_data, iterations=PLAIN.plainly)
@@ -212,11 +145,6 @@ def _is_surely_worse(search: Search, found: Fit, step: Step, data: FitData) -> b
     return search.pays(gain, extra, data.n_values)
 
 
-def _labels(found: Fit) -> set[str]:
-    """Labels of the effects of a fit."""
-    return {effect.label for effect in found.effects}
-
-
 def _with_reading_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
     """The effects, nominal errors among them, with accelerometers assigned anew to a side of the input steps."""
     others = tuple(effect for effect in effects if effect.kind is not NOMINAL_ERRORS)
@@ -229,9 +157,8 @@ def _with_delay_as_effect(search: Search, found: Fit) -> Fit:
     delays = next((e for e in found.effects if e.kind is NOMINAL_ERRORS), None)
     if delays is None or delays.target.groups != ("delay",):
         return found
-    others, fine_data = [e for e in found.effects if e is not delays], search.data.finely(SELECTION.fine)
-    fits = search.workers.map(lambda e: fit(search.rig, (*others, e), fine_data), delay_effects(search.rig, delays))
-    return min((f for f in fits if search.explains(f)), key=lambda f: f.cost, default=found)
+    explaining = _explaining_instead(search, found, delays, delay_effects(search.rig, delays))
+    return min(explaining, key=lambda f: f.cost, default=found)
 
 
 def other_delay_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], ...]:
@@ -241,58 +168,16 @@ def other_delay_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], .
     )
     if late is None:
         return ()
-    others, fine_data = [e for e in found.effects if e is not late], search.data.finely(SELECTION.fine)
-    causes = [e for e in _common_delays(search.rig, delay_of(late)) if e.kind is not late.kind]
-    fits = search.workers.map(lambda e: fit(search.rig, (*others, e), fine_data), causes)
-    best, rivals = ranked(search, [found, *(f for f in fits if search.explains(f))])
+    causes = [e for e in common_delays(search.rig, delay_of(late)) if e.kind is not late.kind]
+    best, rivals = ranked(search, [found, *_explaining_instead(search, found, late, causes)])
     return rivals if best is found else ()
 
 
-def _common_delays(rig: Rig, late: float) -> tuple[Effect, ...]:
-    """Every effect that delays all sensors by a time `late`, s."""
-    kinds = ((kind, targets[0]) for kind in DELAYS_OF_ALL if (targets := kind.targets(rig)))
-    return tuple(Effect(kind, all_, {kind.parameters(rig, all_)[0].name: late}) for kind, all_ in kinds)
-
-
-def delay_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
-    """The single effects that may cause the sensor delays among the nominal errors; empty if none does.
-
-    If one of several sensors is late, its own delay or lag is the cause. If all are equally late, beyond chance, the
-    cause is a lag of the sensors or of the actuators, or a delay of the actuators.
-    """
-    delays = {name.removeprefix("delay_"): float(v) for name, v in errors.values.items() if group_of(name) == "delay"}
-    uncertainty = {name: PLAIN.sure * errors.deviations.get(f"delay_{name}", 0.0) for name in delays}
-    late = [name for name, delay in delays.items() if abs(delay) > max(PLAIN.smallest_delay, uncertainty[name])]
-    sample_time = errors.target.sample_time
-    if len(delays) >= PLAIN.several and len(late) == 1 and delays[late[0]] > 0:
-        delay = delays[late[0]] * sample_time
-        return Effect(SENSOR_DELAY, late[0], {"delay": delay}), Effect(SENSOR_LAG, late[0], {"time_constant": delay})
-    if len(delays) < 2 or len(late) < len(delays) or min(delays.values()) < 0:
-        return ()
-    mean = float(np.mean([*delays.values()]))
-    largest_difference = max(max(abs(delay - mean), uncertainty[name]) for name, delay in delays.items())
-    if (2.0 * largest_difference / mean) ** (
-        len(delays) - 1
-    ) > PLAIN.by_chance:  # probability that independent delays agree
-        return ()
-    return _common_delays(rig, mean * sample_time)
-
-
-def with_common_delay(found: Fit) -> Fit:
-    """The fit, an effect that delays all sensors taking the mean of the delays among the nominal errors, the last.
-
-    Both delay alike, and the records determine only their sum.
-    """
-    *others, late, errors = found.effects
-    delays = {name: value for name, value in errors.values.items() if group_of(name) == "delay"}
-    mean = float(np.mean([*delays.values()])) if delays else 0.0
-    delay = delay_of(late) + mean * errors.target.sample_time
-    if late.kind not in DELAYS_OF_ALL or not mean or delay <= 0.0:
-        return found
-    (name,) = late.values
-    rest = {name: value - mean for name, value in delays.items()}
-    late = replace(late, values={name: delay})
-    return replace(found, effects=(*others, late, replace(errors, values={**errors.values, **rest})))
+def _explaining_instead(search: Search, found: Fit, effect: Effect, causes: Sequence[Effect]) -> list[Fit]:
+    """The fits, with an effect replaced by each of some causes, that explain the records."""
+    others, fine_data = [e for e in found.effects if e is not effect], search.data.finely(SELECTION.fine)
+    fits = search.workers.map(lambda cause: fit(search.rig, (*others, cause), fine_data), causes)
+    return [f for f in fits if search.explains(f)]
 
 
 def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None:
@@ -302,18 +187,18 @@ def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None
     port. Nominal errors of every mode or wave would absorb strong effects that are still missing, and cost more time.
 
     Args:
-        search: records, nominal rig and candidate kinds.
         step: nominal errors that do not explain the records, or are implausible.
-        most: largest number of effects.
     """
     best = fit(search.rig, NO_UNIFORM_ERROR, search.data)
     for _ in range(most):
         if search.is_over:
             return None
-        ahead = one_more(search, best.effects, search.evidence_of(apply_all(search.rig, best.effects)))
+        ahead = one_more(search, best.effects, search.evidence_with(best.effects))
         fits = on_whole_records(search, ahead, PAIRS.more)
-        is_better = bool(fits) and fits[0].cost - 1.0 < PAIRS.nearer * (best.cost - 1.0)
-        if not (is_better or (fits and ahead[0].cost < PAIRS.nearer * cost_of(search.rig, best.effects, search.ahead))):
+        if not fits:
+            return None
+        is_better = fits[0].cost - 1.0 < PAIRS.nearer * (best.cost - 1.0)
+        if not (is_better or ahead[0].cost < PAIRS.nearer * cost_of(search.rig, best.effects, search.ahead)):
             return None
         limiting_cases, cost_limit = contained(fits[0].effects, search.rig), (1.0 + SEARCH.significant) * fits[0].cost
         best = next((f for f in fits if f.key in limiting_cases and f.cost < cost_limit), fits[0])
@@ -345,13 +230,10 @@ def _with_one_linear_effect(
     if not search.logged and start.cost < 1.0 + STEPWISE.no_gap:
         return None
     given = start.effects
-    evidence = search.evidence_of(apply_all(search.rig, given))
-    screened = Screening.of(replace(search, catalogue=linear_kinds), given, evidence).likeliest()
-    likeliest = {effect.kind: effect for effect in reversed(screened)}  # the best of each kind
-    candidates = [(*given, effect) for effect in screened if effect is likeliest[effect.kind]][: PLAIN.likeliest]
-    found = _simplest_explaining(
-        search, [set_ for one in candidates for set_ in dict.fromkeys((one, (*one, *common)))], step
-    )
+    screened = Screening.of(replace(search, catalogue=linear_kinds), given, search.evidence_with(given)).likeliest()
+    likeliest = first_of_each(screened, lambda effect: effect.kind)[: PLAIN.likeliest]
+    sets = [(*given, effect, *some) for effect in likeliest for some in dict.fromkeys(((), common))]
+    found = _simplest_explaining(search, sets, step)
     if found is None:
         return None
     others = [e for e in found.effects if e.kind in UNIFORM or any(e.label == other.label for other in given)]

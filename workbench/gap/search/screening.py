@@ -47,22 +47,14 @@ class Screening:
 
     @classmethod
     def of(cls, search: Search, given: tuple[Effect, ...], evidence: Evidence) -> "Screening":
-        """Screen all effects that may be present in addition to the given ones.
-
-        Args:
-            search: records, nominal rig and candidate kinds.
-            given: effects.
-            evidence: of the rig with the given effects.
-        """
+        """Screen all effects that may be present beside the given ones; the evidence is of the rig with these."""
         data, unprojected = search.first_ahead, search.first_ahead.unprojected
         before = finite_residual(search.rig, (*given, *search.held), unprojected)
         if before is None:
             return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.domain)
         every = slice(None, None, max(1, before.size // SCREENING.most_values))
 
-        tasks = _starts(search, given, evidence)
-        starts = [start for task in tasks for start in task]
-        bounds = [_bounds(task) for task in tasks for _ in task]
+        starts = _starts(search, given, evidence)
         left = before.copy()
         data.project_out(left)
         left = left[every]
@@ -91,7 +83,7 @@ class Screening:
             left = left - basis @ (basis.T @ left)
             for row in moves:
                 row -= basis @ (basis.T @ row)
-        least, most = np.array([bounds[i] for i in usable]).reshape(-1, 2).T
+        least, most = np.array([_bounds(starts[i]) for i in usable]).reshape(-1, 2).T
         return cls(tuple(starts[i] for i in usable), moves, left, least, most, search.rig.modes.domain)
 
     def likeliest(self) -> list[Effect]:
@@ -162,23 +154,24 @@ class Screening:
         return changes
 
 
-def _bounds(starts: list[Effect]) -> tuple[float, float]:
-    """Bounds of the strength of one kind and target, in units of the start's."""
-    if not starts[0].values:
+def _bounds(start: Effect) -> tuple[float, float]:
+    """Bounds of the strength of an effect, in units of the start's."""
+    if not start.values:
         return 1.0, 1.0
-    return (-SCREENING.stronger if starts[0].kind.signed else SCREENING.weaker), SCREENING.stronger
+    return (-SCREENING.stronger if start.kind.signed else SCREENING.weaker), SCREENING.stronger
 
 
-def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[list[Effect]]:
-    """Start values of every kind and target that may join the given effects: one list for each kind and target."""
+def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[Effect]:
+    """Start values of every kind and target that may join the given effects, grouped by kind and target."""
     left = search.data.by_channel(search.data.residual(apply_all(search.rig, (*given, *search.held))))
     starts = [
-        [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
+        Effect(kind, target, dict(values))
         for kind in search.catalogue
         if kind.found_in == "search"
         for target in _plausible_targets(kind, search.rig, left)
+        for values in kind.starts(evidence, target)
     ]
-    return [task for task in starts if task and not any(_duplicates(task[0], effect) for effect in given)]
+    return [start for start in starts if not any(_duplicates(start, effect) for effect in given)]
 
 
 def _plausible_targets(kind: Kind, rig: Rig, left: np.ndarray) -> tuple[Any, ...]:
@@ -211,8 +204,6 @@ def one_more(
     """The best fits of the given effects with one more to one-step-ahead predictions, best first.
 
     Args:
-        search: records, nominal rig and candidate kinds.
-        given: effects.
         evidence: of the rig with the given effects.
         screened: the screening with these effects given, if it is available.
     """
@@ -249,7 +240,6 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
     """Fits of sets to one-step-ahead predictions, best first: all to the most informative record, the best to two.
 
     Args:
-        search: records and nominal rig.
         sets: of effects, the likeliest first.
     """
 
@@ -286,7 +276,6 @@ def on_whole_records(
     """The best one-step-ahead fits, refitted to whole records, best first.
 
     Args:
-        search: records and nominal rig.
         ahead: one-step-ahead fits, best first.
         most: number of fits, at most; those of a much higher cost are left out.
         to_cost: cost that a fit must reach to be useful; fits that will not are stopped early.
@@ -325,7 +314,6 @@ def by_continuation(search: Search, effects: tuple[Effect, ...], iterations: int
     steps until the residual on whole records is small.
 
     Args:
-        search: records and nominal rig.
         effects: with start values.
         iterations: on whole records, at most.
     """

@@ -1,14 +1,14 @@
 """The data that every step of a search for effects shares, and its criteria of what explains the records."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind, apply_all
+from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be
 from workbench.gap.effects.nominal import STIFFNESS, NominalPrior
 from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
 from workbench.gap.prediction.innovations import Observer
@@ -22,6 +22,9 @@ from workbench.gap.search.settings import SEARCH
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain, NamedPoints
 from workbench.structure.member import Structure
+
+Candidate = TypeVar("Candidate")
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +45,7 @@ class Search:
         differs: the nominal parameter that varies from record to record; empty for none.
         by_mode: whether nominal errors are those of each mode (its frequency, its shape at every port) instead of
             smooth variations of mass and stiffness.
+        tolerance: of the signal's rms: neither a gap nor an effect that is smaller in every record counts.
     """
 
     rig: Rig
@@ -56,6 +60,7 @@ class Search:
     logged: float = 0.0
     differs: str = ""
     by_mode: bool = False
+    tolerance: float = 0.0
 
     @property
     def is_over(self) -> bool:
@@ -134,6 +139,30 @@ class Search:
         """Whether the residual power of a fit above the noise is below this share of the gap's."""
         return candidate.cost - 1.0 < share * float(self.nominal.mean() - 1.0)
 
+    def noticeable(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> tuple[Effect, ...]:
+        """Those of the effects that alter the readings of some record by more than the tolerance.
+
+        Args:
+            effects: some of `beside`.
+            beside: the whole set.
+        """
+        scales = [record.outputs.std(axis=1, keepdims=True) for record in self.data.counted]
+        whole = self.data.predictions(apply_all(self.rig, beside))
+
+        def altered(effect: Effect) -> float:
+            others = [e for e in beside if e is not effect]
+            if not can_be(self.rig, others):  # the others cannot exist without this effect
+                return np.inf
+            without = self.data.predictions(apply_all(self.rig, others))
+            each = zip(whole, without, scales, strict=True)
+            return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
+
+        return tuple(effect for effect in effects if altered(effect) > self.tolerance)
+
+    def are_noticeable(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> bool:
+        """Whether all of the effects are `noticeable`."""
+        return len(self.noticeable(effects, beside)) == len(effects)
+
     def with_noise(self, noise: np.ndarray) -> "Search":
         """The same search with other standard deviations of sensor noise (n_outputs,)."""
         nominal = self.nominal * (self.data.noise / noise) ** 2
@@ -158,9 +187,9 @@ class Search:
         """The same search with each of its selections of records changed."""
         return replace(self, data=changed(self.data), quick=changed(self.quick), first=changed(self.first))
 
-    def evidence_of(self, rig: Rig) -> Evidence:
-        """Evidence of a force that a rig lacks."""
-        return Evidence.of(rig, self.data, FEWER_PLACES, self.workers)
+    def evidence_with(self, effects: Sequence[Effect]) -> Evidence:
+        """Evidence of a force that the rig with effects lacks."""
+        return Evidence.of(apply_all(self.rig, effects), self.data, FEWER_PLACES, self.workers)
 
     def without_clipped(self) -> "Search":
         """The same search without sensors that clip or round coarsely, whose errors would pass for a force."""
@@ -237,7 +266,9 @@ class Search:
             return data
         return data.with_nuisance(sensitivity(self.rig, self.held, data, self.workers))
 
-    def side_by_side(self, function: Callable[..., Fit], candidates: Sequence[Fit]) -> list[Fit]:
+    def side_by_side(
+        self, function: Callable[["Search", Candidate], Found], candidates: Iterable[Candidate]
+    ) -> list[Found]:
         """`function(search, candidate)` of each candidate, computed in parallel, in their order."""
         return self.workers.map(lambda candidate: function(self, candidate), candidates)
 
@@ -261,10 +292,19 @@ def most_informative(data: FitData, by_channel: np.ndarray) -> tuple[FitData, Fi
 
 def best_of_each_kind(fits: Sequence[Fit]) -> list[Fit]:
     """The first fit for each kind of its last effect, in the order of the fits; failed ones are left out."""
-    chosen: dict[str, Fit] = {}
-    for candidate in fits:
-        if candidate.cost < HOPELESS:
-            chosen.setdefault(candidate.effects[-1].kind.name, candidate)
+    return first_of_each((f for f in fits if f.cost < HOPELESS), lambda f: f.effects[-1].kind.name)
+
+
+def best_of_each(fits: Iterable[Fit]) -> list[Fit]:
+    """The first fit of every set, in the order of the fits."""
+    return first_of_each(fits, lambda f: f.key)
+
+
+def first_of_each(items: Iterable[Candidate], key: Callable[[Candidate], Hashable]) -> list[Candidate]:
+    """The first item of every key, in the order of the items."""
+    chosen: dict[Hashable, Candidate] = {}
+    for item in items:
+        chosen.setdefault(key(item), item)
     return list(chosen.values())
 
 

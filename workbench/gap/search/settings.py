@@ -16,6 +16,9 @@ class SearchSettings:
     sure: float = 30.0  # twice the log-likelihood ratio that settles a choice
     # of the noise power: no set is preferred to a simpler one for a smaller gain, whatever the likelihood ratio
     trifle: float = 0.005
+    # of the gap's power above the noise: any law fits so much of a measured gap, since friction of a servo drive varies
+    # by a tenth along its rail. A further effect that removes less must remove as large a share as the first
+    negligible: float = 0.002
     significant: float = 0.01  # of the noise power: a smaller gain shows an imperfect model, not an effect
     elsewhere: float = 0.1  # of the extent: fits that start closer usually reach the same local minimum
     same_place: float = 0.02  # of the extent: fits as close as this have the same local minimum
@@ -93,7 +96,6 @@ class FinishSettings:
     too_far: float = 30.0  # times the cost of the set: a simpler form that costs more after them is dropped
     tried: int = 2  # iterations at each other place before the best places are chosen
     lower: float = 0.98  # of the cost on these records: another place with a higher cost is no better minimum
-    apart: float = 0.02  # of the extent: closer places have the same local minimum
     widening: int = 8  # iterations of a set with an effect replaced by a more general one
     # times its strength: start values of an effect at another place
     factors: tuple[float, ...] = (1.0, 0.01, 0.1, 10.0, 100.0)
@@ -124,7 +126,11 @@ class RandomSettings:
 class InputSettings:
     """Constants of the search with input noise."""
 
+    # times the sensor noise power: the residual above it must be larger for input noise to be estimated; less does not
+    # matter to a mean square
+    loud: float = 0.5
     white: float = 2.0  # mean square of the whitened residual up to which input noise is accepted
+    too_white: float = 0.8  # likewise: if it is smaller, the input noise was overestimated
     # of the residual power without input noise: up to this, nominal errors may have over-fitted it and are refitted
     over_fitted: float = 0.1
     rounds: int = 2  # updates of the sensor noise with input noise given
@@ -139,27 +145,21 @@ class RecordSettings:
     enough: float = 0.3  # share of the residual power above the noise that the deviations must remove
     half: float = 0.5  # of the residual power without: largest residual with a parameter that varies
     clearly: float = 0.9  # of the residual power with a varying stiffness: another parameter must leave less
-    blocks: int = 12  # of a record: the scatter over them gives the standard error of its deviation
     sure: float = 4.0  # standard errors by which two records must differ
 
 
 @dataclass(frozen=True)
-class PlainSettings:
-    """Constants of few effects in place of many nominal errors."""
+class ErrorSettings:
+    """Constants of the boundary between errors of a careful model and effects."""
 
     # logarithms of the factors: larger uniform errors are effects
     most_common: tuple[tuple[str, float], ...] = (("modulus_error", 0.05), ("modal_damping", 0.5))
     # likewise, if only one of them is present
     most_alone: tuple[tuple[str, float], ...] = (("modulus_error", 0.015), ("modal_damping", 0.25))
-    plainly: int = 8  # iterations without nominal errors
-    briefly: int = 3  # of these, iterations before hopeless fits are dropped
     smallest_delay: float = 0.01  # of a sample: a sensor that is late by less counts as on time
     sure: float = 4.0  # standard errors by which a sensor must be late
-    near: float = 2.0  # times the noise power on the most informative records: fits above it go no further
-    needless: float = 6.0  # twice the log-likelihood ratio that one more parameter may gain by chance
     several: int = 3  # sensors: among so many, one alone is hardly late by chance
     by_chance: float = 1e-3  # probability that independent delays agree as closely
-    likeliest: int = 4  # kinds that are tried as the one additional effect
     # logarithm of a gain: a larger error is an effect, if it is also `outlying` times the rms of the other gains. Of
     # ten gains calibrated to 2 %, one is so by chance in 1.7 % of draws, and beyond 5 % alone in 12 %; to 1 %, in none
     most_gain: float = 0.05
@@ -167,6 +167,17 @@ class PlainSettings:
     most_moved: float = 0.01  # of the extent: an actuator or sensor that is farther off its place is an effect
     suspect: float = 0.4  # of most_gain: gains above it are tested, since a wrong gain biases the others
     wrong_gains: int = 2  # gains that are tested
+
+
+@dataclass(frozen=True)
+class PlainSettings:
+    """Constants of few effects in place of many nominal errors."""
+
+    plainly: int = 8  # iterations without nominal errors
+    briefly: int = 3  # of these, iterations before hopeless fits are dropped
+    near: float = 2.0  # times the noise power on the most informative records: fits above it go no further
+    needless: float = 6.0  # twice the log-likelihood ratio that one more parameter may gain by chance
+    likeliest: int = 4  # kinds that are tried as the one additional effect
 
 
 @dataclass(frozen=True)
@@ -264,9 +275,6 @@ class StepwiseSettings:
     excess: float = 0.5
     # likewise for each further effect: of three, the first two leave much
     further_excess: float = 0.25
-    # of the nominal gap's power above the noise: a further effect that removes less must remove as large a share as the
-    # first. Any law fits some of a measured gap: friction of a servo drive varies by a tenth along its rail
-    least: float = 0.002
     # share of the best candidate's one-step-ahead gain that another must reach to be tried
     promising: float = 0.2
     as_good: float = 0.9  # likewise, to be tried at a second place, or as a simpler effect in its stead
@@ -292,11 +300,6 @@ class StepwiseSettings:
     excluded: float = 1e-3  # probability below which another set is no rival
     # of the nominal gap's power: with a larger residual, a fit that began one step ahead may have diverged
     astray: float = 0.02
-    # times the sensor noise power: the residual above it must be larger for input noise to be estimated; less does not
-    # matter to a mean square
-    loud: float = 0.5
-    # mean square of the whitened residual: if it is smaller, the input noise was overestimated
-    too_white: float = 0.8
 
 
 @dataclass(frozen=True)
@@ -312,17 +315,9 @@ class PairSettings:
     # of the gap's power: below, simpler forms of a set and other places are tried before other effects
     very_near: float = 0.2 * 0.1
     most: float = 0.3  # of the gap's power: a pair with a smaller residual may be two of three effects
-    least: float = 0.002  # likewise: a smaller residual asks for no third, as any law fits some of a measured gap
     exchanges: int = 2  # rounds in which either half of the best pair is kept and the other exchanged
     tried_further: int = 2  # best pairs that are tried from other places
     named: int = 4  # best sets that may be named or be rivals
-
-
-@dataclass(frozen=True)
-class LawSettings:
-    """Constants of the search for a law beyond the catalogue."""
-
-    tried: int = 2  # one-step-ahead fits of such a law that are continued on whole records
 
 
 @dataclass(frozen=True)
@@ -334,6 +329,7 @@ class AttributionSettings:
     far_behind: float = 2.0
     together: int = 8  # iterations of effects with errors of an identified rig
     briefly: int = 2  # iterations if there may be no effect at all
+    laws: int = 2  # one-step-ahead fits of a law beyond the catalogue that are continued on whole records
     shown: int = 7  # other single effects that are fitted only for display
     a_tenth: float = 1.1**2 - 1.0  # excess power of noise that is a tenth larger in amplitude
     very_near: float = 0.01  # of the gap's power: largest residual of an effect that leaves only louder noise
@@ -363,10 +359,10 @@ FINISH = FinishSettings()
 RANDOM = RandomSettings()
 INPUTS = InputSettings()
 RECORDS = RecordSettings()
+ERRORS = ErrorSettings()
 PLAIN = PlainSettings()
 JOINT = JointSettings()
 STEPWISE = StepwiseSettings()
 PAIRS = PairSettings()
-LAW = LawSettings()
 ATTRIBUTION = AttributionSettings()
 INTERVALS = IntervalSettings()

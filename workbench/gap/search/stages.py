@@ -12,15 +12,15 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
 from workbench.gap.prediction.noise import is_noise_alone, noise_found
 from workbench.gap.search.beside_random import decide_on_random, random_with_effects, random_with_nominal_errors
+from workbench.gap.search.errors_as_effects import NO_UNIFORM_ERROR, are_uniform_errors, is_plausible_error
 from workbench.gap.search.finish import finished, ranked, relocated, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
-from workbench.gap.search.nominal_figures import with_mode_errors, with_record_deviations
+from workbench.gap.search.other_errors import with_mode_errors, with_record_deviations
 from workbench.gap.search.pairs import Pairs
-from workbench.gap.search.plain import NO_UNIFORM_ERROR, are_uniform_errors, is_plausible_error
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, nearest, promise
-from workbench.gap.search.settings import ATTRIBUTION, LAW, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
+from workbench.gap.search.settings import ATTRIBUTION, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 from workbench.rig.simulate import is_stepped
 
@@ -37,7 +37,6 @@ class Stages:
         start: the fit without further effects.
         evidence: of that rig.
         nominal: evidence of the nominal rig.
-        tolerance: of the signal's rms: a smaller gap above the noise is not searched for causes.
         uncertain_nominal: whether nominal errors are fitted with every effect from the first.
         ahead: single effects fitted to one-step-ahead predictions, best first; empty if a stage before decides.
         singles: single effects on whole records, best first, or sets that were tried with a random disturbance.
@@ -47,7 +46,6 @@ class Stages:
     start: Fit
     evidence: Evidence
     nominal: Evidence
-    tolerance: float
     uncertain_nominal: bool = False
     ahead: list[Fit] = field(default_factory=list)
     singles: list[Fit] = field(default_factory=list)
@@ -78,7 +76,7 @@ class Stages:
         """Any effects beside nominal errors, where the model is known to be inexact."""
         if not self.uncertain_nominal or self.is_explained_by_none:
             return None
-        stepwise = Stepwise(self.search, self.tolerance)
+        stepwise = Stepwise(self.search)
         varied = None if stepwise.is_sufficient else with_record_deviations(stepwise)
         if varied is not None:
             return varied.decision()
@@ -109,7 +107,7 @@ class Stages:
         Not if one is a plausible error of the model or has no significant parameter, or if one is a uniform error and
         the other uniform error surely explains more.
         """
-        pairs, search = self.screened_pairs.copy(), self.search
+        pairs, search = replace(self.screened_pairs), self.search
         near = [effect for f in self.singles[:1] if search.near(f, PAIRS.most) for effect in f.effects]
         if not (pairs.explain or pairs.with_any(near)):
             return None
@@ -226,10 +224,10 @@ class Stages:
         for record, residual in zip(self.nominal.data.counted, self.nominal.residuals, strict=True):
             scale = record.outputs.std(axis=1, keepdims=True)
             noise_floor = float(((self.nominal.data.noise[:, None] / scale) ** 2).mean())
-            largest = max(self.tolerance**2, ATTRIBUTION.a_tenth * noise_floor)
+            largest = max(self.search.tolerance**2, ATTRIBUTION.a_tenth * noise_floor)
             if float(((residual / scale) ** 2).mean()) - noise_floor > largest:
                 return False
-        return self.tolerance > 0
+        return self.search.tolerance > 0
 
     @cached_property
     def screened(self) -> Screening:
@@ -257,12 +255,12 @@ class Stages:
     @cached_property
     def pairs(self) -> Pairs:
         """The search for pairs, which goes on from stage to stage."""
-        return self.screened_pairs.copy()
+        return replace(self.screened_pairs)
 
     @cached_property
     def stepwise(self) -> Stepwise:
         """The stepwise selection beside small errors of the model, which goes on from stage to stage."""
-        return Stepwise(self.search, self.tolerance, self.ahead)
+        return Stepwise(self.search, self.ahead)
 
     @cached_property
     def is_explained_beside_errors(self) -> bool:
@@ -349,10 +347,15 @@ def _force_of_other_law(search: Search, evidence: Evidence) -> Fit | None:
     Two effects at one place can fit many laws, so this comes before pairs are accepted. None if there is none.
     """
     search.report("one force of a law beyond the catalogue", 0.35)
-    beyond = replace(search, catalogue=BEYOND)
-    promising = [f for f in one_more(beyond, (), evidence) if f.cost < SELECTION.promising]
-    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.cost_limit)
+    fits = _forces_of_other_laws(search, evidence, SELECTION.promising)
     return next((f for f in (_as_catalogue_kind(search, f) for f in fits) if search.explains(f)), None)
+
+
+def _forces_of_other_laws(search: Search, evidence: Evidence, most: float) -> list[Fit]:
+    """Forces at one point of a law beyond the catalogue, best first, that cost less than `most` one step ahead."""
+    beyond = replace(search, catalogue=BEYOND)
+    promising = [f for f in one_more(beyond, (), evidence) if f.cost < most]
+    return on_whole_records(beyond, promising, ATTRIBUTION.laws, to_cost=search.cost_limit)
 
 
 def _as_catalogue_kind(search: Search, law: Fit) -> Fit:
@@ -365,7 +368,6 @@ def _unless_other_law(search: Search, decision: Decision, evidence: Evidence) ->
     """The decision, or that for a law beyond the catalogue if the records surely prefer it to one law at a point.
 
     Args:
-        search: records and nominal rig.
         decision: to be compared.
         evidence: of the nominal rig.
     """
@@ -376,10 +378,8 @@ def _unless_other_law(search: Search, decision: Decision, evidence: Evidence) ->
     if not effect.kind.nonlinear or effect.at is None:
         return decision
     search.report("one force of a law beyond the catalogue", 0.9)
-    beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.at)
     as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
-    promising = [f for f in one_more(beyond, (), there) if f.cost < as_near]
-    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.cost_limit)
+    fits = _forces_of_other_laws(search, evidence.of_force_at(effect.at), as_near)
     other = [f for f in fits if in_catalogue(f.effects[0]) is None]
     sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
     law = next(sure, None)

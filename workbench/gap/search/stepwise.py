@@ -6,58 +6,45 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from workbench.gap.effects.effect import (
-    Effect,
-    apply_all,
-    contained,
-    each_left_out,
-    key_of,
-    merged_sets,
-    more_general_sets,
-    simpler_sets,
-    with_one_simpler,
-)
-from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
-from workbench.gap.effects.ports import ACTUATOR_GAIN, SENSOR_GAIN
-from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
+from workbench.gap.effects.effect import Effect, apply_all, contained, key_of, more_general_sets
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, in_group, nominal_errors
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.noise import LEAST_LOGGED
-from workbench.gap.search.candidates import TIMING, fit_from_zero, fitted_to_all, fitted_to_quick
+from workbench.gap.search.candidates import TIMING, fit_from_zero, fitted_to_all, fitted_to_quick, with_reading_sides
+from workbench.gap.search.elimination import (
+    backward_eliminated,
+    is_as_good,
+    limiting_case,
+    simplest_step,
+    size_of_set,
+    without_inactive,
+)
+from workbench.gap.search.errors_as_effects import (
+    NO_UNIFORM_ERROR,
+    UNIFORM,
+    is_linear_structural,
+    is_timing,
+    may_be_port_errors,
+    with_delay_as_effect,
+    with_late_accelerometer,
+    with_uniform_effects,
+    with_wrong_gains,
+)
 from workbench.gap.search.finish import other_places
-from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of
+from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import (
     Step,
     are_plausible,
     evaluated,
     fit_jointly,
-    size_of,
-    with_all_groups,
-    with_input_noise,
-    with_reading_sides,
-)
-from workbench.gap.search.plain import (
-    NO_UNIFORM_ERROR,
-    UNIFORM,
-    delay_effects,
-    delay_of,
-    few_with_uniform_errors,
-    in_place_of_nominal_errors,
-    is_linear_structural,
-    other_delay_causes,
-    with_common_delay,
-)
-from workbench.gap.search.preference import (
     is_likelier,
-    is_timing,
     loss,
-    may_be_port_errors,
-    noticeable,
-    size_of_set,
-    surely_prefers,
+    with_input_noise,
 )
+from workbench.gap.search.plain import few_with_uniform_errors, in_place_of_nominal_errors, other_delay_causes
 from workbench.gap.search.screening import fitted_ahead, one_more
 from workbench.gap.search.search import Decision, Search, apart, best_of_each_kind, most_informative
-from workbench.gap.search.settings import FINISH, PLAIN, SEARCH, STEPWISE
+from workbench.gap.search.settings import FINISH, INPUTS, PLAIN, SEARCH, STEPWISE
 from workbench.rig.simulate import is_stepped
 
 
@@ -65,8 +52,6 @@ class Stepwise:
     """Stepwise selection of effects, fitted jointly with nominal errors: forward, with backward elimination.
 
     Attributes:
-        search: records, nominal rig and candidate kinds.
-        tolerance: share of the signal's rms; an effect that alters every record by less is not added.
         ahead: fits of single effects to one-step-ahead predictions without nominal errors, best first; candidates for
             the first effect.
         at_first: the search without input noise.
@@ -81,12 +66,12 @@ class Stepwise:
         known: fits of single effects that are not repeated.
     """
 
-    def __init__(self, search: Search, tolerance: float = 0.0, ahead: Sequence[Fit] = ()) -> None:
+    def __init__(self, search: Search, ahead: Sequence[Fit] = ()) -> None:
         self.ahead = ahead
         self.singles: Sequence[tuple[Effect, ...]] | None = None
         self.known: Sequence[Step] = ()
         catalogue = tuple(kind for kind in search.catalogue if kind not in UNIFORM)
-        self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
+        self.search = replace(search, catalogue=catalogue or search.catalogue)
         self.at_first = self.search
         self.tried_beside_input_noise = False
         self.has_finer_substeps = False
@@ -108,13 +93,66 @@ class Stepwise:
         """The last set or the best single effect with nominal errors, whichever has the smaller residual."""
         return min((self.last, *self.fitted_singles), key=lambda s: s.fit.cost)
 
+    # What the last set shows
+
+    @property
+    def unexplained(self) -> float:
+        """Residual power of the last set above the noise, as a share of that of the nominal rig."""
+        return float(self.last.excess(self.last.noise_power) / self._gap)
+
+    @property
+    def _gap(self) -> float:
+        """Power of the nominal residual above the noise, in units of the stated noise."""
+        return max(float(np.maximum(self.search.nominal - self.last.noise_power, 0.0).mean()), 1e-12)
+
+    @property
+    def closes_gap(self) -> bool:
+        """Whether the residual of the last set is at the noise floor, or a negligible share of the gap."""
+        return self.is_noise_only or self.unexplained < STEPWISE.explained
+
+    @property
+    def is_noise_only(self) -> bool:
+        """Whether the residual of the last set is at the noise floor of sensors and inputs."""
+        return self.last.is_near(self.last.noise_power, STEPWISE.no_gap)
+
+    @property
+    def _is_exhausted(self) -> bool:
+        """Whether the residual of the last set is below what any missing effect would leave."""
+        return self.last.is_near(self.last.noise_power, STEPWISE.noise_floor)
+
+    @property
+    def needs_no_effect(self) -> bool:
+        """Whether nominal errors alone explain the gap."""
+        return not self.last.effects and self.closes_gap
+
+    @property
+    def has_plausible_errors(self) -> bool:
+        """Whether the nominal errors of the last set are plausible; those of damping do not count."""
+        return self.plain is not None or are_plausible(self.last.errors, damping=False)
+
+    @property
+    def is_sufficient(self) -> bool:
+        """Whether the residual of the last set is too small to search for another effect."""
+        left = self.last.explains or (self.last.effects and self.unexplained < STEPWISE.further)
+        return bool(left and self.last.is_plausible and (self.tried_beside_input_noise or not self.search.logged))
+
+    @property
+    def is_conclusive(self) -> bool:
+        """Whether the search may end: the residual is at the noise floor and the nominal errors are plausible."""
+        if self.plain is not None:
+            return True
+        outcome = self.decision().outcome
+        return self.is_noise_only and (outcome == "none" or (outcome == "explained" and self.last.is_plausible))
+
+    # The first effect
+
     @cached_property
     def fitted_singles(self) -> list[Step]:
         """Single effects, each fitted jointly with nominal errors that start from zero, best first."""
         sets = [f.effects for f in self._likeliest_singles()] if self.singles is None else self.singles
         keys = {key_of(step.effects) for step in self.known}
-        fresh = self._from_zero([effects for effects in sets if key_of(effects) not in keys])
-        found = [s for s in (*self.known, *fresh) if not may_be_port_errors(self.search, s)]
+        fresh = self.search.side_by_side(fit_from_zero, [effects for effects in sets if key_of(effects) not in keys])
+        found = [s for s in (*self.known, *fresh) if not may_be_port_errors(self.search, s.effects)]
         best = sorted(found, key=lambda s: s.fit.cost)
         if not best or (self.has_plausible_errors and not self.search.by_mode):
             return best
@@ -173,8 +211,8 @@ class Stepwise:
             return
         uniform = fit(search.rig, NO_UNIFORM_ERROR, search.data)
         stiffness, damping = (float(np.log(effect.values["factor"])) for effect in uniform.effects)
-        sizes = {name: damping for name in errors.values if group_of(name) == "damping"} | {"stiffness_0": stiffness}
-        found = fit_jointly(search, (), nominal_errors(search.rig, search.prior, errors.values | sizes))
+        sizes = {**errors.values, **dict.fromkeys(in_group(errors, "damping"), damping), "stiffness_0": stiffness}
+        found = fit_jointly(search, (), nominal_errors(search.rig, search.prior, sizes))
         if found.explains and are_plausible(found.errors, damping=False):
             self.steps.append(found)
 
@@ -190,12 +228,12 @@ class Stepwise:
         excess = best.excess(best.noise_power)
         if not best.explains and excess > STEPWISE.further * float(self.search.nominal.mean()):
             return False
-        best = replace(self._simplest(best, self.fitted_singles[1:]), others=tuple(self.fitted_singles))
+        best = self._simplest(best, self.fitted_singles[1:], self.fitted_singles)
         # quiet noise of the inputs excites weak modes in the prediction alone, which large damping makes up for
         only_damping = not self.has_plausible_errors and are_plausible(best.errors, damping=False)
         if not ((best.is_plausible or only_damping) and self._is_accepted(best, self.last)):
             return False
-        reduced = self._backward_eliminated(best)
+        reduced = backward_eliminated(self.search, best)
         errors_only = None if reduced.effects else fit_jointly(self.search, (), reduced.errors)
         # the effect only led the nominal errors out of a local minimum
         if errors_only is not None and are_plausible(errors_only.errors, damping=False):
@@ -206,30 +244,6 @@ class Stepwise:
         self.steps.append(self._with_finer_substeps(self.last))
         return True
 
-    def _by_shorter_description(self) -> None:
-        """Add a linear effect if its description length is well below that of nominal errors alone (MDL).
-
-        The likelihood must prefer it too: the noise is seldom exactly as modelled.
-        """
-        errors_only, noise = self.last, self.last.noise_power
-        length_limit = errors_only.description(noise) - STEPWISE.fewer_words
-        if length_limit < 0.0:
-            return
-        sets = [f.effects for f in self._linear_singles[: STEPWISE.finalists]]
-        tried = [s for s in self._from_zero(sets) if s.is_plausible and not may_be_port_errors(self.search, s)]
-        shorter = [s for s in tried if s.description(noise) < length_limit]
-        if not shorter:
-            return
-        # iterated as far as the effects, the errors alone may describe the records as briefly
-        errors_only = fit_jointly(self.search, (), errors_only.errors, rounds=3, until_convergence=True)
-        length_limit = errors_only.description(noise) - STEPWISE.fewer_words
-        shorter = [s for s in shorter if s.description(noise) < length_limit]
-        found = [s for s in shorter if is_likelier(self.search, s, errors_only, least=SEARCH.trifle)]
-        if found:
-            best = min(found, key=lambda s: s.description(noise))
-            if self._are_noticeable(best.effects, best.fit.effects):
-                self.steps.append(replace(best, others=tuple(found)))
-
     def by_few(self) -> bool:
         """Whether few effects with uniform stiffness and damping errors explain the records; sets `plain`.
 
@@ -238,7 +252,7 @@ class Stepwise:
         if self.has_plausible_errors or self.last.effects or self.search.logged:
             return False
         found = few_with_uniform_errors(self.search, self.last, STEPWISE.most)
-        if found is None or not self._are_noticeable(found.effects, found.effects):
+        if found is None or not self.search.are_noticeable(found.effects, found.effects):
             return False
         if all(effect.stands_out(self.search.rig) for effect in found.effects):
             self.plain = found
@@ -263,13 +277,15 @@ class Stepwise:
             return False
         errors = with_reading_sides(search, nominal_errors(search.rig, search.prior), best.effects)
         found = fit_jointly(search, best.effects, errors, until_convergence=True)
-        if may_be_port_errors(self.search, found) or not (
-            found.explains and self._are_noticeable(found.effects, found.fit.effects)
-        ):
+        if may_be_port_errors(search, found.effects) or not found.explains:
+            return False
+        if not search.are_noticeable(found.effects, found.fit.effects):
             return False
         self.steps.append(found)
         self.is_run = not found.is_plausible  # errors that are large absorb the effect at any other place too
         return True
+
+    # Further effects
 
     def run(self, most: int = STEPWISE.most) -> None:
         """Add effects, `most` in all, as long as each removes most of the residual power above the noise; once."""
@@ -286,18 +302,44 @@ class Stepwise:
         self._add(most)
         if self.calibrate():
             self._add(most)
-        limit = self._limiting_case(self.last)
+        limit = limiting_case(self.search, self.last, self._gap)
         if limit is not self.last:
             self.steps.append(replace(limit, others=self.last.others))
         if not (first.effects and self.last is first):  # otherwise done above
             self.plain = self._without_errors(self.last)
         if self.plain is not None:
             return
-        self.steps.append(self._with_delay_as_effect(self._with_common_effects(self.last)))
+        with_uniform = with_uniform_effects(self.search, self.last)
+        self.steps.append(with_delay_as_effect(self.search, with_uniform, STEPWISE.explained * self._gap))
         if self.last.effects:
             self.steps.append(
                 fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, until_convergence=True)
             )
+
+    def _by_shorter_description(self) -> None:
+        """Add a linear effect if its description length is well below that of nominal errors alone (MDL).
+
+        The likelihood must prefer it too: the noise is seldom exactly as modelled.
+        """
+        errors_only, noise = self.last, self.last.noise_power
+        length_limit = errors_only.description(noise) - STEPWISE.fewer_words
+        if length_limit < 0.0:
+            return
+        sets = [f.effects for f in self._linear_singles[: STEPWISE.finalists]]
+        fitted = self.search.side_by_side(fit_from_zero, sets)
+        tried = [s for s in fitted if s.is_plausible and not may_be_port_errors(self.search, s.effects)]
+        shorter = [s for s in tried if s.description(noise) < length_limit]
+        if not shorter:
+            return
+        # iterated as far as the effects, the errors alone may describe the records as briefly
+        errors_only = fit_jointly(self.search, (), errors_only.errors, rounds=3, until_convergence=True)
+        length_limit = errors_only.description(noise) - STEPWISE.fewer_words
+        shorter = [s for s in shorter if s.description(noise) < length_limit]
+        found = [s for s in shorter if is_likelier(self.search, s, errors_only, least=SEARCH.trifle)]
+        if found:
+            best = min(found, key=lambda s: s.description(noise))
+            if self.search.are_noticeable(best.effects, best.fit.effects):
+                self.steps.append(replace(best, others=tuple(found)))
 
     def _add(self, most: int) -> None:
         """Add effects one after the other, `most` in all."""
@@ -318,197 +360,9 @@ class Stepwise:
             self._with_input_noise(step)
             if estimated and not self.search.logged:  # the input noise was none, so the choice is made again
                 self.steps[-1] = self._reselected(replace(self.last, others=step.others))
-            self.steps.append(self._with_finer_substeps(self._backward_eliminated(self.last)))
+            self.steps.append(self._with_finer_substeps(backward_eliminated(self.search, self.last)))
             if len(self.last.effects) <= len(before.effects) and not self._is_accepted(self.last, before):
                 break
-
-    @property
-    def is_sufficient(self) -> bool:
-        """Whether the residual of the last set is too small to search for another effect."""
-        left = self.last.explains or (self.last.effects and self.unexplained < STEPWISE.further)
-        return bool(left and self.last.is_plausible and (self.tried_beside_input_noise or not self.search.logged))
-
-    @property
-    def _is_exhausted(self) -> bool:
-        """Whether the residual of the last set is below what any missing effect would leave."""
-        return self.last.excess(self.last.noise_power) < STEPWISE.noise_floor * float(self.last.noise_power.mean())
-
-    def _with_finer_substeps(self, step: Step) -> Step:
-        """The step refitted with substeps fine enough to be exact, if its residual is close to the noise floor.
-
-        The selection continues with these substeps: the error of coarser ones would pass for another effect.
-        """
-        rig, noise = apply_all(self.search.rig, step.fit.effects), step.noise_power
-        is_near_noise = step.excess(noise) < STEPWISE.further * self._gap
-        if not (step.effects and is_near_noise and is_stepped(rig)) or step.explains:
-            return step
-        data, substeps = self.search.data, self.search.data.substeps
-        residual = data.residual(rig)
-        while substeps < FINISH.finest:
-            finer = data.stepped(2 * substeps).residual(rig)
-            change, residual = finer - residual, finer
-            if float(change @ change) < STEPWISE.stepping * change.size:
-                break
-            substeps *= 2
-        if substeps == data.substeps:
-            return step
-        self.has_finer_substeps = True
-        self.search, self.at_first = (
-            replace(each, data=each.data.stepped(substeps)) for each in (self.search, self.at_first)
-        )
-        return replace(fit_jointly(self.search, step.effects, step.errors, rounds=2), others=step.others)
-
-    def _with_input_noise(self, step: Step) -> Step | None:
-        """The step refitted with input noise, if that whitens its residual; else None.
-
-        The selection continues, and the steps before are evaluated, with input noise of the level that the residual
-        of this step shows; without input noise if this step explains the records.
-        """
-        search = self.at_first
-        without_noise = (
-            fit_jointly(search, step.effects, step.errors) if self.search.logged else evaluated(search, step.fit)
-        )
-        is_loud = without_noise.excess(without_noise.sensor_noise) > STEPWISE.loud * float(
-            without_noise.sensor_noise.mean()
-        )
-        if without_noise.logged < LEAST_LOGGED or not is_loud:
-            return self._continue_in(search, step, without_noise) if self.search.logged else None
-        noisy = with_input_noise(search, step.fit, without_noise.sensor_noise)
-        if noisy is None:
-            return None
-        fitted = fit_jointly(noisy, step.effects, step.errors)
-        if fitted.fit.cost < STEPWISE.too_white:  # nominal errors had fitted the noise, so it was estimated too loud
-            noisy = with_input_noise(search, fitted.fit, without_noise.sensor_noise)
-            if noisy is None:
-                return None
-            fitted = fit_jointly(noisy, step.effects, fitted.errors)
-        if fitted.fit.cost < STEPWISE.too_white:
-            return None
-        # noise this loud masks most effects; if a single effect explains the residual, there is no input noise
-        found = None if step.effects or self.search.logged else self._in_place_of_inputs(without_noise)
-        if found is not None:
-            self.steps.append(found)
-            return None
-        return self._continue_in(noisy, step, fitted)
-
-    def _continue_in(self, search: Search, step: Step, fitted: Step) -> Step:
-        """`fitted`, the step refitted in another search; the selection continues in that search."""
-        self.search, self.tried_beside_input_noise = search, False
-        self.steps = [fitted if s is step else replace(evaluated(search, s.fit), others=s.others) for s in self.steps]
-        return fitted
-
-    @property
-    def unexplained(self) -> float:
-        """Residual power of the last set above the noise, as a share of that of the nominal rig."""
-        return float(self.last.excess(self.last.noise_power) / self._gap)
-
-    def _from_zero(self, sets: Sequence[tuple[Effect, ...]]) -> list[Step]:
-        """Sets of effects, each with nominal errors that start from zero, fitted to all records side by side."""
-        return self.search.workers.map(partial(fit_from_zero, self.search), sets)
-
-    def _to_all(self, steps: Sequence[Step]) -> list[Step]:
-        """Steps fitted to all records side by side."""
-        return self.search.workers.map(partial(fitted_to_all, self.search), steps)
-
-    @property
-    def _gap(self) -> float:
-        """Power of the nominal residual above the noise, in units of the stated noise."""
-        return max(float(np.maximum(self.search.nominal - self.last.noise_power, 0.0).mean()), 1e-12)
-
-    @property
-    def needs_no_effect(self) -> bool:
-        """Whether nominal errors alone explain the gap."""
-        return not self.last.effects and self.closes_gap
-
-    @property
-    def closes_gap(self) -> bool:
-        """Whether the residual of the last set is at the noise floor, or a negligible share of the gap."""
-        return self.is_noise_only or self.unexplained < STEPWISE.explained
-
-    @property
-    def is_noise_only(self) -> bool:
-        """Whether the residual of the last set is at the noise floor of sensors and inputs."""
-        return self.last.excess(self.last.noise_power) < STEPWISE.no_gap * float(self.last.noise_power.mean())
-
-    @property
-    def has_plausible_errors(self) -> bool:
-        """Whether the nominal errors of the last set are plausible; those of damping do not count."""
-        return self.plain is not None or are_plausible(self.last.errors, damping=False)
-
-    @property
-    def is_conclusive(self) -> bool:
-        """Whether the search may end: the residual is at the noise floor and the nominal errors are plausible."""
-        if self.plain is not None:
-            return True
-        outcome = self.decision().outcome
-        return self.is_noise_only and (outcome == "none" or (outcome == "explained" and self.last.is_plausible))
-
-    def decision(self) -> Decision:
-        """The verdict on the last set of effects."""
-        beside = self.search if self.search.logged or self.has_finer_substeps else None
-        if self.plain is not None:
-            rivals = self._rivals_of_plain
-            return Decision("explained", self.plain, rivals=rivals, noise=self.search.data.noise, beside=beside)
-        effects, left = self.last.effects, self.unexplained
-        noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
-        closed = self.closes_gap or (len(effects) > 1 and left < STEPWISE.in_part)
-        if effects and closed and not self.shows_unknown_law:
-            return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise, beside=beside)
-        if self.needs_no_effect:
-            return Decision("none", self.last.fit, noise=noise, beside=beside)
-        return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise, beside=beside)
-
-    @cached_property
-    def _rivals_of_plain(self) -> tuple[tuple[Fit, float], ...]:
-        """Other causes that explain the records as well as `plain`, with their probabilities."""
-        return () if self.plain is None else other_delay_causes(self.search, self.plain)
-
-    def _others(self) -> list[Step]:
-        """The last set as it was selected, then the other candidates that explain the records or fit as well."""
-        key = key_of(self.last.effects)
-        chosen = next((s for s in reversed(self.steps) if s.others and key_of(s.effects) == key), None)
-        if chosen is None:
-            return []
-        others = [s for s in chosen.others if key_of(s.effects) != key]
-        return [chosen, *(s for s in others if s.explains or self._is_as_good(s, chosen))]
-
-    def _rivals(self) -> tuple[tuple[Fit, float], ...]:
-        """Other sets that fit as well, with their probabilities by description length.
-
-        If no set reaches the noise floor, only the description lengths of the nominal errors are compared: the
-        residuals differ by too little, and have no known distribution.
-        """
-        sets = self._others()
-        if not sets:
-            return ()
-        key, rig = key_of(sets[0].effects), self.search.rig
-        sets = [s for s in sets if key not in contained(s.effects, rig)]
-        noise, none_explains = sets[0].sensor_noise, not sets[0].explains
-        length = [
-            s.description(noise, of_errors_alone=none_explains) + self.search.nats_per_parameter * s.fit.n_parameters
-            for s in sets
-        ]
-        odds = np.exp(min(length) - np.array(length))
-        likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
-        return tuple((s.fit, float(p)) for s, p in likely if p > STEPWISE.excluded)
-
-    def _at_another_place(self, step: Step) -> Step | None:
-        """The step with its one linear structural effect moved to another place, if that has a smaller loss.
-
-        Smooth nominal errors approximate such an effect at any place. The cost therefore has a local minimum at every
-        wavelength of these errors, and only a fit from each place finds the global one.
-        """
-        if len(step.effects) != 1 or not is_linear_structural(step.effects[0].kind) or step.effects[0].at is None:
-            return None
-        (effect,), domain = step.effects, self.search.rig.modes.domain
-        self.search.report("the same effect at other places", 0.6)
-        places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
-        here, *others = fitted_to_quick(self.search, [(effect,), *places], step)
-        elsewhere = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
-        near = sorted((s for s in elsewhere if s.fit.cost < STEPWISE.near * here.fit.cost), key=lambda s: s.fit.cost)
-        whole = self._to_all(near[: STEPWISE.finalists])
-        best = min(whole, key=partial(loss, self.search), default=step)
-        return best if loss(self.search, best) < loss(self.search, step) else None
 
     def _with_another_law(self, step: Step) -> Step | None:
         """The step with its one nonlinear law replaced by another at the same place, if that removes enough.
@@ -541,6 +395,24 @@ class Stepwise:
         best, *rest = sorted((step, *others), key=partial(loss, search))
         return replace(best, others=(best, *rest)) if best is not step and self._is_accepted(best, step) else None
 
+    def _at_another_place(self, step: Step) -> Step | None:
+        """The step with its one linear structural effect moved to another place, if that has a smaller loss.
+
+        Smooth nominal errors approximate such an effect at any place. The cost therefore has a local minimum at every
+        wavelength of these errors, and only a fit from each place finds the global one.
+        """
+        if len(step.effects) != 1 or not is_linear_structural(step.effects[0].kind) or step.effects[0].at is None:
+            return None
+        (effect,), domain = step.effects, self.search.rig.modes.domain
+        self.search.report("the same effect at other places", 0.6)
+        places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
+        here, *others = fitted_to_quick(self.search, [(effect,), *places], step)
+        elsewhere = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
+        near = _finalists(sorted(elsewhere, key=lambda s: s.fit.cost), STEPWISE.near * here.fit.cost)
+        whole = self.search.side_by_side(fitted_to_all, near)
+        best = min(whole, key=partial(loss, self.search), default=step)
+        return best if loss(self.search, best) < loss(self.search, step) else None
+
     def _with_an_absorbed(self, step: Step) -> Step | None:
         """The step with one linear effect more that makes its implausible nominal errors much smaller, or None.
 
@@ -552,10 +424,12 @@ class Stepwise:
         self.search.report("effects that errors of the model have absorbed", 0.6)
         named = {effect.kind for effect in step.effects}
         singles = [f.effects for f in self._linear_singles if f.effects[0].kind not in named][: STEPWISE.finalists]
-        tried = self._from_zero([(*step.effects, *each) for each in singles])
+        tried = self.search.side_by_side(fit_from_zero, [(*step.effects, *each) for each in singles])
         noise = step.noise_power
         longest = step.description(noise) - STEPWISE.shorter
-        found = [s for s in tried if s.description(noise) < longest and self._are_noticeable(s.effects, s.fit.effects)]
+        found = [
+            s for s in tried if s.description(noise) < longest and self.search.are_noticeable(s.effects, s.fit.effects)
+        ]
         return replace(min(found, key=lambda s: s.description(noise)), others=tuple(found)) if found else None
 
     def _with_one_more(self, step: Step) -> Step | None:
@@ -564,7 +438,7 @@ class Stepwise:
         tried = self._candidates_with_one_more(step)
         if not tried:
             return None
-        with_late = self._with_late_accelerometer(step, tried)
+        with_late = with_late_accelerometer(self.search, step, tried)
         if with_late is not None:
             self.steps[-1] = with_late
             return self._with_one_more(with_late)
@@ -597,168 +471,47 @@ class Stepwise:
         chosen = [*chosen[: STEPWISE.candidates], *more_general_sets(step.effects)]
         return fitted_to_quick(self.search, chosen, step)
 
-    def _in_place_of_inputs(self, step: Step) -> Step | None:
-        """The step with one more effect that explains the records without input noise, or None."""
-        near = [
-            s
-            for s in self._candidates_with_one_more(step)
-            if s.fit.cost < PLAIN.near and not may_be_port_errors(self.search, s)
-        ]
-        near = sorted(near, key=lambda s: s.fit.cost)[: STEPWISE.finalists]
-        whole = self._to_all(near)
-        found = [s for s in whole if s.explains and s.is_plausible and self._is_accepted(s, step)]
-        return self._simplest_of_sets(sorted(found, key=lambda s: s.fit.cost)) if found else None
-
-    def _with_late_accelerometer(self, step: Step, tried: Sequence[Step]) -> Step | None:
-        """The step with an accelerometer that reads before the input steps, if the best candidate delays it.
-
-        The acceleration jumps with a held input, so the cost jumps at zero delay and no gradient leads across.
-        """
-        best = min(tried, key=lambda s: s.fit.cost)
-        prior, late = step.errors.target, best.effects[-1]
-        if late.kind not in TIMING or prior.interpolated or not is_timing(self.search, best, TIMING):
-            return None
-        accelerometers = {sensor.name for sensor in self.search.rig.sensors if sensor.quantity == "acceleration"}
-        if late.target not in accelerometers.difference(prior.late):
-            return None
-        errors = with_all_groups(self.search, step.errors)
-        early = tuple(name for name in prior.early if name != late.target)
-        target = replace(errors.target, late=(*prior.late, late.target), early=early)
-        delay = delay_of(late) / prior.sample_time
-        values = {**errors.values, f"delay_{late.target}": delay}
-        refitted = fit_jointly(self.search, step.effects, nominal_errors(self.search.rig, target, values))
-        return refitted if refitted.fit.cost < step.fit.cost else None
-
     def _best_of(self, tried: Sequence[Step], step: Step) -> Step:
         """The best set on all records, of candidates fitted to the most informative ones."""
         # the single effects fitted before nominal errors could absorb them compete too
         singles = [] if step.effects else self.fitted_singles
-        tried = sorted((s for s in tried if not may_be_port_errors(self.search, s)), key=partial(loss, self.search))
-        close = [s for s in tried if s.fit.cost < STEPWISE.near * tried[0].fit.cost][: STEPWISE.finalists]
-        whole = self.search.workers.map(lambda s: self._without_inactive(fitted_to_all(self.search, s)), close)
+        search = self.search
+        tried = sorted((s for s in tried if not may_be_port_errors(search, s.effects)), key=partial(loss, search))
+        near = _finalists(tried, STEPWISE.near * tried[0].fit.cost) if tried else []
+        whole = search.workers.map(lambda s: without_inactive(search, fitted_to_all(search, s)), near)
         # the most informative records overstate some
-        whole = [s for s in whole if not may_be_port_errors(self.search, s)]
-        whole = sorted((*whole, *singles), key=partial(loss, self.search))
-        return self._simplest_of_sets(whole) if whole else step
+        whole = [s for s in whole if not may_be_port_errors(search, s.effects)]
+        whole = sorted((*whole, *singles), key=partial(loss, search))
+        return self._simplest(whole[0], whole[1:]) if whole else step
 
-    def _simplest_of_sets(self, sets: Sequence[Step]) -> Step:
-        """The simplest set that is as good as the first of these, which is the best."""
-        return replace(self._simplest(sets[0], sets[1:]), others=tuple(sets))
+    def _simplest(self, best: Step, tried: Sequence[Step], others: Sequence[Step] = ()) -> Step:
+        """The best step, or a simpler one that fits almost as well; its competitors are `others`, or those tried."""
+        found = simplest_step(self.search, best, tried, self.ahead, self._gap)
+        return replace(found, others=tuple(others or (best, *tried)))
 
     def _reselected(self, step: Step) -> Step:
         """The best of a step and its competitors (`others`), refitted in the current search."""
         others = [s for s in step.others if key_of(s.effects) != key_of(step.effects)]
-        others = self._to_all(others)
-        return self._simplest_of_sets(sorted((step, *others), key=partial(loss, self.search)))
-
-    def _are_noticeable(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> bool:
-        """Whether each of these effects alters the readings noticeably, `beside` being the whole set."""
-        return len(noticeable(self.search, effects, beside, self.tolerance)) == len(effects)
+        refitted = self.search.side_by_side(fitted_to_all, others)
+        best, *rest = sorted((step, *refitted), key=partial(loss, self.search))
+        return self._simplest(best, rest)
 
     def _is_accepted(self, best: Step, step: Step) -> bool:
         """Whether a set removes enough of the residual of a smaller one, or makes its nominal errors plausible."""
-        if not self._are_noticeable(best.effects, best.fit.effects):
+        if not self.search.are_noticeable(best.effects, best.fit.effects):
             return False
         # if nominal errors, sensor delays among them, explain the records, another small delay is no effect
-        by_likelihood = step.explains and not is_timing(self.search, best, TIMING)
+        by_likelihood = step.explains and not is_timing(self.search, best.effects, TIMING)
         if (self.search.logged or by_likelihood) and is_likelier(self.search, best, step):
             return True
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
-        is_negligible = bool(step.effects) and before - after < STEPWISE.least * self._gap
+        is_negligible = bool(step.effects) and before - after < SEARCH.negligible * self._gap
         share = STEPWISE.further_excess if step.effects and not is_negligible else STEPWISE.excess
         if not step.explains and before - after > share * before:
             return True
-        saved = step.description(noise, of_errors_alone=is_negligible) - best.description(
-            noise, of_errors_alone=is_negligible
-        )
-        return not step.is_plausible and saved > STEPWISE.shorter
-
-    def _without_inactive(self, step: Step) -> Step:
-        """The step without effects that no longer alter the readings, because another has replaced them."""
-        kept = noticeable(self.search, step.effects, step.fit.effects, self.tolerance)
-        if len(kept) in (0, len(step.effects)):
-            return step
-        return self._without_inactive(fit_jointly(self.search, kept, step.errors, rounds=2))
-
-    def _simplest(self, best: Step, tried: Sequence[Step]) -> Step:
-        """The best step, or a simpler set (a limiting case, or fewer effects) that fits almost as well."""
-        as_good = [s for s in (best, *tried) if len(s.effects) > 1 and not surely_prefers(self.search, best, s)]
-        simpler = [
-            *simpler_sets(best.effects, self.search.rig),
-            *merged_sets(best.effects),
-            *(fewer for s in as_good for fewer in each_left_out(s.effects)),
-        ]
-        on_quick = fitted_to_quick(self.search, simpler, best)
-        sets = [*tried, *self._refitted_to_all(on_quick, best), *self._simpler_singles(best)]
-        # implausible nominal errors may have absorbed the effect that is left out
-        sets = [s for s in sets if s.is_plausible or not best.is_plausible]
-        size = partial(size_of_set, self.search)
-        # a set of as many parameters may fit better: friction, for a hysteretic spring that always slides
-        best = min((best, *(s for s in sets if size(s) == size(best))), key=lambda s: s.fit.cost)
-        excess_limit = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
-        limiting_cases = contained(best.effects, self.search.rig)
-        fewer = [
-            step
-            for step in sets
-            if (size(step) < size(best) or key_of(step.effects) in limiting_cases)
-            and step.excess(best.sensor_noise) < excess_limit
-            and not surely_prefers(self.search, best, step)
-        ]
-        return min(fewer, key=lambda s: (size(s), s.fit.cost)) if fewer else best
-
-    def _refitted_to_all(self, on_quick: Sequence[Step], best: Step) -> list[Step]:
-        """The steps; those that may be as good as `best`, which was fitted to all records, are refitted to all."""
-        if not best.explains:
-            return list(on_quick)
-        cost_limit = max(STEPWISE.near * best.fit.cost, STEPWISE.least * self._gap)
-        return self.search.workers.map(
-            lambda s: fit_jointly(self.search, s.effects, s.errors, rounds=2) if s.fit.cost < cost_limit else s,
-            list(on_quick),
-        )
-
-    def _limiting_case(self, step: Step) -> Step:
-        """The step with effects replaced by limiting cases that fit as well, if no set explains the records.
-
-        Any law fits some of the residual of a measured gap, so a slightly smaller residual justifies no wider law.
-        """
-        if step.explains:
-            return step
-        sets = list(with_one_simpler(step.effects, self.search.rig))
-        limits = fitted_to_quick(self.search, sets, step)
-        as_good = [s for s in self._to_all(limits) if self._is_as_good(s, step)]
-        return self._limiting_case(min(as_good, key=lambda s: s.fit.cost)) if as_good else step
-
-    def _is_as_good(self, step: Step, best: Step) -> bool:
-        """Whether a step with plausible nominal errors fits almost as well as the best, which does not explain the gap.
-
-        Implausible nominal errors do not count: they may have absorbed an effect.
-        """
-        more = step.excess(best.sensor_noise) - best.excess(best.sensor_noise)
-        return step.is_plausible and not best.explains and more < STEPWISE.least * self._gap
-
-    def _simpler_singles(self, best: Step) -> list[Step]:
-        """Single effects of fewer parameters that fit almost as well as a single effect, fitted to all records."""
-        if len(best.effects) != 1 or not self.ahead:
-            return []
-        size = len(parameters_of(self.search.rig, best.effects))
-        nominal = self.search.nominal_ahead
-        good = nominal - STEPWISE.as_good * (nominal - self.ahead[0].cost)
-        likely = [f.effects for f in best_of_each_kind(self.ahead) if f.cost <= good and f.n_parameters < size]
-        on_quick = fitted_to_quick(self.search, likely, best)
-        near = [step for step in on_quick if step.fit.cost < STEPWISE.near * best.fit.cost]
-        fitted = [fitted_to_all(self.search, step) for step in near]
-        return [step for step in fitted if not may_be_port_errors(self.search, step)]
-
-    def _backward_eliminated(self, step: Step) -> Step:
-        """The step after backward elimination: without effects that later ones have made unnecessary."""
-        if not step.effects:
-            return step
-        fewer = fitted_to_quick(self.search, list(each_left_out(step.effects)), step)
-        best = min(fewer, key=lambda s: s.fit.cost)
-        excess_limit = (1.0 + STEPWISE.needless) * max(step.excess(step.sensor_noise), STEPWISE.simpler)
-        is_needless = best.excess(step.sensor_noise) < excess_limit and (best.is_plausible or not step.is_plausible)
-        return self._backward_eliminated(best) if is_needless else step
+        longer, shorter = (s.description(noise, of_errors_alone=is_negligible) for s in (step, best))
+        return not step.is_plausible and longer - shorter > STEPWISE.shorter
 
     def _without_errors(self, step: Step) -> Fit | None:
         """Few effects that explain the records without nominal errors as well as a step with them, or None."""
@@ -775,74 +528,147 @@ class Stepwise:
         # uniform stiffness and damping errors together are nominal errors; one alone is an effect
         errors = {NOMINAL_ERRORS, *(UNIFORM if {e.kind for e in found.effects}.issuperset(UNIFORM) else ())}
         named = [effect for effect in found.effects if effect.kind not in errors]
-        if not self._are_noticeable(named, found.effects):
+        if not self.search.are_noticeable(named, found.effects):
             return None
         self.search = search
         return found
 
     def calibrate(self) -> bool:
         """Turn gain errors too large for any calibration into effects; True if there are any."""
-        found = self._with_wrong_gains(self.last)
+        found = with_wrong_gains(self.search, self.last)
         if found is self.last:
             return False
         self.steps.append(found)
         return True
 
-    def _with_wrong_gains(self, step: Step, most: int = PLAIN.wrong_gains) -> Step:
-        """The step with gain errors too large for any calibration, and outlying among the gains, as effects."""
-        gains = {n: v for n, v in step.errors.values.items() if group_of(n) == "gain"}
-        name = max(gains, key=lambda n: abs(gains[n]), default="")
-        if not most or abs(gains.get(name, 0.0)) < PLAIN.suspect * PLAIN.most_gain:
-            return step
-        _, side, port = name.split("_", 2)
-        kind = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}[side]
-        if kind not in self.search.catalogue:
-            return step
-        effect = Effect(kind, port, {"gain": float(np.exp(gains[name]))})
-        found = fit_from_zero(self.search, (*step.effects, effect))  # other nominal errors have absorbed part of it
-        gain = found.effects[-1].values["gain"]
-        error = abs(float(np.log(gain))) if gain > 0.0 else 0.0  # a gain that passed zero: the fit has gone astray
-        is_wrong = error >= max(PLAIN.most_gain, PLAIN.outlying * size_of(found.errors, "gain"))
-        if not (is_wrong and self._are_noticeable(found.effects, found.fit.effects)):
-            return step
-        return self._with_wrong_gains(found, most - 1)
+    # Input noise and substeps, with which the selection continues
 
-    def _with_common_effects(self, step: Step) -> Step:
-        """The step with uniform stiffness and damping errors as effects, if too large for nominal errors."""
-        values = step.errors.values
-        damping = float(np.mean([v for n, v in values.items() if group_of(n) == "damping"] or [0.0]))
-        stiffness = values.get("stiffness_0", 0.0) - values.get("mass_0", 0.0)
-        named = {effect.kind for effect in step.effects}
-        added, reset, largest = [], dict(values), dict(PLAIN.most_common)
-        if abs(damping) > largest["modal_damping"] and MODAL_DAMPING not in named:
-            added.append(Effect(MODAL_DAMPING, None, {"factor": float(np.exp(damping))}))
-            reset.update({n: v - damping for n, v in values.items() if group_of(n) == "damping"})
-        if abs(stiffness) > largest["modulus_error"] and MODULUS_ERROR not in named:
-            added.append(Effect(MODULUS_ERROR, None, {"factor": float(np.exp(stiffness))}))
-            reset.update({"stiffness_0": 0.0, "mass_0": 0.0})
-        if not added:
-            return step
-        return fit_jointly(self.search, (*step.effects, *added), replace(step.errors, values=reset), rounds=2)
+    def _with_input_noise(self, step: Step) -> Step | None:
+        """The step refitted with input noise, if that whitens its residual; else None.
 
-    def _with_delay_as_effect(self, step: Step) -> Step:
-        """The step with sensor delays of one common cause as that effect, if it fits as well.
-
-        Delays that account for a negligible share of the gap stay nominal errors.
+        The selection continues, and the steps before are evaluated, with input noise of the level that the residual
+        of this step shows; without input noise if this step explains the records.
         """
-        search, target, named = self.search, step.errors.target, {effect.kind for effect in step.effects}
-        late = [effect for effect in delay_effects(search.rig, step.errors) if effect.kind not in named]
-        late = [effect for effect in late if self._are_noticeable([effect], [*step.effects, effect])]
-        if not late:
+        search = self.at_first
+        without_noise = (
+            fit_jointly(search, step.effects, step.errors) if self.search.logged else evaluated(search, step.fit)
+        )
+        noise = without_noise.sensor_noise
+        is_loud = without_noise.excess(noise) > INPUTS.loud * float(noise.mean())
+        if without_noise.logged < LEAST_LOGGED or not is_loud:
+            return self._continue_in(search, step, without_noise) if self.search.logged else None
+        noisy = with_input_noise(search, step.fit, noise)
+        if noisy is None:
+            return None
+        fitted = fit_jointly(noisy, step.effects, step.errors)
+        if fitted.fit.cost < INPUTS.too_white:  # nominal errors had fitted the noise, so it was estimated too loud
+            noisy = with_input_noise(search, fitted.fit, noise)
+            if noisy is None:
+                return None
+            fitted = fit_jointly(noisy, step.effects, fitted.errors)
+        if fitted.fit.cost < INPUTS.too_white:
+            return None
+        # noise this loud masks most effects; if a single effect explains the residual, there is no input noise
+        found = None if step.effects or self.search.logged else self._in_place_of_inputs(without_noise)
+        if found is not None:
+            self.steps.append(found)
+            return None
+        return self._continue_in(noisy, step, fitted)
+
+    def _in_place_of_inputs(self, step: Step) -> Step | None:
+        """The step with one more effect that explains the records without input noise, or None."""
+        tried = [s for s in self._candidates_with_one_more(step) if not may_be_port_errors(self.search, s.effects)]
+        near = _finalists(sorted(tried, key=lambda s: s.fit.cost), PLAIN.near)
+        whole = self.search.side_by_side(fitted_to_all, near)
+        found = [s for s in whole if s.explains and s.is_plausible and self._is_accepted(s, step)]
+        if not found:
+            return None
+        best, *rest = sorted(found, key=lambda s: s.fit.cost)
+        return self._simplest(best, rest)
+
+    def _continue_in(self, search: Search, step: Step, fitted: Step) -> Step:
+        """`fitted`, the step refitted in another search; the selection continues in that search."""
+        self.search, self.tried_beside_input_noise = search, False
+        self.steps = [fitted if s is step else replace(evaluated(search, s.fit), others=s.others) for s in self.steps]
+        return fitted
+
+    def _with_finer_substeps(self, step: Step) -> Step:
+        """The step refitted with substeps fine enough to be exact, if its residual is close to the noise floor.
+
+        The selection continues with these substeps: the error of coarser ones would pass for another effect.
+        """
+        rig, noise = apply_all(self.search.rig, step.fit.effects), step.noise_power
+        is_near_noise = step.excess(noise) < STEPWISE.further * self._gap
+        if not (step.effects and is_near_noise and is_stepped(rig)) or step.explains:
             return step
-        without_delays = {n: 0.0 if group_of(n) == "delay" else v for n, v in step.errors.values.items()}
-        errors = nominal_errors(search.rig, replace(target, late=(), early=(), interpolated=False), without_delays)
-        each = search.workers.map(lambda e: fit_jointly(search, (*step.effects, e), errors, rounds=2), late)
-        each = [evaluated(search, with_common_delay(s.fit)) for s in each]
-        best, *others = sorted(each, key=lambda s: s.fit.cost)
-        effect = best.effects[-1]
-        if is_likelier(self.search, step, best) or not effect.stands_out(search.rig):
+        data, substeps = self.search.data, self.search.data.substeps
+        residual = data.residual(rig)
+        while substeps < FINISH.finest:
+            finer = data.stepped(2 * substeps).residual(rig)
+            change, residual = finer - residual, finer
+            if float(change @ change) < STEPWISE.stepping * change.size:
+                break
+            substeps *= 2
+        if substeps == data.substeps:
             return step
-        share = cost_of(search.rig, (*step.effects, errors), search.data) - best.fit.cost
-        if share < STEPWISE.explained * self._gap or not self._are_noticeable([effect], best.effects):
-            return step
-        return replace(best, others=(best, *others))
+        self.has_finer_substeps = True
+        self.search, self.at_first = (
+            replace(each, data=each.data.stepped(substeps)) for each in (self.search, self.at_first)
+        )
+        return replace(fit_jointly(self.search, step.effects, step.errors, rounds=2), others=step.others)
+
+    # The verdict
+
+    def decision(self) -> Decision:
+        """The verdict on the last set of effects."""
+        beside = self.search if self.search.logged or self.has_finer_substeps else None
+        if self.plain is not None:
+            rivals = self._rivals_of_plain
+            return Decision("explained", self.plain, rivals=rivals, noise=self.search.data.noise, beside=beside)
+        effects, left = self.last.effects, self.unexplained
+        noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
+        closed = self.closes_gap or (len(effects) > 1 and left < STEPWISE.in_part)
+        if effects and closed and not self.shows_unknown_law:
+            return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise, beside=beside)
+        if self.needs_no_effect:
+            return Decision("none", self.last.fit, noise=noise, beside=beside)
+        return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise, beside=beside)
+
+    @cached_property
+    def _rivals_of_plain(self) -> tuple[tuple[Fit, float], ...]:
+        """Other causes that explain the records as well as `plain`, with their probabilities."""
+        return () if self.plain is None else other_delay_causes(self.search, self.plain)
+
+    def _rivals(self) -> tuple[tuple[Fit, float], ...]:
+        """Other sets that fit as well, with their probabilities by description length.
+
+        If no set reaches the noise floor, only the description lengths of the nominal errors are compared: the
+        residuals differ by too little, and have no known distribution.
+        """
+        sets = self._others()
+        if not sets:
+            return ()
+        key, rig = key_of(sets[0].effects), self.search.rig
+        sets = [s for s in sets if key not in contained(s.effects, rig)]
+        noise, none_explains = sets[0].sensor_noise, not sets[0].explains
+        length = [
+            s.description(noise, of_errors_alone=none_explains) + self.search.nats_per_parameter * s.fit.n_parameters
+            for s in sets
+        ]
+        odds = np.exp(min(length) - np.array(length))
+        likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
+        return tuple((s.fit, float(p)) for s, p in likely if p > STEPWISE.excluded)
+
+    def _others(self) -> list[Step]:
+        """The last set as it was selected, then the other candidates that explain the records or fit as well."""
+        key = key_of(self.last.effects)
+        chosen = next((s for s in reversed(self.steps) if s.others and key_of(s.effects) == key), None)
+        if chosen is None:
+            return []
+        others = [s for s in chosen.others if key_of(s.effects) != key]
+        return [chosen, *(s for s in others if s.explains or is_as_good(s, chosen, self._gap))]
+
+
+def _finalists(steps: Sequence[Step], cost_limit: float) -> list[Step]:
+    """The first of some steps that cost less than a limit on the most informative records."""
+    return [step for step in steps if step.fit.cost < cost_limit][: STEPWISE.finalists]

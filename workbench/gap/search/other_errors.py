@@ -1,4 +1,4 @@
-"""Nominal errors that vary by record, and nominal errors of each mode by itself."""
+"""The stepwise selection with other nominal errors: of each mode, or of a parameter that varies between records."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,11 +9,11 @@ from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import differing, figures_of
 from workbench.gap.search.candidates import fit_from_zero
+from workbench.gap.search.errors_as_effects import PORT_GROUPS
 from workbench.gap.search.fit import finite_residual
 from workbench.gap.search.jointly import Step, too_large
-from workbench.gap.search.plain import PORT_GROUPS
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import RECORDS, STEPWISE
+from workbench.gap.search.settings import INTERVALS, RECORDS, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 
 
@@ -48,7 +48,6 @@ def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviat
     standard errors are those of a linear fit, from the scatter of the gradient over blocks of the record.
 
     Args:
-        search: records and nominal rig.
         effects: nominal errors among them.
         figure: the parameter, of `figures_of`.
     """
@@ -89,11 +88,11 @@ def _standard_error(residuals: Sequence[Floats], n_outputs: int) -> float:
     along = (residuals[i + 1] - residuals[i - 1]) / (RECORDS.tried[i + 1] - RECORDS.tried[i - 1])
     # by time, all sensors together
     gradient = (along * residuals[i]).reshape(n_outputs, -1).sum(axis=0)
-    blocks = np.array([block.sum() for block in np.array_split(gradient, RECORDS.blocks)])
+    blocks = np.array([block.sum() for block in np.array_split(gradient, INTERVALS.blocks)])
     return float(np.sqrt(((blocks - blocks.mean()) ** 2).sum()) / max(float(along @ along), 1e-300))
 
 
-def varying_parameter(search: Search, step: Step) -> Deviations | None:
+def _varying_parameter(search: Search, step: Step) -> Deviations | None:
     """The parameter whose variation from record to record surely removes much of the residual of a step, or None."""
     if len(search.data.records) < 2:
         return None
@@ -114,7 +113,7 @@ def with_record_deviations(before: Stepwise) -> Stepwise | None:
         before: the selection without, single effects tried; it is run if a parameter varies.
     """
     search, nearest = before.at_first, before.nearest
-    varying = varying_parameter(search, nearest)
+    varying = _varying_parameter(search, nearest)
     if varying is None:
         return None
     before.run()
@@ -122,11 +121,10 @@ def with_record_deviations(before: Stepwise) -> Stepwise | None:
         return before
     search.report(f"{varying.figure} that varies from record to record", 0.5)
     varying_search = replace(search, differs=varying.figure)
-    with_deviations = Stepwise(varying_search, before.tolerance, before.ahead)
-    if not (
-        with_deviations.has_plausible_errors or search.prior.shape
-    ):  # errors of profiles over-fit errors of single shapes
-        by_mode = Stepwise(replace(varying_search, by_mode=True), before.tolerance, before.ahead)
+    with_deviations = Stepwise(varying_search, before.ahead)
+    # errors of profiles over-fit errors of single shapes
+    if not (with_deviations.has_plausible_errors or search.prior.shape):
+        by_mode = Stepwise(replace(varying_search, by_mode=True), before.ahead)
         # errors of ports and records cannot absorb an effect in the structure
         if by_mode.is_noise_only and set(too_large(by_mode.last.errors)) <= {"damping", "record", *PORT_GROUPS}:
             by_mode.run(most=0)
@@ -157,7 +155,7 @@ def with_mode_errors(before: Stepwise) -> Stepwise | None:
     if nearest.excess(nearest.noise_power) > STEPWISE.of_modes * float(before.search.nominal.mean()):
         return None
     before.search.report("errors of each mode", 0.5)
-    with_modes = Stepwise(replace(before.at_first, by_mode=True), before.tolerance, before.ahead)
+    with_modes = Stepwise(replace(before.at_first, by_mode=True), before.ahead)
     if with_modes.is_noise_only:
         n_effects = len(with_modes.last.effects)
         if not with_modes.has_plausible_errors:
