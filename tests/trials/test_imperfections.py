@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from workbench.gap.diagnose_case import diagnose_case
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.rig.simulate import simulate
@@ -293,3 +294,12 @@ def test_a_strong_effect_alters_the_readings_by_more_than_a_diagnosis_leaves_alo
         )
         gaps.append(np.sqrt(np.mean(((lagged - without) / lagged.std(axis=1, keepdims=True)) ** 2)))
     assert max(gaps) > 0.018
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [20350945, 20351053])
+def test_no_effect_takes_the_place_of_errors_that_are_iterated_less(seed):
+    """Stiffness and damping that are all a little off: a spring, a loss of stiffness described the records as well."""
+    case, _ = make_trial(seed, imperfections="offset")
+    verdict = diagnose_case(case, seconds=None)
+    assert verdict.outcome == "none" and verdict.sentence.startswith("There is no gap beyond small errors")

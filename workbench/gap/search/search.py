@@ -155,7 +155,9 @@ class Search:
                 return np.inf
             without = self.data.predictions(apply_all(self.rig, others))
             each = zip(whole, without, scales, strict=True)
-            return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
+            with np.errstate(over="ignore", invalid="ignore"):  # without the effect the simulation may diverge
+                powers = [float((((a - b) / scale) ** 2).mean()) for a, b, scale in each]
+            return max(np.sqrt(power) if np.isfinite(power) else np.inf for power in powers)
 
         return tuple(effect for effect in effects if altered(effect) > self.tolerance)
 
