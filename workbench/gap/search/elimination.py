@@ -97,9 +97,9 @@ def is_as_good(step: Step, best: Step, gap: float) -> bool:
 
 def backward_eliminated(search: Search, step: Step) -> Step:
     """The step after backward elimination: without effects that later ones have made unnecessary."""
-    if not step.effects:
+    fewer = fitted_to_quick(search, list(each_left_out(step.effects)), step) if step.effects else []
+    if not fewer:  # no effect can act without the others
         return step
-    fewer = fitted_to_quick(search, list(each_left_out(step.effects)), step)
     best = min(fewer, key=lambda s: s.fit.cost)
     excess_limit = (1.0 + STEPWISE.needless) * max(step.excess(step.sensor_noise), STEPWISE.simpler)
     is_needless = best.excess(step.sensor_noise) < excess_limit and (best.is_plausible or not step.is_plausible)
