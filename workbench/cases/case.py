@@ -1,5 +1,6 @@
 """A case folder: a nominal model, and records measured on the real structure."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -269,11 +270,12 @@ def _arrays(
             stated = {channel.name: channel.unit for _, channel, _ in record.signals()}
     except RecordFileError as error:
         raise CaseError(str(error)) from error
-    names = [renamed.get(name, name) for name in arrays]
+    named = {name: renamed.get(name, name) for name in arrays}
+    count = Counter(named.values())
     for name, values in arrays.items():
         if values.dtype.kind not in "fiu" or values.size > MOST_SAMPLES:
             raise CaseError(f"{file}: array {name!r} must hold at most {MOST_SAMPLES} real numbers")
-        if names.count(renamed.get(name, name)) > 1:
-            raise CaseError(f"{file}: two channels are {renamed.get(name, name)!r} by [channels] of case.toml")
-    stated = {renamed.get(name, name): unit for name, unit in stated.items()}
-    return {renamed.get(name, name): values.astype(float) for name, values in arrays.items()}, stated
+        if count[named[name]] > 1:
+            raise CaseError(f"{file}: two channels are {named[name]!r} by [channels] of case.toml")
+    stated = {named[name]: unit for name, unit in stated.items()}
+    return {named[name]: values.astype(float) for name, values in arrays.items()}, stated

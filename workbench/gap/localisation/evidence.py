@@ -149,6 +149,11 @@ class Evidence:
             found.append(next((known for known in found if np.isclose(known, dt, EVIDENCE.one_rate, 0.0)), dt))
         return tuple(found)
 
+    @property
+    def has_several_rates(self) -> bool:
+        """Whether the records differ in sample rate."""
+        return len(set(self.sample_times)) > 1
+
     @cached_property
     def models(self) -> dict[float, SampledModel]:
         """The rig's modes and sensors, discretised, by sample time of the records."""

@@ -90,7 +90,7 @@ def _of_gap(verdict: Verdict) -> Iterator[str]:
             f"Record {where.record_names[i]!r}: on {('odd', 'even')[j]} lines that the inputs do not excite, the gap is"
             f" {10.0 * np.log10(where.distortions[i, j]):.0f} dB above the noise: a nonlinearity is present."
         )
-    if len(set(verdict.attribution.evidence.sample_times)) > 1:
+    if verdict.attribution.evidence.has_several_rates:
         yield "The records have several sample rates, so no random force was sought: bring them to one rate for that."
     if verdict.outcome == "unknown" and verdict.budget.is_open and verdict.budget.errors:
         yield "Most of the gap is unexplained, so the fitted sizes of the model's errors are not meaningful."

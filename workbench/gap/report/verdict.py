@@ -448,16 +448,12 @@ def proportional_points(where: Any, modes: Modes) -> tuple[str, ...]:
     """
     if not isinstance(where, str):
         return ()
-    shape = modes.phi_at(where)
-    size = float(np.linalg.norm(shape))
-    found = []
-    for name in map(str, modes.domain.grid(0)):
-        other = modes.phi_at(name)
-        ratio = float(other @ shape) / max(size**2, 1e-300)
-        is_proportional = np.linalg.norm(other - ratio * shape) < PROPORTIONAL * np.linalg.norm(other)
-        if is_proportional and abs(abs(ratio) - 1.0) > PROPORTIONAL:
-            found.append(name)
-    return tuple(found)
+    names, shape = [str(name) for name in modes.domain.grid(0)], modes.phi_at(where)
+    others = modes.phi(names)
+    ratios = others @ shape / max(float(shape @ shape), 1e-300)
+    off = np.linalg.norm(others - ratios[:, None] * shape, axis=1)
+    alike = (off < PROPORTIONAL * np.linalg.norm(others, axis=1)) & (np.abs(np.abs(ratios) - 1.0) > PROPORTIONAL)
+    return tuple(name for name, is_alike in zip(names, alike, strict=True) if is_alike)
 
 
 def place_in_words(where: Any, deviations: Mapping[str, float]) -> str:

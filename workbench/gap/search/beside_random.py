@@ -50,7 +50,7 @@ def looks_random(evidence: Evidence) -> bool:
 
     False for records of several sample rates: the force varies within a sample, so it has another strength at each.
     """
-    if len(set(evidence.sample_times)) > 1:
+    if evidence.has_several_rates:
         return False
     records, place = evidence.data.counted, evidence.at_peaks[0]
     forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
