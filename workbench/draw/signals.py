@@ -131,8 +131,10 @@ def plot_frf(record: Record) -> Figure:
         axes[0].semilogy(lines[1:], response[1:], linewidth=0.9, label=channel.name)
         axes[1].plot(lines[1:], coherence(u, y, rate, nperseg=segment)[1][1:], linewidth=0.9)
     (force,), units = record.input_channels, {channel.unit for channel in record.output_channels}
-    unit = f" [({units.pop()})/{force.unit}]" if len(units) == 1 and force.unit else ""
-    axes[0].set(ylabel=f"|output / {force.name}|{unit}", title="frequency response (H1)")
+    output = units.pop() if len(units) == 1 else ""
+    per_input = f"({output})/{force.unit}" if "/" in output else f"{output}/{force.unit}"
+    label = in_units(f"|output / {force.name}|", per_input if output and force.unit else "")
+    axes[0].set(ylabel=label, title="frequency response (H1)")
     axes[1].set(xlabel="frequency [Hz]", ylabel="coherence", ylim=(0.0, 1.05))
     axes[0].legend(ncols=4, fontsize=8)
     return figure
