@@ -267,8 +267,7 @@ def _stability(loops: Sequence[tuple[str, str]]) -> str:
         return "Every closed loop is stable on the full plant." if stable == rest else f"Every closed loop {undamped}."
     if not rest:
         drifts = all(found == DRIFTS for _, found in loops)
-        why = "a rigid-body mode drifts" if drifts else "spillover destabilises residual modes"
-        return f"Every closed loop is unstable on the full plant: {why}."
+        return f"Every closed loop is unstable on the full plant{': a rigid-body mode drifts' if drifts else ''}."
     others = "are stable" if stable == rest else "have no pole right of the imaginary axis"
     return f"Unstable on the full plant: {', '.join(unstable)}. The other {rest} loops {others}."
 

@@ -4,6 +4,7 @@ import ctypes
 import runpy
 import shutil
 import subprocess
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -197,19 +198,21 @@ def test_the_controller_is_held_over_each_sample_as_scipy_does_it(modes, observe
     assert len(written["states"]) == 4
 
 
-@pytest.mark.parametrize("late", [0.0, 0.3, 1.0, 2.6])
-def test_the_sampled_loop_is_that_of_the_differential_equation(modes, observer, late):
+@pytest.mark.parametrize(("late", "crosstalk"), [(0.0, ()), (0.3, ()), (1.0, ()), (2.6, ()), (0.3, (("v2", 0.2),))])
+def test_the_sampled_loop_is_that_of_the_differential_equation(modes, observer, late, crosstalk):
     period = 1 / RATE
     digital = export(modes, observer, sample_rate_hz=RATE).controller
-    matrix = sampled_loop(modes, ACTUATORS, SENSORS, digital, late * period)
+    sensors = [replace(SENSORS[0], crosstalk=crosstalk), SENSORS[1]]
+    matrix = sampled_loop(modes, ACTUATORS, sensors, digital, late * period)
     plant = state_space(modes, ACTUATORS, SENSORS)
+    mixed = np.eye(2) + [[0.0, dict(crosstalk).get("v2", 0.0)], [0.0, 0.0]]
     n = plant.nstates
     x, z = np.random.default_rng(3).standard_normal(n), np.zeros(4)
     found = np.linalg.matrix_power(matrix, 6) @ np.r_[x, np.zeros(matrix.shape[0] - n)]
     whole, rest = int(late), late - int(late)
     past = [np.zeros(2)] * 4
     for _ in range(6):
-        y = plant.C @ x
+        y = mixed @ plant.C @ x
         command, z = digital.C @ z + digital.D @ y, digital.A @ z + digital.B @ y
         past = [command, *past]
         for held, span in ((past[whole + 1], rest * period), (past[whole], (1 - rest) * period)):

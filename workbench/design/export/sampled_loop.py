@@ -41,14 +41,12 @@ def sampled_loop(
         computing_delay: from a reading to the command's first effect, beside the actuators' own delays, s.
 
     Raises:
-        DesignError: a sensor with a delay or cross-talk, or a negative delay.
+        DesignError: a sensor with a delay, or a negative delay.
+        ValueError: cross-talk from a sensor that is not among these.
     """
-    refused = [sensor.name for sensor in sensors if sensor.delay or sensor.crosstalk]
-    if refused:
-        raise DesignError(
-            f"sensor {refused[0]} has a delay or cross-talk; include the delay in the computing delay, leave out"
-            " cross-talk"
-        )
+    late = [sensor.name for sensor in sensors if sensor.delay]
+    if late:
+        raise DesignError(f"sensor {late[0]} has a delay; include it in the computing delay, and set the sensor's to 0")
     if not (np.isfinite(computing_delay) and computing_delay >= 0):
         raise DesignError(f"the computing delay must be 0 s or more; got {computing_delay:g} s")
     a, b, c = linear_plant(modes, actuators, sensors)

@@ -35,6 +35,7 @@ LARGEST_SMALL = (
 MOSTLY = 0.5  # of the gap: its greater part; if that is unexplained, the fitted nominal errors have over-fitted it
 RUNAWAY = 1e30  # mean square of a divergent residual, in units of the signal's
 COMMON = 2.0  # times the scatter of delays: a larger mean is reported as a common delay
+LEAST_DELAY = 1e-3  # of a sample: shorter delays are not reported
 DRAWS = 400  # bootstrap draws, for the interval of the shrinkage
 REACH = 4.0  # standard deviations from record to record: bound of the deviation of a held-out record
 TOLERANCE = 1e-3  # of that bound: accuracy of the deviation
@@ -322,7 +323,8 @@ def are_small(sizes: Mapping[str, float]) -> bool:
 def sizes_of(errors: Effect | None) -> dict[str, float]:
     """Root mean squares of the errors of a nominal model, by group, per cent; delays and their common part, ms.
 
-    A common delay may be of the sensors or of the actuators: in open loop the readings are the same.
+    Delays of less than a thousandth of a sample are left out. A common delay may be of the sensors or of the actuators:
+    in open loop the readings are the same.
     """
     if errors is None:
         return {}
@@ -332,7 +334,7 @@ def sizes_of(errors: Effect | None) -> dict[str, float]:
         for group, name in PLURAL.items()
         if values[group]
     }
-    if values["delay"]:
+    if np.abs(values["delay"]).max(initial=0.0) >= LEAST_DELAY:
         sample_time = getattr(errors.target, "sample_time", 1.0)
         delays = 1e3 * sample_time * np.array(values["delay"])
         common = float(delays.mean())
