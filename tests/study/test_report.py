@@ -142,7 +142,7 @@ def test_a_placement_on_a_plate_and_at_named_points_in_other_units(tmp_path, pos
 def test_one_sensor_has_no_shape_and_remarks_are_kept(tmp_path):
     one = {**IDENTIFIED, "positions": [None], "shapes_real": [[1.0]], "shapes_imag": [[0.0]]}
     shown = page_content_in(written(tmp_path, {**one, "heading": "1 sensor", "lines": ["mode 1: mains hum?"]}))
-    assert shown.lead == "1 sensor" and shown.lines == ["mode 1: mains hum?"]
+    assert shown.lead == "1 mode at 3 Hz; 1 sensor" and shown.lines == ["mode 1: mains hum?"]
     assert all("motion" not in one for one in shown.blocks)
 
 

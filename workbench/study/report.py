@@ -22,7 +22,7 @@ from workbench.records.transfer_functions import TransferFunctions
 from workbench.records.units import Units
 from workbench.structure.domain import listed, place_array, same_place
 from workbench.structure.modes import SampledModes, mac
-from workbench.structure.printed import command_headings, place_text
+from workbench.structure.printed import command_headings, counted, place_text
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
 from workbench.study.pages.page import (
@@ -183,11 +183,18 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
         for r, (f, f_std, zeta, zeta_std) in enumerate(zip(*columns, strict=True))
     ]
     return {
-        "lead": _words([content.get("heading", "")])[0],
+        "lead": "; ".join([_band(hertz), *filter(None, _words([content.get("heading", "")]))]),
         "lines": _words(content.get("lines", [])),
         "blocks": blocks,
         "tables": [("Modes", heads, rows)],
     }
+
+
+def _band(hertz: np.ndarray) -> str:
+    """How many modes, and between which frequencies, such as: 6 modes from 4.995 to 124.1 Hz."""
+    if hertz.size < 2:
+        return f"1 mode at {hertz[0]:.4g} Hz" if hertz.size else "no mode"
+    return f"{counted(hertz.size, 'mode')} from {hertz.min():.4g} to {hertz.max():.4g} Hz"
 
 
 def _designed(content: dict[str, Any]) -> dict[str, Any]:
