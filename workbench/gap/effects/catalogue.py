@@ -29,6 +29,7 @@ from workbench.gap.effects.structural import KINDS as STRUCTURAL
 from workbench.structure.printed import joined_in_words
 
 CATALOGUE: tuple[Kind, ...] = (*STRUCTURAL, *NONLINEAR, *OF_PORTS, *OF_THE_ENVIRONMENT)
+"""Every kind of effect that a diagnosis tries, unless it is given others."""
 
 
 def kind_named(name: str, catalogue: tuple[Kind, ...] = CATALOGUE) -> Kind:
