@@ -28,10 +28,10 @@ from workbench.study.catalogue import describe, run_study
 from workbench.study.runs.cases import StudyError
 from workbench.study.runs.outcome import Outcome
 from workbench.study.saved_design import save
-from workbench.study.trying import design_from, read_structure, results_of, start, try_out
+from workbench.study.trying import design_from, read_structure, results_of, setting, start, try_out
 from workbench.trials.plane_frame import Section, plane_frame
 
-RIG, TEXT = read_structure(None)
+RIG, TEXT, _ = read_structure(None)
 PLATE = """[structure]
 kind = "plate"
 length = [1.2, 0.8]
@@ -85,7 +85,16 @@ def plate(request, tmp_path):
     """A plate with two actuators: its rig and its description."""
     path = tmp_path / "plate.toml"
     path.write_text(PLATE if request.param == "forces" else PATCHES)
-    return read_structure(path)
+    return read_structure(path)[:2]
+
+
+def test_labels_have_the_units_of_the_rig(tmp_path):
+    labels = setting(RIG)["labels"]
+    assert labels["effort"] == "effort [N² s]" and labels["forces"] == "force [N]" and labels["x"] == "x [m]"
+    (tmp_path / "case.toml").write_text(f'[units]\nlength = "mm"\nmass = "t"\ntime = "s"\nforce = "N"\n{PATCHES}')
+    rig, _, units = read_structure(tmp_path)
+    labels = setting(rig, units)["labels"]
+    assert labels["residual"] == "spillover work W_R [N mm]" and labels["forces"] == "moment [N mm/mm]"
 
 
 def plain(design) -> dict:
@@ -180,7 +189,7 @@ def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
 def test_what_makes_no_design_on_a_plate_is_refused(change, words, tmp_path):
     path = tmp_path / "plate.toml"
     path.write_text(PLATE)
-    rig, _ = read_structure(path)
+    rig, *_ = read_structure(path)
     with pytest.raises(ValueError, match=words):
         results_of(rig, design_from({**plain(start(rig)), **change}))
 
@@ -346,7 +355,7 @@ def frame(tmp_path):
         'point = "R.x"\n[[input]]\nname = "hammer"\nkind = "hammer"\npoint = "m.y"\n'
         '[[output]]\nname = "a"\nquantity = "acceleration"\npoint = "r.x"\nnoise_std = 0.01\n'
     )
-    return read_structure(tmp_path / "frame.toml")
+    return read_structure(tmp_path / "frame.toml")[:2]
 
 
 def test_a_design_on_a_frame_is_what_the_library_makes_of_it(frame):
@@ -473,7 +482,7 @@ return { boxes: boxes, ticks: ticks };
 
 def test_a_case_folder_has_a_bench_too(tmp_path):
     (tmp_path / "case.toml").write_text(PLATE)
-    rig, text = read_structure(tmp_path)
+    rig, text, _ = read_structure(tmp_path)
     assert text == PLATE and rig.actuators == read_structure(tmp_path / "case.toml")[0].actuators
 
 

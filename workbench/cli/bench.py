@@ -28,8 +28,8 @@ def bench(
     from workbench.study.bench import bench_server
     from workbench.study.trying import read_structure
 
-    found, text = read_structure(rig)
-    with bench_server(found, text, port=port) as server:
+    found, text, units = read_structure(rig)
+    with bench_server(found, text, units, port=port) as server:
         address = f"http://127.0.0.1:{server.server_address[1]}/"
         say(f"The bench is at {address}\n  designs are saved in studies/; end with Ctrl-C")
         if show:

@@ -12,6 +12,7 @@ from typing import Any
 
 from jinja2 import Environment
 
+from workbench.records.units import SI, Units
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints
 from workbench.study.pages.page import asset, in_script
@@ -30,19 +31,22 @@ POLICY = (
 )
 
 
-def bench_server(rig: Rig, structure: str, *, port: int = 0, folder: Path = Path("studies")) -> ThreadingHTTPServer:
+def bench_server(
+    rig: Rig, structure: str, units: Units = SI, *, port: int = 0, folder: Path = Path("studies")
+) -> ThreadingHTTPServer:
     """The server of the bench on 127.0.0.1, not yet serving.
 
     Args:
         rig: the rig on which designs are evaluated.
         structure: the TOML description of the rig, saved with a design.
+        units: of the rig.
         port: to listen on; 0 for any free one.
         folder: where designs are saved as studies.
 
     Raises:
         StudyError: modes at points without positions, or a port that is not available.
     """
-    content = {**setting(rig), "folder": str(folder)}
+    content = {**setting(rig, units), "folder": str(folder)}
     template = Environment(autoescape=True, trim_blocks=True).from_string(asset("bench.html"))
     page = template.render(
         css=asset("page.css"),

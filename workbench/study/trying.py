@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import simpson
 
+from workbench.cases.case import read_units
 from workbench.cases.nominal import read_rig
 from workbench.design.estimation.modal_filter import filter_on
 from workbench.design.laws.coupled import coupled_lqr
@@ -18,10 +19,11 @@ from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop, 
 from workbench.design.placement.task import patch_of
 from workbench.design.spillover.spillover import Spillover, finite_spillover
 from workbench.draw.motion import frame_net
-from workbench.rig.actuators import Actuator
+from workbench.records.units import SI, Units
+from workbench.rig.actuators import Actuator, command_unit
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, centred_at, middle, reach
-from workbench.structure.printed import rounded
+from workbench.structure.printed import command_headings, rounded
 from workbench.study.runs.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
@@ -190,7 +192,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
             raise StudyError(f"a place is {wanted}, m; got {at}")
     if design.controlled > modes.n_modes:
         raise DesignError(f"{design.controlled} controlled modes, but the rig has {modes.n_modes}; control fewer")
-    kind = patch_of(rig) or Actuator("F", design.impulse_at)
+    kind = _kind(rig, design.impulse_at)
     actuators = [replace(kind, name=f"F{i + 1}", at=centred_at(kind.at, at)) for i, at in enumerate(design.actuators)]
     if design.law == "IMSC":
         law = imsc(modes, design.controlled, actuators, weight=design.weight)
@@ -212,6 +214,11 @@ def try_out(rig: Rig, design: Design) -> Tried:
     response = initial_response(loop, np.linspace(0.0, design.final_time, N_TIMES), state)
     effort = float(simpson((response.forces**2).sum(axis=0), x=response.time))
     return Tried(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
+
+
+def _kind(rig: Rig, at: Place) -> Actuator:
+    """The kind of actuator that a design has: a patch of the rig, or a force."""
+    return patch_of(rig) or Actuator("F", at)
 
 
 def results_of(rig: Rig, design: Design) -> dict[str, Any]:
@@ -237,16 +244,24 @@ def results_of(rig: Rig, design: Design) -> dict[str, Any]:
     }
 
 
-def setting(rig: Rig) -> dict[str, Any]:
-    """Data that the page of the bench loads once: the structure, its modes and its shapes."""
-    domain = _domain(rig)
+def setting(rig: Rig, units: Units = SI) -> dict[str, Any]:
+    """Data that the page of the bench loads once: the structure, its modes and its shapes, and the labels of axes."""
+    domain, first = _domain(rig), start(rig)
+    effort, peak = command_headings(command_unit([_kind(rig, first.impulse_at)]))
+    labels = {
+        "residual": "spillover work W_R [J]", "by_mode": "spillover work W_r [J]", "energy": "energy of all modes [J]",
+        "effort": effort, "peak_force": peak, "forces": peak.removeprefix("peak "), "time": "time [s]",
+        "final_time": "final time [s]", "real": "real part [rad/s]", "imaginary": "imaginary part [rad/s]",
+        "rate": "rad/s", "x": "x [m]", "y": "y [m]",
+    }  # fmt: skip
     return {
+        "labels": {name: units.named(label) for name, label in labels.items()},
         **(_frame(rig, domain) if isinstance(domain, NamedPoints) else _field(rig, domain)),
         "omega": _plain(rig.modes.omega),
         "zeta": _plain(rig.modes.zeta),
         "most": MOST_PORTS,
         "laws": LAWS,
-        "design": {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(start(rig)).items()},
+        "design": {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(first).items()},
     }
 
 
@@ -299,8 +314,12 @@ def _rounded(values: Any) -> Any:
     return [_rounded(value) for value in values] if isinstance(values, list) else rounded(values)
 
 
-def read_structure(path: Path | None) -> tuple[Rig, str]:
-    """The rig of a TOML file or case folder (the hinged beam of the dissertation unless given), and the TOML text."""
+def read_structure(path: Path | None) -> tuple[Rig, str, Units]:
+    """The rig of a TOML file or case folder, with the TOML text and its units; unless given, the dissertation's beam.
+
+    Raises:
+        CaseError: naming the file, the key, the value, and what would be right.
+    """
     path = Path(__file__).with_name("assets") / "bench.toml" if path is None else path
     path = path / "case.toml" if path.is_dir() else path
-    return read_rig(path), path.read_text(encoding="utf-8")
+    return read_rig(path), path.read_text(encoding="utf-8"), read_units(path)

@@ -1,7 +1,7 @@
 // The bench: each change of the design is sent to the server, one request at a time; the last change is always sent.
 "use strict";
 (function () {
-  var setting = JSON.parse(document.getElementById("setting").textContent), design = setting.design;
+  var setting = JSON.parse(document.getElementById("setting").textContent), design = setting.design, labels = setting.labels;
   var svg = workbench.svg, html = workbench.html, shown = workbench.shown, by = function (id) { return document.getElementById(id); };
   var stand = document.querySelector(".stand"), say = document.querySelector(".say"), hint = say.textContent;
   var answer = null, busy = false, waiting = false, calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -49,7 +49,7 @@
 
   // numbers
   var cards = {};
-  [["residual", "W_R, spillover work [J]"], ["effort", "effort ∫ FᵀF dt"], ["peak_force", "largest force"], ["stable", "closed loop"]].forEach(function (card) {
+  [["residual", labels.residual], ["effort", labels.effort], ["peak_force", labels.peak_force], ["stable", "closed loop"]].forEach(function (card) {
     var box = html("div", {}, document.querySelector(".cards"));
     cards[card[0]] = html("b", { id: card[0] }, box, "–");
     html("span", {}, box, card[1]);
@@ -78,7 +78,7 @@
     });
     ports("actuators", "actuators");
     ports("sensors", "sensors (none: exact modes)");
-    var t = row("final time [s]"), time = html("input", { id: "time", type: "number", min: 0, step: "any", value: +design.final_time.toPrecision(4) }, t);
+    var t = row(labels.final_time), time = html("input", { id: "time", type: "number", min: 0, step: "any", value: +design.final_time.toPrecision(4) }, t);
     time.addEventListener("change", function () { if (+time.value > 0) { design.final_time = +time.value; ask(); } });
     weights();
   }
@@ -149,16 +149,18 @@
     animate();
   }
   function aside(width) {
-    var height = Math.max(224, Math.min(314, 0.4 * width));
+    var height = Math.max(240, Math.min(330, 0.4 * width));
     beamY = 0.42 * height;
     X = workbench.scale([0, setting.length], false, 18, width - 18);
     svg("line", { x1: X(0), x2: X(setting.length), y1: beamY, y2: beamY, stroke: "var(--line)", "stroke-width": 2 }, stand);
-    along(height - 4, width);
+    along(height - 20, width);
     still = svg("path", { fill: "none", stroke: "var(--soft)", "stroke-width": 1.2, opacity: 0.6 }, stand);
     line = svg("path", { class: "track", fill: "none", stroke: "#0072B2", "stroke-width": 2.6 }, stand);
     return height;
   }
+  // the scale along x, its label below
   function along(y, width) {
+    svg("text", { x: 0.5 * (X(0) + X(sides[0])), y: y + 16, "text-anchor": "middle", class: "axis" }, stand, labels.x);
     workbench.ticks({}, [0, sides[0]], Math.round(width / 90)).forEach(function (t) {
       svg("text", { x: X(t[0]), y: y, "text-anchor": "middle" }, stand, t[1]);
     });
@@ -189,19 +191,20 @@
   }
   // the plate under control, and a smaller one without control
   function above(width) {
-    var left = 34, small = width > 640, most = (small ? 1 - INSET : 1) * width - left - 16;
+    var left = 50, small = width > 640, most = (small ? 1 - INSET : 1) * width - left - 16;
     var scale = Math.min(most / sides[0], 420 / sides[1]), w = scale * sides[0], h = scale * sides[1];
     X = workbench.scale([0, sides[0]], false, left, left + w);
     Y = workbench.scale([0, sides[1]], false, 12 + h, 12);
     line = field("track", left, 12, w, h);
     along(28 + h, w);
+    svg("text", { x: 12, y: 12 + 0.5 * h, transform: "rotate(-90 12 " + (12 + 0.5 * h) + ")", "text-anchor": "middle", class: "axis" }, stand, labels.y);
     workbench.ticks({}, [0, sides[1]], Math.max(2, Math.round(h / 90))).forEach(function (t) {
       svg("text", { x: left - 6, y: Y(t[0]) + 4, "text-anchor": "end" }, stand, t[1]);
     });
-    var share = Math.min(INSET * width - 20, 0.55 * w) / w, x = small ? left + w + 24 : left, y = small ? 12 : 44 + h;
+    var share = Math.min(INSET * width - 20, 0.55 * w) / w, x = small ? left + w + 24 : left, y = small ? 12 : 60 + h;
     still = field("still", x, y, share * w, share * h);
     svg("text", { x: x, y: y + share * h + 16 }, stand, "without control");
-    return Math.max(h + 34, y + share * h + 24);
+    return Math.max(h + 50, y + share * h + 24);
   }
   function field(name, x, y, w, h) {
     var image = svg("image", { class: name, x: x, y: y, width: w, height: h, preserveAspectRatio: "none" }, stand);
@@ -336,7 +339,7 @@
     cards.stable.textContent = undamped ? "undamped" : answer.stable ? "stable" : "unstable";
     cards.stable.nextSibling.textContent = "closed loop; " + (undamped ?
       answer.undamped + (answer.undamped > 1 ? " pairs of poles" : " pair of poles") + " on the imaginary axis" :
-      "rightmost pole at " + shown(answer.rightmost) + " rad/s");
+      "rightmost pole at " + shown(answer.rightmost) + " " + labels.rate);
     cards.stable.className = undamped ? "" : answer.stable ? "good" : "bad";
     reach = 1e-12;
     for (var k = 0; k < answer.time.length; k += 5) displaced(k).concat(idle(k)).forEach(function (w) { reach = Math.max(reach, Math.abs(w)); });
@@ -344,18 +347,18 @@
     var n = answer.by_mode.length, numbers = answer.by_mode.map(function (_, i) { return i + 1; }).slice(design.controlled);
     var work = answer.by_mode.slice(design.controlled).map(function (w) { return w || 0; }), top = Math.max.apply(null, work.concat([1e-300]));
     figure("work", { x: axis("residual mode", [design.controlled + 0.4, Math.max(n, design.controlled + 1) + 0.6], false, numbers.map(function (v) { return [v, String(v)]; })),
-      y: axis("spillover work, W_r [J]", [Math.min(0, 1.1 * Math.min.apply(null, work.concat([0]))), 1.1 * top]), title: work.length ? "spillover work by residual mode" : "no residual mode",
+      y: axis(labels.by_mode, [Math.min(0, 1.1 * Math.min.apply(null, work.concat([0]))), 1.1 * top]), title: work.length ? "spillover work by residual mode" : "no residual mode",
       marks: [{ kind: "bars", boxes: work.map(function (w, i) { return [numbers[i] - 0.35, numbers[i] + 0.35, 0, w]; }), colours: [COLOURS[0]], label: "W_r" }] });
     var re = answer.poles.map(function (p) { return p[0]; }), im = answer.poles.map(function (p) { return p[1]; });
     var left = Math.min.apply(null, re), right = Math.max.apply(null, re), pad = 0.08 * (right - left || 1);
-    figure("poles", { x: axis("real part [rad/s]", [left - pad, Math.max(right, 0) + pad]), y: axis("imaginary part [rad/s]", [-0.03 * Math.max.apply(null, im), 1.08 * Math.max.apply(null, im)]),
+    figure("poles", { x: axis(labels.real, [left - pad, Math.max(right, 0) + pad]), y: axis(labels.imaginary, [-0.03 * Math.max.apply(null, im), 1.08 * Math.max.apply(null, im)]),
       title: "closed-loop poles", marks: [{ kind: "rule", axis: "x", at: 0, colour: "#8a8a8a", width: 1, dash: "", alpha: 1 },
         { kind: "line", x: re, y: im, width: 0, marker: "x", size: 9, colour: COLOURS[1], alpha: 1, label: "poles" }] });
     var energy = answer.energy.map(function (v) { return v > 0 ? v : null; }), seen = energy.filter(function (v) { return v; });
-    figure("energy", { x: axis("time [s]", [0, answer.time[answer.time.length - 1]]), y: axis("energy of all modes [J]", [0.7 * Math.min.apply(null, seen), 1.4 * Math.max.apply(null, seen)], true),
+    figure("energy", { x: axis(labels.time, [0, answer.time[answer.time.length - 1]]), y: axis(labels.energy, [0.7 * Math.min.apply(null, seen), 1.4 * Math.max.apply(null, seen)], true),
       title: "energy after the impulse", marks: [curve(answer.time, energy, 2)] });
     var forces = [].concat.apply([], answer.forces), most = 1.1 * Math.max.apply(null, forces.map(Math.abs).concat([1e-300]));
-    figure("forces", { x: axis("time [s]", [0, answer.time[answer.time.length - 1]]), y: axis("force", [-most, most]), title: "actuator forces", legend: answer.forces.length > 1,
+    figure("forces", { x: axis(labels.time, [0, answer.time[answer.time.length - 1]]), y: axis(labels.forces, [-most, most]), title: "actuator forces", legend: answer.forces.length > 1,
       marks: answer.forces.map(function (f, i) { var c = curve(answer.time, f, i); c.label = "F" + (i + 1); return c; }) });
   }
   // four digits, with a power of ten where there would be many zeros
