@@ -15,6 +15,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.report.budget import Budget
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Record
+from workbench.rig.actuators import command_unit
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
@@ -101,7 +102,9 @@ def plot_where(verdict: Verdict) -> Figure:
     for i in order:
         at = (where.input_levels[i], where.record_gaps[i])
         by_level.annotate(where.record_names[i], at, (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    by_level.set(title="by record and level", xlabel="rms of the inputs", ylabel="gap (rms error / rms signal)")
+    unit = verdict.units.named(command_unit(verdict.nominal.actuators))
+    by_level.set(title="by record and level", ylabel="gap (rms error / rms signal)")
+    by_level.set_xlabel(f"rms of the inputs [{unit}]" if unit else "rms of the inputs")
     by_level.set(xscale="log", yscale="log")
     by_time.imshow(100 * where.time_shares, aspect="auto", cmap="Blues", vmin=0.0, extent=(0, 8, len(order), 0))
     by_time.set(title="by time: darker is more of the record's gap", xlabel="eighth of the record")
@@ -164,7 +167,10 @@ def _rank(ax: Axes, verdict: Verdict) -> None:
     below = place.profile.max() - np.sort(place.profile)[::-1][:MOST_BARS]
     acting, called = _acting(verdict)
     is_acting = [any(separation(at, other) == 0 for other in acting) for at in shown]
-    ax.barh(range(len(shown)), below, color=[COLOURS[0] if named else COLOURS[3] for named in is_acting])
+    colours = [COLOURS[0] if named else COLOURS[3] for named in is_acting]
+    ax.barh(range(len(shown)), below, height=0.4, color=colours)
+    for i, colour in enumerate(colours):  # the bars of points that fit as well as the likeliest have no length
+        ax.plot(below[i], i, "o", color=colour, clip_on=False)
     names = [_short(at) + f" ({called})" * named for at, named in zip(shown, is_acting, strict=True)]
     ax.set_yticks(range(len(shown)), names, fontsize=8)
     ax.invert_yaxis()
@@ -172,7 +178,7 @@ def _rank(ax: Axes, verdict: Verdict) -> None:
     top = int(np.ceil(np.log10(max(below.max(), 10.0))))
     ax.set_xticks([0.0, *10.0 ** np.arange(0, top + 1, 1 + top // 6)])
     ax.set(xlim=(0.0, 10.0**top), xlabel="log-likelihood below that of the likeliest")
-    ax.annotate("likeliest", (0.0, 0), (4, 0), textcoords="offset points", va="center", fontsize=8)
+    ax.annotate("likeliest", (0.0, 0), (8, 0), textcoords="offset points", va="center", fontsize=8)
     unseen = [_short(at) for at in acting if all(separation(at, other) > 0 for other in shown)]
     if unseen:
         label = f"{called}, not among these: {', '.join(unseen)}"
