@@ -18,7 +18,6 @@ from workbench.gap.effects.structural import (
     buckling_load,
     modes_of,
     solved_once,
-    stiffness_name,
 )
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, derivative_of, shape_of
@@ -238,7 +237,7 @@ def _with_profile_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]
             return rig
         shapes, factor = modes.shapes, float(np.exp(-0.5 * mass[0]))
         return replace(rig, modes=replace(modes, shapes=lambda at, derivative: factor * shapes(at, derivative)))
-    profiles = {stiffness_name(structure): stiffness, "mass_per_length": mass}
+    profiles = {structure.stiffness_name: stiffness, "mass_per_length": mass}
     changed: dict[str, Any] = {
         name: _with_variation(getattr(structure, name), amplitudes, structure.length)
         for name, amplitudes in profiles.items()
