@@ -138,7 +138,7 @@ class _Search:
     def __init__(self, task: PlacementTask, limits: Limits, best: Placement, gap: float) -> None:
         self._task, self._limits, self._best = task, limits, best
         self._wanted = np.sqrt(best.residual_work * (1.0 - gap))
-        self._tree = CellTree.of(task, limits)
+        self._tree = (_of_interval if limits.candidates is None else _of_candidates)(task, limits)
         self._bounds = CellBounds(task, limits, self._tree.table, self._wanted)
         self._shelves: list[list[np.ndarray]] = [[] for _ in range(SHELVES)]
         self._stuck = np.inf  # lowest bound of a cell of the smallest size
@@ -288,15 +288,6 @@ class CellTree:
     levels: int
     places: Callable[[np.ndarray], np.ndarray | None]
     kept: Callable[[np.ndarray], np.ndarray] | None = None
-
-    @classmethod
-    def of(cls, task: PlacementTask, limits: Limits) -> "CellTree":
-        """The tree of the candidates where the limits name them, else of the interval.
-
-        Raises:
-            DesignError: no room for all actuators.
-        """
-        return _of_candidates(task, limits) if limits.candidates is not None else _of_interval(task, limits)
 
 
 def _of_interval(task: PlacementTask, limits: Limits) -> CellTree:
