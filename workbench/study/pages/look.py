@@ -5,7 +5,7 @@ import io
 import re
 import shlex
 from collections.abc import Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +71,7 @@ def _record(record: Record, path: Path) -> Look:
     faulty |= {fault.outputs[-1] for fault in faults if fault.kind == "unstated"}
     kept = [name for name in record.output_names if name not in faulty | set(forces)]
     if forces and kept:
-        record = _with_inputs(record, forces)
+        record = record.with_inputs(forces)
     channels = (*record.input_channels, *record.output_channels)
     signals = (*record.inputs, *record.outputs)
     shown = [*zip(channels, signals, strict=True)][:MOST_ROWS]
@@ -161,14 +161,6 @@ def _quiet(record: Record) -> list[DataFault]:
                 )
                 faults.append(DataFault("quiet", (name,), message))
     return faults
-
-
-def _with_inputs(record: Record, names: Sequence[str]) -> Record:
-    """The record with these outputs as inputs."""
-    at = [record.output_names.index(name) for name in names]
-    applied = tuple(record.output_channels[i] for i in at)
-    rest = record.select_outputs([name for name in record.output_names if name not in names])
-    return replace(rest, inputs=record.outputs[at], input_channels=applied)
 
 
 def _transfer(measured: TransferFunctions, path: Path) -> Look:
