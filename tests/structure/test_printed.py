@@ -8,7 +8,7 @@ from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import filter_on
 from workbench.identification.updating.distributions import SelfCheck
 from workbench.structure.domain import NamedPoints
-from workbench.structure.printed import warns_of_remarks
+from workbench.structure.printed import places_text, warns_of_remarks
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,12 @@ def test_a_structure_says_its_ends_and_profiles(beam):
     text = str(beam).splitlines()
     assert text[0] == "beam, 2 m, left clamped, right free"
     assert text[2].split() == ["mass_per_length", "1.5", "1.5", "1.5"]
+
+
+def test_places_are_parted_by_commas_and_pairs_by_semicolons():
+    assert places_text(np.array([0.25, 1.0])) == "0.25, 1"
+    assert places_text(np.array(["N1z", "N2z"], object)) == "N1z, N2z"
+    assert places_text(np.array([[0.25, 1.0], [0.5, 2.0]])) == "0.25, 1; 0.5, 2"
 
 
 def test_nothing_prints_an_array(beam, rig, record):

@@ -7,7 +7,9 @@ from math import isfinite
 from typing import ParamSpec, Protocol, TypeVar
 from warnings import warn
 
-from workbench.structure.domain import Patch
+import numpy as np
+
+from workbench.structure.domain import Patch, listed
 
 
 class Remarked(Protocol):
@@ -95,6 +97,11 @@ def place_text(place: object) -> str:
     if isinstance(place, tuple):
         return ", ".join(place_text(part) for part in place)
     return "" if place is None else f"{place:.4g}" if isinstance(place, int | float) else str(place)
+
+
+def places_text(places: np.ndarray) -> str:
+    """Texts of an array of places (n_places,) or (n_places, 2): by commas, or by semicolons between pairs."""
+    return ("; " if places.ndim == 2 else ", ").join(map(place_text, listed(places)))
 
 
 def mode_text(r: int, hz: float, more: str = "") -> str:

@@ -20,9 +20,9 @@ from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.records.units import Units
-from workbench.structure.domain import listed, place_array, same_place
+from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
-from workbench.structure.printed import command_headings, place_text
+from workbench.structure.printed import command_headings, places_text
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
 from workbench.study.pages.page import (
@@ -279,7 +279,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     names = ["optimum", *(str(one["status"]) for one in placements[1:])]
     places = {name: np.array(one["positions"]) for name, one in zip(names, placements, strict=True)}
     are_points = next(iter(places.values())).dtype.kind == "U"
-    texts = [_between(at) for at in places.values()]
+    texts = [places_text(at) for at in places.values()]
     works = {n: np.array(one["by_mode"], float) for n, one in zip(names, placements, strict=True)}
     rows = [
         [name, *(short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), text]
@@ -304,10 +304,6 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         "blocks": blocks,
         "tables": [("Placements", headings, rows)],
     }
-
-
-def _between(places: np.ndarray) -> str:
-    return ("; " if places.ndim == 2 else ", ").join(map(place_text, listed(places)))
 
 
 def _units_of(content: Mapping[str, Any]) -> Units:

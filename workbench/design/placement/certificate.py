@@ -24,7 +24,7 @@ from workbench.design.placement.task import Placement, PlacementTask
 from workbench.renamed import former_arguments
 from workbench.structure.domain import NamedPoints, Rectangle, listed
 from workbench.structure.modes import frozen
-from workbench.structure.printed import place_text
+from workbench.structure.printed import places_text
 from workbench.threads import cores, one_blas_thread
 
 LEAST_LEVELS = 3  # halvings of candidates at least
@@ -69,17 +69,12 @@ class Certificate:
         count = f"{self.cells:,} cells, {self.seconds:.0f} s"
         if self.better is not None:
             unit = "" if self.better.dtype == object else " m"
-            return f"not the optimum: actuators at {_listed(self.better)}{unit} have less residual work ({count})"
+            return f"not the optimum: actuators at {places_text(self.better)}{unit} have less residual work ({count})"
         text = f"no placement under the limits has less than {1.0 - self.gap:.1%} of its residual work ({count})"
         if self.cell is None:
             return text
         where = "; ".join(f"{low:.4g} to {high:.4g}" for low, high in self.cell)
         return f"{text}; the lowest bound is that of actuators at {where} m"
-
-
-def _listed(places: np.ndarray) -> str:
-    each = [place_text(place) for place in listed(places)]
-    return "; ".join(each) if places.ndim > 1 else ", ".join(each)
 
 
 @former_arguments(most_cells="max_cells")
