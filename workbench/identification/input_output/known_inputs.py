@@ -45,6 +45,7 @@ from workbench.identification.input_output.modal_fit import (
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
 from workbench.identification.signal.projection import (
     independent,
+    local_noise_ratio,
     noise_along,
     noise_near,
     variances,
@@ -477,8 +478,7 @@ class KnownInputs:
         longest = max(self.rows, key=lambda rows: rows.stop - rows.start)
         power = (np.abs(np.fft.rfft(self.samples(residual[longest]), axis=0)[1:]) ** 2).mean(axis=1)
         nearest = round(pole.imag / self.resolution) - 1
-        around = power[max(nearest - SELECTION.noise_bins, 0) : nearest + SELECTION.noise_bins + 1]
-        return max(1.0, float(np.median(around) / power.mean())) if around.size else 1.0
+        return local_noise_ratio(power, nearest, SELECTION.noise_bins)
 
 
 def powers(exponent: complex, n: int) -> np.ndarray:
