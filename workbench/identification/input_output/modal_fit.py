@@ -321,6 +321,11 @@ def orthonormal(columns: np.ndarray) -> Pair:
     return q, r_total
 
 
+def normalised_basis(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of columns scaled to unit length, (n_rows, n_columns)."""
+    return orthonormal(normalised_columns(columns))[0]
+
+
 def scaled_vectors(fit: Fit, kept: np.ndarray, derivative: np.ndarray) -> Pair:
     """Shapes of displacement, (n_outputs, n_kept), largest entry 1, and participation factors, (n_kept, n_excitations).
 

@@ -20,9 +20,8 @@ from workbench.identification.input_output.modal_fit import (
     column_norms,
     columns,
     modal_coordinate,
-    normalised_columns,
+    normalised_basis,
     only,
-    orthonormal,
     products_of,
     projected,
     search,
@@ -471,7 +470,7 @@ def basis_of(phi: Floats, part: Part) -> Floats:
                 return np.asarray(phi @ (size[:, None] * factor))
         except np.linalg.LinAlgError:
             pass
-    return orthonormal(normalised_columns(phi))[0]
+    return normalised_basis(phi)
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
