@@ -24,6 +24,7 @@ from workbench.identification.input_output.modal_fit import (
     only,
     products_of,
     projected,
+    row_weights,
     search,
     settled,
 )
@@ -280,9 +281,7 @@ class _Modes:
             left = copy(data)
             phi = columns(data, poles[near[:-1]], factors[near[:-1]])[0][:, : 2 * near.size - 2]
             at_near = np.concatenate([near[:-1], n + near[:-1]])
-            left.values = model.residual + (phi @ model.coefficients[at_near]) * (
-                1.0 if data.weights is None else data.weights
-            )
+            left.values = model.residual + (phi @ model.coefficients[at_near]) * row_weights(data)
             start = projected(left, poles[near], factors[near])
             fit = search(left, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
             if not _is_overdamped(fit) and not np.delete(are_near(fit.poles[-1]), near[:-1]).any():

@@ -16,7 +16,7 @@ import numpy as np
 
 from workbench.arrays import scaled_inverse
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, changes_of, normalised_basis, regressors
+from workbench.identification.input_output.modal_fit import Fit, changes_of, normalised_basis, regressors, row_weights
 from workbench.identification.input_output.time_variance import slopes_in_time
 from workbench.identification.signal.modal_estimates import time_derivatives
 from workbench.identification.signal.searches import Budget
@@ -49,7 +49,7 @@ def output_clock(data: KnownInputs, fit: Fit) -> OutputClock:
     """The clock of the outputs that the residual of a fit shows, to first order."""
     x = regressors(data, fit.poles, fit.participation)
     in_time = slopes_in_time(data, fit, x)
-    weights = np.ones((1, fit.noise.size)) if data.weights is None else data.weights
+    weights = row_weights(data)
     motion = data.as_samples((data.values - fit.residual) / weights)
     time = [data.first + np.arange(len(samples)) for samples in motion]
     late = data.rows_of([t[:, None] * derivative_of(y.T).T for t, y in zip(time, motion, strict=True)])

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.special import hyp2f1
 from scipy.stats import chi2, f, kruskal, spearmanr
 
-from workbench.identification.input_output.modal_fit import Fit, Pair
+from workbench.identification.input_output.modal_fit import Fit, Pair, row_weights
 from workbench.identification.input_output.model_order import bases_of, weights_of
 from workbench.identification.signal.projection import local_noise_ratio
 from workbench.identification.signal.searches import SELECTION
@@ -148,11 +148,11 @@ class Lines:
 
     def fitted(self, fit: Fit) -> np.ndarray:
         """The fitted FRFs at the lines, (n_outputs, n_references, n_lines)."""
-        return self.unstacked((self.values - fit.residual) / (1.0 if self.weights is None else self.weights))
+        return self.unstacked((self.values - fit.residual) / row_weights(self))
 
     def left(self, fit: Fit) -> np.ndarray:
         """The residual at the lines, (n_outputs, n_references, n_lines)."""
-        return self.unstacked(fit.residual / (1.0 if self.weights is None else self.weights))
+        return self.unstacked(fit.residual / row_weights(self))
 
     def misfit(self, fit: Fit) -> np.ndarray:
         """Rms of the residual of each output, (n_outputs,), in units of the noise where that was stated."""
