@@ -62,7 +62,8 @@ def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
 def _record(record: Record, path: Path) -> Look:
     faults = [fault for fault in data_faults(record) if not fault.inputs]
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
-    doubtful = [c.name for c in record.output_channels if c.quantity == "force" and _is_motion(c.name)]
+    by_unit = [c.name for c in record.output_channels if c.quantity == "force"]
+    doubtful = [name for name in by_unit if MOTIONS.search(name) and not FORCES.search(name)]
     applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
     applied -= set(doubtful)
     forces = [] if record.n_inputs else [name for name in record.output_names if name in applied]
@@ -207,11 +208,6 @@ def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:
     peaks = peaks[power[peaks] > PROMINENT * about[peaks]]
     best = peaks[np.argsort(-power[peaks])[:PEAKS]]
     return sorted(float(lines[i]) for i in best)
-
-
-def _is_motion(name: str) -> bool:
-    """Whether the name of a channel is that of a motion."""
-    return bool(MOTIONS.search(name)) and not FORCES.search(name)
 
 
 def _is_band_limited(record: Record) -> bool:
