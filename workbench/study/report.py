@@ -10,7 +10,7 @@ import numpy as np
 
 from workbench.cases.case import read_case
 from workbench.design.loop.closed_loop import DRIFTS, stability
-from workbench.draw.design import plot_poles, plot_two_works
+from workbench.draw.design import plot_poles, plot_work_linear
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.identification import plot_deviations, plot_mac, stabilisation_diagram
 from workbench.draw.motion import mode_motion
@@ -226,7 +226,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}
     loops = [(str(row[0]), str(row[-1])) for row in rows] + [(str(row[0]), str(row[2])) for row in sensed]
     unstable = [name for name, found in loops if found.startswith("unstable")]
-    work = plot_two_works(works, first=len(controlled), units=units)
+    work = plot_work_linear(works, first=len(controlled), units=units)
     blocks = [
         block(work, "Spillover work of each law in each residual mode."),
         block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
@@ -289,7 +289,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     length, energy = "" if are_points else f" {units.length}", units.named("J")
     proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g} {energy}."
     lead = f"Actuators at {texts[0]}{length} leave spillover work W_R = {float(first):.4g} {energy}.{proof}"
-    work = plot_two_works(works, first=len(content.get("controlled", ())), units=units)
+    work = plot_work_linear(works, first=len(content.get("controlled", ())), units=units)
     blocks = [block(work, "Spillover work of each placement in each residual mode.")]
     if not are_points:
         where = plot_places(places, content.get("length"), units=units)
