@@ -15,7 +15,7 @@ from workbench.design.loop.closed_loop import close_loop, impulse_state, initial
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import place_actuators, placement_task
 from workbench.design.spillover.spillover import effort, finite_spillover, quadratic_cost
-from workbench.draw.design import plot_motion, plot_two_works
+from workbench.draw.design import plot_motion, plot_work_linear
 from workbench.draw.motion import response_motion
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.free_decay.ibrahim import stacked_delays
@@ -208,7 +208,7 @@ def report_designs(outcome, truth, modes, laws) -> None:
     outcome.check("placed: effort over that of even places", placed["effort"] / even["effort"], 1.505)
     outcome.figure(
         "work",
-        plot_two_works({row["law"]: row["W_r"] for row in rows}, first=N_CONTROLLED),
+        plot_work_linear({row["law"]: row["W_r"] for row in rows}, first=N_CONTROLLED),
         "Work that each law puts into the modes it does not control, on the true beam.",
     )
 

@@ -15,7 +15,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import Law
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.spillover.spillover import spillover
-from workbench.draw.design import plot_two_works
+from workbench.draw.design import plot_work_linear
 from workbench.draw.surface import plot_surface_modes, plot_surface_motion
 from workbench.identification.driven import identify_driven
 from workbench.rig.actuators import Actuator
@@ -173,5 +173,5 @@ def study(outcome, data=None):
         "on the plate itself": closed,
     }
     outcome.figure(
-        "work", plot_two_works(works, first=N_CONTROLLED), "Work that control spills into the residual modes."
+        "work", plot_work_linear(works, first=N_CONTROLLED), "Work that control spills into the residual modes."
     )

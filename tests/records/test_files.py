@@ -192,6 +192,19 @@ def test_python_control_round_trip():
     assert back.output_names == record.output_names
 
 
+def test_signals_named_as_inputs_become_inputs():
+    values = np.arange(12.0).reshape(4, 3)
+    u, v, a, b = (Channel(name) for name in "uvab")
+    record = Record(0.1, values[2:], (a, b), values[:2], (u, v), input_hold="first")
+    found = record.with_inputs(["b", "u"])
+    assert (found.input_names, found.output_names, found.input_hold) == (("u", "b"), ("v", "a"), "first")
+    np.testing.assert_array_equal(np.vstack([found.inputs, found.outputs]), values[[0, 3, 1, 2]])
+    alone = record.with_inputs("uvab")
+    assert alone.input_names == alone.output_names == tuple("uvab")
+    with pytest.raises(ValueError, match="no signal 'c' to take as an input; it has u, v, a, b"):
+        record.with_inputs(["c"])
+
+
 def test_a_record_refuses_what_does_not_fit():
     with pytest.raises(ValueError, match="channel 'a': sample 1 is nan"):
         Record(sample_time=0.1, outputs=[[1.0, np.nan]], output_channels=(Channel("a"),))

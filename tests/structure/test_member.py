@@ -31,6 +31,13 @@ def test_hinged_beam_closed_form():
     assert np.abs(modes.phi(x, 1) - slope).max() < 1e-7 * slope.max()
 
 
+def test_the_stiffness_has_a_name_and_an_order_of_its_strain():
+    bar = Bar(length=2.0, mass_per_length=1.0, axial_stiffness=3.0, left="fixed", right="free")
+    beam = uniform("hinged", "hinged")
+    assert (bar.stiffness_name, bar.strain_order, bar.stiffness) == ("axial_stiffness", 1, bar.axial_stiffness)
+    assert (beam.stiffness_name, beam.strain_order, beam.stiffness) == ("bending_stiffness", 2, beam.bending_stiffness)
+
+
 def test_tapered_bar_closed_form():
     bar = Bar(
         length=1.0,

@@ -8,7 +8,7 @@ from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import filter_on
 from workbench.identification.updating.distributions import SelfCheck
 from workbench.structure.domain import NamedPoints
-from workbench.structure.printed import warns_of_remarks
+from workbench.structure.printed import all_rounded, places_text, warns_of_remarks
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,18 @@ def test_a_structure_says_its_ends_and_profiles(beam):
     text = str(beam).splitlines()
     assert text[0] == "beam, 2 m, left clamped, right free"
     assert text[2].split() == ["mass_per_length", "1.5", "1.5", "1.5"]
+
+
+def test_places_are_parted_by_commas_and_pairs_by_semicolons():
+    assert places_text(np.array([0.25, 1.0])) == "0.25, 1"
+    assert places_text(np.array(["N1z", "N2z"], object)) == "N1z, N2z"
+    assert places_text(np.array([[0.25, 1.0], [0.5, 2.0]])) == "0.25, 1; 0.5, 2"
+
+
+def test_all_numbers_have_six_digits_or_are_null():
+    assert all_rounded(np.array([[1.23456789, np.nan], [np.inf, 2.0]])) == [[1.23457, None], [None, 2.0]]
+    assert all_rounded({"a": 0.1234567, "b": -np.inf}) == {"a": 0.123457, "b": None}
+    assert (all_rounded(1 / 3), all_rounded([])) == (0.333333, [])
 
 
 def test_nothing_prints_an_array(beam, rig, record):

@@ -75,8 +75,7 @@ def _member(member: Structure, n_modes: int) -> str:
     if any(member.frequency_errors):
         raise ValueError("the case format has no frequency_errors of a structure: its frequencies are computed")
     beam = isinstance(member, Beam)
-    stiffness = "bending_stiffness" if beam else "axial_stiffness"
-    profiles = {"mass_per_length": member.mass_per_length, stiffness: getattr(member, stiffness)}
+    profiles = {"mass_per_length": member.mass_per_length, member.stiffness_name: member.stiffness}
     return _table(
         "[structure]",
         kind="beam" if beam else "rod",

@@ -11,8 +11,8 @@ import typer
 from workbench.cli import options
 from workbench.cli.design_options import impulse_place, place_in, read_structure_rig, typed_place
 from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
-from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, listed, middle, reach
-from workbench.structure.printed import command_headings, place_text
+from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, middle, reach
+from workbench.structure.printed import command_headings, places_text
 
 if TYPE_CHECKING:
     from workbench.design.placement.limits import Limits
@@ -126,9 +126,8 @@ def place(
             rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
     shown = []
     for row in rows:
-        where = ("; " if isinstance(domain, Rectangle) else ", ").join(map(place_text, listed(row.positions)))
         numbers = (row.residual_work, row.effort, row.peak_force, row.condition)
-        shown.append((where, *(f"{value:.5g}" for value in numbers), row.status))
+        shown.append((places_text(row.positions), *(f"{value:.5g}" for value in numbers), row.status))
     where = domain.text(impulse_point, 6)
     say(f"{control} of {modes.n_modes} modes controlled, unit impulse at {where}, R = {weight:g}", bold=True)
     where = "points" if isinstance(domain, NamedPoints) else "places [m]"

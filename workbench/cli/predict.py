@@ -4,8 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from workbench.cli import options
 from workbench.cli.terminal import (
     as_typed,
@@ -97,19 +95,4 @@ def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
     read = read_record(name, sample_rate_hz=sample_rate_hz, units=case.units)
     known = [channel for _, channel, _ in case.fit[0].signals()]
     check_units(Path(name), known, {channel.name: channel.unit for _, channel, _ in read.signals()})
-    return _with_inputs(read, tuple(actuator.name for actuator in case.rig.actuators))
-
-
-def _with_inputs(read: Record, names: tuple[str, ...]) -> Record:
-    """The record with the channels of these names as inputs; without other channels, they are also the outputs."""
-    channels = (*read.input_channels, *read.output_channels)
-    rows = (*read.inputs, *read.outputs)
-    into = [i for i, channel in enumerate(channels) if channel.name in names]
-    out = [i for i in range(len(channels)) if i not in into] or into
-    return replace(
-        read,
-        inputs=np.array([rows[i] for i in into]),
-        input_channels=tuple(channels[i] for i in into),
-        outputs=np.array([rows[i] for i in out]),
-        output_channels=tuple(channels[i] for i in out),
-    )
+    return read.with_inputs([actuator.name for actuator in case.rig.actuators])

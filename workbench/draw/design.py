@@ -35,8 +35,14 @@ def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
     return figure
 
 
-def plot_two_works(works: Mapping[str, np.ndarray], *, first: int, units: Units = SI) -> Figure:
-    """Work put into each residual mode, a group of bars per mode; `first` is the zero-based index of the first one."""
+def plot_work_linear(works: Mapping[str, np.ndarray], *, first: int, units: Units = SI) -> Figure:
+    """Work in each residual mode on a linear scale, a group of bars per mode.
+
+    Args:
+        works: (n_residual,) J, by the name of the design.
+        first: zero-based index of the first residual mode.
+        units: of the axis.
+    """
     figure, ax = new_figure(width=9, height=4)
     shifts, width = grouped_bars(len(works))
     for shift, (name, work) in zip(shifts, works.items(), strict=True):

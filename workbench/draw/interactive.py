@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from workbench.arrays import Floats
 from workbench.draw.style import MOST_POINTS, envelope
-from workbench.structure.printed import rounded
+from workbench.structure.printed import all_rounded
 
 MOST_CELLS = (160, 320)
 DASHES = {"-": "", "--": "6 4", ":": "2 3", "-.": "7 3 2 3"}
@@ -139,17 +139,17 @@ def _thinned(x: np.ndarray, y: np.ndarray) -> dict[str, Any]:
     if x.size > MOST_POINTS:
         keep = envelope(y) if (np.diff(x) >= 0).all() else np.arange(0, x.size, -(-x.size // MOST_POINTS))
         x, y = x[keep], y[keep]
-    return {"x": _numbers(x), "y": _numbers(y)}
+    return {"x": all_rounded(x), "y": all_rounded(y)}
 
 
 def _box(ax: Axes, patch: Rectangle) -> list[float | None]:
     x0, y0 = patch.get_xy()
     x1, y1 = x0 + patch.get_width(), y0 + patch.get_height()
     if patch.get_data_transform() == ax.get_xaxis_transform():
-        return [*_numbers([x0, x1]), None, None]
+        return [*all_rounded([x0, x1]), None, None]
     if patch.get_data_transform() == ax.get_yaxis_transform():
-        return [None, None, *_numbers([y0, y1])]
-    return _numbers([x0, x1, y0, y1])
+        return [None, None, *all_rounded([y0, y1])]
+    return [*all_rounded([x0, x1, y0, y1])]
 
 
 def _rectangle(ax: Axes, patch: Rectangle) -> list[dict[str, Any]]:
@@ -167,7 +167,7 @@ def _points(ax: Axes, points: PathCollection) -> list[dict[str, Any]]:
     colours = [to_hex(face) for face in faces] or [to_hex(c) for c in np.atleast_2d(points.get_edgecolor())]
     same = {"colour": colours[0]} if len(colours) <= 1 else {"colours": colours, "colour": colours[0]}
     size = round(float(np.sqrt(np.mean(sizes))) * POINTS, 2)
-    return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "width": 0, "marker": "o", "size": size, **same,
+    return [{"kind": "line", "x": all_rounded(x), "y": all_rounded(y), "width": 0, "marker": "o", "size": size, **same,
              "label": _label(points), "alpha": _alpha(points)}]  # fmt: skip
 
 
@@ -177,14 +177,15 @@ def _areas(ax: Axes, artist: PolyCollection | Polygon) -> list[dict[str, Any]]:
         raise Undescribed("areas without a colour")
     paths = [artist.get_xy()] if isinstance(artist, Polygon) else [path.vertices for path in artist.get_paths()]
     look = {"colour": to_hex(faces[0]), "alpha": float(faces[0][3]), "label": _label(artist)}
-    return [{"kind": "area", **dict(zip("xy", map(_numbers, np.asarray(path).T))), **look} for path in paths]
+    return [{"kind": "area", **dict(zip("xy", map(all_rounded, np.asarray(path).T))), **look} for path in paths]
 
 
 def _segments(ax: Axes, lines: LineCollection) -> list[dict[str, Any]]:
     gap = np.full((1, 2), np.nan)
     points = np.concatenate([part for segment in lines.get_segments() for part in (np.asarray(segment), gap)])
     x, y = points[:, 0], points[:, 1]
-    return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "colour": to_hex(np.atleast_2d(lines.get_color())[0]),
+    colour = to_hex(np.atleast_2d(lines.get_color())[0])
+    return [{"kind": "line", "x": all_rounded(x), "y": all_rounded(y), "colour": colour,
              "width": round(float(np.mean(lines.get_linewidth())) * POINTS, 2), "dash": "", "label": _label(lines),
              "alpha": _alpha(lines)}]  # fmt: skip
 
@@ -216,8 +217,8 @@ def _field(artist: QuadMesh | AxesImage, values: Floats, x: ArrayLike, y: ArrayL
     bar = artist.colorbar
     return {
         "kind": "field",
-        "x": _numbers(x),
-        "y": _numbers(y),
+        "x": all_rounded(x),
+        "y": all_rounded(y),
         "shape": list(steps.shape),
         "values": base64.b64encode(steps.tobytes()).decode(),
         "limits": [low, high],
@@ -262,10 +263,6 @@ KINDS: dict[type, Callable[[Axes, Any], list[dict[str, Any]]]] = {
     AxesImage: _image,
     Text: _words,
 }
-
-
-def _numbers(values: ArrayLike) -> list[float | None]:
-    return [rounded(v) for v in np.asarray(values, float)]
 
 
 def _alpha(artist: Artist) -> float:

@@ -93,8 +93,7 @@ def correlation_functions(
         ValueError: an output that never moves; an unknown reference; a record shorter than forty times `max_lag`.
     """
     check_outputs_move([record])
-    lags, rows = _lags(record, max_lag, references)
-    return _as_records(record, _correlations(record, lags, rows) / record.n_samples, rows)
+    return _decays(record, max_lag, references)
 
 
 @former_arguments(longest="max_lag")
@@ -128,8 +127,7 @@ def identify_ambient(
     check_count("n_modes", n_modes)
     check_outputs_move([record])
     budget = Budget(seconds, progress)
-    lags, rows = _lags(record, max_lag, references)
-    decays = _as_records(record, _correlations(record, lags, rows) / record.n_samples, rows)
+    decays = _decays(record, max_lag, references)
     subspace = Subspace(_combinations(record), record.sample_time)
     stable = subspace.stable()
     # A mode has a pole, a shape and an excitation, less a scale factor, at one of n_samples frequencies.
@@ -236,8 +234,10 @@ def _correlations(record: Record, lags: int, rows: list[int]) -> np.ndarray:
     return np.ascontiguousarray(np.fft.irfft(references.conj()[:, None] * outputs, size)[..., 1 : lags + 1])
 
 
-def _as_records(record: Record, correlations: np.ndarray, rows: list[int]) -> tuple[Record, ...]:
+def _decays(record: Record, max_lag: float | None, references: Sequence[str] | None) -> tuple[Record, ...]:
     """Correlation functions as records, one per reference, over its standard deviation for equal weights."""
+    lags, rows = _lags(record, max_lag, references)
+    correlations = _correlations(record, lags, rows) / record.n_samples
     std = record.outputs.std(axis=1)
     return tuple(
         Record(

@@ -29,7 +29,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         found = {name: each for name, each in held.items() if isinstance(each, h5py.Dataset) and _is_read(each)}
         structs = {name: _held(each) for name, each in held.items() if each.attrs.get("MATLAB_class") == b"struct"
                    and isinstance(each, h5py.Group)}  # fmt: skip
-        if structs and not any(_is_signal(each) for each in found.values()):
+        if structs and not any(_is_numeric(each) and (each.size or 0) > 1 for each in found.values()):
             fields = {name: each for name, each in next(iter(structs.values())).items()
                       if isinstance(each, h5py.Dataset) and _is_read(each)}  # fmt: skip
             check_struct(path, structs, fields)
@@ -81,10 +81,6 @@ def _held(group: Any) -> dict[str, Any]:
 
 def _is_numeric(dataset: Any) -> bool:
     return dataset.dtype.base.kind in "fiubc" or dataset.dtype.names == MATLAB_COMPLEX
-
-
-def _is_signal(dataset: Any) -> bool:
-    return _is_numeric(dataset) and (dataset.size or 0) > 1
 
 
 def _is_text(dataset: Any) -> bool:

@@ -218,6 +218,31 @@ class Record(Printed):
         rows = rows_of(f"record {self.name!r}", self.output_names, outputs)
         return replace(self, outputs=self.outputs[rows], output_channels=tuple(self.output_channels[r] for r in rows))
 
+    def with_inputs(self, names: Sequence[str]) -> "Record":
+        """The record with the named signals as inputs and all others as outputs, each in the order they had.
+
+        Without others, they are the outputs too.
+
+        Raises:
+            ValueError: an unknown name.
+        """
+        channels, rows = (*self.input_channels, *self.output_channels), (*self.inputs, *self.outputs)
+        there = [channel.name for channel in channels]
+        for name in names:
+            if name not in there:
+                raise ValueError(
+                    f"record {self.name!r} has no signal {name!r} to take as an input; it has {', '.join(there)}"
+                )
+        into = [i for i, name in enumerate(there) if name in names]
+        out = [i for i in range(len(there)) if i not in into] or into
+        return replace(
+            self,
+            inputs=np.array([rows[i] for i in into]),
+            input_channels=tuple(channels[i] for i in into),
+            outputs=np.array([rows[i] for i in out]),
+            output_channels=tuple(channels[i] for i in out),
+        )
+
     def to_control(self) -> "control.TimeResponseData":
         """The same signals as python-control's `TimeResponseData`."""
         import control

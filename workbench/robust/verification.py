@@ -18,7 +18,7 @@ from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
 from workbench.structure.domain import NamedPoints, middle
 from workbench.structure.modes import Modes, freeze
-from workbench.structure.printed import rounded
+from workbench.structure.printed import all_rounded, rounded
 from workbench.threads import one_blas_thread
 
 SETTLED = 0.01  # of the largest energy: a tenth of the amplitude
@@ -119,8 +119,8 @@ class Verification:
             "stable": self.n_stable,
             "small_gain_margin": rounded(self.small_gain_margin),
             "margin_frequency_hz": rounded(self.margin_frequency_hz),
-            "damping": [[rounded(v) for v in interval(self.damping[:, r])] for r in self.controlled],
-            **{name: [rounded(v) for v in interval(values)] for name, values in quantities.items()},
+            "damping": [all_rounded(interval(self.damping[:, r])) for r in self.controlled],
+            **{name: all_rounded(interval(values)) for name, values in quantities.items()},
         }
 
 

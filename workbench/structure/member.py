@@ -54,12 +54,18 @@ class _Member(Printed):
     damping: Damping = field(default_factory=ModalDamping)
     frequency_errors: tuple[float, ...] = ()
 
-    _continuity: ClassVar[int]  # of the shapes: 0 of displacements alone, 1 of slopes too
-    _stiffness_name: ClassVar[str]
+    stiffness_name: ClassVar[str]
+    strain_order: ClassVar[int]
 
     @property
-    def _stiffness(self) -> Profile:
-        return getattr(self, self._stiffness_name)  # type: ignore[no-any-return]
+    def stiffness(self) -> Profile:
+        """The profile named `stiffness_name`."""
+        return getattr(self, self.stiffness_name)  # type: ignore[no-any-return]
+
+    @property
+    def _continuity(self) -> int:
+        """Of the shapes: 0 of displacements alone, 1 of slopes too."""
+        return self.strain_order - 1
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         at = self.length * np.array([0.0, 0.5, 1.0])
@@ -74,7 +80,7 @@ class _Member(Printed):
         object.__setattr__(self, "left", as_end(self.left, allowed=allowed_ends))
         object.__setattr__(self, "right", as_end(self.right, allowed=allowed_ends))
         object.__setattr__(self, "attachments", tuple(self.attachments))
-        for name in ("mass_per_length", self._stiffness_name):
+        for name in ("mass_per_length", self.stiffness_name):
             profile = as_profile(getattr(self, name))
             object.__setattr__(self, name, profile)
             _check_positive(name, profile, self.length)
@@ -88,7 +94,7 @@ class _Member(Printed):
 
     def _segments(self, n_modes: int, extra: int) -> Segments:
         """Segments that represent n_modes half waves, with `extra` degrees more than estimated."""
-        nodes = segment_ends((*self.mass_per_length.breaks, *self._stiffness.breaks), self.length)
+        nodes = segment_ends((*self.mass_per_length.breaks, *self.stiffness.breaks), self.length)
         for part in self.attachments:
             # a node at an attachment, where a derivative of the shapes jumps
             if np.abs(nodes - part.at).min() >= self._thinnest:
@@ -109,8 +115,8 @@ class _Member(Printed):
     def _shares_of_waves(self, nodes: np.ndarray) -> np.ndarray:
         """Share (n_segments,) of a high mode's half waves in each segment, by the local wavenumber (WKB)."""
         points = nodes[:-1, None] + np.diff(nodes)[:, None] * INSIDE
-        ratio = self.mass_per_length(points.ravel()) / self._stiffness(points.ravel())
-        density = ratio.reshape(points.shape) ** (0.5 / (self._continuity + 1))
+        ratio = self.mass_per_length(points.ravel()) / self.stiffness(points.ravel())
+        density = ratio.reshape(points.shape) ** (0.5 / self.strain_order)
         waves: Floats = np.diff(nodes) * density.mean(axis=1)
         return waves / float(waves.sum())
 
@@ -126,7 +132,7 @@ class _Member(Printed):
 
     def _is_tip(self, end: float) -> bool:
         """Whether the stiffness vanishes at an end."""
-        return bool(self._stiffness(end) <= TIP * self._stiffness(0.5 * self.length))
+        return bool(self.stiffness(end) <= TIP * self.stiffness(0.5 * self.length))
 
     @property
     def _thinnest(self) -> float:
@@ -176,7 +182,7 @@ class _Member(Printed):
     def _eigenpairs(
         self, segments: Segments, n_modes: int, tension: float
     ) -> tuple[Floats, Floats, tuple[tuple[float, int], ...]]:
-        order, stiffness = self._continuity + 1, self._stiffness
+        order, stiffness = self.strain_order, self.stiffness
         mass = segments.assemble(self.mass_per_length, 0)
         rigidity = segments.assemble(stiffness, order)
         if tension:
@@ -235,7 +241,7 @@ class _Member(Printed):
         self, segments: Segments
     ) -> tuple[list[int], list[tuple[float, int]], list[tuple[float, np.ndarray]]]:
         """Functions held by the ends, their (x, derivative), and springs with the rows of their elongations."""
-        order = self._continuity + 1
+        order = self.strain_order
         held, essential = [], []
         springs: list[tuple[float, np.ndarray]] = []
         last = segments.nodes.size - 1
@@ -257,7 +263,7 @@ class _Member(Printed):
         middle = 0.5 * self.length
         size = 1.0 / np.sqrt(float(self.mass_per_length(middle)) * self.length)
         signs = np.zeros(coefficients.shape[1])
-        for derivative in range(self._continuity + 2):
+        for derivative in range(self.strain_order + 1):
             start = (segments.evaluation(0.0, derivative) @ coefficients)[0] * self.length**derivative / size
             signs = np.where((signs == 0) & (np.abs(start) > 1e-6), np.sign(start), signs)
             if signs.all():
@@ -338,6 +344,8 @@ class Bar(_Member):
         attachments: `PointMass`, `PointSpring`, `PointDamper`.
         damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping`.
         frequency_errors: (n_modes,) ln of the ratio of natural frequencies to those computed from the profiles.
+        stiffness_name: "axial_stiffness", the name of the profile `stiffness`, the EA of the strain energy.
+        strain_order: 1, the order of the derivative of the shape in the strain energy.
 
     Raises:
         ValueError: a profile that is not positive, an end of unknown name, an attachment outside or against rotation, a
@@ -345,8 +353,8 @@ class Bar(_Member):
     """
 
     axial_stiffness: Profile
-    _continuity = 0
-    _stiffness_name = "axial_stiffness"
+    stiffness_name = "axial_stiffness"
+    strain_order = 1
 
     if TYPE_CHECKING:  # the arguments may have short forms, which become `Profile` and `End`
 
@@ -395,6 +403,8 @@ class Beam(_Member):
         damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping`.
         tension: axial load in N, positive in tension.
         frequency_errors: (n_modes,) ln of the ratio of natural frequencies to those computed from the profiles.
+        stiffness_name: "bending_stiffness", the name of the profile `stiffness`, the EI of the strain energy.
+        strain_order: 2, the order of the derivative of the shape in the strain energy.
 
     Raises:
         ValueError: a profile that is not positive, an end of unknown name, an attachment outside, buckling.
@@ -402,8 +412,8 @@ class Beam(_Member):
 
     bending_stiffness: Profile
     tension: float = 0.0
-    _continuity = 1
-    _stiffness_name = "bending_stiffness"
+    stiffness_name = "bending_stiffness"
+    strain_order = 2
 
     if TYPE_CHECKING:  # the arguments may have short forms, which become `Profile` and `End`
 

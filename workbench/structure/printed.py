@@ -1,13 +1,16 @@
 """Printing of results: a summary line and a short table, as text and in a notebook."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from html import escape
 from math import isfinite
-from typing import ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 from warnings import warn
 
-from workbench.structure.domain import Patch
+import numpy as np
+from numpy.typing import ArrayLike
+
+from workbench.structure.domain import Patch, listed
 
 
 class Remarked(Protocol):
@@ -50,6 +53,17 @@ class Printed:
 def rounded(value: float) -> float | None:
     """Six digits of a number, as JSON holds it: what is not finite is null."""
     return float(f"{value:.6g}") if isfinite(value) else None
+
+
+def all_rounded(values: ArrayLike | Mapping[str, float]) -> Any:
+    """Every number `rounded`: of an array in lists, of a mapping by name."""
+    if isinstance(values, Mapping):
+        return {name: rounded(value) for name, value in values.items()}
+    return _each_rounded(np.asarray(values, float).tolist())
+
+
+def _each_rounded(values: Any) -> Any:
+    return [_each_rounded(value) for value in values] if isinstance(values, list) else rounded(values)
 
 
 def warns_of_remarks(function: Callable[P, R]) -> Callable[P, R]:
@@ -95,6 +109,11 @@ def place_text(place: object) -> str:
     if isinstance(place, tuple):
         return ", ".join(place_text(part) for part in place)
     return "" if place is None else f"{place:.4g}" if isinstance(place, int | float) else str(place)
+
+
+def places_text(places: np.ndarray) -> str:
+    """Texts of an array of places (n_places,) or (n_places, 2): by commas, or by semicolons between pairs."""
+    return ("; " if places.ndim == 2 else ", ").join(map(place_text, listed(places)))
 
 
 def mode_text(r: int, hz: float, more: str = "") -> str:

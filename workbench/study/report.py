@@ -10,7 +10,7 @@ import numpy as np
 
 from workbench.cases.case import read_case
 from workbench.design.loop.closed_loop import DRIFTS, stability
-from workbench.draw.design import plot_poles, plot_two_works
+from workbench.draw.design import plot_poles, plot_work_linear
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.identification import plot_deviations, plot_mac, stabilisation_diagram
 from workbench.draw.motion import mode_motion
@@ -20,9 +20,9 @@ from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.records.units import Units
-from workbench.structure.domain import listed, place_array, same_place
+from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
-from workbench.structure.printed import command_headings, counted, place_text
+from workbench.structure.printed import command_headings, counted, places_text
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
 from workbench.study.pages.page import (
@@ -233,7 +233,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}
     loops = [(str(row[0]), str(row[-1])) for row in rows] + [(str(row[0]), str(row[2])) for row in sensed]
     unstable = [name for name, found in loops if found.startswith("unstable")]
-    work = plot_two_works(works, first=len(controlled), units=units)
+    work = plot_work_linear(works, first=len(controlled), units=units)
     blocks = [
         block(work, "Spillover work of each law in each residual mode."),
         block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
@@ -285,7 +285,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     names = ["optimum", *(str(one["status"]) for one in placements[1:])]
     places = {name: np.array(one["positions"]) for name, one in zip(names, placements, strict=True)}
     are_points = next(iter(places.values())).dtype.kind == "U"
-    texts = [_between(at) for at in places.values()]
+    texts = [places_text(at) for at in places.values()]
     works = {n: np.array(one["by_mode"], float) for n, one in zip(names, placements, strict=True)}
     rows = [
         [name, *(short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), text]
@@ -295,7 +295,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     length, energy = "" if are_points else f" {units.length}", units.named("J")
     proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g} {energy}."
     lead = f"Actuators at {texts[0]}{length} leave spillover work W_R = {float(first):.4g} {energy}.{proof}"
-    work = plot_two_works(works, first=len(content.get("controlled", ())), units=units)
+    work = plot_work_linear(works, first=len(content.get("controlled", ())), units=units)
     blocks = [block(work, "Spillover work of each placement in each residual mode.")]
     if not are_points:
         where = plot_places(places, content.get("length"), units=units)
@@ -310,10 +310,6 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         "blocks": blocks,
         "tables": [("Placements", headings, rows)],
     }
-
-
-def _between(places: np.ndarray) -> str:
-    return ("; " if places.ndim == 2 else ", ").join(map(place_text, listed(places)))
 
 
 def _units_of(content: Mapping[str, Any]) -> Units:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.integrate import simpson
 
 from workbench.cases.case import read_units
@@ -23,7 +22,7 @@ from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator, command_unit
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, centred_at, middle, reach
-from workbench.structure.printed import command_headings, rounded
+from workbench.structure.printed import all_rounded, command_headings
 from workbench.study.runs.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
@@ -228,19 +227,19 @@ def results_of(rig: Rig, design: Design) -> dict[str, Any]:
     poles = tried.loop.poles
     energy = tried.response.energy[:, ::step].sum(axis=0)
     return {
-        "residual": _plain(tried.work.residual_work),
-        "by_mode": _plain(tried.work.work_by_mode),
-        "effort": _plain(tried.effort),
-        "peak_force": _plain(np.abs(tried.response.forces).max()),
+        "residual": all_rounded(tried.work.residual_work),
+        "by_mode": all_rounded(tried.work.work_by_mode),
+        "effort": all_rounded(tried.effort),
+        "peak_force": all_rounded(np.abs(tried.response.forces).max()),
         "stable": not tried.loop.unstable_poles.size,
         "undamped": int(np.sum(np.abs(poles.real) <= ON_AXIS * np.abs(poles)) // 2),
-        "rightmost": _plain(poles.real.max()),
-        "poles": [[_plain(p.real), _plain(p.imag)] for p in poles if p.imag >= 0],
-        "time": _plain(tried.response.time[::step]),
-        "modal": _plain(tried.response.modal[: rig.modes.n_modes, ::step]),
-        "energy": _plain(energy),
-        "forces": _plain(tried.response.forces[:, ::step]),
-        "struck": _plain(rig.modes.phi(design.impulse_at)[0]),
+        "rightmost": all_rounded(poles.real.max()),
+        "poles": [[all_rounded(p.real), all_rounded(p.imag)] for p in poles if p.imag >= 0],
+        "time": all_rounded(tried.response.time[::step]),
+        "modal": all_rounded(tried.response.modal[: rig.modes.n_modes, ::step]),
+        "energy": all_rounded(energy),
+        "forces": all_rounded(tried.response.forces[:, ::step]),
+        "struck": all_rounded(rig.modes.phi(design.impulse_at)[0]),
     }
 
 
@@ -257,8 +256,8 @@ def setting(rig: Rig, units: Units = SI) -> dict[str, Any]:
     return {
         "labels": {name: units.named(label) for name, label in labels.items()},
         **(_frame(rig, domain) if isinstance(domain, NamedPoints) else _field(rig, domain)),
-        "omega": _plain(rig.modes.omega),
-        "zeta": _plain(rig.modes.zeta),
+        "omega": all_rounded(rig.modes.omega),
+        "zeta": all_rounded(rig.modes.zeta),
         "most": MOST_PORTS,
         "laws": LAWS,
         "design": {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(first).items()},
@@ -277,9 +276,9 @@ def _field(rig: Rig, domain: Interval | Rectangle) -> dict[str, Any]:
     return {
         "length": domain.length,
         "cells": across,
-        "x": _plain(shown_at),
-        "shapes": _plain(rig.modes.phi(shown_at)),
-        "patch": [] if patch is None else _plain(2.0 * reach(domain, patch.at)[0]),
+        "x": all_rounded(shown_at),
+        "shapes": all_rounded(rig.modes.phi(shown_at)),
+        "patch": [] if patch is None else all_rounded(2.0 * reach(domain, patch.at)[0]),
     }
 
 
@@ -292,26 +291,17 @@ def _frame(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
     ways = {"": (0.0, 0.0), "x": (1.0, 0.0), "y": (0.0, 1.0), "z": (0.6, 0.6)}
     moves = np.asarray(net.moves(rig.modes))
     return {
-        "length": _plain(np.maximum(np.ptp(net.rest, axis=0), SLENDER * size)),
+        "length": all_rounded(np.maximum(np.ptp(net.rest, axis=0), SLENDER * size)),
         "points": {
             "names": names,
-            "spots": _plain(np.array([net.at(name) for name in names]) - corner),
+            "spots": all_rounded(np.array([net.at(name) for name in names]) - corner),
             "ways": [ways[domain.directions[domain.locate(name)[0]]] for name in names],
-            "rest": _plain(net.rest - corner),
+            "rest": all_rounded(net.rest - corner),
             "lines": net.lines,
         },
-        "shapes": _plain(moves.reshape(-1, rig.modes.n_modes)),
+        "shapes": all_rounded(moves.reshape(-1, rig.modes.n_modes)),
         "patch": [],
     }
-
-
-def _plain(values: ArrayLike) -> Any:
-    """The values as JSON numbers of six digits; None where not finite."""
-    return _rounded(np.asarray(values, float).tolist())
-
-
-def _rounded(values: Any) -> Any:
-    return [_rounded(value) for value in values] if isinstance(values, list) else rounded(values)
 
 
 def read_structure(path: Path | None) -> tuple[Rig, str, Units]:

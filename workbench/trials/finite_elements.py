@@ -19,7 +19,6 @@ from workbench.structure.domain import Between, Domain, NamedPoints, Where, posi
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, freeze
-from workbench.structure.profile import Profile
 from workbench.structure.supports import HELD
 
 ELEMENTS = 240
@@ -91,7 +90,7 @@ def element_modes(
     beam = isinstance(member, Beam)
     special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
     special += [at + side * width / 2 for at, width, _ in altered.losses for side in (-1, 1)]
-    breaks = [*member.mass_per_length.breaks, *_stiffness(member).breaks]
+    breaks = [*member.mass_per_length.breaks, *member.stiffness.breaks]
     special += [*breaks, *(part.at for part in member.attachments)]
     nodes = _nodes(np.array(special, float), member.length)
     basis = Basis(MeshLine(nodes), ElementLineHermite() if beam else ElementLineP2(), intorder=8)
@@ -196,7 +195,7 @@ def _node(nodes: np.ndarray, at: float) -> int:
 
 def _matrices(basis: Basis, member: Structure, altered: Alterations) -> tuple[sparray, sparray, sparray, Functional]:
     """The matrices of strain, mass and slopes, and the functional of twice the strain energy of a shape."""
-    profile = _stiffness(member)
+    profile = member.stiffness
 
     def rigidity(x: Floats) -> Floats:
         values: Floats = altered.stiffness_factor * profile(x) * waves(altered.stiffness_waves, x / member.length)
@@ -245,11 +244,6 @@ def _attached(member: Structure, name: str) -> list[tuple[float, float]]:
 
 def _typical_frequency(member: Structure) -> float:
     """A frequency of the order of the first elastic one, rad/s."""
-    order = 2 if isinstance(member, Beam) else 1
     x = np.linspace(0.05, 0.95, 19) * member.length
-    ratio = _stiffness(member)(x).mean() / member.mass_per_length(x).mean()
-    return float(np.sqrt(ratio) * (np.pi / member.length) ** order)
-
-
-def _stiffness(member: Structure) -> Profile:
-    return member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness
+    ratio = member.stiffness(x).mean() / member.mass_per_length(x).mean()
+    return float(np.sqrt(ratio) * (np.pi / member.length) ** member.strain_order)

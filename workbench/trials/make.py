@@ -163,12 +163,16 @@ def _case(
     _check_visible([figures[test] for test in fitted], effects)
     outside = [{"kind": UNKNOWN, "outside": e["kind"]} for e in effects if e["kind"] in OUTSIDE]
     domain = bench.rig.modes.domain
+    # share of the mean square of the nominal residual that noise makes; the residual of the exact model under random
+    # forces or input noise counts as explained: nothing is unexplained
+    held = figures["validate"]
+    noise_share = min(held["noise_floor"], held["true_model"]) ** 2 / held["gap"] ** 2
     label = {
         "title": name,
         "snr_db": bench.snr_db,
         "effects": outside or effects or [{"kind": NONE}],
         "length": 1.0 if isinstance(domain, NamedPoints) and domain.positions is None else domain.size,
-        "budget": _budget(figures["validate"]),
+        "budget": {"explained": 1.0 - noise_share, "unexplained": 0.0, "noise": noise_share},
         "records": figures,
     }
     validation = (records.pop("validate"),)
@@ -245,15 +249,6 @@ def _logged(sent: Floats, noise: float, rng: np.random.Generator) -> Floats:
         return sent
     rms: Floats = np.sqrt(np.mean(sent**2, axis=1, keepdims=True))
     return sent + noise * rms * rng.standard_normal(sent.shape)
-
-
-def _budget(figures: dict[str, float]) -> dict[str, float]:
-    """Shares of the mean square of the nominal residual that the exact model explains and that noise makes.
-
-    The residual of the exact model under random forces or input noise counts as explained: nothing is unexplained.
-    """
-    noise = min(figures["noise_floor"], figures["true_model"]) ** 2 / figures["gap"] ** 2
-    return {"explained": 1.0 - noise, "unexplained": 0.0, "noise": noise}
 
 
 def _check_visible(figures: Sequence[dict[str, float]], effects: list[dict[str, Any]]) -> None:

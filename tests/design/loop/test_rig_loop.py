@@ -94,6 +94,15 @@ def test_what_is_read_is_what_the_sensors_read(rig):
         assert told[j] == pytest.approx(expected[j], abs=5e-3 * np.abs(expected[j]).max() + (0.02 if j == 4 else 0.0))
 
 
+def test_a_sensor_without_gain_reads_zero(rig):
+    dead = tuple(replace(s, gain=0.0) if s.name == "v0" else s for s in rig.sensors)
+    controller, test = restless(rig), LoopTest(200, DT)
+    deaf = replace(controller, D=np.where(np.array(controller.sensors) == "v0", 0.0, controller.D))
+    found = run_loop(replace(rig, sensors=dead), controller, test).commands
+    np.testing.assert_array_equal(found, run_loop(rig, deaf, test).commands)
+    assert np.abs(found - run_loop(rig, controller, test).commands).max() > 0.1
+
+
 def test_a_fast_loop_comes_to_the_exact_continuous_one(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
     controller = kalman_controller(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-2)

@@ -13,9 +13,8 @@ from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.loop_steps import ControllerArrays, loop_record
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import PeriodicForce, RandomForce
-from workbench.rig.rig import Rig, participation_of
+from workbench.rig.rig import Rig, participation_of, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.statespace import output_matrix
 from workbench.rig.stepping import law_arrays, structure_arrays
 from workbench.structure.domain import Where
 from workbench.structure.modes import freeze
@@ -217,7 +216,7 @@ def _output_matrices(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
         for source, share in ((sensor, 1.0), *((named(rig.sensors, n), part) for n, part in sensor.crosstalk)):
             order = MEASURED[source.quantity][1]
             if order < 2:
-                matrices[order, j] += share / source.gain * output_matrix(rig.modes, [source])[0]
+                matrices[order, j] += share * shape_of(rig.modes, source)
     return matrices
 
 

@@ -152,16 +152,6 @@ class CellBounds:
 
 
 @njit(cache=True, nogil=True)
-def _largest(score: Floats) -> int:
-    """Index of the largest entry, the first of equals (argmax)."""
-    largest = 0
-    for j in range(1, score.size):
-        if score[j] > score[largest]:
-            largest = j
-    return largest
-
-
-@njit(cache=True, nogil=True)
 def _bounds(
     cells: Integers,
     halves: Floats,
@@ -198,13 +188,13 @@ def _bounds(
             if np.isfinite(limit):
                 bound = dual_bound(node, h, tables, transforms, squares[s], inverses[s], limit, SINGULAR, score)
                 if bound > nearest:
-                    nearest, axis[cell] = bound, _largest(score)
+                    nearest, axis[cell] = bound, np.argmax(score)
         lower[cell], work[cell] = max(nearest, 0.0), np.inf
         if np.isinf(lower[cell]):
             continue
         bound, work[cell] = _series_bound(node, h, tables, transforms, forces, peak, score)
         if bound > lower[cell] or nearest == -np.inf:
-            axis[cell] = _largest(score)
+            axis[cell] = np.argmax(score)
         lower[cell] = max(lower[cell], bound)
 
 

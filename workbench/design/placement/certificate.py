@@ -24,7 +24,7 @@ from workbench.design.placement.task import Placement, PlacementTask
 from workbench.renamed import former_arguments
 from workbench.structure.domain import NamedPoints, Rectangle, listed
 from workbench.structure.modes import frozen
-from workbench.structure.printed import place_text
+from workbench.structure.printed import places_text
 from workbench.threads import cores, one_blas_thread
 
 LEAST_LEVELS = 3  # halvings of candidates at least
@@ -69,17 +69,12 @@ class Certificate:
         count = f"{self.cells:,} cells, {self.seconds:.0f} s"
         if self.better is not None:
             unit = "" if self.better.dtype == object else " m"
-            return f"not the optimum: actuators at {_listed(self.better)}{unit} have less residual work ({count})"
+            return f"not the optimum: actuators at {places_text(self.better)}{unit} have less residual work ({count})"
         text = f"no placement under the limits has less than {1.0 - self.gap:.1%} of its residual work ({count})"
         if self.cell is None:
             return text
         where = "; ".join(f"{low:.4g} to {high:.4g}" for low, high in self.cell)
         return f"{text}; the lowest bound is that of actuators at {where} m"
-
-
-def _listed(places: np.ndarray) -> str:
-    each = [place_text(place) for place in listed(places)]
-    return "; ".join(each) if places.ndim > 1 else ", ".join(each)
 
 
 @former_arguments(most_cells="max_cells")
@@ -138,7 +133,7 @@ class _Search:
     def __init__(self, task: PlacementTask, limits: Limits, best: Placement, gap: float) -> None:
         self._task, self._limits, self._best = task, limits, best
         self._wanted = np.sqrt(best.residual_work * (1.0 - gap))
-        self._tree = CellTree.of(task, limits)
+        self._tree = (_of_interval if limits.candidates is None else _of_candidates)(task, limits)
         self._bounds = CellBounds(task, limits, self._tree.table, self._wanted)
         self._shelves: list[list[np.ndarray]] = [[] for _ in range(SHELVES)]
         self._stuck = np.inf  # lowest bound of a cell of the smallest size
@@ -288,15 +283,6 @@ class CellTree:
     levels: int
     places: Callable[[np.ndarray], np.ndarray | None]
     kept: Callable[[np.ndarray], np.ndarray] | None = None
-
-    @classmethod
-    def of(cls, task: PlacementTask, limits: Limits) -> "CellTree":
-        """The tree of the candidates where the limits name them, else of the interval.
-
-        Raises:
-            DesignError: no room for all actuators.
-        """
-        return _of_candidates(task, limits) if limits.candidates is not None else _of_interval(task, limits)
 
 
 def _of_interval(task: PlacementTask, limits: Limits) -> CellTree:

@@ -18,7 +18,6 @@ from workbench.gap.effects.structural import (
     buckling_load,
     modes_of,
     solved_once,
-    stiffness_name,
 )
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, derivative_of, shape_of
@@ -104,9 +103,9 @@ def group_of(parameter: str) -> str:
     return parameter.split("_", 1)[0]
 
 
-def in_group(errors: Effect, group: str) -> dict[str, float]:
-    """The values of the nominal errors of one group, by parameter name."""
-    return {name: value for name, value in errors.values.items() if group_of(name) == group}
+def in_group(values: Mapping[str, float], *groups: str) -> dict[str, float]:
+    """The values of nominal errors of some groups, by parameter name."""
+    return {name: value for name, value in values.items() if group_of(name) in groups}
 
 
 def weight_of(parameter: str, prior: NominalPrior) -> float:
@@ -224,21 +223,16 @@ def _with_variation(profile: Profile, amplitudes: np.ndarray, length: float) -> 
     )
 
 
-def _values_of(values: dict[str, float], group: str) -> np.ndarray:
-    """The errors of a group, in their order."""
-    return np.array([value for name, value in values.items() if group_of(name) == group])
-
-
 def _with_profile_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
     """The rig with errors of its profiles, or of its modal mass."""
-    stiffness, mass = _values_of(values, "stiffness"), _values_of(values, "mass")
+    stiffness, mass = (np.array(list(in_group(values, group).values())) for group in ("stiffness", "mass"))
     structure, modes = rig.structure, rig.modes
     if not isinstance(structure, Structure):
         if not mass.any():
             return rig
         shapes, factor = modes.shapes, float(np.exp(-0.5 * mass[0]))
         return replace(rig, modes=replace(modes, shapes=lambda at, derivative: factor * shapes(at, derivative)))
-    profiles = {stiffness_name(structure): stiffness, "mass_per_length": mass}
+    profiles = {structure.stiffness_name: stiffness, "mass_per_length": mass}
     changed: dict[str, Any] = {
         name: _with_variation(getattr(structure, name), amplitudes, structure.length)
         for name, amplitudes in profiles.items()
@@ -255,7 +249,7 @@ _profiles_solved = solved_once(_with_profile_errors)
 
 def _with_structural_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
     """The rig with errors of its structure and modes; only those of profiles require new modes."""
-    along = {name: value for name, value in values.items() if group_of(name) in ("stiffness", "mass")}
+    along = in_group(values, "stiffness", "mass")
     if not isinstance(rig.structure, Structure):
         rig = replace(rig, structure=None)  # later effects must change these modes, not solve the structure again
     rig = _profiles_solved(rig, prior, along)
@@ -435,7 +429,7 @@ def parted(errors: Effect) -> tuple[Effect, Effect | None]:
     prior = errors.target
     if not isinstance(prior, NominalPrior) or not prior.record:
         return errors, None
-    between = {name: value for name, value in errors.values.items() if group_of(name) == "record"}
+    between = in_group(errors.values, "record")
     alike = {name: value for name, value in errors.values.items() if name not in between}
     others: dict[str, Any] = {group: 0.0 for group in prior.groups if group != "record"}
     return (
@@ -446,7 +440,7 @@ def parted(errors: Effect) -> tuple[Effect, Effect | None]:
 
 def deviations_of(values: Mapping[str, float]) -> dict[str, float]:
     """Deviation of the varying parameter in each record, by name."""
-    return {name.split("_", 1)[1]: value for name, value in values.items() if group_of(name) == "record"}
+    return {name.split("_", 1)[1]: value for name, value in in_group(values, "record").items()}
 
 
 def _values_by_mode(values: dict[str, float], group: str, n_modes: int) -> Floats:

@@ -79,8 +79,7 @@ CUBIC_SPRING = Kind(
 
 def _stretching_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
     modes = evidence.rig.modes
-    points, weights = np.polynomial.legendre.leggauss(40)
-    x, w = 0.5 * modes.length * (points + 1), 0.5 * modes.length * weights
+    x, w = modes.domain.quadrature(40)
     slopes = modes.phi(x, 1)
     motion = max(evidence.motions, key=lambda m: np.mean(m.displacement[0] ** 2))
     stretch = float(np.mean(w @ (slopes @ motion.displacement[:, ::7]) ** 2))

@@ -149,11 +149,6 @@ def _with_attachment(rig: Rig, part: Attachment) -> Rig:
     return resolved(rig, structure)
 
 
-def stiffness_name(structure: Structure) -> str:
-    """The name of the stiffness profile of a bar or beam."""
-    return "bending_stiffness" if isinstance(structure, Beam) else "axial_stiffness"
-
-
 # --- modulus_error
 
 
@@ -163,8 +158,8 @@ def _modulus(rig: Rig, _: object, values: dict[str, float]) -> Rig:
         return replace(rig, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
     if isinstance(rig.structure, Plate | Membrane):
         return _with_scaled_stiffness(rig, rig.structure, factor)
-    name = stiffness_name(rig.structure)
-    structure = replace(rig.structure, **{name: getattr(rig.structure, name).scaled(factor)})
+    scaled: dict[str, Any] = {rig.structure.stiffness_name: rig.structure.stiffness.scaled(factor)}
+    structure = replace(rig.structure, **scaled)
     if structure.attachments or (isinstance(structure, Beam) and structure.tension):
         return resolved(rig, structure)
     if any(0 < s < HELD for end in (structure.left, structure.right) for s in (end.translation, end.rotation)):
@@ -287,13 +282,13 @@ POINT_DAMPER = Kind(
 
 def _with_loss(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     member = _member(rig)
-    name, length = stiffness_name(member), member.length
+    length = member.length
     start, stop = values["at"] - 0.5 * values["width"], values["at"] + 0.5 * values["width"]
     if start < -EDGE * length or stop > (1.0 + EDGE) * length:
         # a stretch beyond the end has no effect, so place and width could not be distinguished
         raise ValueError(f"the stretch from {start:.4g} to {stop:.4g} reaches beyond the structure")
-    profile = getattr(member, name).scaled(1.0 - values["loss"], max(start, 0.0), min(stop, length))
-    return resolved(rig, replace(member, **{name: profile}))
+    profile: Any = member.stiffness.scaled(1.0 - values["loss"], max(start, 0.0), min(stop, length))
+    return resolved(rig, replace(member, **{member.stiffness_name: profile}))
 
 
 def _loss_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:

@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.nominal import TENSION, deviations_of, group_of, label_of, parted
+from workbench.gap.effects.nominal import TENSION, deviations_of, in_group, label_of, parted
 from workbench.gap.effects.structural import buckling_load
 from workbench.gap.prediction.noise import loudest_logging_noise
 from workbench.gap.prediction.residuals import FitData, lead_of, scale_of
@@ -328,7 +328,7 @@ def sizes_of(errors: Effect | None) -> dict[str, float]:
     """
     if errors is None:
         return {}
-    values = {group: [v for n, v in errors.values.items() if group_of(n) == group] for group in (*PLURAL, "delay")}
+    values = {group: list(in_group(errors.values, group).values()) for group in (*PLURAL, "delay")}
     sizes = {
         f"{name}_percent": 100.0 * float(np.sqrt(np.mean(np.square(values[group]))))
         for group, name in PLURAL.items()

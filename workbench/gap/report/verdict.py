@@ -18,7 +18,7 @@ from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
-from workbench.structure.printed import joined_in_words, rounded
+from workbench.structure.printed import all_rounded, joined_in_words, rounded
 
 NEAR = 0.05  # of the gap: a set that closes less is not stated as the nearest
 SHOWN = 0.005  # of the gap: smaller shares are not stated
@@ -314,13 +314,13 @@ class Verdict:
             ],
             "where": where_json(self.where),
             "gap": {
-                "before": _rounded_all(shrink.before if shrink else {}),
-                "after": _rounded_all(shrink.after if shrink else {}),
-                "floor": _rounded_all(shrink.floor if shrink else {}),
+                "before": all_rounded(shrink.before if shrink else {}),
+                "after": all_rounded(shrink.after if shrink else {}),
+                "floor": all_rounded(shrink.floor if shrink else {}),
             },
             "shrinkage": {
-                **_rounded_all(shrink.share if shrink else {}),
-                **({"ci95": [rounded(c) for c in shrink.ci95]} if shrink else {}),
+                **all_rounded(shrink.share if shrink else {}),
+                **({"ci95": all_rounded(shrink.ci95)} if shrink else {}),
             },
             "residual": {
                 "nominal": rounded(self.attribution.nominal_cost),
@@ -332,11 +332,11 @@ class Verdict:
             },
             "next_experiment": None if self.experiment is None else self.experiment.sentence,
             "budget": self.budget.to_json(),
-            "nominal": _rounded_all(dict(self.budget.errors)),
+            "nominal": all_rounded(dict(self.budget.errors)),
             "record_to_record": None if self.record_to_record is None else self.record_to_record.to_json(),
             "noise": {
                 "stated": [None if s.name in guessed else rounded(s.noise_std) for s in self.nominal.sensors],
-                "found": [rounded(v) for v in self.budget.noise_found],
+                "found": all_rounded(self.budget.noise_found),
                 "found_at_most": list(self.budget.is_noise_at_bound),
             },
             "notes": list(self.notes),
@@ -347,7 +347,7 @@ def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
     """An effect as the case format writes it: kind, parameters with standard deviations, place, input or output."""
     kind = effect.kind
     stated = effect.stated(nominal)
-    entry: dict[str, Any] = {"kind": kind.name, "parameters": {n: rounded(v) for n, v in stated.items()}}
+    entry: dict[str, Any] = {"kind": kind.name, "parameters": all_rounded(stated)}
     deviations = {n: rounded(d) for n, d in effect.deviations.items() if n in stated}
     if deviations:
         entry["parameters_std"] = deviations
@@ -371,7 +371,7 @@ def _place_json(where: Any) -> dict[str, Any]:
     if isinstance(where, Between):
         return {"between": list(where)}
     if isinstance(where, tuple):
-        return {"at": [rounded(coordinate) for coordinate in where]}
+        return {"at": all_rounded(where)}
     return {"at": where if isinstance(where, str) else rounded(where)}
 
 
@@ -389,17 +389,17 @@ def where_json(where: Where) -> dict[str, Any]:
             "share": rounded(where.place.share),
             "single_force": where.place.is_single_force,
         },
-        "by_mode": [rounded(s) for s in where.mode_shares],
+        "by_mode": all_rounded(where.mode_shares),
         "by_band": {
-            "edges_hz": [rounded(f) for f in where.band_edges_hz],
-            "shares": [rounded(s) for s in where.band_shares],
+            "edges_hz": all_rounded(where.band_edges_hz),
+            "shares": all_rounded(where.band_shares),
         },
-        "by_sensor": [rounded(s) for s in where.sensor_shares],
+        "by_sensor": all_rounded(where.sensor_shares),
         "by_record": {
             name: {
                 "gap": rounded(gap),
                 "input_rms": rounded(level),
-                "by_eighth": [rounded(s) for s in shares],
+                "by_eighth": all_rounded(shares),
             }
             for name, gap, level, shares in zip(
                 where.record_names, where.record_gaps, where.input_levels, where.time_shares, strict=True
@@ -484,7 +484,3 @@ def _with_deviation(value: float, deviation: float) -> str:
     if digits > 4 or abs(value) >= 1e5:
         return f"{value:.4g} ± {deviation:.1g}"
     return f"{value:.{digits}f} ± {deviation:.{digits}f}"
-
-
-def _rounded_all(values: dict[str, float]) -> dict[str, float | None]:
-    return {name: rounded(value) for name, value in values.items()}

@@ -69,7 +69,7 @@ def fit_from_zero(search: Search, effects: Sequence[Effect]) -> Step:
 def _interpolated(search: Search, ahead: Fit) -> Fit:
     """The one-step-ahead fit, or one with delays by linear interpolation of the readings if its cost is lower."""
     *effects, errors = ahead.effects
-    delays = in_group(errors, "delay")
+    delays = in_group(errors.values, "delay")
     is_late = any(effect.kind in TIMING for effect in effects)
     may_be_late = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.surely_late
     if not may_be_late and (effects or ahead.cost < JOINT.straight):

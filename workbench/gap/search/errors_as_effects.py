@@ -116,7 +116,7 @@ def delay_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
     If one of several sensors is late, its own delay or lag is the cause. If all are equally late, beyond chance, the
     cause is a lag of the sensors or of the actuators, or a delay of the actuators.
     """
-    delays = {name.removeprefix("delay_"): float(delay) for name, delay in in_group(errors, "delay").items()}
+    delays = {name.removeprefix("delay_"): float(delay) for name, delay in in_group(errors.values, "delay").items()}
     uncertainty = {name: ERRORS.sure * errors.deviations.get(f"delay_{name}", 0.0) for name in delays}
     late = [name for name, delay in delays.items() if abs(delay) > max(ERRORS.smallest_delay, uncertainty[name])]
     sample_time = errors.target.sample_time
@@ -145,7 +145,7 @@ def with_common_delay(found: Fit) -> Fit:
     Both delay alike, and the records determine only their sum.
     """
     *others, late, errors = found.effects
-    delays = in_group(errors, "delay")
+    delays = in_group(errors.values, "delay")
     mean = float(np.mean([*delays.values()])) if delays else 0.0
     delay = delay_of(late) + mean * errors.target.sample_time
     if late.kind not in DELAYS_OF_ALL or not mean or delay <= 0.0:
@@ -180,7 +180,7 @@ def with_late_accelerometer(search: Search, step: Step, tried: Sequence[Step]) -
 def with_wrong_gains(search: Search, step: Step) -> Step:
     """The step with gain errors too large for any calibration, and outlying among the gains, as effects."""
     for _ in range(ERRORS.wrong_gains):
-        gains = in_group(step.errors, "gain")
+        gains = in_group(step.errors.values, "gain")
         name = max(gains, key=lambda n: abs(gains[n]), default="")
         if abs(gains.get(name, 0.0)) < ERRORS.suspect * ERRORS.most_gain:
             break
@@ -201,7 +201,7 @@ def with_wrong_gains(search: Search, step: Step) -> Step:
 
 def with_uniform_effects(search: Search, step: Step) -> Step:
     """The step with uniform stiffness and damping errors as effects, if too large for nominal errors."""
-    values, dampings = step.errors.values, in_group(step.errors, "damping")
+    values, dampings = step.errors.values, in_group(step.errors.values, "damping")
     damping = float(np.mean([*dampings.values()] or [0.0]))
     stiffness = values.get("stiffness_0", 0.0) - values.get("mass_0", 0.0)
     named = {effect.kind for effect in step.effects}
@@ -229,7 +229,7 @@ def with_delay_as_effect(search: Search, step: Step, least: float) -> Step:
     late = [effect for effect in late if search.are_noticeable([effect], [*step.effects, effect])]
     if not late:
         return step
-    without_delays = {**step.errors.values, **dict.fromkeys(in_group(step.errors, "delay"), 0.0)}
+    without_delays = {**step.errors.values, **dict.fromkeys(in_group(step.errors.values, "delay"), 0.0)}
     errors = nominal_errors(search.rig, replace(target, late=(), early=(), interpolated=False), without_delays)
     each = search.workers.map(lambda e: fit_jointly(search, (*step.effects, e), errors, rounds=2), late)
     each = [evaluated(search, with_common_delay(s.fit)) for s in each]

@@ -95,7 +95,7 @@ class Step:
         if not of_errors_alone:
             left = JOINT.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
         for group, small in JOINT.small:
-            left += len(in_group(self.errors, group)) * np.log(max(size_of(self.errors, group), small) / small)
+            left += len(in_group(self.errors.values, group)) * np.log(max(size_of(self.errors, group), small) / small)
         return float(left)
 
     def excess(self, noise_power: np.ndarray) -> float:
@@ -338,7 +338,7 @@ def _limit_of_prior_stds(search: Search, found: Fit) -> dict[str, float]:
 
 def _scaled_errors(errors: Effect, group: str) -> Floats:
     """Nominal errors of a group and their posterior standard deviations, each over its weight: (2, n_errors)."""
-    names = list(in_group(errors, group))
+    names = list(in_group(errors.values, group))
     weights = [weight_of(name, errors.target) for name in names]
     each = [[found.get(name, 0.0) for name in names] for found in (errors.values, errors.deviations)]
     scaled: Floats = np.array(each).reshape(2, len(names)) / np.array(weights)

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, contained, each_left_out, simpler_sets
-from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, in_group
 from workbench.gap.effects.ports import SENSOR_DELAY
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.candidates import surely_late, with_reading_sides
@@ -97,7 +97,7 @@ def _at_ports(errors: Effect) -> Iterator[tuple[Effect, ...]]:
     if prior.delay > ERRORS.smallest_delay or prior.late:
         timing = replace(timing, delay=prior.delay)
     for kept in dict.fromkeys((timing, replace(timing, gain=prior.gain, place=prior.place))):
-        values = {name: value for name, value in errors.values.items() if group_of(name) in kept.groups}
+        values = in_group(errors.values, *kept.groups)
         yield (replace(errors, target=kept, values=values),) if values else ()
 
 

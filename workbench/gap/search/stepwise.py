@@ -211,7 +211,11 @@ class Stepwise:
             return
         uniform = fit(search.rig, NO_UNIFORM_ERROR, search.data)
         stiffness, damping = (float(np.log(effect.values["factor"])) for effect in uniform.effects)
-        sizes = {**errors.values, **dict.fromkeys(in_group(errors, "damping"), damping), "stiffness_0": stiffness}
+        sizes = {
+            **errors.values,
+            **dict.fromkeys(in_group(errors.values, "damping"), damping),
+            "stiffness_0": stiffness,
+        }
         found = fit_jointly(search, (), nominal_errors(search.rig, search.prior, sizes))
         if found.explains and are_plausible(found.errors, damping=False):
             self.steps.append(found)

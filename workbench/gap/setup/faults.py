@@ -122,12 +122,10 @@ def _best(gap: Comparison, detectors: Sequence[Detector]) -> list[SetupFault]:
     certain = [faults for faults in ([f for f in faults if f.certain] for faults in detected) if faults]
     if not certain:
         return [fault for faults in detected for fault in faults]
-    return certain[0] if len(certain) == 1 else min(certain, key=lambda faults: _remaining(_without_all(gap, faults)))
-
-
-def _remaining(gap: Comparison) -> float:
-    """Residual power as a share of the power measured, the mean over outputs."""
-    return float(np.minimum(gap.before, 1.0).mean())
+    if len(certain) == 1:
+        return certain[0]
+    # by residual power as a share of the power measured, the mean over outputs
+    return min(certain, key=lambda faults: float(np.minimum(_without_all(gap, faults).before, 1.0).mean()))
 
 
 def _worsened(gaps: Sequence[Comparison], fault: SetupFault) -> list[Comparison]:

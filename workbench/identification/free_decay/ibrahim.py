@@ -31,6 +31,19 @@ from workbench.threads import one_blas_thread
 LARGEST_MATRIX = 4_000_000  # entries
 
 
+@dataclass(frozen=True)
+class StabilitySettings:
+    """Constants of the choice of modes that are stable over the orders of a diagram."""
+
+    frequency: float = 0.02  # largest relative difference of frequency between the poles of one mode
+    shape: float = 0.8  # least MAC between them
+    presence: float = 0.5  # least share of the orders
+    most_damped: float = 0.2  # damping ratio above which a pole is noise, as below zero
+
+
+STABILITY = StabilitySettings()
+
+
 def two_delays(record: Record, *, first: int = 0, spacing: int = 1, columns: int | None = None) -> SampledModes:
     """As many modes as sensors, by the least squares form of 1981: Â = G A with A of order 2m x columns (3.31).
 
@@ -188,39 +201,27 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
     return Stabilisation(tuple(orders), tuple(_modes_of(basis[:, : 2 * n], records[0]) for n in orders))
 
 
-def stable_modes(
-    diagram: Stabilisation,
-    *,
-    frequency: float = 0.02,
-    shape: float = 0.8,
-    standing: float = 0.8,
-    presence: float = 0.5,
-    largest_damping: float = 0.2,
-) -> StableModes:
+def stable_modes(diagram: Stabilisation, *, standing: float = 0.8) -> StableModes:
     """The modes that are stable over the orders of a diagram.
 
     Args:
         diagram: from `stabilise`.
-        frequency: largest relative difference of frequency between the poles of one mode.
-        shape: least MAC between them.
         standing: least phase collinearity of a shape.
-        presence: least share of the orders.
-        largest_damping: damping ratio above which a pole is noise, as below zero.
     """
     groups: list[list[tuple[SampledModes, int]]] = []
     for modes in diagram.found:
-        keep = (modes.zeta > 0) & (modes.zeta < largest_damping) & (modes.phase_collinearity >= standing)
+        keep = (modes.zeta > 0) & (modes.zeta < STABILITY.most_damped) & (modes.phase_collinearity >= standing)
         taken = set()
         # The most collinear shapes are assigned first: a mode precedes poles that split off it.
         for r in sorted(np.flatnonzero(keep).tolist(), key=lambda r: -modes.phase_collinearity[r]):
-            near = _nearest(groups, modes, r, frequency, shape)
+            near = _nearest(groups, modes, r)
             if near is None:
                 near = len(groups)
                 groups.append([])
             if near not in taken:
                 groups[near].append((modes, r))
                 taken.add(near)
-    stayed = [group for group in groups if len(group) >= presence * len(diagram.orders)]
+    stayed = [group for group in groups if len(group) >= STABILITY.presence * len(diagram.orders)]
     best = [max(group, key=lambda item: item[0].phase_collinearity[item[1]]) for group in stayed]
     n_outputs, positions = len(diagram.found[0].positions), diagram.found[0].positions
     omega, zeta = np.array([(modes.omega[r], modes.zeta[r]) for modes, r in best]).reshape(-1, 2).T
@@ -230,14 +231,12 @@ def stable_modes(
     return StableModes(SampledModes(omega[order], zeta[order], shapes[:, order], positions), share[order])
 
 
-def _nearest(
-    groups: list[list[tuple[SampledModes, int]]], modes: SampledModes, r: int, frequency: float, shape: float
-) -> int | None:
+def _nearest(groups: list[list[tuple[SampledModes, int]]], modes: SampledModes, r: int) -> int | None:
     """Index of the group whose last member agrees best with mode r in frequency and shape; None if none agrees."""
-    nearest, distance = None, frequency
+    nearest, distance = None, STABILITY.frequency
     for i, group in enumerate(groups):
         last, k = group[-1]
         difference = abs(modes.omega[r] / last.omega[k] - 1.0)
-        if difference <= distance and mac(modes.shapes[:, [r]], last.shapes[:, [k]])[0, 0] >= shape:
+        if difference <= distance and mac(modes.shapes[:, [r]], last.shapes[:, [k]])[0, 0] >= STABILITY.shape:
             nearest, distance = i, difference
     return nearest

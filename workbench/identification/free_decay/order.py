@@ -36,7 +36,14 @@ from workbench.identification.free_decay.refinement import (
 )
 from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors, steps
 from workbench.identification.signal.modal_estimates import Identified
-from workbench.identification.signal.projection import Projection, differ, project, variances, whitened
+from workbench.identification.signal.projection import (
+    Projection,
+    differ,
+    local_noise_ratio,
+    project,
+    variances,
+    whitened,
+)
 from workbench.identification.signal.searches import (
     FALSE_ALARM,
     FIT,
@@ -445,11 +452,8 @@ class _FreeDecay:
 
     def _noise_ratio(self, model: _Model, pole: complex) -> float:
         """Noise about a frequency over its mean, 1 or more: by the median of the residual's spectrum there."""
-        grid = self.grids[0]
-        power = model.residual_power
-        at = round((pole.imag - grid.bin_width) / grid.bin_width)
-        nearby = power[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
-        return max(1.0, float(np.median(nearby)) / float(power.mean())) if nearby.size else 1.0
+        nearest = round((pole.imag - self.grids[0].bin_width) / self.grids[0].bin_width)
+        return local_noise_ratio(model.residual_power, nearest, SELECTION.noise_bins)
 
 
 class _Grid:

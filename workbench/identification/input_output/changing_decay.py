@@ -21,7 +21,7 @@ from scipy.interpolate import CubicSpline
 
 from workbench.arrays import Floats
 from workbench.identification.free_decay.backbone import POWERS, backbone_integrals
-from workbench.identification.input_output.modal_fit import Fit, regressors
+from workbench.identification.input_output.modal_fit import Fit, regressors, row_weights
 from workbench.identification.input_output.rivals import (
     RIVALS,
     bases_with_changes,
@@ -202,7 +202,7 @@ class _Peak:
     def __init__(self, lines: Lines, fit: Fit, cluster: np.ndarray, pole: complex) -> None:
         self.decays = _Decays(lines, pole, fit.participation[cluster[0]])
         self.noise = fit.noise
-        self.weights = (np.ones((1, fit.noise.size)) if lines.weights is None else lines.weights).T[:, :, None]
+        self.weights = row_weights(lines).T[:, :, None]
         others = np.setdiff1d(np.arange(fit.poles.size), cluster)
         rows = regressors(lines, fit.poles, fit.participation)
         self.bases = bases_with_changes(rows, fit, others, list(self.weights))

@@ -23,7 +23,14 @@ from scipy.stats import chi2
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, projected, tangent_weights
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    columns,
+    free_parameters,
+    projected,
+    row_weights,
+    tangent_weights,
+)
 from workbench.identification.input_output.model_order import SelectionOptions, sure_modes
 from workbench.identification.input_output.noise_spectrum import autoregression, lines_of, samples_of
 from workbench.identification.signal.projection import PROJECTION
@@ -237,7 +244,7 @@ def spread_by_inputs(data: KnownInputs, fit: Fit, std: Floats, acts: Sequence[Fl
     """
     phi, tangents = columns(data, fit.poles, fit.participation)
     free, bound, responses = free_parameters(fit), covariance(fit), _impulse_responses(data, fit)
-    weights = np.ones((1, fit.noise.size)) if data.weights is None else data.weights
+    weights = row_weights(data)
     total: Floats = np.zeros((free.size + fit.coefficients.size,) * 2)
     for rows, noisy in zip(data.rows, acts, strict=True):
         n = rows.stop - rows.start

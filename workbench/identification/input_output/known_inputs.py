@@ -40,11 +40,13 @@ from workbench.identification.input_output.modal_fit import (
     free_parameters,
     modal_coordinate,
     regressors,
+    row_weights,
     tangent_weights,
 )
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
 from workbench.identification.signal.projection import (
     independent,
+    local_noise_ratio,
     noise_along,
     noise_near,
     variances,
@@ -208,7 +210,7 @@ class KnownInputs:
             x = np.vstack([lines_of(x[rows]) for rows in self.rows])
         combined, free, leverages = combinations(fit.participation, self.fixed.shape[1]), free_parameters(fit), []
         bound = scaled_root(covariance(fit) if free.size else np.zeros((0, 0)))
-        weights = np.ones((1, fit.noise.size)) if self.weights is None else self.weights
+        weights = row_weights(self)
         for part, outputs in fit.outputs():
             changes = -combined @ part.tilt
             changes[: len(part.gram)] += np.eye(len(part.gram))  # tangents less their projections
@@ -235,7 +237,7 @@ class KnownInputs:
         for k, rows in enumerate(self.rows):
             residual = self.samples(fit.residual[rows] / std[k])
             near.append(noise_near(fit.poles, residual, np.ones(residual.shape[1]), self.dt))
-            weights = np.ones((1, std.shape[1])) if self.weights is None else self.weights[rows]
+            weights = row_weights(self, rows)
             weighted = [self.samples(weight[:, None] * self.fixed[rows]) for weight in weights.T]
             ratios = [noise_along(column, row, fit.poles.size) for column, row in zip(weighted, residual.T[:, :, None])]
             along.append(np.hstack(ratios))
@@ -414,11 +416,10 @@ class KnownInputs:
         frequencies at that rate of decay. The initial state is an impulse before the first sample.
         """
         size, omega = self.size, 2.0 * np.pi * np.fft.rfftfreq(self.size, self.dt)
-        lags, n_outputs = np.arange(size // 2), residual.shape[1]
+        lags = np.arange(size // 2)
         cross_correlations = []
         for record, rows in zip(self.records, self.rows):
-            weights = np.ones((1, n_outputs)) if self.weights is None else self.weights[rows]
-            y = np.fft.rfft(self.samples(weights * residual[rows]).T, size)
+            y = np.fft.rfft(self.samples(row_weights(self, rows) * residual[rows]).T, size)
             cross_correlations += [
                 np.fft.irfft(y * np.fft.rfft(u, size).conj(), size)[:, : size // 2] for u in self._exciting(record)
             ]
@@ -477,8 +478,7 @@ class KnownInputs:
         longest = max(self.rows, key=lambda rows: rows.stop - rows.start)
         power = (np.abs(np.fft.rfft(self.samples(residual[longest]), axis=0)[1:]) ** 2).mean(axis=1)
         nearest = round(pole.imag / self.resolution) - 1
-        around = power[max(nearest - SELECTION.noise_bins, 0) : nearest + SELECTION.noise_bins + 1]
-        return max(1.0, float(np.median(around) / power.mean())) if around.size else 1.0
+        return local_noise_ratio(power, nearest, SELECTION.noise_bins)
 
 
 def powers(exponent: complex, n: int) -> np.ndarray:

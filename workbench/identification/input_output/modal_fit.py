@@ -156,6 +156,13 @@ def projected(data: Measurement, poles: np.ndarray, participation: np.ndarray, i
     return Fit(poles, participation, tuple(parts))
 
 
+def row_weights(data: Measurement, rows: slice | None = None) -> Floats:
+    """Weights of all rows, or of some, (n_rows, n_outputs); ones (1, n_outputs) where all have equal weight."""
+    if data.weights is None:
+        return np.ones((1, data.values.shape[1]))
+    return data.weights if rows is None else data.weights[rows]
+
+
 def modal_coordinate(response: Pair, l_r: np.ndarray) -> Pair:
     """Real and imaginary part of z_r, (n_rows,) each, from `Measurement.responses` and participation factors."""
     real, imaginary = response
@@ -319,6 +326,11 @@ def orthonormal(columns: np.ndarray) -> Pair:
     except np.linalg.LinAlgError:
         q, r_total = qr(columns, mode="economic", check_finite=False)
     return q, r_total
+
+
+def normalised_basis(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of columns scaled to unit length, (n_rows, n_columns)."""
+    return orthonormal(normalised_columns(columns))[0]
 
 
 def scaled_vectors(fit: Fit, kept: np.ndarray, derivative: np.ndarray) -> Pair:

@@ -20,11 +20,11 @@ from workbench.identification.input_output.modal_fit import (
     column_norms,
     columns,
     modal_coordinate,
-    normalised_columns,
+    normalised_basis,
     only,
-    orthonormal,
     products_of,
     projected,
+    row_weights,
     search,
     settled,
 )
@@ -281,9 +281,7 @@ class _Modes:
             left = copy(data)
             phi = columns(data, poles[near[:-1]], factors[near[:-1]])[0][:, : 2 * near.size - 2]
             at_near = np.concatenate([near[:-1], n + near[:-1]])
-            left.values = model.residual + (phi @ model.coefficients[at_near]) * (
-                1.0 if data.weights is None else data.weights
-            )
+            left.values = model.residual + (phi @ model.coefficients[at_near]) * row_weights(data)
             start = projected(left, poles[near], factors[near])
             fit = search(left, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
             if not _is_overdamped(fit) and not np.delete(are_near(fit.poles[-1]), near[:-1]).any():
@@ -471,7 +469,7 @@ def basis_of(phi: Floats, part: Part) -> Floats:
                 return np.asarray(phi @ (size[:, None] * factor))
         except np.linalg.LinAlgError:
             pass
-    return orthonormal(normalised_columns(phi))[0]
+    return normalised_basis(phi)
 
 
 def _spurious(data: Measurement, fit: Fit) -> np.ndarray:

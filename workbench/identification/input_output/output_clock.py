@@ -16,7 +16,7 @@ import numpy as np
 
 from workbench.arrays import scaled_inverse
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, changes_of, normalised_columns, orthonormal, regressors
+from workbench.identification.input_output.modal_fit import Fit, changes_of, normalised_basis, regressors, row_weights
 from workbench.identification.input_output.time_variance import slopes_in_time
 from workbench.identification.signal.modal_estimates import time_derivatives
 from workbench.identification.signal.searches import Budget
@@ -49,16 +49,16 @@ def output_clock(data: KnownInputs, fit: Fit) -> OutputClock:
     """The clock of the outputs that the residual of a fit shows, to first order."""
     x = regressors(data, fit.poles, fit.participation)
     in_time = slopes_in_time(data, fit, x)
-    weights = np.ones((1, fit.noise.size)) if data.weights is None else data.weights
+    weights = row_weights(data)
     motion = data.as_samples((data.values - fit.residual) / weights)
     time = [data.first + np.arange(len(samples)) for samples in motion]
     late = data.rows_of([t[:, None] * derivative_of(y.T).T for t, y in zip(time, motion, strict=True)])
-    known = _basis(x) if data.weights is None else None
+    known = normalised_basis(x) if data.weights is None else None
     size = 2 * fit.poles.size + 1
     normal, right_side = np.zeros((size, size)), np.zeros(size)
     for j, (a, noise, residual) in enumerate(zip(fit.amplitudes, fit.noise, fit.residual.T, strict=True)):
         weight = weights[:, j : j + 1]
-        q = _basis(weight * x) if known is None else known
+        q = normalised_basis(weight * x) if known is None else known
         columns = weight * np.column_stack([changes_of(a, in_time), late[:, j]]) / noise
         columns -= q @ (q.T @ columns)
         normal += columns.T @ columns
@@ -119,7 +119,3 @@ def clock_remarks(data: KnownInputs, fit: Fit) -> tuple[str, ...]:
     rate = (1.0 + data.clock) * (1.0 + rest.rate) - 1.0
     size = f"{1e6 * abs(rate):.1f} ± {1e6 * rest.std:.1g} ppm {'slow' if rate > 0 else 'fast'}"
     return (f"the outputs' clock runs {size} against the inputs': outputs resampled; log both by one clock",)
-
-
-def _basis(columns: np.ndarray) -> np.ndarray:
-    return orthonormal(normalised_columns(columns))[0]

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.arrays import Floats
-from workbench.identification.input_output.modal_fit import Fit, changes_of, columns, normalised_columns
+from workbench.identification.input_output.modal_fit import Fit, changes_of, columns, normalised_columns, row_weights
 from workbench.identification.input_output.spectral_lines import Lines
 
 
@@ -66,7 +66,7 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
     size = np.maximum(np.hypot(np.linalg.norm(real, axis=0), np.linalg.norm(imaginary, axis=0)), 1e-300)
     rows, residuals = [], []
     for j, (a, noise) in enumerate(zip(fit.amplitudes, fit.noise, strict=True)):
-        weight = 1.0 if lines.weights is None else lines.weights[:, j : j + 1]
+        weight = row_weights(lines)[:, j : j + 1]
         q = np.linalg.qr(weight * phi)[0]
         regressors = weight * changes_of(np.tile(a, 2) / size, (real, imaginary))
         rows.append((regressors - q @ (q.T @ regressors)) / noise)

@@ -8,8 +8,9 @@ from scipy.optimize import least_squares
 from scipy.special import hyp2f1
 from scipy.stats import chi2, f, kruskal, spearmanr
 
-from workbench.identification.input_output.modal_fit import Fit, Pair
+from workbench.identification.input_output.modal_fit import Fit, Pair, row_weights
 from workbench.identification.input_output.model_order import bases_of, weights_of
+from workbench.identification.signal.projection import local_noise_ratio
 from workbench.identification.signal.searches import SELECTION
 
 
@@ -147,11 +148,11 @@ class Lines:
 
     def fitted(self, fit: Fit) -> np.ndarray:
         """The fitted FRFs at the lines, (n_outputs, n_references, n_lines)."""
-        return self.unstacked((self.values - fit.residual) / (1.0 if self.weights is None else self.weights))
+        return self.unstacked((self.values - fit.residual) / row_weights(self))
 
     def left(self, fit: Fit) -> np.ndarray:
         """The residual at the lines, (n_outputs, n_references, n_lines)."""
-        return self.unstacked(fit.residual / (1.0 if self.weights is None else self.weights))
+        return self.unstacked(fit.residual / row_weights(self))
 
     def misfit(self, fit: Fit) -> np.ndarray:
         """Rms of the residual of each output, (n_outputs,), in units of the noise where that was stated."""
@@ -194,9 +195,7 @@ class Lines:
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         power = (np.abs(self.unstacked(residual)) ** 2).mean(axis=(0, 1))
         nearest = int(np.argmin(np.abs(self.omega - pole.imag)))
-        around = power[max(nearest - LINES.beside, 0) : nearest + LINES.beside + 1]
-        # The median of a power with two or more degrees of freedom is at most its mean.
-        return max(1.0, float(np.median(around) / power.mean())) * self._window_gain(-pole.real)
+        return local_noise_ratio(power, nearest, LINES.beside) * self._window_gain(-pole.real)
 
     def _window_gain(self, rate: float) -> float:
         """Power of windowed noise in the impulse response of a pole over that of stationary noise."""

@@ -33,6 +33,7 @@ from workbench.identification.input_output.modal_fit import (
     only,
     products_of,
     regressors,
+    row_weights,
     settled,
 )
 from workbench.identification.input_output.rivals import in_place_of_clusters, orthonormal_basis
@@ -82,7 +83,7 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     normal, right_side = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
     unweighted = products_of(x, np.ones((1, 1)), fit.residual)[0] if data.weights is None else None
     for j, (a, noise, residual) in enumerate(zip(fit.amplitudes, fit.noise, fit.residual.T, strict=True)):
-        weight = np.ones((1, 1)) if data.weights is None else data.weights[:, j : j + 1]
+        weight = row_weights(data)[:, j : j + 1]
         products = products_of(x, weight, fit.residual)[0] if unweighted is None else unweighted
         real, imaginary = np.diag(a.real), np.diag(a.imag)
         along = np.vstack([np.zeros((known.stop, 2 * n)), np.block([[real, -imaginary], [-imaginary, -real]])]) / noise
@@ -227,7 +228,7 @@ def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise:
     """Decrease of χ² of a fit with columns Φ by further columns."""
     decrease = 0.0
     for j in range(noise.size):
-        weight = 1.0 if data.weights is None else data.weights[:, j : j + 1]
+        weight = row_weights(data)[:, j : j + 1]
         q = np.linalg.qr(weight * np.hstack([phi, further]))[0]
         decrease += float(((q.T @ fit.residual[:, j]) ** 2).sum() / noise[j] ** 2)
     return decrease

@@ -469,6 +469,20 @@ def noise_near(poles: np.ndarray, residual: np.ndarray, noise: np.ndarray, sampl
     return factors
 
 
+def local_noise_ratio(power: Floats, nearest: int, half_width: int) -> float:
+    """Noise power about a line over its mean, by the median of the lines near it; 1 at least, and where none is near.
+
+    The median of a power with two or more degrees of freedom is at most its mean.
+
+    Args:
+        power: (n_lines,) of the residual.
+        nearest: index of the line, which may lie outside.
+        half_width: number of lines near it on either side.
+    """
+    around = power[max(nearest - half_width, 0) : nearest + half_width + 1]
+    return max(1.0, float(np.median(around) / power.mean())) if around.size else 1.0
+
+
 def power_of(row: np.ndarray, size: int | None = None) -> np.ndarray:
     """Power spectrum |·|² of a signal, zero-padded to `size`, in the precision of the signal."""
     spectrum = rfft(row, size)

@@ -92,11 +92,6 @@ class SeriesStructure:
     n_modes: int
 
     @property
-    def order(self) -> int:
-        """Order of the derivative of the shape in the strain energy: 1 for a bar, 2 for a beam."""
-        return 2 if isinstance(self.nominal, Beam) else 1
-
-    @property
     def bases(self) -> tuple[Basis, Basis]:
         """M_j and K_j."""
         return self.mass, self.stiffness
@@ -104,9 +99,7 @@ class SeriesStructure:
     @property
     def nominal_profiles(self) -> tuple[Profile, Profile]:
         """m_0 and k_0."""
-        nominal = self.nominal
-        stiffness = nominal.bending_stiffness if isinstance(nominal, Beam) else nominal.axial_stiffness
-        return nominal.mass_per_length, stiffness
+        return self.nominal.mass_per_length, self.nominal.stiffness
 
     def solve(self, d: np.ndarray, e: np.ndarray, loss: LocalLoss | None = None) -> "SolvedSeries | None":
         """The modes with these coefficients; None if mass or stiffness is negative."""
@@ -123,7 +116,7 @@ class SeriesStructure:
         free = mesh.free
         m, k = m[np.ix_(free, free)], k[np.ix_(free, free)]
         # As in `member`: the inverse problem keeps the lowest modes exact, the shift separates rigid-body modes.
-        shift = np.mean(stiffness) / np.mean(mass) * (np.pi / length) ** (2 * self.order)
+        shift = np.mean(stiffness) / np.mean(mass) * (np.pi / length) ** (2 * self.nominal.strain_order)
         nu, vectors = eigh(m, k + shift * m)
         lowest = np.flatnonzero(nu > ROUND_OFF * nu[-1])[::-1]
         nu, vectors = nu[lowest], vectors[:, lowest]
@@ -191,7 +184,8 @@ class SolvedSeries:
         by_share = -(strains.T * weights) @ strains[:, r]
         begin, end = edges = loss.edges(length)
         beside = np.clip([begin, begin, end, end] + np.array([-1.0, 1.0, -1.0, 1.0]) * 1e-10 * length, 0.0, length)
-        strains_at_edges = (mesh.segments.evaluation(beside, self.series.order) @ self.coefficients).reshape(2, 2, -1)
+        order = self.series.nominal.strain_order
+        strains_at_edges = (mesh.segments.evaluation(beside, order) @ self.coefficients).reshape(2, 2, -1)
         by_edge = []
         for at, outward, (before, after) in zip(edges, (-1.0, 1.0), strains_at_edges, strict=True):
             # the shift of an edge beyond the end of the structure has no effect
@@ -215,7 +209,7 @@ class _Mesh:
     """
 
     def __init__(self, series: SeriesStructure, edges: tuple[float, ...]) -> None:
-        nominal, order, length = series.nominal, series.order, series.nominal.length
+        nominal, order, length = series.nominal, series.nominal.strain_order, series.nominal.length
         m, k = series.nominal_profiles
         of_mass, of_stiffness = (*m.breaks, *series.mass.breaks), (*k.breaks, *series.stiffness.breaks, *edges)
         at_parts = (position(part.at) for part in nominal.attachments)

@@ -226,8 +226,7 @@ def report(problem: Problem, z: np.ndarray) -> FittedStructure:
     m, k = series.nominal_profiles
     mass = _uncertain(m, series.mass, d, draws[:, : d.size], length)
     stiffness = _uncertain(k, series.stiffness, e, draws[:, d.size :], length, loss)
-    name = "bending_stiffness" if isinstance(nominal, Beam) else "axial_stiffness"
-    changes: dict[str, Any] = {"mass_per_length": mass.profile, name: stiffness.profile}
+    changes: dict[str, Any] = {"mass_per_length": mass.profile, nominal.stiffness_name: stiffness.profile}
     try:
         structure = replace(nominal, **changes)
     except ValueError as error:

@@ -5,7 +5,7 @@ import io
 import re
 import shlex
 from collections.abc import Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +62,8 @@ def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
 def _record(record: Record, path: Path) -> Look:
     faults = [fault for fault in data_faults(record) if not fault.inputs]
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
-    doubtful = [c.name for c in record.output_channels if c.quantity == "force" and _is_motion(c.name)]
+    by_unit = [c.name for c in record.output_channels if c.quantity == "force"]
+    doubtful = [name for name in by_unit if MOTIONS.search(name) and not FORCES.search(name)]
     applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
     applied -= set(doubtful)
     forces = [] if record.n_inputs else [name for name in record.output_names if name in applied]
@@ -71,7 +72,7 @@ def _record(record: Record, path: Path) -> Look:
     faulty |= {fault.outputs[-1] for fault in faults if fault.kind == "unstated"}
     kept = [name for name in record.output_names if name not in faulty | set(forces)]
     if forces and kept:
-        record = _with_inputs(record, forces)
+        record = record.with_inputs(forces)
     channels = (*record.input_channels, *record.output_channels)
     signals = (*record.inputs, *record.outputs)
     shown = [*zip(channels, signals, strict=True)][:MOST_ROWS]
@@ -163,14 +164,6 @@ def _quiet(record: Record) -> list[DataFault]:
     return faults
 
 
-def _with_inputs(record: Record, names: Sequence[str]) -> Record:
-    """The record with these outputs as inputs."""
-    at = [record.output_names.index(name) for name in names]
-    applied = tuple(record.output_channels[i] for i in at)
-    rest = record.select_outputs([name for name in record.output_names if name not in names])
-    return replace(rest, inputs=record.outputs[at], input_channels=applied)
-
-
 def _transfer(measured: TransferFunctions, path: Path) -> Look:
     lines = measured.frequencies_hz
     rows = []
@@ -215,11 +208,6 @@ def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:
     peaks = peaks[power[peaks] > PROMINENT * about[peaks]]
     best = peaks[np.argsort(-power[peaks])[:PEAKS]]
     return sorted(float(lines[i]) for i in best)
-
-
-def _is_motion(name: str) -> bool:
-    """Whether the name of a channel is that of a motion."""
-    return bool(MOTIONS.search(name)) and not FORCES.search(name)
 
 
 def _is_band_limited(record: Record) -> bool:

@@ -114,11 +114,11 @@ class _Walk:
         else:
             self.visit(function.__code__, where)
             self._each((function.__defaults__, function.__kwdefaults__), f"default of {where}")
-            for name in sorted(_globals_read(function.__code__)):
+            for name in sorted(_read_by(function.__code__, "LOAD_GLOBAL", "LOAD_NAME")):
                 if name in function.__globals__:
                     self.add(name)
                     self.visit(function.__globals__[name], f"global {name}, read by {where},")
-            for name in sorted(_modules_read(function.__code__)):
+            for name in sorted(_read_by(function.__code__, "IMPORT_NAME")):
                 self._imported(name, where)
         for name, cell in zip(function.__code__.co_freevars, function.__closure__ or ()):
             self.add(name)
@@ -242,10 +242,6 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
             yield from _codes(constant)
 
 
-def _globals_read(code: CodeType) -> set[str]:
-    names = ("LOAD_GLOBAL", "LOAD_NAME")
-    return {i.argval for part in _codes(code) for i in dis.get_instructions(part) if i.opname in names}
-
-
-def _modules_read(code: CodeType) -> set[str]:
-    return {i.argval for part in _codes(code) for i in dis.get_instructions(part) if i.opname == "IMPORT_NAME"}
+def _read_by(code: CodeType, *instructions: str) -> set[str]:
+    """Names that instructions of these names read."""
+    return {i.argval for part in _codes(code) for i in dis.get_instructions(part) if i.opname in instructions}

@@ -102,11 +102,12 @@ class Results(tuple[Result, ...]):
         if path.suffix not in ENDINGS:
             raise StudyError(f"{path}: a table is written as {', '.join(ENDINGS)}; got {path.suffix or 'no ending'}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        rows = [{name: _plain(value) for name, value in row.items()} for row in self.rows()]
+        is_json = path.suffix == ".json"
+        rows = [{name: _plain(value, finite=is_json) for name, value in row.items()} for row in self.rows()]
         if path.suffix == ".parquet":
             _write_parquet(path, rows)
-        elif path.suffix == ".json":
-            write_whole(path, json.dumps(_finite(rows), indent=1, allow_nan=False) + "\n")
+        elif is_json:
+            write_whole(path, json.dumps(rows, indent=1, allow_nan=False) + "\n")
         else:
             write_whole(path, _csv(rows))
         return path
@@ -135,22 +136,17 @@ def _flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     return flat
 
 
-def _plain(value: object) -> object:
+def _plain(value: object, *, finite: bool = False) -> object:
+    """The value as lists, dicts, texts and numbers; with `finite` a number that is not finite is None."""
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return _plain(value.tolist(), finite=finite)
     if isinstance(value, list):
-        return [_plain(item) for item in value]
+        return [_plain(item, finite=finite) for item in value]
     if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
+        return {name: _plain(item, finite=finite) for name, item in value.items()}
+    if finite and isinstance(value, float) and not np.isfinite(value):
+        return None
     return str(value) if isinstance(value, complex | Path) else value
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _csv(rows: list[dict[str, Any]]) -> str:
