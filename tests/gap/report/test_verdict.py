@@ -221,9 +221,23 @@ def test_a_single_force_that_leaves_little_beyond_the_noise_is_not_said_to_expla
     rig, rng = hinged_rig(3), np.random.default_rng(5)
     record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
     found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
-    for share, words in ((0.99995, "leaves 0.005 % of the gap, more than noise"), (0.97, "explains 97 % of it")):
+    told = ((0.99995, "leaves 0.7 % of the gap's rms, more than noise"), (0.97, "leaves 17 % of its rms"))
+    for share, words in told:  # the rms, as of what effects close in the sentence
         place = replace(found.where.place, share=share, is_single_force=False)
         assert replace(found, where=replace(found.where, place=place)).location_in_words.endswith(words)
+
+
+def test_the_place_of_a_single_force_is_not_told_beside_another_place_that_explains_the_gap(hinged_rig, record_of):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
+    place = replace(found.where.place, share=0.995, is_single_force=False, at=0.9, at_std=0.01)
+    found = replace(found, outcome="explained", where=replace(found.where, place=place))
+    spring = kind_named("cubic_spring")
+    for at, is_told in ((0.9, True), (0.4, False)):
+        shown = replace(found, effects=(Effect(spring, None, {"at": at, "stiffness": 1.0}),))
+        assert bool(shown.location_in_words) is is_told
+    assert replace(shown, outcome="part").location_in_words, "the effects do not explain the gap"
 
 
 @pytest.mark.parametrize(

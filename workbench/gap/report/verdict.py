@@ -109,10 +109,16 @@ class Verdict:
         """Whether a single point force, of any law, explains the gap, at a place that agrees with a named effect."""
         if not self.where.place.is_single_force:
             return False
-        if self.outcome != "explained":
-            return True
+        return self.outcome != "explained" or self._agrees(self._acting)
+
+    @property
+    def _acting(self) -> tuple[Effect, ...]:
+        """The effects that act at a place of the structure."""
+        return tuple(e for e in self.effects if e.at is not None and e.kind.path in ("structure", "environment"))
+
+    def _agrees(self, acting: tuple[Effect, ...]) -> bool:
+        """Whether the place of a single point force is that of one of the effects, within its error."""
         domain = self.nominal.modes.domain
-        acting = [e for e in self.effects if e.at is not None and e.kind.path in ("structure", "environment")]
         if isinstance(domain, NamedPoints):
             return any(domain.separation(effect.at, self.where.at) == 0 for effect in acting)
         tolerance = max(3.0 * self.where.at_std / domain.size, SAME_PLACE)
@@ -122,19 +128,22 @@ class Verdict:
     def location_in_words(self) -> str:
         """Where the unmodelled point force acts, or that no single one does; empty if neither is certain.
 
-        Small errors of the model act all over the structure, so nothing is said where they cause most of the gap.
+        Small errors of the model act all over the structure, so nothing is said where they cause most of the gap; nor
+        where the place is another than that of the effects that explain it.
         """
-        place = self.where.place
-        if self.outcome == "explained" and self.budget.nominal > MOSTLY:
+        place, explained = self.where.place, self.outcome == "explained"
+        if explained and self.budget.nominal > MOSTLY:
             return ""
         at = place_in_words(place.at, dict.fromkeys(COORDINATES, place.at_std))
         if self.is_located:
             return f"{at}, of the unmodelled point force, without a force law"
-        if place.is_single_force is not False:
+        elsewhere = explained and self._acting and not self._agrees(self._acting)
+        if place.is_single_force is not False or elsewhere:
             return ""
+        left = f"leaves {_percent(float(np.sqrt(1.0 - place.share)))}"
         if place.share > NEARLY_ALL:
-            return f"a single point force, {at}, leaves {100.0 * (1.0 - place.share):.1g} % of the gap, more than noise"
-        return f"no single point force explains all of the gap; the best, {at}, explains {_percent(place.share)} of it"
+            return f"a single point force, {at}, {left} of the gap's rms, more than noise"
+        return f"no single point force explains all of the gap; the best, {at}, {left} of its rms"
 
     @property
     def nominal_errors(self) -> Effect | None:
