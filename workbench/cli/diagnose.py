@@ -2,18 +2,23 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from workbench.cli import options
-from workbench.cli.terminal import as_typed, by_options, check_target, guarded, names_in, reporting, say, short
+from workbench.cli.terminal import (
+    as_typed,
+    by_options,
+    check_target,
+    guarded,
+    names_in,
+    print_result,
+    reporting,
+    say,
+    short,
+)
 from workbench.cli.uncertain import write_verdict
-
-if TYPE_CHECKING:
-    from workbench.gap.report.verdict import Verdict
-
-SHOWN_ALTERNATIVES = 3
 
 
 @guarded
@@ -103,30 +108,10 @@ def diagnose(
         verdict = diagnose_case(
             found, uncertain_nominal=uncertain_nominal, settle=settle, workers=workers, seconds=seconds, progress=report
         )
-    _say_verdict(verdict)
+    print_result(by_options(str(verdict)))
     verdict = replace(verdict, notes=(*corrected, *verdict.notes))
     if json_path is not None:
         write_verdict(verdict, json_path)
         say(f"  verdict    {short(json_path)}")
     target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case, made_by=as_typed())
     say(f"  page       {short(target)}")
-
-
-def _say_verdict(verdict: "Verdict") -> None:
-    """Print the sentence, the place, the gap of each record, the alternatives and the notes."""
-    say(verdict.sentence, bold=True)
-    gap, where = verdict.to_json()["gap"], verdict.where
-    if verdict.shows_gap:  # without a gap the residual is noise, and has no place
-        amplitude = {True: "; depends on amplitude", False: "; does not depend on amplitude", None: ""}
-        say(f"  path       {where.path}{amplitude[where.amplitude_dependent]}")
-        say(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
-    if verdict.shows_gap and where.path in ("structure", "environment") and verdict.location_in_words:
-        say(f"  place      {verdict.location_in_words}")
-    for name, before in gap["before"].items():
-        say(f"  {name:<10} gap {before:.4g} → {gap['after'][name]:.4g}, noise floor {gap['floor'][name]:.4g}")
-    if verdict.alternatives and verdict.outcome == "explained":
-        say(f"  named      probability {verdict.probability:.2g}, against")
-    for words, probability in verdict.alternatives_in_words[:SHOWN_ALTERNATIVES]:
-        say(f"  alternative {words} ({probability:.2g})")
-    for note in verdict.notes:
-        say(f"  {by_options(note)}")

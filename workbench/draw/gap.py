@@ -21,6 +21,7 @@ from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
 
 MOST_BARS, FEW_BARS = 16, 6  # named points that are shown; sensors whose names fit horizontally
+FAINT = "#c4c4c4"  # beside the grey of the sensors' noise
 SHOWN = 0.005  # least share of the gap that is drawn
 
 
@@ -64,13 +65,16 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
 def plot_budget(budget: Budget) -> Figure:
     """The gap of each record, one bar split by cause; above 100 % if effects enlarge the gap."""
     causes = [label_in_words(label) for label in budget.effects]
-    causes += ["errors of the nominal model", "unexplained", "noise"]
-    colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], GREY]
+    causes += ["errors of the nominal model", "unexplained", "noise of the logged inputs", "noise"]
+    colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], FAINT, GREY]
     records = list(budget.by_record)
+    logged = np.array([budget.input_noise.get(record, 0.0) for record in records])
+    *shares, nominal, unexplained, noise = np.array([*budget.by_record.values()], float).T
+    shares += [nominal - logged, unexplained, logged, noise]
     figure, ax = new_figure(width=9, height=1.6 + 0.5 * len(records))
     left = np.zeros(len(records))
-    for i, (cause, colour) in enumerate(zip(causes, colours, strict=True)):
-        share = 100.0 * np.array([max(float(budget.by_record[record][i]), 0.0) for record in records])
+    for cause, colour, part in zip(causes, colours, shares, strict=True):
+        share = 100.0 * np.maximum(part, 0.0)
         if share.max() > 0.05:
             ax.barh(records, share, left=left, color=colour, label=cause, height=0.6)
         left += share

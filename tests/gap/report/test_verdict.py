@@ -145,6 +145,48 @@ def test_what_is_closed_of_one_record_is_its_share_however_it_falls_into_blocks(
     assert closed.overall == pytest.approx(closed.share["held out"], rel=1e-12)
 
 
+def test_noise_of_the_logged_inputs_is_told_apart(hinged_rig, record_of):
+    """The inputs were logged with noise of 5 %, and the sensors' noise is a tenth of what that makes."""
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    sent = np.repeat(rng.normal(size=(1, 400)), 10, axis=1)
+    records = []
+    for name in ("fit", "held out"):
+        clean = record_of(rig, sent, rng, name=name)
+        records.append(replace(clean, inputs=sent + 0.05 * sent.std() * rng.normal(size=sent.shape)))
+    found = diagnose(rig, records[:1], validation=records[1:], catalogue=(kind_named("actuator_gain"),), seconds=0.3)
+    budget = budget_of(rig, (), None, records[1:], noise_found=np.full(4, 1e-5), logged=0.05)
+    assert budget.nominal == pytest.approx(budget.input_noise["held out"]) and budget.nominal > 0.8
+    labels = [text.get_text() for text in plot_budget(budget).axes[0].get_legend().get_texts()]
+    assert "noise of the logged inputs" in labels and "errors of the nominal model" not in labels
+    shown = replace(found, budget=budget, outcome="none", effects=())
+    gap, (line,) = shown.to_json()["gap"], (line for line in str(shown).splitlines() if "'held out'" in line)
+    assert gap["input_noise"]["held out"] ** 2 == pytest.approx(
+        gap["before"]["held out"] ** 2 * budget.nominal, rel=1e-4
+    )
+    told = re.fullmatch(r"  record 'held out': rms error / rms signal ([\d.]+) %, noise floor ([\d.]+) %; (.*)", line)
+    assert float(told[1]) == pytest.approx(100.0 * gap["before"]["held out"], rel=5e-3)
+    assert told[3] == "the rest is noise of the logged inputs, which no model predicts"
+    plain = replace(shown, budget=replace(budget, input_noise={}))
+    assert "logged" not in str(plain) and "input_noise" not in plain.to_json()["gap"]
+
+
+def test_a_verdict_prints_as_the_command_tells_it(hinged_rig, record_of):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    real = kind_named("actuator_gain").apply(rig, rig.actuators[0].name, {"gain": 1.3})
+    records = [record_of(real, np.repeat(rng.normal(size=40), 10)[None], rng, name=name) for name in ("fit", "check")]
+    gain = (kind_named("actuator_gain"),)
+    verdict = diagnose(rig, records[:1], validation=records[1:], catalogue=gain, workers=1)
+    verdict = replace(verdict, notes=("A note.",))
+    first, path, modes, *_, record, last = str(verdict).splitlines()
+    assert first == verdict.sentence and last == "  A note."
+    assert path.startswith("  path       actuator") and modes.startswith("  modes      ")
+    told = re.fullmatch(r"  record 'check': rms error / rms signal (.*) % → [\d.]+ %, noise floor [\d.]+ %", record)
+    read = records[1].outputs
+    expected = 0.3 / 1.3 * np.sqrt(np.mean((read / read.std(axis=1, keepdims=True)) ** 2))
+    assert float(told[1]) == pytest.approx(100.0 * expected, rel=5e-3)
+    assert repr(verdict) == f"<Verdict on case: {verdict.sentence}>"
+
+
 def test_errors_beside_a_gap_that_is_still_there_have_no_sizes(hinged_rig, record_of):
     """The model lacks what is above its last mode, which no error of the two that it has takes away."""
     rig, rng = hinged_rig(2), np.random.default_rng(5)

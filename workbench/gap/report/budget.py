@@ -141,6 +141,8 @@ class Budget:
         by_record: the same shares (n_shares,) of each record by name: effects, nominal, unexplained, noise.
         errors: root mean squares of the small errors: "frequencies_percent", "inputs_percent", "delays_ms" and so on;
             "common_delay_ms" is the delay of all sensors.
+        input_noise: share of each record by name that noise of the logged inputs causes, a part of the nominal one; no
+            entry where there is none.
         noise_stated, noise_found: (n_outputs,) stated and estimated standard deviation of each sensor's noise, in its
             unit.
     """
@@ -153,6 +155,7 @@ class Budget:
     errors: Mapping[str, float] = field(default_factory=dict)
     noise_stated: tuple[float, ...] = ()
     noise_found: tuple[float, ...] = ()
+    input_noise: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def noise_ratio(self) -> float:
@@ -263,15 +266,19 @@ def budget_of(
     whole = shares.sum(axis=1).clip(0.0) / max(nominal.sum(), 1e-300)
     whole = whole / max(whole.sum(), 1e-300)
     by_record = {r.name: shares[:, i] / max(nominal[i], 1e-300) for i, r in enumerate(records)}
+    of_inputs = {
+        r.name: float(by_inputs[i] / max(nominal[i], 1e-300)) for i, r in enumerate(records) if by_inputs[i] > 0
+    }
     return Budget(
         effects={labels[i]: float(share) for i, share in zip(by_size, whole, strict=False)},
         nominal=float(whole[-3]),
         unexplained=float(whole[-2]),
         noise=float(whole[-1]),
         by_record=by_record,
-        errors={**sizes_of(common), **({"inputs_percent": 100.0 * logged} if by_inputs.sum() > 0 else {})},
+        errors={**sizes_of(common), **({"inputs_percent": 100.0 * logged} if of_inputs else {})},
         noise_stated=tuple(float(s.noise_std) for s in rig.sensors),
         noise_found=tuple(noise_found.tolist()),
+        input_noise=of_inputs,
     )
 
 

@@ -25,6 +25,9 @@ SHOWN = 0.005  # of the gap: smaller shares are not stated
 NEARLY_ALL = 0.99  # of the gap: a single force that explains more lacks only what noise shows
 PROPORTIONAL = 1e-6  # relative: deviation of the shape at a point from a multiple of that at another
 SAME_PLACE = 0.02  # of the extent: places as close as this agree
+AT_FLOOR = 1.05  # times the noise floor: nothing is said of what a smaller gap is beyond it
+ALL_OF_REST = 0.8  # of the power beyond the noise floor: a cause of more is said to be the rest
+ALTERNATIVES = 3  # that are printed
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,6 +305,35 @@ class Verdict:
         likely = [words for words, probability in self.alternatives_in_words if probability > 0.01]
         return f"; {', or '.join(likely)} cannot be excluded." if likely else "."
 
+    def __str__(self) -> str:
+        """The sentence, the place, the gap of each record, the alternatives and the notes, by lines."""
+        lines, where, gap = [self.sentence], self.where, self._gap
+        if self.shows_gap:  # without a gap the residual is noise, and has no place
+            amplitude = {True: "; depends on amplitude", False: "; does not depend on amplitude", None: ""}
+            lines.append(f"path       {where.path}{amplitude[where.amplitude_dependent]}")
+            lines.append(f"modes      {', '.join(map(str, where.modes)) or 'none'}")
+        if self.shows_gap and where.path in ("structure", "environment") and self.location_in_words:
+            lines.append(f"place      {self.location_in_words}")
+        lines += [f"record {name!r}: {_gap_in_words(gap, name)}" for name in gap["before"]]
+        if self.alternatives and self.outcome == "explained":
+            lines.append(f"named      probability {self.probability:.2g}, against")
+        rivals = self.alternatives_in_words[:ALTERNATIVES]
+        lines += [f"alternative {words} ({probability:.2g})" for words, probability in rivals]
+        return "\n  ".join([*lines, *self.notes])
+
+    @property
+    def _gap(self) -> dict[str, dict[str, Any]]:
+        """The gap of each validation record: rms error / rms signal before and after, and of noise alone."""
+        shrink, logged = self.shrinkage, self.budget.input_noise
+        before = {} if shrink is None else shrink.before
+        of_inputs = {name: gap * float(np.sqrt(logged[name])) for name, gap in before.items() if name in logged}
+        return {
+            "before": all_rounded(before),
+            "after": all_rounded(shrink.after if shrink else {}),
+            "floor": all_rounded(shrink.floor if shrink else {}),
+            **({"input_noise": all_rounded(of_inputs)} if of_inputs else {}),
+        }
+
     def __repr__(self) -> str:
         return f"<Verdict on {self.case}: {self.sentence}>"
 
@@ -322,11 +354,7 @@ class Verdict:
                 for (label, p), (words, _) in zip(self.alternatives, self.alternatives_in_words, strict=True)
             ],
             "where": where_json(self.where),
-            "gap": {
-                "before": all_rounded(shrink.before if shrink else {}),
-                "after": all_rounded(shrink.after if shrink else {}),
-                "floor": all_rounded(shrink.floor if shrink else {}),
-            },
+            "gap": self._gap,
             "shrinkage": {
                 **all_rounded(shrink.share if shrink else {}),
                 **({"ci95": all_rounded(shrink.ci95)} if shrink else {}),
@@ -473,6 +501,34 @@ def place_in_words(where: Any, deviations: Mapping[str, float]) -> str:
         x, y = (_with_deviation(value, deviations.get(n, 0.0)) for n, value in zip("xy", where, strict=True))
         return f"at ({x}, {y})"
     return f"at {where}" if isinstance(where, str) else f"at x = {_with_deviation(where, deviations.get('at', 0.0))}"
+
+
+def rest_in_words(gap: Mapping[str, Mapping[str, float | None]], record: str) -> str:
+    """What the gap of a record, as in the JSON, is beyond the noise floor; empty where that is not known."""
+    after, floor = gap["after"].get(record), gap["floor"].get(record)
+    of_inputs = gap.get("input_noise", {}).get(record)
+    if not (after and floor and of_inputs) or after <= AT_FLOOR * floor:
+        return ""
+    is_all = of_inputs**2 > ALL_OF_REST * (after**2 - floor**2)
+    return "noise of the logged inputs, which no model predicts" if is_all else ""
+
+
+def _gap_in_words(gap: Mapping[str, Mapping[str, float]], record: str) -> str:
+    """The gap of a record, such as: rms error / rms signal 17.3 % → 0.378 %, noise floor 0.375 %."""
+    before, after = gap["before"][record], gap["after"][record]
+    sizes = [before] if before == after else [before, after]  # equal where nothing was corrected
+    rest = rest_in_words(gap, record)
+    text = f"rms error / rms signal {' → '.join(map(_to_three_digits, sizes))}"
+    text += f", noise floor {_to_three_digits(gap['floor'][record])}"
+    return text + (f"; the rest is {rest}" if rest else "")
+
+
+def _to_three_digits(share: float | None) -> str:
+    """A share in per cent to three digits, or to the per cent if it is larger."""
+    if share is None:
+        return "beyond all bounds"
+    percent = 100.0 * share
+    return f"{percent:.0f} %" if percent >= 100.0 else f"{percent:.3g} %"
 
 
 def _percent(share: float) -> str:
