@@ -11,7 +11,7 @@ from workbench.study.runs.cases import StudyError
 VERDICT = {
     "case": "arm", "outcome": "explained", "sentence": "A spring explains it.", "nearest": [], "notes": ["a note"],
     "effects": [{"kind": "ground_spring", "parameters": {"stiffness": 2.0}, "parameters_std": {"stiffness": 0.1},
-                 "at": 3.0}],
+                 "parameters_unit": {"stiffness": "N/m"}, "at": 3.1234, "at_std": 0.02}],
     "alternatives": [{"kind": "point_mass", "probability": 0.01}], "next_experiment": "Strike it.",
     "gap": {"before": {"r": 0.5}, "after": {"r": 0.02}, "floor": {"r": 0.01}},
 }  # fmt: skip
@@ -46,10 +46,26 @@ def test_a_verdict_makes_a_page(tmp_path):
     shown = page_content_in(written(tmp_path, VERDICT))
     assert shown.title == "Diagnosis of arm" and shown.lead == "A spring explains it."
     assert shown.lines == ["a note", "Strike it."]
-    assert shown.tables[0][2] == [["ground spring", "stiffness", "2.00", "0.10", 3.0, ""]] and shown.standing == "good"
-    assert shown.tables[1][2] == [["r", 0.5, 0.02, 0.01, ""]]
+    assert (
+        shown.tables[0][2] == [["ground spring", "stiffness", "2.00 N/m", "0.10 N/m", "3.123 ± 0.020", ""]]
+        and shown.standing == "good"
+    )
+    assert shown.tables[1][2] == [["r", 50.0, 2.0, 1.0, ""]] and len(shown.tables[1][1]) == 5
     boxes = [mark["boxes"][0][3] for mark in shown.blocks[0]["figure"]["panels"][0]["marks"]]
     assert boxes == [0.5, 0.02, 0.01]
+
+
+def test_a_page_says_where_effects_are_and_what_the_rest_is(tmp_path):
+    pair = {"kind": "point_mass", "parameters": {"mass": 0.123456}, "at": [0.63, 0.7], "at_std": [0.011, 0.0]}
+    named = {"kind": "ground_spring", "parameters": {"stiffness": 2.0}, "at": "P1", "at_std": 0.0}
+    gap = {"before": {"r": 0.01527}, "after": {"r": 0.01504}, "floor": {"r": 0.01015}, "input_noise": {"r": 0.0111}}
+    effects, gaps, _ = page_content_in(written(tmp_path, {**VERDICT, "effects": [pair, named], "gap": gap})).tables
+    assert effects[2][0][2:] == ["0.1235", "", "(0.630 ± 0.011, 0.7)", ""]
+    assert effects[2][1][2:] == ["2", "", "P1", ""]
+    assert gaps[1][1:3] == ["before [%]", "after [%]"] and gaps[1][4] == "share of the rms closed [%]"
+    assert gaps[2] == [["r", 1.527, 1.504, 1.015, "", "noise of the logged inputs, which no model predicts"]]
+    quieter = {**gap, "input_noise": {"r": 0.005}}
+    assert len(page_content_in(written(tmp_path, {**VERDICT, "gap": quieter})).tables[1][1]) == 5
 
 
 def test_identified_modes_swing(tmp_path):

@@ -339,7 +339,7 @@ class Verdict:
 
     def to_json(self) -> dict[str, Any]:
         """The verdict as the case format writes it, with the shares and estimates behind it."""
-        effects = [effect_json(effect, self.nominal) for effect in self._named]
+        effects = [effect_json(effect, self.nominal, self.units) for effect in self._named]
         shrink, guessed = self.shrinkage, self.attribution.search.data.guessed
         return {
             "case": self.case,
@@ -380,14 +380,17 @@ class Verdict:
         }
 
 
-def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
-    """An effect as the case format writes it: kind, parameters with standard deviations, place, input or output."""
+def effect_json(effect: Effect, nominal: Rig, named_units: Units = SI) -> dict[str, Any]:
+    """An effect as the case format writes it: kind, parameters with deviations and units, place, input or output."""
     kind = effect.kind
     stated = effect.stated(nominal)
     entry: dict[str, Any] = {"kind": kind.name, "parameters": all_rounded(stated)}
     deviations = {n: rounded(d) for n, d in effect.deviations.items() if n in stated}
     if deviations:
         entry["parameters_std"] = deviations
+    units = {p.name: named_units.named(p.unit) for p in effect.parameters(nominal) if p.unit and p.name in stated}
+    if units:
+        entry["parameters_unit"] = units
     if kind.path in ("actuator", "sensor"):
         side, target = "input" if kind.path == "actuator" else "output", effect.target
         entry |= {side: target[0], kind.second_channel: target[1]} if isinstance(target, tuple) else {side: target}

@@ -15,7 +15,7 @@ from workbench.draw.signals import plot_distortion
 from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import label_in_words
 from workbench.gap.effects.nonlinear import BEYOND
-from workbench.gap.report.verdict import Verdict
+from workbench.gap.report.verdict import Verdict, rest_in_words
 from workbench.identification.signal.distortion import Distortion, distortion_of
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -27,7 +27,7 @@ MOVING = (
     "The modes of the nominal model, and of the corrected one where it differs; circles are sensors, triangles inputs."
 )
 
-GAPS = ("before", "after", "floor")
+GAPS = {"before": "before [%]", "after": "after [%]", "floor": "noise floor [%]"}
 STANDING_OF = {"none": "good", "explained": "good", "part": "part", "unknown": "bad"}  # by outcome
 
 
@@ -107,30 +107,69 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
         [
             label_in_words(effect["kind"]),
             name.replace("_", " "),
-            *to_its_error(value, effect.get("parameters_std", {}).get(name)),
-            " to ".join(effect["between"]) if "between" in effect else effect.get("at", ""),
+            *_in_its_unit(effect, name),
+            _place(effect),
             effect.get("input", effect.get("output", "")),
         ]
         for effect in [*content["effects"], *nearest]
-        for name, value in effect["parameters"].items()
+        for name in effect["parameters"]
     ]
     gap, closed = content["gap"], content.get("shrinkage", {})
     length = content.get("units", {}).get("length", "m")
     gaps = [
-        [record, *(short(gap[name].get(record)) for name in GAPS), short(closed.get(record))]
+        [record, *(_in_percent(gap[name].get(record)) for name in GAPS), _in_percent(closed.get(record))]
         for record in gap["before"]
     ]
+    heads = ["record", *GAPS.values(), "share of the rms closed [%]"]
+    rests = [rest_in_words(gap, record) for record in gap["before"]]
+    if any(rests):
+        heads.append("the rest")
+        gaps = [[*row, rest] for row, rest in zip(gaps, rests, strict=True)]
     rivals = [
         [rival.get("words") or in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]
     ]
     if rivals and content.get("probability") is not None:
         rivals.insert(0, ["the set named", content["probability"]])
     tables = [
-        (title, ("effect", "parameter", "value", "standard error", f"place [{length}]", "input or output"), effects),
-        ("Gap (rms error / rms signal)", ("record", *GAPS, "share closed"), gaps),
+        (
+            title,
+            ("effect", "parameter", "value", "standard deviation", f"place [{length}]", "input or output"),
+            effects,
+        ),
+        ("Gap: rms error / rms signal", heads, gaps),
         ("Alternatives that the records do not exclude", ("set of effects", "probability"), rivals),
     ]
     return [table for table in tables if table[2]]
+
+
+def _in_its_unit(effect: Mapping[str, Any], name: str) -> list[str]:
+    """The value and the standard deviation of a parameter with their unit, to the digits of the deviation."""
+    value, deviation = _to_its_error(effect["parameters"][name], effect.get("parameters_std", {}).get(name))
+    unit = effect.get("parameters_unit", {}).get(name, "")
+    return [f"{number} {unit}".strip() if number else "" for number in (value, deviation)]
+
+
+def _place(effect: Mapping[str, Any]) -> str:
+    """The place of an effect with its standard deviation: 6.40 ± 0.01; (0.63 ± 0.01, 0.72 ± 0.01); a name or two."""
+    if "between" in effect:
+        return " to ".join(effect["between"])
+    at, error = effect.get("at", ""), effect.get("at_std")
+    is_pair = isinstance(at, list)
+    pairs = zip(at, error if isinstance(error, list) else [error] * len(at), strict=True) if is_pair else [(at, error)]
+    texts = [" ± ".join(filter(None, _to_its_error(value, std))) for value, std in pairs]
+    return f"({', '.join(texts)})" if is_pair else texts[0]
+
+
+def _to_its_error(value: object, error: object) -> tuple[str, str]:
+    """As `to_its_error`; to four digits, without an error, where that is not known or zero."""
+    if isinstance(error, int | float) and error > 0:
+        value, error = to_its_error(value, error)
+        return str(value), str(error)
+    return (f"{value:.4g}" if isinstance(value, float) else str(value)), ""
+
+
+def _in_percent(share: float | None) -> float | str:
+    return short(None if share is None else 100.0 * share)
 
 
 def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
