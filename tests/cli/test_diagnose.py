@@ -9,6 +9,8 @@ import pytest
 
 from workbench.cases.case import Case
 from workbench.cases.writing import write_case
+from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.catalogue import kind_named
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -87,6 +89,29 @@ def test_what_was_corrected_is_stated_in_the_verdict_and_on_the_page(run, tmp_pa
     assert told.exit_code == 0 and note in json.loads(verdict.read_text())["notes"]
     assert note in page.read_text()
     assert json.loads(verdict.read_text())["outcome"] == "none"
+
+
+def test_a_page_names_options_and_ends_its_list_with_what_could_be_detected(run, tmp_path, monkeypatch):
+    beam = Beam(
+        length=2.0, mass_per_length=1.0, bending_stiffness=20.0, left="hinged", right="hinged",
+        damping=ModalDamping(0.3),
+    )  # fmt: skip
+    rig = Rig(beam.modes(3), [Actuator("F", 0.5)], [Sensor("y1", 0.4, noise_std=1e-6)], structure=beam)
+    rng = np.random.default_rng(1)
+    record = simulate(rig, rng.normal(size=(1, 600)), sample_time=0.01, name="low")
+    record = replace(record, outputs=record.outputs + 1e-6 * rng.normal(size=record.outputs.shape))
+    write_case(Case("plain", rig, (record,), ()), tmp_path / "plain")
+    found = diagnose(rig, record, catalogue=(kind_named("actuator_gain"),), workers=1)
+    note = "The search reached its limit of time, `seconds` 15; a larger one lets it continue."
+    told = replace(found, notes=(note,))
+    monkeypatch.setattr("workbench.gap.diagnose_case.diagnose_case", lambda case, **options: told)
+    verdict, page = tmp_path / "v.json", tmp_path / "p.html"
+    printed = run("diagnose", tmp_path / "plain", "--json", verdict, "--page", page)
+    assert printed.exit_code == 0 and "limit of time, --seconds 15; a" in printed.output
+    assert json.loads(verdict.read_text())["notes"] == [note]
+    first, *_, last = json.loads((tmp_path / "p.page.json").read_text())["lines"]
+    assert first == note.replace("`seconds`", "--seconds")
+    assert last.startswith("Detectability, before any fit: these records can show")
 
 
 def test_a_validation_record_that_repeats_a_fit_record_is_refused(run, tmp_path, nothing_hidden):

@@ -113,5 +113,6 @@ def diagnose(
     if json_path is not None:
         write_verdict(verdict, json_path)
         say(f"  verdict    {short(json_path)}")
+    verdict = replace(verdict, notes=tuple(map(by_options, verdict.notes)))
     target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case, made_by=as_typed())
     say(f"  page       {short(target)}")

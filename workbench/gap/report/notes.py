@@ -66,8 +66,8 @@ def notes_of(
     guessed = [sensor.name for sensor in verdict.nominal.sensors if sensor.name in found.search.data.guessed]
     if guessed:
         notes.append(f"noise_std of {', '.join(guessed)} is not stated; it was estimated from the records.")
-    if found.is_cut:
-        notes.append(f"The search reached its limit of time, `seconds` {seconds}; a larger one lets it continue.")
+    if found.is_cut and seconds is not None:
+        notes.append(f"The search reached its limit of time, `seconds` {seconds:g}; a larger one lets it continue.")
     if verdict.is_decided and not guessed and budget.noise_remark:  # otherwise the residual is not only noise
         notes.append(budget.noise_remark)
     notes += dict.fromkeys(effect.kind.unpredictable for effect in verdict.effects if effect.kind.unpredictable)

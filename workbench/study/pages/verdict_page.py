@@ -205,7 +205,8 @@ def _could_show(verdict: Verdict) -> str:
     """A sentence on the effects that the records can and cannot show."""
     hidden, alike = verdict.detectability.undetectable, verdict.detectability.indistinguishable
     count = len(verdict.detectability.strengths)
-    text = f"Before any fit: these records can show {f'all but {len(hidden)} of' if hidden else 'all'} {count} effects"
+    text = "Detectability, before any fit: these records can show"
+    text += f" {f'all but {len(hidden)} of' if hidden else 'all'} {count} effects"
     if hidden:
         named = ", ".join(map(label_in_words, hidden[:6]))
         text += f" (not {named}{', …' if len(hidden) > 6 else ''})"
