@@ -1,5 +1,7 @@
 """What results look like when printed: figures of the object, in SI, and never an array."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import filter_on
 from workbench.identification.updating.distributions import SelfCheck
 from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.printed import all_rounded, places_text, warns_of_remarks
 
 
@@ -39,6 +42,24 @@ def test_a_record_is_a_table_of_channels(record):
     assert "1 input and 2 outputs, 500 samples at 100 Hz, 5 s" in text[0]
     assert text[2].split()[:6] == ["F", "input", "force", "N", "0.5", "0"]
     assert float(text[3].split()[-1]) == pytest.approx(np.abs(record.outputs[0]).max(), rel=1e-2)
+
+
+def test_a_rig_shows_what_differs_from_the_defaults(rig):
+    """So that a corrected rig does not print as the nominal one."""
+    assert str(rig).splitlines()[1].split() == ["name", "quantity", "at", "[m]"]
+    late = replace(rig.actuators[0], delay=0.004, gain=0.3, limit=2.0, rate_limit=5.0, direct=True, hysteresis_width=2)
+    loud = replace(rig.sensors[1], noise_std=1e-3, crosstalk=(("y", 0.1),), shape_error=(0.01, 0.0, 0.0))
+    text = str(replace(rig, actuators=[late], sensors=[rig.sensors[0], loud])).splitlines()
+    assert text[1].split() == ["name", "quantity", "at", "[m]", "properties"]
+    actuator = "gain 0.3, limit 2 N, delay 0.004 s, direct, hysteresis width 2, rate limit 5 N/s"
+    assert text[2].endswith(f"  0.5  {actuator}")
+    assert text[3].split() == ["y", "sensor", "displacement", "1.5"]
+    assert text[4].endswith("  noise std 0.001 m/s, crosstalk 0.1 of y, shape error")
+    shapes = PointShapes(np.array([[1.0], [0.5]]))
+    modes = Modes(omega=[2.0], damping=[[0.1]], shapes=shapes, domain=NamedPoints(("P1", "P2")))
+    lagging = wb.Actuator("F", "P1", time_constant=0.02)
+    at_points = str(wb.Rig(modes, [lagging], [wb.Sensor("y", "P2")])).splitlines()
+    assert at_points[1].split()[2:] == ["at", "properties"] and at_points[2].endswith("P1  time constant 0.02 s")
 
 
 def test_a_structure_says_its_ends_and_profiles(beam):

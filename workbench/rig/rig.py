@@ -1,22 +1,23 @@
 """A test rig: a structure with its actuators, sensors and attached elements."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.records.record import Channel, Record
-from workbench.rig.actuators import Actuator
+from workbench.records.record import QUANTITIES, Channel, Record
+from workbench.rig.actuators import Actuator, force_unit
 from workbench.rig.elements import Element
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.structure.domain import Between, Patch, PlaceError, check_place
+from workbench.structure.domain import Between, NamedPoints, Patch, PlaceError, check_place
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
 from workbench.structure.printed import Printed, counted, place_text
 
+WITHOUT_UNIT = ("gain", "hysteresis_share", "hysteresis_width", "direction")  # the width is in the unit of commands
 KEPT = 8  # rigs in a cache of arrays that all records share
 
 
@@ -147,12 +148,39 @@ class Rig(Printed):
         return rig if change is None else change(rig)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        rows = [(a.name, "actuator", a.quantity, place_text(a.at)) for a in self.actuators]
-        rows += [(s.name, "sensor", s.quantity, place_text(s.at)) for s in self.sensors]
-        rows += [("", "element", type(e).__name__, place_text(getattr(e, "at", None))) for e in self.elements]
+        rows = [(a.name, "actuator", a.quantity, place_text(a.at), _properties(a)) for a in self.actuators]
+        rows += [(s.name, "sensor", s.quantity, place_text(s.at), _properties(s)) for s in self.sensors]
+        rows += [("", "element", type(e).__name__, place_text(getattr(e, "at", None)), "") for e in self.elements]
+        headings = (
+            "name",
+            "",
+            "quantity",
+            "at" if isinstance(self.modes.domain, NamedPoints) else "at [m]",
+            "properties",
+        )
+        shown = len(headings) - (not any(row[-1] for row in rows))  # all are as by default
         parts = ((self.actuators, "actuator"), (self.sensors, "sensor"), (self.elements, "element"))
         line = ", ".join([counted(self.modes.n_modes, "mode"), *(counted(len(each), word) for each, word in parts)])
-        return line, ("name", "", "quantity", "at"), rows, ()
+        return line, headings[:shown], [row[:shown] for row in rows], ()
+
+
+def _properties(port: Actuator | Sensor) -> str:
+    """The properties of an actuator or a sensor that differ from their defaults: delay 0.004 s, gain 0.3, limit 2 N."""
+    unit = force_unit(port) if isinstance(port, Actuator) else QUANTITIES[port.quantity]
+    units = {"delay": "s", "time_constant": "s", "rate_limit": f"{unit}/s", **dict.fromkeys(WITHOUT_UNIT, "")}
+    texts = []
+    for each in fields(port):
+        value, words = getattr(port, each.name), each.name.replace("_", " ")
+        if each.name in ("name", "at", "quantity") or value == each.default:
+            continue
+        if each.name == "crosstalk":
+            texts += [f"crosstalk {share:.4g} of {other}" for other, share in value]
+        elif each.name == "shape_error" or value is True:
+            texts.append(words)
+        else:
+            text = f"{value:.4g}" if isinstance(value, int | float) else str(value)
+            texts.append(f"{words} {text} {units.get(each.name, unit)}".rstrip())
+    return ", ".join(texts)
 
 
 @lru_cache(maxsize=KEPT)
