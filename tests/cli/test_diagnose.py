@@ -140,7 +140,15 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
     monkeypatch.setattr("workbench.gap.diagnose_case.diagnose", search)
     options = ("--nominal", tmp_path / "low.csv", "--records", tmp_path / "high.csv", "--inputs", "F1")
     assert "--quantity" in run("diagnose", *options).output
-    assert "the search has begun" in run("diagnose", *options, "--quantity", "displacement").output
+    begun = run("diagnose", *options, "--quantity", "displacement")
+    assert "the search has begun" in begun.output
+    (warning,) = (line for line in begun.stderr.splitlines() if "have no scale" in line)
+    assert warning.startswith("workbench: warning: no output is at the place of an input")
+    assert "give --driving-point INPUT,OUTPUT" in warning and "modal_masses" not in warning
+    copy(tmp_path / "low.csv", tmp_path / "again.csv")
+    for option, file in (("--records", "low.csv"), ("--records", "again.csv"), ("--validation", "low.csv")):
+        refused = run("diagnose", *options, "--quantity", "displacement", option, tmp_path / file)
+        assert refused.exit_code == 2 and "holds the same measurement as --nominal" in " ".join(refused.stderr.split())
     found, high = seen
     np.testing.assert_allclose(found.modes.omega, rig.modes.omega, rtol=1e-3)
     predicted = simulate(found, high.inputs, sample_time=dt).outputs

@@ -88,7 +88,7 @@ def _one_line(text: str) -> str:
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     """Print a warning in one line, except arithmetic warnings, which are for developers."""
     if not issubclass(category, RuntimeWarning):
-        errors.print(f"workbench: {_one_line(str(message))}", style="yellow")
+        errors.print(f"workbench: warning: {_one_line(str(message))}", style="yellow")
 
 
 def progress_bar() -> Progress:

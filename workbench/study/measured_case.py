@@ -1,15 +1,19 @@
 """A case from records alone: a linear model identified at a low level, and records at a higher level to diagnose."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from workbench.cases.case import Case
-from workbench.identification.driven import identify_driven
+from workbench.identification.driven import Driven, identify_driven
 from workbench.identification.rig_from import rig_from
 from workbench.records.files import read_record
 from workbench.records.record import Record
+from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED
+
+UNSCALED = "no output is at the place of an input"  # how the warning of `rig_from` begins that has another remedy here
 
 
 def measured_case(
@@ -37,7 +41,7 @@ def measured_case(
 
     Raises:
         ValueError: no inputs, outputs of unknown quantity, files with different channels, a driving point with unknown
-            names, or a file given twice.
+            names, a file given twice, or one that repeats the nominal record.
     """
 
     def read(path: Path, name: str) -> Record:
@@ -56,9 +60,32 @@ def measured_case(
     if len(driving_point) not in (0, 2):
         raise ValueError(f"--driving-point is INPUT,OUTPUT; got {','.join(driving_point)}")
     pair = (driving_point[0], driving_point[1]) if driving_point else None
-    rig = rig_from(identify_driven([low]), driving_point=pair)
     read_all = tuple(map(read, (*records, *validation), names))
+    for path, record in zip((*records, *validation), read_all, strict=True):
+        if record.repeats(low):
+            raise ValueError(
+                f"{path} holds the same measurement as --nominal {nominal}: the model was learnt from it, so it shows"
+                " no gap; give --nominal a record at low level, and --records and --validation others"
+            )
+    rig = _rig_of(identify_driven([low]), pair)
     return Case(nominal.stem, rig, read_all[: len(records)], read_all[len(records) :])
+
+
+def _rig_of(identified: Driven, driving_point: tuple[str, str] | None) -> Rig:
+    """The rig of identified modes; a warning that they have no scale names the option that gives one."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        rig = rig_from(identified, driving_point=driving_point)
+    for each in told:
+        message = str(each.message)
+        if message.startswith(UNSCALED):
+            message = (
+                f"{UNSCALED}, so the shapes have no scale: responses to these inputs are right, those to masses,"
+                " springs or forces elsewhere are not; give --driving-point INPUT,OUTPUT, an input and the output at"
+                " its place"
+            )
+        warnings.warn(message, each.category, stacklevel=3)
+    return rig
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
