@@ -21,7 +21,7 @@ from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
 
 MOST_BARS, FEW_BARS = 16, 6  # named points that are shown; sensors whose names fit horizontally
-FAINT = "#c4c4c4"  # beside the grey of the sensors' noise
+YELLOW = "#F0E442"  # of the same palette; a second grey is not to be told from the first on a dark page
 SHOWN = 0.005  # least share of the gap that is drawn
 
 
@@ -66,7 +66,7 @@ def plot_budget(budget: Budget) -> Figure:
     """The gap of each record, one bar split by cause; above 100 % if effects enlarge the gap."""
     causes = [label_in_words(label) for label in budget.effects]
     causes += ["errors of the nominal model", "unexplained", "noise of the logged inputs", "noise"]
-    colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], FAINT, GREY]
+    colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], YELLOW, GREY]
     records = list(budget.by_record)
     logged = np.array([budget.input_noise.get(record, 0.0) for record in records])
     *shares, nominal, unexplained, noise = np.array([*budget.by_record.values()], float).T
