@@ -131,7 +131,7 @@ def test_identify_takes_inputs_that_run_straight(tmp_path):
     assert imaginary == pytest.approx(-81.0 / (2.0 * np.sqrt(81.0 - 0.3**2)), rel=1e-4)  # the residue, k / 2i ω_d
     assert real_parts[1] < 1e-3 < 0.3 < real_parts[0]
     refused = run("identify", path, "--inputs", "F", "--input-hold", "second")
-    assert refused.exit_code == 2 and "input_hold is zero (held), first" in " ".join(refused.output.split())
+    assert refused.exit_code == 2 and "--input-hold is zero (held), first" in " ".join(refused.output.split())
 
 
 def test_identify_reads_transfer_functions(tmp_path):
@@ -415,10 +415,15 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         (("identify", "\x1b[31mred\n.csv"), "\\x1b[31mred .csv: there is no such file"),
         (("identify", "{rig}"), "names no format"),
         (("design", "nowhere.toml"), "no such file"),
-        (("design", "{rig}", "--damping", 1), "damping ratio wanted must lie between 0 and 1"),
-        (("design", "{rig}", "--errors", 0), "a share between 0 and 1, 0.05 for 5 %; got 0"),
+        (("design", "{rig}", "--damping", 1), "--damping must lie between 0 and 1"),
+        (("design", "{rig}", "--errors", 0), "--errors is a share between 0 and 1, 0.05 for 5 %; got 0"),
         (("design", "{rig}", "--errors", 5), "a share between 0 and 1, 0.05 for 5 %; got 5"),
-        (("design", "{rig}", "--weight", -1), "positive"),
+        (("design", "{rig}", "--weight", -1), "--weight must be positive; got -1"),
+        (("place", "{rig}", "--control", 4, "--weight", -1), "--weight must be positive; got -1"),
+        (("place", "{rig}", "--control", 4, "--figure", "a.xyz"), "--figure writes .png, .svg, .pdf"),
+        (("trial", "{rig}", "--figure", "a"), "name a file such as a.png; got a"),
+        (("look", "nowhere.csv", "--page", "p.pdf"), "--page writes HTML; name a file such as p.html; got p.pdf"),
+        (("report", "nowhere.json", "--page", "p"), "--page writes HTML; name a file such as p.html; got p"),
         (("design", "{rig}", "--control", -1), "controlled modes is 1 to 9, those of the model; got -1"),
         (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),
         (("design", "{rig}", "--final-time", 0), "final time must be positive and finite; got 0"),

@@ -79,7 +79,7 @@ def place(
     from workbench.design.placement.task import SPREAD, extent, patch_of
     from workbench.rig.actuators import command_unit
 
-    check_target(json_path, picture)
+    check_target(json_path, picture, figure=picture)
     if certified_gap is not None and not 0 < certified_gap < 1:
         raise ValueError(f"--certify is a share between 0 and 1; got {certified_gap:g}")
     found, units = read_structure_rig(rig)
