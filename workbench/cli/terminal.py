@@ -71,7 +71,7 @@ def with_notes(error: BaseException) -> str:
 
 
 def complain(fault: str, parameters: Collection[str] = ()) -> None:
-    """Print an error in one line, with the names of arguments replaced by those of options of the command's parameters."""
+    """Print an error in one line, with the names of arguments replaced by those of the command's options."""
     for argument, option in OPTIONS.items():
         if option.removeprefix("--").replace("-", "_") in parameters:
             fault = re.sub(rf"\b{argument}\b", option, fault)

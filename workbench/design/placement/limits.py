@@ -14,6 +14,7 @@ from workbench.design.placement.places import Box, coordinates, free_boxes, leas
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
 from workbench.renamed import Renamed, former_arguments
 from workbench.structure.domain import Interval, NamedPoints, Place, Rectangle, position, reach, same_place
+from workbench.structure.printed import Constructed
 
 TOLERANCE = 2e-6  # relative, of a limit
 APART = 1e-6  # of the length: least distance of two actuators
@@ -27,8 +28,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-@dataclass(frozen=True)
-class Limits:
+@dataclass(frozen=True, repr=False)
+class Limits(Constructed):
     """Constraints of a placement.
 
     Attributes:

@@ -118,11 +118,6 @@ class Explanation(Printed):
         return first if first and first.closed_pole.real == self.poles.real.max() else None
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        rate = {
-            "stable": f", decay rate {self.decay_rate:.3g} 1/s",
-            "unstable": f", growth rate {-self.decay_rate:.3g} 1/s",
-        }
-        state = self.loop.stability + rate.get(self.loop.stability, "")
         rows = [
             (
                 str(each.mode + 1),
@@ -145,7 +140,8 @@ class Explanation(Printed):
             "Re λ, closed loop [1/s]",
             "dominant path",
         )
-        return f"closed loop of {counted(self.loop.modes.n_modes, 'mode')}: {state}", headings, rows, remarks
+        line = f"closed loop of {counted(self.loop.modes.n_modes, 'mode')}: {self.loop.stability_text}"
+        return line, headings, rows, remarks
 
     @property
     def poles(self) -> np.ndarray:
