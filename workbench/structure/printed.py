@@ -126,6 +126,12 @@ def command_headings(unit: str) -> tuple[str, str]:
     )
 
 
+def in_unit(value: float, heading: str) -> str:
+    """A value to four digits with the unit of its heading: "effort [N² s]" and 12.0912 give "12.09 N² s"."""
+    _, bracket, unit = heading.partition(" [")
+    return f"{value:.4g} {unit[:-1]}" if bracket else f"{value:.4g}"
+
+
 def place_text(place: object) -> str:
     """Text of a place: x or x, y in m, a name, two of these, or a patch of a plate; empty where unknown."""
     if isinstance(place, Patch):

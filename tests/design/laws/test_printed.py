@@ -35,7 +35,8 @@ def test_spillover_prints_the_work_in_every_mode():
     state[7:] = 0.0
     found = spillover(MODES, LAW, state)
     lines = str(found).splitlines()
-    assert f"W_R = {found.residual_work:.4g}" in lines[0] and len(lines) == 2 + 5
+    assert lines[0].endswith(f"W_C = {found.controlled_work:.4g} J, W_R = {found.residual_work:.4g} J")
+    assert lines[1].split() == ["mode", "W_r", "[J]"] and len(lines) == 2 + 5
     assert lines[-1].split() == ["5", "residual", f"{found.work_by_mode[4]:.4g}"]
 
 
@@ -43,7 +44,9 @@ def test_a_placement_prints_its_places_and_what_they_cost():
     task = placement_task(MODES, 2, impulse_at=6.3, weight=20.0)
     best = place_actuators(task, Limits(effort=1.0, spacing=0.5), starts=1)
     text = str(best)
-    assert f"W_R = {best.residual_work:.4g}" in text and f"{best.positions[0]:.4g}" in text
+    assert f"W_R = {best.residual_work:.4g} J, effort {best.effort:.4g} N² s" in text
+    assert f"peak force {best.peak_force:.4g} N;" in text and "search: converged" in text
+    assert "places: even" in str(task.placed([3.0, 6.5], "even")) and f"{best.positions[0]:.4g}" in text
     assert len(repr(best)) < 120
 
 
