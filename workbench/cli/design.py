@@ -73,9 +73,8 @@ def design(
     headings = map(units.named, (*command_headings(unit), "W_C [J]", "W_R [J]"))
     show_table(("law", "cost", *headings, "largest W_r", "loop"), shown)
     say("  W_C, W_R: work of the actuators on the controlled and on the residual modes, W_r on mode r, until")
-    say(
-        f"  {end:.4g} {units.time}, with residual modes that start at rest and have their damping; cost and effort over all time"
-    )
+    say(f"  {end:.4g} {units.time}, with residual modes that start at rest and have their damping; cost and effort")
+    say("  over all time")
     if {row.law.name for row in rows} >= {"IMSC", "coupled LQR"}:
         say("  R weights FᵀF in the cost and coupled LQR, but fᵀf of modal forces in IMSC: the ranking depends on")
         say("  masses and units; --damping compares the laws at equal poles")
