@@ -70,6 +70,11 @@ class Step:
         return not self.loss < AWAY
 
     @property
+    def in_new_controller(self) -> str:
+        """Whether the new controller has the step, as text; empty for the present controller."""
+        return "" if self.name == "present" else "yes" if self.kept else "no"
+
+    @property
     def lost(self) -> str:
         """The loss in words."""
         if 0.0 < self.loss < LEAST_SHOWN:

@@ -51,7 +51,7 @@ def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, fol
     if max(s.loss for s in found.steps) > NEGLIGIBLE:
         stepwise = f"From the present controller to the redesigned one, step by step: the {LOSS}."
         blocks.append(block(plot_steps(found), stepwise))
-    steps = [(s.name, s.what, s.lost, "yes" if s.kept else "no") for s in found.steps]
+    steps = [(s.name, s.what, s.lost, s.in_new_controller) for s in found.steps]
     tables: list[Table] = [
         ("On the same samples: median (95 % interval)", ("", "present", "redesigned"), _figures(found)),
         ("Steps", ("step", "what", "loss", "in the new controller"), steps),
