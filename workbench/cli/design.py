@@ -88,7 +88,11 @@ def design(
             count = None if perturbed is None else len(perturbed)
             sensed.append(_sensed(controller.name, explained, found, share, count))
     heads = ["controller", "decay rate, -max Re λ [1/s]", "limiting residual mode, Re λ", "path"]
-    heads += [] if perturbed is None else [f"stable of {len(perturbed)} models with {100 * errors:.3g} % error"]
+    heads += (
+        []
+        if perturbed is None or errors is None
+        else [f"stable of {len(perturbed)} models with {100 * errors:.3g} % error"]
+    )
     show_table(heads, [row for row, _ in sensed])
     write_json(
         json_path,

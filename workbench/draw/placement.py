@@ -79,7 +79,8 @@ def plot_places(
     if next(iter(places.values())).ndim == 2:
         figure, ax = new_figure(width=6, height=5)
         for i, (low, high) in enumerate(forbidden):
-            box = 0.5 * (1.0 + CORNERS) * np.subtract(high, low) + low
+            corner, opposite = np.array(low, float), np.array(high, float)
+            box = corner + 0.5 * (1.0 + CORNERS) * (opposite - corner)
             ax.fill(*box.T, **zone, label="forbidden" if i == 0 else None)
         for (name, positions), marker in zip(places.items(), "osD^v"):
             ax.plot(*positions.T, marker, label=name, markersize=9, clip_on=False, zorder=3)
@@ -95,7 +96,7 @@ def plot_places(
     rows = [*places, *(["impulse"] if impulse_at is not None else [])]
     figure, ax = new_figure(width=9, height=1.4 + 0.5 * len(rows))
     for i, (low, high) in enumerate(forbidden):
-        ax.axvspan(low, high, **zone, label="forbidden" if i == 0 else None)  # type: ignore[arg-type]
+        ax.axvspan(low, high, **zone, label="forbidden" if i == 0 else None)
     for row, (positions, colour) in enumerate(zip(places.values(), COLOURS)):
         ax.plot(positions, np.full(len(positions), row), "^", color=colour, markersize=9)
     if impulse_at is not None:
