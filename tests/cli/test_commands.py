@@ -1,6 +1,7 @@
 """The command: what it finds on files a user has, its exit codes, and one clear line for bad input."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -131,7 +132,7 @@ def test_identify_takes_inputs_that_run_straight(tmp_path):
     assert imaginary == pytest.approx(-81.0 / (2.0 * np.sqrt(81.0 - 0.3**2)), rel=1e-4)  # the residue, k / 2i ω_d
     assert real_parts[1] < 1e-3 < 0.3 < real_parts[0]
     refused = run("identify", path, "--inputs", "F", "--input-hold", "second")
-    assert refused.exit_code == 2 and "input_hold is zero (held), first" in " ".join(refused.output.split())
+    assert refused.exit_code == 2 and "--input-hold is zero (held), first" in " ".join(refused.output.split())
 
 
 def test_identify_reads_transfer_functions(tmp_path):
@@ -179,7 +180,8 @@ def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
     expected = [1.213865e-3, 5.203347e-5, 1.294254e-4, 1.037589e-4]
     np.testing.assert_allclose(imsc["work"][5:], expected, rtol=1e-5)
     assert coupled["cost"] <= imsc["cost"] * (1 + 1e-9)
-    assert "mode 6" in result.output
+    assert "mode 6" in result.output and "residual modes that start at rest and have their damping" in result.output
+    assert "decay rate, -max Re λ [1/s]" in result.output and "y → F2" in result.output
     page = run("report", found, "--page", tmp_path / "p.html")
     assert page.exit_code == 0 and "page" in page.output
     assert "coupled LQR" in (tmp_path / "p.html").read_text() and (tmp_path / "p.page.json").is_file()
@@ -207,6 +209,7 @@ def test_design_offers_what_can_be_had(rig, tmp_path):
     assert nodes.exit_code == 2 and "mode 5 is uncontrollable: all actuators stand at its nodes" in nodes.output
     rig.write_text(rig.read_text().replace("at = 4.0", "at = 4.3"))
     few = run("design", rig, "--control", 5, "--damping", 0.1, "--errors", 0.02, "--json", found)
+    assert "stable of 100 models with 2 % error" in few.output
     assert few.exit_code == 0 and "IMSC needs as many actuators as controlled modes, 5; there are 4" in few.output
     told = json.loads(found.read_text())
     assert [law["law"] for law in told["laws"]] == ["coupled LQR", "coupled poles"]
@@ -222,6 +225,11 @@ def test_place_does_better_than_even_places(rig, tmp_path):
     best, even, nodes = json.loads(found.read_text())["placements"]
     assert best["residual_work"] < min(even["residual_work"], nodes["residual_work"])
     assert best["effort"] <= 1.5 * even["effort"] * (1 + 1e-6)
+    _, heads, first, second, *told = result.output.splitlines()
+    assert heads.startswith("placement ") and first.startswith("best found ")
+    assert second.startswith("evenly spaced, nodes of mode 5 ")  # which are the same places, in one row
+    assert "residual modes, which start at rest, without damping and over all time" in told[0]
+    assert told[1].strip() == "search: converged"
 
 
 def test_patches_on_a_beam_are_placed_beside_each_other(tmp_path):
@@ -247,8 +255,10 @@ def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
     limits = ("--peak-force", 0.5, "--condition", 3, "--forbid", "4.9:5.6", "--certify", 0.05)
     result = run("place", rig, "--control", 2, "--weight", 20, *limits, "--json", found)
     assert result.exit_code == 0, result.output
-    assert "no placement under the limits has less than 95.0%" in result.output
     written = json.loads(found.read_text())
+    bound = f"W_R below {written['lower_bound']:.4g} J, 5 % under that of the one found"
+    assert f"certified: no placement within the limits has {bound}" in result.output
+    assert written["certified"] and written["limits"]["forbidden"] == [[4.9, 5.6]]
     best = written["placements"][0]
     assert written["lower_bound"] == pytest.approx(0.95 * best["residual_work"])
     assert best["peak_force"] <= 0.5 * (1 + 1e-5) and not any(4.9 < x < 5.6 for x in best["positions"])
@@ -259,7 +269,7 @@ def test_places_are_chosen_from_those_there_are(rig, tmp_path):
     given = ("--at", "1.5,3,4.5,6.5,7,8.5", "--effort", 3, "--certify", 0.05)
     result = run("place", rig, "--control", 3, "--weight", 20, *given, "--json", found)
     assert result.exit_code == 0, result.output
-    assert "no placement under the limits has less than 100.0%" in result.output
+    assert re.search(r"certified: .* W_R below \S+ J, that of the one found", result.output)
     assert set(json.loads(found.read_text())["placements"][0]["positions"]) <= {1.5, 3, 4.5, 6.5, 7, 8.5}
 
 
@@ -415,10 +425,15 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         (("identify", "\x1b[31mred\n.csv"), "\\x1b[31mred .csv: there is no such file"),
         (("identify", "{rig}"), "names no format"),
         (("design", "nowhere.toml"), "no such file"),
-        (("design", "{rig}", "--damping", 1), "damping ratio wanted must lie between 0 and 1"),
-        (("design", "{rig}", "--errors", 0), "a share between 0 and 1, 0.05 for 5 %; got 0"),
+        (("design", "{rig}", "--damping", 1), "--damping must lie between 0 and 1"),
+        (("design", "{rig}", "--errors", 0), "--errors is a share between 0 and 1, 0.05 for 5 %; got 0"),
         (("design", "{rig}", "--errors", 5), "a share between 0 and 1, 0.05 for 5 %; got 5"),
-        (("design", "{rig}", "--weight", -1), "positive"),
+        (("design", "{rig}", "--weight", -1), "--weight must be positive; got -1"),
+        (("place", "{rig}", "--control", 4, "--weight", -1), "--weight must be positive; got -1"),
+        (("place", "{rig}", "--control", 4, "--figure", "a.xyz"), "--figure writes .png, .svg, .pdf"),
+        (("trial", "{rig}", "--figure", "a"), "name a file such as a.png; got a"),
+        (("look", "nowhere.csv", "--page", "p.pdf"), "--page writes HTML; name a file such as p.html; got p.pdf"),
+        (("report", "nowhere.json", "--page", "p"), "--page writes HTML; name a file such as p.html; got p"),
         (("design", "{rig}", "--control", -1), "controlled modes is 1 to 9, those of the model; got -1"),
         (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),
         (("design", "{rig}", "--final-time", 0), "final time must be positive and finite; got 0"),
@@ -430,7 +445,11 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         ),
         (("place", "{rig}", "--control", 9), "residual"),
         (("place", "{rig}", "--control", 4, "--grid", 0.1), "--grid is for a plate; name candidate places by --at"),
-        (("place", "{rig}", "--control", 1, "--effort", 0.01), "--effort is a multiple of"),
+        (("place", "{rig}", "--control", 1, "--effort", 0.01), "raise --effort or lower --spacing; --effort is a"),
+        (("place", "{rig}", "--control", 1, "--effort", -1), "--effort is a multiple, above 0, of the effort at even"),
+        (("place", "{rig}", "--control", 2, "--peak-force", 0.01), "meets the limits: --peak-force is 0.01 N with a"),
+        (("place", "{rig}", "--control", 2, "--peak-force", -1), "--peak-force must be positive; got -1"),
+        (("place", "{rig}", "--control", 2, "--spacing", -1), "--spacing must be 0 or more; got -1"),
         (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
         (("place", "{rig}", "--control", 4, "--at", "1,2,3,11"), "outside the structure"),
         (("place", "{rig}", "--control", 4, "--at", "1 to 9"), "separated by commas"),

@@ -83,7 +83,7 @@ def test_the_damping_that_a_law_gives_is_told(run, rig, tmp_path, law, asked):
     rig.write_text(RIG.replace("damping_ratio = 0.01", "damping_ratio = 0.02"))
     options = ("--law", law, "--damping", asked, "--rate-hz", 1000, "--to", tmp_path / "one.py")
     result = run("export", rig, "--control", 1, *options)
-    assert f"with exact modal coordinates: {given:.3g}\n" in result.output, result.output
+    assert f"with exact modal coordinates: {100 * given:.3g} %\n" in result.output, result.output
 
 
 @pytest.mark.parametrize(

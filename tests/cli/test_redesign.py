@@ -42,6 +42,7 @@ def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
     assert "stable on 6 of 6 Monte Carlo samples" in done.output and "F1: delay 40 ms" in done.output
     assert "the range of 6 draws, not of 95 %, which need 40 draws or more" in " ".join(done.output.split())
     assert re.search(r"test: an impulse of \S+ N s at x = \S+, which moves the structure as far", done.output)
+    assert "in the new controller" in done.output and "  loss: vibration and effort above those with" in done.output
     found = json.loads(told.read_text())
     assert found["safe"] and found["redesigned"]["stable"] == 6
     assert found["steps"][-1]["loss"] < 0.5 * found["steps"][0]["loss"]
@@ -52,7 +53,7 @@ def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
     commands = np.array([step.step(readings) for readings in np.eye(4)])
     assert commands.shape == (4, 2) and np.abs(commands).max() > 0
     html = page.read_text(encoding="utf-8")
-    assert found["sentence"].split(";")[0] in html and "Under the inputs of the measured record low" in html
+    assert found["sentence"].split(";")[0] in html and "Under the inputs of the measured record “low”" in html
 
 
 @pytest.mark.slow

@@ -343,13 +343,13 @@ def test_the_ends_of_an_interval_are_told_apart(rig, controller):
     sure = redesign(uncertain(rig), controller, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
     near, far = (
         replace(sure.verification, damping=np.outer(v, np.ones(6)))
-        for v in ((0.1041, 0.1043, 0.1045), (0.2, 0.25, 0.3))
+        for v in ((0.1030, 0.1040, 0.1050), (0.2, 0.25, 0.3))
     )
     found = replace(sure, present_verification=near, verification=far)
-    assert "at 10.43 % (95 %: 10.41 to 10.45) damping" in found.sentence
+    assert "at 10.4 % (95 %: 10.3 to 10.5) damping" in found.sentence
     assert "25 % (20 to 30), as much effort" in found.sentence
-    alike = replace(sure.verification, damping=np.full((3, 6), 0.05))
-    assert "redesigned: 5.00 % (the same in all samples)," in replace(found, verification=alike).sentence
+    alike = replace(sure.verification, damping=np.outer((0.05, 0.05001, 0.05002), np.ones(6)))
+    assert "redesigned: 5.00 %, as much effort" in replace(found, verification=alike).sentence
 
 
 def test_every_draw_is_judged_by_its_own_simulation(rig, controller):
@@ -373,7 +373,7 @@ def test_on_off_control_is_told_by_its_settling(rig):
     found = redesign(stuck, relays, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
     assert "settles in" in found.sentence and found.steps[-1].loss < 0.1 * found.steps[0].loss
     alike = replace(found.verification, controlled_settling=np.full(3, 2.29), settling=np.full(3, 2.29))
-    assert "redesigned: 2.29 s (the same in all samples)" in replace(found, verification=alike).sentence
+    assert "redesigned: 2.29 s, " in replace(found, verification=alike).sentence
 
 
 def test_relays_that_a_dead_zone_silences_are_made_to_act_again(rig):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import workbench as wb
+from workbench.cases.case import Case
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import filter_on
 from workbench.identification.updating.distributions import SelfCheck
@@ -119,3 +120,28 @@ def test_a_function_warns_its_caller_of_the_remarks_of_what_it_returns():
         assert isinstance(found_of(3), Found)
     assert [(str(w.message), w.filename) for w in told] == [("one", __file__), ("two", __file__)]
     assert found_of.__name__ == "found_of"
+
+
+def test_parts_print_as_calls_with_what_differs_from_the_defaults():
+    assert repr(wb.Sensor("y1", 0.4 / 3.0, noise_std=1e-3)) == "Sensor(name='y1', at=0.133333, noise_std=0.001)"
+    assert repr(wb.Actuator("F1", 0.2, limit=3.0)) == "Actuator(name='F1', at=0.2, limit=3)"
+    assert repr(wb.Limits(spacing=0.1, forbidden=((0.1, 0.2),))) == "Limits(spacing=0.1, forbidden=((0.1, 0.2),))"
+    assert repr(wb.Channel("a", "acceleration", at=0.3)) == "Channel(name='a', quantity='acceleration', at=0.3)"
+    assert repr(wb.Channel("F", "force", "lbf")) == "Channel(name='F', quantity='force', unit='lbf')"
+
+
+def test_a_plate_prints_its_edges_and_the_values_of_its_fields():
+    thing = {"length": (1.2, 0.8), "mass_per_area": lambda x, y: 10.0 + x, "bending_stiffness": 100.0}
+    sides = {"left": "clamped", "right": "free", "bottom": "simply supported", "top": wb.Edge(5.0, 0.0)}
+    lines = str(wb.Plate(**thing, poisson_ratio=0.3, edges=sides)).splitlines()
+    around = "left clamped, right free, bottom simply supported, top on springs of 5 N/m² and 0 N"
+    assert lines[0] == f"plate, 1.2 by 0.8 m, {around}, Poisson's ratio 0.3"
+    assert lines[2].split() == ["mass_per_area", "10", "10.6", "11.2"]
+    membrane = wb.Membrane(length=(1.0, 2.0), mass_per_area=1.0, tension=3.0)
+    assert repr(membrane) == "<Membrane: membrane, 1 by 2 m, all edges fixed>"
+
+
+def test_a_case_is_a_table_of_its_records(rig, record):
+    lines = str(Case("arm", rig, fit=(record,), validation=())).splitlines()
+    assert lines[0] == "case 'arm': 3 modes, 1 actuator, 2 sensors, 0 elements"
+    assert lines[2].split() == [*record.name.split(), "fit", "500", "100"]

@@ -101,7 +101,7 @@ def test_a_design_says_which_loops_are_unstable(tmp_path):
     }
     shown = page_content_in(written(tmp_path, {**DESIGNED, "through_sensors": sensed}))
     _, heads, rows = shown.tables[1]
-    assert heads[3:] == ("residual mode that limits it", "path") and rows[1][3:] == [
+    assert heads[3:] == ("limiting residual mode, Re λ", "path") and rows[1][3:] == [
         "mode 5: +0.2 1/s",
         "sensor at 6 to F2",
     ]
@@ -133,15 +133,26 @@ def test_what_is_said_of_the_stability_of_all_loops_is_true(tmp_path, words, sai
 
 def test_a_placement_shows_where_and_how_surely(tmp_path):
     shown = page_content_in(written(tmp_path, PLACED))
-    assert shown.lead.startswith("Actuators at 2, 6 m leave spillover work W_R = 0.25 J. ")
+    assert shown.lead.startswith("Actuators at 2 m and 6 m leave spillover work W_R = 0.25 J. ")
     assert shown.lead.endswith("No placement within the limits has W_R below 0.2 J.")
     [places] = [m for m in shown.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "line"]
     assert places["x"] == [2.0, 6.0]
+    assert shown.standing == "good" and shown.tables[0][2][0][0] == "best found"
+    limits = {"effort": 2.0, "forbidden": [[2.5, 3.0]]}
+    zoned = {**PLACED, "impulse_at": 6.3, "limits": limits, "certified": False}
+    shown = page_content_in(written(tmp_path, zoned))
+    assert shown.standing == "" and shown.lines[:2] == [
+        "Unit impulse at 6.3 m.",
+        "Forbidden zone: 2.5 m to 3 m.",
+    ]
+    marks = shown.blocks[0]["figure"]["panels"][0]["marks"]
+    assert [m["boxes"] for m in marks if m["kind"] == "bars"] == [[[2.5, 3.0, None, None]]]
+    assert [m["x"] for m in marks if m["kind"] == "line"] == [[2.0, 6.0], [6.3]]
 
 
 @pytest.mark.parametrize(
     ("positions", "where", "n_figures"),
-    [([[30.0, 20.0], [80.0, 60.0]], "30, 20; 80, 60 mm", 2), (["N4", "J"], "N4, J", 1)],
+    [([[30.0, 20.0], [80.0, 60.0]], "(30, 20) mm and (80, 60) mm", 2), (["N4", "J"], "N4 and J", 1)],
 )
 def test_a_placement_on_a_plate_and_at_named_points_in_other_units(tmp_path, positions, where, n_figures):
     units = {"length": "mm", "mass": "t", "time": "s", "force": "N"}
@@ -152,7 +163,7 @@ def test_a_placement_on_a_plate_and_at_named_points_in_other_units(tmp_path, pos
     assert len(shown.blocks) == n_figures and "W_R [N mm]" in shown.tables[0][1]
     if n_figures == 2:
         axes = shown.blocks[0]["figure"]["panels"][0]
-        assert "x [mm]" in str(axes) and "y [mm]" in str(axes)
+        assert "x [mm]" in str(axes) and "y [mm]" in str(axes) and axes["equal"]
 
 
 def test_one_sensor_has_no_shape_and_remarks_are_kept(tmp_path):

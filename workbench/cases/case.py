@@ -16,6 +16,7 @@ from workbench.records.npz_file import arrays as load_arrays
 from workbench.records.record import HOLDS, Channel, Record
 from workbench.records.units import SI, Units
 from workbench.rig.rig import Rig
+from workbench.structure.printed import Printed
 
 MOST_SAMPLES = 5_000_000
 LEAST_SAMPLES = 16
@@ -24,8 +25,8 @@ UNITS = ("length", "mass", "time", "force")
 RECORD = ("name", "file", "sample_time", "use", "input_hold")
 
 
-@dataclass(frozen=True, eq=False)
-class Case:
+@dataclass(frozen=True, eq=False, repr=False)
+class Case(Printed):
     """A nominal model and the records of a test with which it disagrees.
 
     Attributes:
@@ -41,6 +42,15 @@ class Case:
     fit: tuple[Record, ...]
     validation: tuple[Record, ...]
     units: Units = SI
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        line = f"case {self.name!r}: {self.rig}".splitlines()[0]
+        rows = [
+            (record.name, use, str(record.n_samples), f"{record.sample_rate_hz:.6g}")
+            for use, records in (("fit", self.fit), ("validate", self.validation))
+            for record in records
+        ]
+        return line, ("record", "use", "samples", "sample rate [Hz]"), rows, ()
 
 
 def read_case(folder: str | Path) -> Case:

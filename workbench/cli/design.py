@@ -12,6 +12,7 @@ from workbench.structure.printed import command_headings
 
 if TYPE_CHECKING:
     from workbench.design.spillover.explain import Explanation
+    from workbench.rig.rig import Rig
 
 PERIODS = 20  # default final time of the work, in periods of the first mode
 
@@ -71,8 +72,9 @@ def design(
         say(f"  {why}")
     headings = map(units.named, (*command_headings(unit), "W_C [J]", "W_R [J]"))
     show_table(("law", "cost", *headings, "largest W_r", "loop"), shown)
-    say(f"  the impulse moves the controlled modes alone; W_C and W_R count until {end:.4g} {units.time},")
-    say("  cost and effort over all time")
+    say("  W_C, W_R: work of the actuators on the controlled and on the residual modes, W_r on mode r, until")
+    say(f"  {end:.4g} {units.time}, with residual modes that start at rest and have their damping; cost and effort")
+    say("  over all time")
     if {row.law.name for row in rows} >= {"IMSC", "coupled LQR"}:
         say("  R weights FᵀF in the cost and coupled LQR, but fᵀf of modal forces in IMSC: the ranking depends on")
         say("  masses and units; --damping compares the laws at equal poles")
@@ -83,9 +85,14 @@ def design(
             say(f"  {why}")
         else:
             share = None if perturbed is None else stable_share(perturbed, controller)
-            sensed.append(_sensed(controller.name, explained, share))
-    heads = ["controller", "decay rate [1/s]", "residual mode that limits it", "path"]
-    heads += [] if errors is None else [f"stable share, {errors:.2g} model error"]
+            count = None if perturbed is None else len(perturbed)
+            sensed.append(_sensed(controller.name, explained, found, share, count))
+    heads = ["controller", "decay rate, -max Re λ [1/s]", "limiting residual mode, Re λ", "path"]
+    heads += (
+        []
+        if perturbed is None or errors is None
+        else [f"stable of {len(perturbed)} models with {100 * errors:.3g} % error"]
+    )
     show_table(heads, [row for row, _ in sensed])
     write_json(
         json_path,
@@ -115,12 +122,14 @@ def design(
     )
 
 
-def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[list[str], dict[str, Any]]:
-    """A controller that works through sensors, as a row of the table and as JSON; `share` is its robustness."""
+def _sensed(
+    name: str, explained: "Explanation", rig: "Rig", share: float | None, count: int | None
+) -> tuple[list[str], dict[str, Any]]:
+    """A controller that works through sensors, as a row of the table and as JSON; `share` of `count` is stable."""
     rate, stability = f"{explained.decay_rate:.3g}", explained.loop.stability
-    limiting, path = _limit(explained)
+    limiting, path = _limit(explained, rig)
     row = [name, {"stable": rate, "unstable": f"{rate} unstable"}.get(stability, stability), limiting, path]
-    return row + ([] if share is None else [f"{share:.0%}"]), {
+    return row + ([] if share is None or count is None else [str(round(share * count))]), {
         "design": name,
         "margin": explained.decay_rate,  # the key of earlier files
         "stable": not explained.loop.unstable_poles.size,
@@ -133,7 +142,7 @@ def _sensed(name: str, explained: "Explanation", share: float | None) -> tuple[l
     }
 
 
-def _limit(explained: "Explanation") -> tuple[str, str]:
+def _limit(explained: "Explanation", rig: "Rig") -> tuple[str, str]:
     """The residual mode that limits the decay rate, and the path through which it does, as text."""
     no_growth = not explained.loop.unstable_poles.size
     worst = explained.limiting if no_growth else explained.destabilising
@@ -143,4 +152,6 @@ def _limit(explained: "Explanation") -> tuple[str, str]:
         return "none: unstable without residual modes" if explained.reduced_decay_rate <= 0 else "no single mode", ""
     grows = no_growth or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without this mode"
-    return f"mode {worst.mode + 1}: {pole}", f"sensor at {worst.dominant.text}"
+    at = worst.dominant.sensor_at
+    names = [sensor.name for sensor in rig.sensors if sensor.at == at]
+    return f"mode {worst.mode + 1}: {pole}", f"{', '.join(names)} → {worst.dominant.actuator}"

@@ -162,10 +162,10 @@ def damping_by(modes: "Modes", law: "Law | OnOffLaw") -> str:
     a, b = controlled_plant(modes, law.controlled, law.actuators)
     poles = np.linalg.eigvals(a - b @ law.gain)
     oscillating = sorted(poles[poles.imag > 0], key=abs)
-    found = [f"{-p.real / abs(p):.3g}" for p in oscillating]
+    found = [f"{-100.0 * p.real / abs(p):.3g} %" for p in oscillating]
     if (modes.omega[list(law.controlled)] == 0).any():
         found.append("none of rigid modes")
-    ratios = ", ".join(found) or "1 or more"
+    ratios = ", ".join(found) or "100 % or more"
     return f"damping ratio of the controlled modes by {law.name}, with exact modal coordinates: {ratios}"
 
 

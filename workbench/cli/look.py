@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.terminal import as_typed, by_options, guarded, names_in, say, short, show_table
+from workbench.cli.terminal import as_typed, by_options, check_target, guarded, names_in, say, short, show_table
 
 
 @guarded
@@ -29,6 +29,7 @@ def look(
     from workbench.study.pages.look import HEADINGS, look_at
     from workbench.study.pages.page import write_page
 
+    check_target(page=page)
     measured = read_measured(file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=Limits.of_gib(memory))
     seen = look_at(measured, file)
     shown = replace(seen.page_content, made_by=as_typed())

@@ -12,7 +12,7 @@ from workbench.cli import options
 from workbench.cli.design_options import impulse_place, place_in, read_structure_rig, typed_place
 from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, middle, reach
-from workbench.structure.printed import command_headings, places_text
+from workbench.structure.printed import command_headings, in_unit, places_text
 
 if TYPE_CHECKING:
     from workbench.design.placement.limits import Limits
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from workbench.records.units import Units
     from workbench.rig.rig import Rig
 
+BEST = "best found"
+SAME = 1e-6  # of the size: places nearer to each other than this are the same
 LEAST_SPACING = 1 / 20  # default least spacing, over the size of the structure
 WRITTEN = ("positions", "residual_work", "residual_work_by_mode", "effort", "peak_force", "condition", "status")
 IN_JSON = {"residual_work_by_mode": "by_mode"}  # other names there
@@ -79,7 +81,13 @@ def place(
     from workbench.design.placement.task import SPREAD, extent, patch_of
     from workbench.rig.actuators import command_unit
 
-    check_target(json_path, picture)
+    check_target(json_path, picture, figure=picture)
+    if not effort > 0:
+        raise ValueError(
+            f"--effort is a multiple, above 0, of the effort at even places or the rig's own; got {effort:g}"
+        )
+    if spacing is not None and not 0 <= spacing < math.inf:
+        raise ValueError(f"--spacing must be 0 or more; got {spacing:g}")
     if certified_gap is not None and not 0 < certified_gap < 1:
         raise ValueError(f"--certify is a share between 0 and 1; got {certified_gap:g}")
     found, units = read_structure_rig(rig)
@@ -93,6 +101,7 @@ def place(
         raise ValueError("--certify on a plate needs candidate places; give their spacing by --grid M, or --at PLACES")
     with reporting("placing actuators") as report:
         task = placement_task(modes, control, impulse_at=impulse_point, weight=weight, actuator=patch_of(found))
+        unit_of_commands = command_unit([task.actuator])
         reference = _reference(task, found)
         least = 0.0 if isinstance(domain, NamedPoints) else max(LEAST_SPACING * domain.size, extent(task.actuator))
         limits = Limits(
@@ -106,10 +115,13 @@ def place(
         try:
             best = least_work(task, limits)
         except DesignError as error:
-            if "effort" not in str(error):
+            if "meets the limits" not in str(error):
                 raise
-            multiple = f"--effort is a multiple of {reference.effort:.4g}, that of actuators {reference.status}"
-            raise DesignError(f"{error}; {multiple}") from error
+            text = units.named(str(error))
+            if "effort" in text:
+                unit = in_unit(reference.effort, units.named(command_headings(unit_of_commands)[0]))
+                text += f"; --effort is a multiple of {unit}, that of actuators {reference.status}"
+            raise DesignError(text) from error
         certificate = None
         if certified_gap is not None:
 
@@ -124,35 +136,42 @@ def place(
         nodes, (first, last) = nodes_of_mode(modes, control), task.reach
         if nodes.size == control and first <= nodes.min() and nodes.max() <= last:  # a patch may reach beyond the end
             rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
+    named = dict(zip((BEST, *(row.status for row in rows[1:])), rows))
+    if len(rows) > 2 and np.abs(rows[2].positions - reference.positions).max() < SAME * domain.size:
+        named = {BEST: best, f"{reference.status}, {rows[2].status}": reference}
     shown = []
-    for row in rows:
+    for name, row in named.items():
         numbers = (row.residual_work, row.effort, row.peak_force, row.condition)
-        shown.append((places_text(row.positions), *(f"{value:.5g}" for value in numbers), row.status))
+        shown.append((name, places_text(row.positions), *(f"{value:.5g}" for value in numbers)))
     where = domain.text(impulse_point, 6)
     say(f"{control} of {modes.n_modes} modes controlled, unit impulse at {where}, R = {weight:g}", bold=True)
     where = "points" if isinstance(domain, NamedPoints) else "places [m]"
-    unit = command_unit([task.actuator])
-    headings = map(units.named, (where, "W_R [J]", *command_headings(unit)))
-    show_table((*headings, "condition number of B", ""), shown)
-    say("  the impulse moves the controlled modes alone; W_R is that of undamped residual modes over all time")
+    headings = map(units.named, (where, "W_R [J]", *command_headings(unit_of_commands)))
+    show_table(("placement", *headings, "condition number of B"), shown)
+    say("  W_R: work of the actuators on the residual modes, which start at rest, without damping and over all time")
+    say(f"  search: {best.status}")
     if best.overlapping:
         size = float(np.linalg.norm(2.0 * reach(domain, task.actuator.at)[0]))  # type: ignore[arg-type]
         say(f"  patches overlap; {SPREAD}: --spacing {size:.3g}")
     if certificate is not None:
-        say(f"  {certificate}")
+        say(f"  {certificate.text(units.named('J'), units.length)}")
     if picture is not None:
-        _draw(picture, task, {"least work": best, reference.status: reference}, limits, impulse_point, units)
+        _draw(picture, task, {BEST: best, reference.status: reference}, limits, impulse_point, units)
     write_json(
         json_path,
         {
             "length": None if isinstance(domain, NamedPoints) else domain.length,
             "impulse_at": impulse_point,
             "weight": weight,
-            "command_unit": unit,
+            "command_unit": unit_of_commands,
             "units": asdict(units),
             "controlled": list(range(1, control + 1)),
+            "limits": {
+                name: getattr(limits, name) for name in ("effort", "spacing", "peak_force", "condition", "forbidden")
+            },
             "placements": [{IN_JSON.get(name, name): getattr(row, name) for name in WRITTEN} for row in rows],
             "lower_bound": None if certificate is None else certificate.lower_bound,
+            "certified": certificate is not None and certificate.complete and certificate.better is None,
         },
     )
 

@@ -85,6 +85,7 @@ def redesign(
     from workbench.robust.on_rig import Design
     from workbench.robust.redesign import CRITERIA
     from workbench.robust.redesign import redesign as run
+    from workbench.robust.steps import LOSS
     from workbench.study.pages.redesign_page import redesign_page
 
     check_target(json_path, to, page=page)
@@ -125,8 +126,9 @@ def redesign(
     if test.impulse_at is not None:
         size, where = f"{test.impulse:.3g} {found.units.named('N s')}", rig.modes.domain.text(test.impulse_at, 4)
         say(f"  test: an impulse of {size} at {where}, which moves the structure as far as the records did")
-    steps = [(step.name, step.what, step.lost, "yes" if step.kept else "no") for step in result.steps]
-    show_table(("step", "what", "loss", "kept"), steps)
+    steps = [(step.name, step.what, step.lost, step.in_new_controller) for step in result.steps]
+    show_table(("step", "what", "loss", "in the new controller"), steps)
+    say(f"  {LOSS}")
     if result.relocation is not None:
         say(f"  {result.relocation.sentence}")
     for note in result.notes:

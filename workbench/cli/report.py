@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.terminal import guarded, say, short
+from workbench.cli.terminal import check_target, guarded, say, short
 
 
 @guarded
@@ -23,6 +23,7 @@ def report(
     from workbench.study.pages.page import write_page
     from workbench.study.report import page_content_about
 
+    check_target(page=page)
     name, page_content = page_content_about(what)
     say(page_content.title, bold=True)
     for line in (*filter(None, [page_content.lead]), *page_content.lines):

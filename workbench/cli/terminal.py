@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,20 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 FAILURE, BAD_INPUT = 1, 2
-OPTIONS = {"sample_rate_hz": "--sample-rate-hz", "n_modes": "--modes", "band_hz": "--band-hz"}  # by argument
+OPTIONS = {  # by argument, or by its words in a message, a regular expression
+    "sample_rate_hz": "--sample-rate-hz",
+    "n_modes": "--modes",
+    "band_hz": "--band-hz",
+    r"input_hold(?= is zero \(held\))": "--input-hold",  # not the key of a case file
+    "(?<=raise )the limit of effort": "--effort",
+    "the limit of peak force": "--peak-force",
+    "the limit of condition": "--condition",
+    "(?<=lower )the spacing": "--spacing",
+    "the control weight R": "--weight",
+    "the relative error of the models": "--errors",
+    "the damping ratio wanted": "--damping",
+}
+PAGES, FIGURES = (".html", ".htm"), (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".eps", ".ps")
 WIDE = 150  # width of a table written to a file or a pipe
 
 
@@ -31,6 +45,7 @@ errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
 
 def guarded(command: Callable[..., None]) -> Callable[..., None]:
     """The command with exit codes: 2 for bad input, 1 for any other error, each with one line on stderr."""
+    parameters = signature(command).parameters
 
     @wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -41,13 +56,13 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
         except typer.Exit:
             raise
         except (ValueError, OSError, MemoryError) as error:
-            complain(with_notes(error))
+            complain(with_notes(error), parameters)
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt:
             complain("interrupted")
             raise typer.Exit(FAILURE) from None
         except Exception as error:
-            complain(f"{type(error).__name__}: {with_notes(error)}")
+            complain(f"{type(error).__name__}: {with_notes(error)}", parameters)
             raise typer.Exit(FAILURE) from None
 
     return run
@@ -59,10 +74,11 @@ def with_notes(error: BaseException) -> str:
     return f"{error} ({'; '.join(notes)})" if notes else str(error)
 
 
-def complain(fault: str) -> None:
-    """Print an error in one line, with the names of arguments replaced by those of options."""
+def complain(fault: str, parameters: Collection[str] = ()) -> None:
+    """Print an error in one line, with the names of arguments replaced by those of the command's options."""
     for argument, option in OPTIONS.items():
-        fault = re.sub(rf"\b{argument}\b", option, fault)
+        if option.removeprefix("--").replace("-", "_") in parameters:
+            fault = re.sub(rf"\b{argument}\b", option, fault)
     errors.print(f"workbench: {_one_line(fault)}", style="red")
 
 
@@ -143,16 +159,22 @@ def show_table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, right:
     console.print(table)
 
 
-def check_target(*paths: Path | None, page: Path | None = None) -> None:
+def check_target(*paths: Path | None, page: Path | None = None, figure: Path | None = None) -> None:
     """Refuse paths that cannot be written, before the computation.
 
     Args:
         paths: files in folders that exist.
         page: an HTML file, whose folder is made if there is none.
+        figure: an image, of which the suffix alone is checked.
 
     Raises:
-        ValueError: a folder, or a file in a folder that does not exist or cannot be made.
+        ValueError: a folder, a file in a folder that does not exist or cannot be made, or a suffix of another format.
     """
+    if page is not None and not page.is_dir() and page.suffix.lower() not in PAGES:
+        raise ValueError(f"--page writes HTML; name a file such as {page.stem}.html; got {page.name}")
+    if figure is not None and not figure.is_dir() and figure.suffix.lower() not in FIGURES:
+        wanted = f"{', '.join(FIGURES[:-1])} or {FIGURES[-1]}"
+        raise ValueError(f"--figure writes {wanted}; name a file such as {figure.stem}.png; got {figure.name}")
     for path in filter(None, (*paths, page)):
         if path.is_dir():
             raise ValueError(f"{path} is a folder; name a file in it")

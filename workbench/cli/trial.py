@@ -25,7 +25,7 @@ def trial(
     from workbench.draw.trials import plot_confusion
     from workbench.trials.hold import hold_trials
 
-    check_target(json_path)
+    check_target(json_path, figure=picture)
     if cases < 1:
         raise ValueError(f"--cases must be at least 1; got {cases}")
     found = read_case(case)

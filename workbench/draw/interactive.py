@@ -64,7 +64,9 @@ def described(figure: Figure) -> dict[str, Any]:
 
 
 def _panel(ax: Axes, axes: list[Axes], height: float) -> dict[str, Any]:
+    equal = {"equal": True} if ax.get_aspect() == 1.0 else {}  # lengths along both axes to one scale
     return {
+        **equal,
         "title": _text(ax.get_title("left") or ax.get_title()),
         "height": round(ax.get_position().height * height),
         "x": _axis(ax, ax.xaxis, ax.get_shared_x_axes(), axes),

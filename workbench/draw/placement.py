@@ -17,7 +17,7 @@ from workbench.draw.style import COLOURS, GREY, few_ticks, grouped_bars, new_fig
 from workbench.draw.surface import draw_moved, draw_nodal_lines, rest_and_moved
 from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
-from workbench.structure.domain import NamedPoints, Patch, Rectangle, listed
+from workbench.structure.domain import NamedPoints, Patch, Place, Rectangle, listed
 from workbench.structure.printed import counted, place_text
 
 SHOWN_SHARE = 1e-5  # least work that is drawn along a member, over the largest in one mode
@@ -59,32 +59,54 @@ def plot_placement(placement: Placement, *, units: Units = SI) -> Figure:
 
 
 def plot_places(
-    places: Mapping[str, np.ndarray], length: float | Sequence[float] | None = None, *, units: Units = SI
+    places: Mapping[str, np.ndarray],
+    length: float | Sequence[float] | None = None,
+    *,
+    forbidden: Sequence[tuple[Place, Place]] = (),
+    impulse_at: Place | None = None,
+    units: Units = SI,
 ) -> Figure:
-    """Places of each placement along a structure, (n_actuators,), or on a plate, (n_actuators, 2).
+    """Places of each placement along a structure, (n_actuators,), or on a plate, (n_actuators, 2), to scale.
 
     Args:
         places: by the name of the placement, m.
         length: of the structure, or both sides of the plate, m; None leaves the outline out.
+        forbidden: zones without actuators, m.
+        impulse_at: place of the impulse, m, marked by a star.
         units: of the axes.
     """
+    zone: Any = {"facecolor": GREY, "alpha": 0.3, "linewidth": 0}
     if next(iter(places.values())).ndim == 2:
         figure, ax = new_figure(width=6, height=5)
+        for i, (low, high) in enumerate(forbidden):
+            corner, opposite = np.array(low, float), np.array(high, float)
+            box = corner + 0.5 * (1.0 + CORNERS) * (opposite - corner)
+            ax.fill(*box.T, **zone, label="forbidden" if i == 0 else None)
         for (name, positions), marker in zip(places.items(), "osD^v"):
             ax.plot(*positions.T, marker, label=name, markersize=9, clip_on=False, zorder=3)
+        if impulse_at is not None:
+            ax.plot(*np.array(impulse_at, float), **IMPULSE, zorder=3)
         if length is not None:
-            ax.fill(*(0.5 * (1.0 + CORNERS) * np.array(length)).T, facecolor="none", edgecolor=GREY)
+            outline = 0.5 * (1.0 + CORNERS[[0, 1, 2, 3, 0]]) * np.array(length)
+            ax.plot(*outline.T, color=GREY, linewidth=1.0)
         ax.set(xlabel=units.named("x [m]"), ylabel=units.named("y [m]"), title="places of the actuators")
         ax.set_aspect("equal")
         ax.legend(**BELOW)
         return figure
-    figure, ax = new_figure(width=9, height=1.4 + 0.5 * len(places))
+    rows = [*places, *(["impulse"] if impulse_at is not None else [])]
+    figure, ax = new_figure(width=9, height=1.4 + 0.5 * len(rows))
+    for i, (low, high) in enumerate(forbidden):
+        ax.axvspan(low, high, **zone, label="forbidden" if i == 0 else None)
     for row, (positions, colour) in enumerate(zip(places.values(), COLOURS)):
         ax.plot(positions, np.full(len(positions), row), "^", color=colour, markersize=9)
+    if impulse_at is not None:
+        ax.plot(impulse_at, len(places), **{**IMPULSE, "label": None})
     if length is not None:
         ax.set_xlim(np.array((-0.02, 1.02)) * length)
-    ax.set_yticks(range(len(places)), list(places))
-    ax.set(xlabel=units.named("x [m]"), ylim=(len(places) - 0.5, -0.5), title="places of the actuators")
+    if forbidden:
+        ax.legend(loc="upper right")
+    ax.set_yticks(range(len(rows)), rows)
+    ax.set(xlabel=units.named("x [m]"), ylim=(len(rows) - 0.5, -0.5), title="places of the actuators")
     return figure
 
 

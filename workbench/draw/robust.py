@@ -10,6 +10,7 @@ from workbench.draw.style import COLOURS, GREY, in_units, new_figure, plain_tick
 from workbench.records.record import Record
 from workbench.robust.prediction import Prediction, amplitudes
 from workbench.robust.redesign import Redesign
+from workbench.robust.steps import LOSS
 from workbench.robust.verification import LEVEL, SETTLED, interval
 
 OLD, NEW = COLOURS[1], COLOURS[0]
@@ -61,7 +62,7 @@ def plot_steps(result: Redesign) -> Figure:
         ax.annotate(step.lost, (losses[i], i), (4, 0), textcoords="offset points", va="center", fontsize=8)
     ax.set_yticks(range(len(names)), names)
     ax.set(ylim=(len(names) - 0.5, -0.5), xlim=(0, 1.25 * max(*losses, 1e-6)))
-    ax.set_xlabel("vibration and effort above the ideal [%]")
+    ax.set_xlabel(f"{LOSS} [%]")
     return figure
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from workbench.renamed import Renamed
 from workbench.structure.domain import Where, place_array, same_place
 from workbench.structure.modes import frozen
-from workbench.structure.printed import Printed, counted, place_text
+from workbench.structure.printed import Constructed, Printed, counted, place_text
 
 if TYPE_CHECKING:
     import control  # takes seconds to import: most who read a record never need it
@@ -30,8 +30,8 @@ QUANTITIES = {
 SAME = 1e-5  # rms difference of one measurement written twice, to six digits or more, over its rms
 
 
-@dataclass(frozen=True)
-class Channel:
+@dataclass(frozen=True, repr=False)
+class Channel(Constructed):
     """One signal of a record.
 
     Attributes:
@@ -55,6 +55,9 @@ class Channel:
             raise ValueError(f"channel {self.name!r}: noise_std must be 0 or more; got {self.noise_std}")
         object.__setattr__(self, "unit", self.unit or QUANTITIES.get(self.quantity, ""))
         object.__setattr__(self, "at", None if self.at is None else same_place(self.at))
+
+    def _derived(self) -> tuple[str, ...]:
+        return ("unit",) if self.unit == QUANTITIES.get(self.quantity) else ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -7,10 +7,11 @@ import numpy as np
 
 from workbench.renamed import Renamed, former_arguments
 from workbench.structure.domain import Between, Patch, Place, PlaceError, Where, centred_at, same_place
+from workbench.structure.printed import Constructed
 
 
-@dataclass(frozen=True)
-class Actuator:
+@dataclass(frozen=True, repr=False)
+class Actuator(Constructed):
     """An actuator that exerts a force or a moment.
 
     A command u passes hysteresis, gain, dead zone, saturation, rate limit, delay, lag and bias, in that order.

@@ -6,6 +6,7 @@ import numpy as np
 
 from workbench.renamed import Renamed
 from workbench.structure.domain import Place, same_place
+from workbench.structure.printed import Constructed
 
 # quantity: (derivative along x, derivative in time)
 MEASURED = {
@@ -17,8 +18,8 @@ MEASURED = {
 }
 
 
-@dataclass(frozen=True)
-class Sensor:
+@dataclass(frozen=True, repr=False)
+class Sensor(Constructed):
     """A sensor at a point.
 
     The measured quantity passes cross-talk, delay, lag, gain, bias and drift, noise, clipping and rounding, in that

@@ -211,8 +211,8 @@ class Redesign:
             middle, low, high = interval(getattr(verification, self._settling))
             if not np.isfinite(high):
                 return self._settles(middle)
-            ends = "the same in all samples" if f"{low:.3g}" == f"{high:.3g}" else f"{lead}{low:.3g} to {high:.3g}"
-            return f"{'settles in ' * named}{middle:.3g} {self.units.time} ({ends})"
+            ends = "" if f"{low:.3g}" == f"{high:.3g}" else f" ({lead}{low:.3g} to {high:.3g})"
+            return f"{'settles in ' * named}{middle:.3g} {self.units.time}{ends}"
         ratios = _ratios(verification.damping[:, self.mode], lead)
         return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
 
@@ -347,11 +347,11 @@ def _percent(share: float) -> str:
 
 
 def _ratios(values: np.ndarray, lead: str) -> str:
-    """Median and 95 % interval in per cent as text, with two to four digits until the ends differ."""
+    """Median and 95 % interval in per cent as text, with two or three digits; the median alone where the ends agree."""
     middle, low, high = (100.0 * v for v in interval(values))
-    digits = next((n for n in (2, 3, 4) if _rounded(low, n) != _rounded(high, n)), 0)
+    digits = next((n for n in (2, 3) if _rounded(low, n) != _rounded(high, n)), 0)
     if not digits:
-        return f"{_rounded(middle, 3)} % (the same in all samples)"
+        return f"{_rounded(middle, 3)} %"
     return f"{_rounded(middle, digits)} % ({lead}{_rounded(low, digits)} to {_rounded(high, digits)})"
 
 

@@ -20,6 +20,7 @@ from workbench.robust.small_motion import loop_poles
 from workbench.robust.verification import settling
 
 AWAY = 1e3  # loss above which the motion is called divergent
+LOSS = "loss: vibration and effort above those with perfect actuators and sensors"
 LEAST_SHOWN = 1e-4  # loss below which its size is not stated
 GAINED = 0.005  # least reduction of the loss by a step; least change of the cost for a change of the controller
 # factors of the control weight, and of the noise of the Kalman filter, that are tried
@@ -67,6 +68,11 @@ class Step:
     def diverges(self) -> bool:
         """Whether the motion grows so far that the loss is not stated in per cent."""
         return not self.loss < AWAY
+
+    @property
+    def in_new_controller(self) -> str:
+        """Whether the new controller has the step, as text; empty for the present controller."""
+        return "" if self.name == "present" else "yes" if self.kept else "no"
 
     @property
     def lost(self) -> str:

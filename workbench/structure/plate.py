@@ -2,16 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes
+from workbench.structure.printed import Printed
 from workbench.structure.profile import Field, FieldLike, as_field
 from workbench.structure.supports import (
     HELD,
+    NAMED_EDGES,
     SIDES,
     Attachment,
     Edge,
@@ -28,17 +30,30 @@ SAMPLES = 41  # per side, at which a field is checked to be positive
 SAME_POINT = 1e-6  # of a side: attachments nearer to one another are at one point
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Surface:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class _Surface(Printed):
     length: tuple[float, float]
     mass_per_area: Field
     edges: Mapping[str, Edge] = field(default_factory=dict)
     damping: Damping = field(default_factory=ModalDamping)
 
+    _held: ClassVar[str]  # name of an edge without displacement
+
     @property
     def domain(self) -> Rectangle:
         """The rectangle of the surface."""
         return Rectangle(self.length)
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        sides = np.multiply.outer([0.0, 0.5, 1.0], self.length)
+        quantities = {name: value for name, value in vars(self).items() if isinstance(value, Field)}
+        rows = [(name, *(f"{v:.4g}" for v in quantity(*sides.T))) for name, quantity in quantities.items()]
+        edges = {side: _edge_text(edge, self._held) for side, edge in self.edges.items()}
+        alike = len(set(edges.values())) == 1
+        around = f"all edges {edges['left']}" if alike else ", ".join(f"{side} {edge}" for side, edge in edges.items())
+        line = f"{type(self).__name__.lower()}, {self.length[0]:g} by {self.length[1]:g} m, {around}"
+        headings = ("", *(f"at {x:.4g}, {y:.4g} m" for x, y in sides))
+        return line, headings, rows, tuple(map(str, getattr(self, "attachments", ())))
 
     def _prepare(self, allowed_edges: tuple[str, ...], names: tuple[str, ...]) -> None:
         object.__setattr__(self, "length", Rectangle(self.length).length)
@@ -77,7 +92,7 @@ class _Surface:
         return Modes(omega=found.omega, damping=damping, shapes=found.shapes, domain=self.domain)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Plate(_Surface):
     """A thin rectangular plate in bending (Kirchhoff), of strain energy
 
@@ -105,6 +120,13 @@ class Plate(_Surface):
     poisson_ratio: float
     attachments: tuple[Attachment, ...] = ()
     tension: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    _held = "simply supported"
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        line, *table = super()._printed()
+        pulled = f", tension {', '.join(f'{pull:g}' for pull in self.tension)} N/m" if any(self.tension) else ""
+        return f"{line}, Poisson's ratio {self.poisson_ratio:g}{pulled}", *table  # type: ignore[return-value]
 
     if TYPE_CHECKING:  # the arguments may have short forms, which become `Field`, `Edge` and a triple
 
@@ -312,7 +334,7 @@ def bending_squares(rigidity: Field, poisson_ratio: float) -> tuple[Square, ...]
     )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Membrane(_Surface):
     """A rectangular membrane: ω² m w = -∇·(T ∇w).
 
@@ -330,6 +352,8 @@ class Membrane(_Surface):
     """
 
     tension: Field
+
+    _held = "fixed"
 
     if TYPE_CHECKING:
 
@@ -368,6 +392,13 @@ class Membrane(_Surface):
             scale=self._mean(self.tension) / self._mean(self.mass_per_area) * np.pi**2 / (a * b),
         )
         return self._solved(problem, n_modes, tolerance)
+
+
+def _edge_text(edge: Edge, held: str) -> str:
+    """Text of an edge: its name, `held` where it is without displacement alone, or its stiffnesses."""
+    names = {known: name for name, known in NAMED_EDGES.items() if name not in ("fixed", "simply supported")}
+    names[NAMED_EDGES["fixed"]] = held
+    return names.get(edge, f"on springs of {edge.translation:g} N/m² and {edge.rotation:g} N")
 
 
 def _breaks(*fields: Field) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -1,6 +1,7 @@
 """Printing of results: a summary line and a short table, as text and in a notebook."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import fields
 from functools import wraps
 from html import escape
 from math import isfinite
@@ -48,6 +49,29 @@ class Printed:
         below = "".join(f"<p>{escape(remark)}</p>" for remark in remarks)
         table = f"<table><tr>{head}</tr>{body}</table>" if rows or not line else ""
         return f"{f'<p>{escape(line)}</p>' if line else ''}{table}{below}"
+
+
+class Constructed:
+    """A dataclass that prints as a call of its constructor, with the arguments that differ from their defaults."""
+
+    def __repr__(self) -> str:
+        given = []
+        for each in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, each.name)
+            if value != each.default and each.name not in self._derived():
+                given.append(f"{each.name}={argument_text(value)}")
+        return f"{type(self).__name__}({', '.join(given)})"
+
+    def _derived(self) -> Collection[str]:
+        """Names of fields that follow from others and are left out."""
+        return ()
+
+
+def argument_text(value: object) -> str:
+    """The `repr` of an argument, with six digits of each float."""
+    if isinstance(value, tuple):
+        return f"({', '.join(map(argument_text, value))}{',' * (len(value) == 1)})"
+    return f"{value:.6g}" if isinstance(value, float) else repr(value)
 
 
 def rounded(value: float) -> float | None:
@@ -100,6 +124,12 @@ def command_headings(unit: str) -> tuple[str, str]:
         f"effort [{'N² s' if unit == 'N' else f'({unit})² s'}]",
         f"peak {'force' if unit == 'N' else 'moment'} [{unit}]",
     )
+
+
+def in_unit(value: float, heading: str) -> str:
+    """A value to four digits with the unit of its heading: "effort [N² s]" and 12.0912 give "12.09 N² s"."""
+    _, bracket, unit = heading.partition(" [")
+    return f"{value:.4g} {unit[:-1]}" if bracket else f"{value:.4g}"
 
 
 def place_text(place: object) -> str:

@@ -22,7 +22,7 @@ from workbench.records.transfer_functions import TransferFunctions
 from workbench.records.units import Units
 from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
-from workbench.structure.printed import command_headings, counted, places_text
+from workbench.structure.printed import command_headings, counted, joined_in_words, places_text
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
 from workbench.study.pages.page import (
@@ -227,7 +227,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         ]
         for one in through
     ]
-    heads = ("controller", "decay rate [1/s]", "loop", "residual mode that limits it", "path", ROBUSTNESS)
+    heads = ("controller", "decay rate, -max Re λ [1/s]", "loop", "limiting residual mode, Re λ", "path", ROBUSTNESS)
     filled = [i for i in range(len(heads)) if i < 3 or any(row[i] != "" for row in sensed)]
     sensed = [[row[i] for i in filled] for row in sensed]
     seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}
@@ -282,7 +282,7 @@ def _stability(loops: Sequence[tuple[str, str]]) -> str:
 def _placed(content: dict[str, Any]) -> dict[str, Any]:
     """Actuator placements."""
     placements, units = content["placements"], _units_of(content)
-    names = ["optimum", *(str(one["status"]) for one in placements[1:])]
+    names = ["best found", *(str(one["status"]) for one in placements[1:])]
     places = {name: np.array(one["positions"]) for name, one in zip(names, placements, strict=True)}
     are_points = next(iter(places.values())).dtype.kind == "U"
     texts = [places_text(at) for at in places.values()]
@@ -292,24 +292,42 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         for name, one, text in zip(names, placements, texts, strict=True)
     ]
     first, bound = placements[0]["residual_work"], content.get("lower_bound")
-    length, energy = "" if are_points else f" {units.length}", units.named("J")
+    energy, found = units.named("J"), joined_in_words([_place_words(at, units) for at in placements[0]["positions"]])
     proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g} {energy}."
-    lead = f"Actuators at {texts[0]}{length} leave spillover work W_R = {float(first):.4g} {energy}.{proof}"
+    lead = f"Actuators at {found} leave spillover work W_R = {float(first):.4g} {energy}.{proof}"
+    impulse_at, zones = content.get("impulse_at"), content.get("limits", {}).get("forbidden", ())
+    lines = [f"The search: {placements[0]['status']}."]
+    if impulse_at is not None:
+        lines.insert(0, f"Unit impulse at {_place_words(impulse_at, units)}.")
+    if zones:
+        ends = [" to ".join(_place_words(end, units) for end in zone) for zone in zones]
+        lines.insert(-1, f"Forbidden zone{'s' * (len(ends) > 1)}: {joined_in_words(ends)}.")
     work = plot_work_linear(works, first=len(content.get("controlled", ())), units=units)
     blocks = [block(work, "Spillover work of each placement in each residual mode.")]
     if not are_points:
-        where = plot_places(places, content.get("length"), units=units)
-        blocks.insert(0, block(where, "Positions of the actuators."))
+        where = plot_places(places, content.get("length"), forbidden=zones, impulse_at=impulse_at, units=units)
+        also = ["positions of the actuators", *["the place of the impulse"] * (impulse_at is not None)]
+        also += ["the forbidden zones, grey"] * bool(zones)
+        words = joined_in_words(also)
+        blocks.insert(0, block(where, f"{words[:1].upper()}{words[1:]}."))
     numbers = ("W_R [J]", *command_headings(str(content.get("command_unit", "N"))), "condition number of B")
     headings = ("placement", *map(units.named, (*numbers, "points" if are_points else "places [m]")))
     return {
         "title": "Actuator placement",
         "lead": lead,
-        "standing": "good" if bound is not None else "",
-        "lines": [f"The search: {placements[0]['status']}."],
+        "standing": "good" if content.get("certified", bound is not None) else "",
+        "lines": lines,
         "blocks": blocks,
         "tables": [("Placements", headings, rows)],
     }
+
+
+def _place_words(at: Any, units: Units) -> str:
+    """A place in words: a name, "0.34 m" or "(0.34, 0.5) m"."""
+    if isinstance(at, str):
+        return at
+    numbers = ", ".join(f"{float(x):.3g}" for x in np.atleast_1d(at))
+    return f"({numbers}) {units.length}" if np.ndim(at) else f"{numbers} {units.length}"
 
 
 def _units_of(content: Mapping[str, Any]) -> Units:

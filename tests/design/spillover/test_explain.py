@@ -433,4 +433,4 @@ def test_the_dominant_path_of_a_pole_that_moves_left_is_what_moves_it():
     controller = luenberger_controller(modes, law, sensors, poles=modes.omega[:2] * (-0.3 + 1j))
     third = next(shift for shift in explain_spillover(modes, controller).shifts if shift.mode == 2)
     assert third.shift.real < 0.0
-    assert third.dominant.text == "1.2 to F1" and third.dominant.shift.real < 0.7 * third.shift.real
+    assert third.dominant.text == "v → F1" and third.dominant.shift.real < 0.7 * third.shift.real

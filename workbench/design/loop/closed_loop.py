@@ -20,7 +20,7 @@ from workbench.renamed import Renamed
 from workbench.rig.statespace import modal_plant, signal_names
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze, frozen
-from workbench.structure.printed import counted, place_text
+from workbench.structure.printed import Printed, counted, place_text
 
 UNSEEN = 1e-9  # response of a modal filter to a mode, below which the mode is unobservable
 WELL_CONDITIONED = 1e6  # condition number of eigenvectors up to which the closed form is used
@@ -44,8 +44,8 @@ def rounding(poles: np.ndarray) -> float:
     return float(ON_AXIS * max(np.abs(poles).max(), 1.0))
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedLoop:
+@dataclass(frozen=True, eq=False, repr=False)
+class ClosedLoop(Printed):
     """The closed loop x' = A x of all modes under the forces u = -K x̂.
 
     The state x holds (q, q') of every mode, then lags and delays (see `delay_line`) of actuators and sensors, then an
@@ -65,6 +65,17 @@ class ClosedLoop:
 
     def __post_init__(self) -> None:
         freeze(self, "matrix", "feedback")
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        further = len(self.matrix) - 2 * self.modes.n_modes
+        of = counted(self.modes.n_modes, "mode") + (f" and {counted(further, 'further state')}" if further else "")
+        one_of_pair = self.poles[self.poles.imag >= 0]
+        rows = [
+            (f"{abs(s) / (2.0 * np.pi):.4g}", f"{-100.0 * s.real / abs(s):.4g}" if s else "", f"{s.real:.4g}")
+            for s in sorted(one_of_pair, key=abs)
+        ]
+        line = f"closed loop of {of}: {self.stability_text}"
+        return line, ("frequency [Hz]", "damping ratio [%]", "Re λ [1/s]"), rows, ()
 
     @cached_property
     def poles(self) -> np.ndarray:
@@ -92,6 +103,15 @@ class ClosedLoop:
         """
         by_poles = stability(self.poles)
         return DRIFTS if by_poles != "unstable" and self._drifts() else by_poles
+
+    @property
+    def stability_text(self) -> str:
+        """Stability, with the decay or growth rate."""
+        rate = {
+            "stable": f", decay rate {self.decay_rate:.3g} 1/s",
+            "unstable": f", growth rate {-self.decay_rate:.3g} 1/s",
+        }
+        return self.stability + rate.get(self.stability, "")
 
     @property
     def stable(self) -> bool:
@@ -142,8 +162,8 @@ class ClosedLoop:
         return reached
 
 
-@dataclass(frozen=True, eq=False)
-class Response:
+@dataclass(frozen=True, eq=False, repr=False)
+class Response(Printed):
     """Modal motion and actuator forces over time.
 
     Attributes:
@@ -160,6 +180,20 @@ class Response:
 
     def __post_init__(self) -> None:
         freeze(self, "time", "modal", "forces")
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        line = f"response of {counted(self.modes.n_modes, 'mode')} with {counted(len(self.forces), 'actuator')}"
+        if not self.time.size:
+            return f"{line}, no instants", (), (), ()
+        line += f" over {self.time[-1] - self.time[0]:.4g} s, {counted(self.time.size, 'instant')}"
+        rows = [
+            (str(r + 1), f"{hz:.4g}", *(f"{value:.4g}" for value in (energy[0], energy.max(), energy[-1])))
+            for r, (hz, energy) in enumerate(zip(self.modes.frequencies_hz, self.energy, strict=True))
+        ]
+        largest_forces = ", ".join(f"{peak:.4g}" for peak in np.abs(self.forces).max(axis=1))
+        remarks = (f"largest command of each actuator: {largest_forces}",) if len(self.forces) else ()
+        headings = ("mode", "frequency [Hz]", "energy at the start [J]", "largest [J]", "at the end [J]")
+        return line, headings, rows, remarks
 
     def displacement(self, x: ArrayLike) -> Floats:
         """w(x, t): (n_points, n_times)."""

@@ -66,15 +66,22 @@ class Certificate:
         return 1.0 - self.lower_bound / self.placement.residual_work
 
     def __str__(self) -> str:
+        return self.text()
+
+    def text(self, energy: str = "J", length: str = "m") -> str:
+        """The certificate in words, with the names of the units."""
         count = f"{self.cells:,} cells, {self.seconds:.0f} s"
         if self.better is not None:
-            unit = "" if self.better.dtype == object else " m"
-            return f"not the optimum: actuators at {places_text(self.better)}{unit} have less residual work ({count})"
-        text = f"no placement under the limits has less than {1.0 - self.gap:.1%} of its residual work ({count})"
+            unit = "" if self.better.dtype == object else f" {length}"
+            return f"not the optimum: actuators at {places_text(self.better)}{unit} have less W_R ({count})"
+        bound, percent = f"{self.lower_bound:.4g} {energy}", f"{100.0 * self.gap:.2g} %"
+        less = "that of the one found" if self.gap <= 0 else f"{percent} under that of the one found"
+        text = f"{'certified' if self.complete else 'proven so far'}: no placement within the limits has W_R below"
+        text += f" {bound}, {less} ({count})"
         if self.cell is None:
             return text
         where = "; ".join(f"{low:.4g} to {high:.4g}" for low, high in self.cell)
-        return f"{text}; the lowest bound is that of actuators at {where} m"
+        return f"{text}; the lowest bound is that of actuators at {where} {length}"
 
 
 @former_arguments(most_cells="max_cells")

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from itertools import combinations
 from typing import Any, ParamSpec, TypeVar
 from warnings import warn
@@ -13,7 +13,9 @@ from workbench.design.laws.law import DesignError
 from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
 from workbench.renamed import Renamed, former_arguments
+from workbench.rig.actuators import command_unit
 from workbench.structure.domain import Interval, NamedPoints, Place, Rectangle, position, reach, same_place
+from workbench.structure.printed import Constructed, command_headings, in_unit
 
 TOLERANCE = 2e-6  # relative, of a limit
 APART = 1e-6  # of the length: least distance of two actuators
@@ -27,8 +29,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-@dataclass(frozen=True)
-class Limits:
+@dataclass(frozen=True, repr=False)
+class Limits(Constructed):
     """Constraints of a placement.
 
     Attributes:
@@ -217,25 +219,28 @@ def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None
     within = {name: excess <= TOLERANCE for name, excess in violations.items()}
     measured = {"effort": costs.effort, "peak force": costs.peak_force, "condition": costs.condition}
     given = {"effort": limits.effort, "peak force": limits.peak_force, "condition": limits.condition}
+    headings = (*command_headings(command_unit([task.actuator])), "")
+    worded = {name: partial(in_unit, heading=heading) for name, heading in zip(measured, headings, strict=True)}
     head = f"no placement of {n} actuators meets the limits"
     spaced, with_spacing, lower = within["spacing"], "", ""
     if limits.spacing > 0:
-        with_spacing, lower = f" with spacing {limits.spacing:g}", " or lower the spacing"
+        with_spacing, lower = f" with a spacing of {limits.spacing:g} m", " or lower the spacing"
     if not spaced.any():
-        return f"{head}: spacing {limits.spacing:g} leaves no room; lower it"
+        return f"{head}: a spacing of {limits.spacing:g} m leaves no room; lower the spacing"
     for name, values in measured.items():
         if not (within[name] & spaced).any():
             least = values[spaced].min()
             return (
-                f"{head}: {name} limit {given[name]:.4g}{with_spacing}; the least found was {least:.4g}: raise the"
-                f" limit{lower}"
+                f"{head}: the limit of {name} is {worded[name](given[name])}{with_spacing}, and the least found was"
+                f" {worded[name](least)}: raise the limit of {name}{lower}"
             )
     for one, other in combinations(measured, 2):
         if not (within[one] & within[other] & spaced).any():
             least = measured[other][within[one] & spaced].min()
             return (
-                f"{head}: {one} {given[one]:.4g} and {other} {given[other]:.4g} conflict; with the first the least"
-                f" {other} found was {least:.4g}: raise one of them"
+                f"{head}: the limit of {one}, {worded[one](given[one])}, and the limit of {other},"
+                f" {worded[other](given[other])}, conflict; with the first the least {other} found was"
+                f" {worded[other](least)}: raise one of them"
             )
     return f"{head} together, though any two can be met; raise one of them"
 

@@ -20,7 +20,7 @@ from workbench.design.loop.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.design.spillover.spillover import settled_moments
 from workbench.renamed import Renamed, former_arguments
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, command_unit
 from workbench.rig.rig import Rig
 from workbench.structure.domain import (
     Between,
@@ -34,7 +34,7 @@ from workbench.structure.domain import (
     reach,
 )
 from workbench.structure.modes import Modes, freeze, frozen, modal_state_matrix
-from workbench.structure.printed import Printed, place_text
+from workbench.structure.printed import Printed, command_headings, in_unit, place_text
 
 SINGULAR_SHARE = 1e-14  # of the product of B's row lengths: |det B| below which B counts as singular
 SHOWN_INSTANTS = 240  # at which modal forces are sampled
@@ -88,13 +88,15 @@ class Placement(Printed):
         if self.law is not None:
             names = [actuator.name for actuator in self.law.actuators]
         n_controlled = count if self.law is None else self.law.n_controlled
-        line = f"{count} actuator{'s' * (count > 1)} placed: W_R = {self.residual_work:.4g}, effort {self.effort:.4g}"
+        effort, peak = command_headings("" if self.law is None else command_unit(self.law.actuators))
+        line = f"{count} actuator{'s' * (count > 1)} placed: W_R = {self.residual_work:.4g} J"
+        line += f", effort {in_unit(self.effort, effort)}"
         rows = [(name, place_text(x)) for name, x in zip(names, listed(self.positions), strict=True)]
         most = int(np.argmax(self.residual_work_by_mode))
         remarks = (
-            f"largest W_r = {self.residual_work_by_mode[most]:.4g}, in mode {n_controlled + most + 1}; peak force"
-            f" {self.peak_force:.4g}; condition of B {self.condition:.3g}",
-            *((f"search: {self.status}",) if self.status else ()),
+            f"largest W_r = {self.residual_work_by_mode[most]:.4g} J, in mode {n_controlled + most + 1};"
+            f" {peak.partition(' [')[0]} {in_unit(self.peak_force, peak)}; condition number of B {self.condition:.3g}",
+            *((f"{'search' if self.local_optima else 'places'}: {self.status}",) if self.status else ()),
             *((f"patches overlap; {SPREAD}",) if self.overlapping else ()),
         )
         named = self.positions.dtype == object

@@ -46,17 +46,21 @@ class Path:
         sensor_at: place of the sensors; all channels there count together.
         shift: its term of the exact shift, rad/s; the real part adds to the growth rate.
         first_order: its term of the first-order shift, rad/s; nan for a double pole (a rigid mode, or ζ = 1).
+        sensors: names of the channels at that place.
     """
 
     actuator: str
     sensor_at: Place
     shift: complex
     first_order: complex
+    sensors: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
-        """The path in words: sensor place to actuator."""
-        return f"{place_text(self.sensor_at)} to {self.actuator}"
+        """The path in words, from the sensor, by its name or, where several channels are there, its place."""
+        unit = "" if isinstance(self.sensor_at, str) else " m"
+        start = self.sensors[0] if len(self.sensors) == 1 else f"sensors at {place_text(self.sensor_at)}{unit}"
+        return f"{start} → {self.actuator}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +122,6 @@ class Explanation(Printed):
         return first if first and first.closed_pole.real == self.poles.real.max() else None
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        rate = {
-            "stable": f", decay rate {self.decay_rate:.3g} 1/s",
-            "unstable": f", growth rate {-self.decay_rate:.3g} 1/s",
-        }
-        state = self.loop.stability + rate.get(self.loop.stability, "")
         rows = [
             (
                 str(each.mode + 1),
@@ -145,7 +144,8 @@ class Explanation(Printed):
             "Re λ, closed loop [1/s]",
             "dominant path",
         )
-        return f"closed loop of {counted(self.loop.modes.n_modes, 'mode')}: {state}", headings, rows, remarks
+        line = f"closed loop of {counted(self.loop.modes.n_modes, 'mode')}: {self.loop.stability_text}"
+        return line, headings, rows, remarks
 
     @property
     def poles(self) -> np.ndarray:
@@ -272,7 +272,9 @@ class _ResidualMode:
         for j, actuator in enumerate(self._controller.law.actuators):
             for place in self._controller.places:
                 here = [sensor.at == place for sensor in self._controller.sensors]
-                paths.append(Path(actuator.name, place, complex(exact[j, here].sum()), complex(first[j, here].sum())))
+                names = tuple(sensor.name for sensor in self._controller.sensors if sensor.at == place)
+                shift, first_order = complex(exact[j, here].sum()), complex(first[j, here].sum())
+                paths.append(Path(actuator.name, place, shift, first_order, names))
         return PoleShift(self._r, self._pole, closed, tuple(sorted(paths, key=lambda path: -path.shift.real)))
 
     def _terms(self, s: complex) -> Complexes:

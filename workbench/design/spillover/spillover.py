@@ -79,12 +79,12 @@ class Spillover(Printed):
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         until = "for all time" if np.isinf(self.final_time) else f"until {self.final_time:g} s"
-        line = f"work of the actuators {until}: W_C = {self.controlled_work:.4g}, W_R = {self.residual_work:.4g}"
+        line = f"work of the actuators {until}: W_C = {self.controlled_work:.4g} J, W_R = {self.residual_work:.4g} J"
         rows = [
             (str(r + 1), "controlled" if r in self.controlled else "residual", f"{work:.4g}")
             for r, work in enumerate(self.work_by_mode)
         ]
-        return line, ("mode", "", "W_r"), rows, ()
+        return line, ("mode", "", "W_r [J]"), rows, ()
 
 
 Spillover.__init__ = former_arguments(by_mode="work_by_mode")(Spillover.__init__)  # type: ignore[method-assign]

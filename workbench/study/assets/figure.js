@@ -165,6 +165,12 @@ var workbench = (function () {
       // room for half the width of the last number
       var over = ticks(p.x, panel.x, wanted).map(function (t) { return X(t[0]) + 0.5 * textWidth(t[1]) - width; });
       right -= Math.max(0, Math.max.apply(null, over.concat([0])));
+      if (p.equal) {  // lengths along both axes to one scale: the frame shrinks
+        var across = (right - left) / (panel.x[1] - panel.x[0]), up = (bottom - top) / (panel.y[1] - panel.y[0]);
+        right = left + Math.min(across, up) * (panel.x[1] - panel.x[0]);
+        top = bottom - Math.min(across, up) * (panel.y[1] - panel.y[0]);
+        Y = scale(panel.y, p.y.log, bottom, top);
+      }
       X = scale(panel.x, p.x.log, left, right);
       panel.frame = { left: left, right: right, top: top, bottom: bottom, X: X, Y: Y };
       panel.hits = [];

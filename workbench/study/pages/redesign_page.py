@@ -14,6 +14,7 @@ from workbench.draw.style import COLOURS, new_figure
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
 from workbench.robust.redesign import Redesign
+from workbench.robust.steps import LOSS
 from workbench.robust.verification import Verification, displacement_at, interval
 from workbench.structure.domain import NamedPoints
 from workbench.study.pages.page import PageContent, Table, block, write_page
@@ -48,15 +49,12 @@ def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, fol
     )
     blocks.append(block(plot_redesign(found), compared))
     if max(s.loss for s in found.steps) > NEGLIGIBLE:
-        stepwise = (
-            "From the present controller to the redesigned one, step by step: the excess of vibration and effort"
-            " over the redesigned law with perfect actuators and sensors."
-        )
+        stepwise = f"From the present controller to the redesigned one, step by step: the {LOSS}."
         blocks.append(block(plot_steps(found), stepwise))
-    steps = [(s.name, s.what, s.lost, "yes" if s.kept else "no") for s in found.steps]
+    steps = [(s.name, s.what, s.lost, s.in_new_controller) for s in found.steps]
     tables: list[Table] = [
         ("On the same samples: median (95 % interval)", ("", "present", "redesigned"), _figures(found)),
-        ("Steps", ("step", "what", "loss", "kept"), steps),
+        ("Steps", ("step", "what", "loss", "in the new controller"), steps),
     ]
     used = found.verification if found.improves else found.present_verification
     moved = [] if found.relocation is None else [found.relocation.sentence]
@@ -100,8 +98,8 @@ def _figures(found: Redesign) -> list[tuple[str, ...]]:
 
 
 def _rounded(values: np.ndarray) -> str:
-    middle, low, high = interval(values)
-    return f"{middle:.3g} ({low:.3g} to {high:.3g})"
+    middle, low, high = (f"{value:.3g}" for value in interval(values))
+    return middle if low == high else f"{middle} ({low} to {high})"
 
 
 def _margin(verification: Verification) -> str:
@@ -121,7 +119,8 @@ def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
     old, new = run_loop(rig, found.present, test), run_loop(rig, found.redesigned, test)
     if not (old.bounded or new.bounded):
         return []
-    caption = f"Under the inputs of the measured record {record.name or ''}".rstrip()
+    name = f" “{record.name}”" if record.name else ""
+    caption = f"Under the inputs of the measured record{name}"
     shown = []
     domain = rig.modes.domain
     placed = not (isinstance(domain, NamedPoints) and domain.positions is None)
