@@ -53,8 +53,10 @@ def plot_placement(placement: Placement, *, units: Units = SI) -> Figure:
     numbers = len(placement.positions) + 1 + np.arange(placement.residual_work_by_mode.size)
     ax.bar(numbers, placement.residual_work_by_mode)
     where = "; ".join(place_text(place) for place in listed(placement.positions))
+    where += "" if placement.positions.dtype.kind == "U" else f" {units.named('m')}"
     ax.set(xlabel="residual mode", ylabel=units.named("spillover work, W_r [J]"), xticks=few_ticks(numbers))
-    ax.set_title(f"actuators at {where}: W_R = {placement.residual_work:.3g}, effort {placement.effort:.3g}")
+    work, spent = f"{placement.residual_work:.3g}", f"{placement.effort:.3g}"
+    ax.set_title(f"actuators at {where}: W_R = {units.named(f'{work} J')}, effort {units.named(f'{spent} N² s')}")
     return figure
 
 
@@ -114,7 +116,7 @@ def plot_member_placement(
         left.axvspan(low, high, facecolor="white", edgecolor=GREY, hatch="////", label="forbidden" if i == 0 else None)
     half = 0.5 * extent(task.actuator)
     for i, (name, placement) in enumerate(placements.items()):
-        look = {"fmt": "o", "color": COLOURS[i], "markersize": 8, "label": _with_work(name, placement)}
+        look = {"fmt": "o", "color": COLOURS[i], "markersize": 8, "label": _with_work(name, placement, units)}
         left.errorbar(placement.positions, np.full(n, -1.25 - 0.2 * i), xerr=half, **look)
     if impulse_at is not None:
         left.plot(impulse_at, 1.2, **IMPULSE)
@@ -155,7 +157,7 @@ def plot_surface_placement(
         look = {
             "color": COLOURS[i],
             "markersize": 10,
-            "label": _with_work(name, placement),
+            "label": _with_work(name, placement, units),
             "zorder": 3,
             "clip_on": False,
         }
@@ -178,8 +180,8 @@ def plot_surface_placement(
     return figure
 
 
-def _with_work(name: str, placement: Placement) -> str:
-    return f"{name}: W_R = {placement.residual_work:.2g}"
+def _with_work(name: str, placement: Placement, units: Units) -> str:
+    return f"{name}: W_R = {placement.residual_work:.2g} {units.named('J')}"
 
 
 def _draw_works(
