@@ -217,7 +217,15 @@ def plot_designs(rows, figures, title):
                 ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             ax.xaxis.set_minor_formatter(NullFormatter())
         for law in set(laws) - {row["law"] for row in rows if row[key] is not None}:
-            ax.text(0.5, laws.index(law), "not applicable", transform=ax.get_yaxis_transform(), ha="center", va="center", fontsize=8)
+            ax.text(
+                0.5,
+                laws.index(law),
+                "not applicable",
+                transform=ax.get_yaxis_transform(),
+                ha="center",
+                va="center",
+                fontsize=8,
+            )
         ax.set_xlabel(heading)
         for y in np.arange(len(laws) - 1) + 0.5:
             ax.axhline(y, color=GREY, linewidth=0.6)

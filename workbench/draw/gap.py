@@ -212,7 +212,7 @@ def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
     bar.ax.invert_yaxis()
     bar.minorticks_off()
     ticks = _decades(most)
-    bar.set_ticks(ticks, labels=_numbered(ticks))
+    bar.set_ticks(list(ticks), labels=_numbered(ticks))
     acting, called = _acting(verdict)
     look: Any = {"clip_on": False, "zorder": 3, "path_effects": [withStroke(linewidth=4.5, foreground="white")]}
     ax.plot(*place.at, "+", color=COLOURS[6], markersize=9, markeredgewidth=2, label="likeliest", **look)
@@ -234,7 +234,8 @@ def _below(profile: Floats) -> tuple[Floats, float]:
 def _decades(most: float) -> Floats:
     """Powers of ten from `ALIKE` to `most`, seven or fewer."""
     last = int(np.floor(np.log10(most)))
-    return ALIKE * 10.0 ** np.arange(0, last + 2, 1 + last // 6)
+    powers = np.arange(0, last + 2, 1 + last // 6)
+    return np.asarray(ALIKE * 10.0**powers, float)
 
 
 def _numbered(ticks: Floats) -> list[str]:
