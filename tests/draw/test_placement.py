@@ -77,3 +77,11 @@ def test_numbers_of_a_placement_have_their_units(units):
     assert title == f"actuators at 3; 7 {m}: W_R = {placed.residual_work:.3g} {energy}, effort {placed.effort:.3g} N² s"
     left = plot_member_placement(task, {"here": placed}, units=units).axes[0]
     assert f"here: W_R = {placed.residual_work:.2g} {energy}" in left.get_legend_handles_labels()[1]
+
+
+def test_a_mode_that_no_actuator_drives_is_marked_on_the_logarithmic_axis():
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(5)
+    task = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
+    nodes = task.placed([10.0 / 3.0, 20.0 / 3.0], "")  # of mode 3
+    right = plot_member_placement(task, {"nodes": nodes}).axes[1]
+    assert [(text.get_text(), text.get_position()[0]) for text in right.texts] == [("≈ 0", pytest.approx(3.0))]
