@@ -89,7 +89,7 @@ def plot_ring_down(record, *, stretch):
     for j, channel in enumerate(shown.output_channels):
         ax.axhline(j, color=GREY, linewidth=0.4)
         ax.plot(shown.time, j + 0.5 * shown.outputs[j] / size, color=COLOURS[0], linewidth=0.9)
-        place = channel.name if channel.at is None else f"x = {channel.at:.3g}"
+        place = channel.name if channel.at is None else f"x = {channel.at:.3g} m"
         ax.text(shown.time[-1], j, f"  {place}", va="center")
     ax.set(xlabel="time [s]", yticks=[], xlim=(shown.time[0], shown.time[-1]))
     first = record.output_channels[0]
@@ -128,7 +128,7 @@ def study(outcome, data=None) -> None:
     outcome.figure(
         "ring_down",
         plot_ring_down(record, stretch=120.0),
-        "What was measured: velocity at eleven places after an impulse at x = 7.3. Noise is 1 % of the signal.",
+        "What was measured: velocity at eleven places after an impulse at x = 7.3 m. Noise is 1 % of the signal.",
     )
     outcome.figure(
         "modes",
@@ -246,5 +246,5 @@ def report_motion(outcome, truth, modes, laws, x) -> None:
     sensors = [Sensor(f"y{i + 1}", at, "displacement") for i, at in enumerate(SENSORS)]
     outcome.motion(
         response_motion(shown, actuators=laws["IMSC"].actuators, sensors=sensors),
-        "The same motion after an impulse at x = 6.3, uncontrolled and with four actuators (triangles).",
+        "The same motion after an impulse at x = 6.3 m, uncontrolled and with four actuators (triangles).",
     )

@@ -66,7 +66,7 @@ def plot_displacements(responses, positions, times, x):
             ax.plot(where, np.zeros(len(where)), "x", color=COLOURS[1], markersize=7, mew=2, label="actuator")
             if column == 0:
                 ax.set_ylabel(f"w [m] at\nt = {time:g} s")
-        axes[0, column].set_title(f"actuators at {name}")
+        axes[0, column].set_title(f"actuators at {name} m")
         axes[-1, column].set_xlabel("x [m]")
     axes[0, 0].legend(loc="upper right", fontsize=8)
     return figure
@@ -138,7 +138,7 @@ def study(outcome, data=None):
             TIMES,
             np.linspace(0, 10, 201),
         ),
-        "Displacement of the beam after an impulse at x = 6.3, for three sets of actuators (crosses). Figs. 5.1-5.6.",
+        "Displacement of the beam after an impulse at x = 6.3 m, for three sets of actuators (crosses). Figs. 5.1-5.6.",
     )
     outcome.figure(
         "work",

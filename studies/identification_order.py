@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from scipy.optimize import linear_sum_assignment
 
-from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.draw.style import COLOURS, new_figure
 from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.signal.synthesis import free_decay
@@ -75,16 +75,20 @@ def order_found(rows):
     level = np.array([row["level_db"] for row in rows])
     kinds = (
         ([row["found"] for row in rows], "identified", "o", COLOURS[0]),
-        ([-(row["count"] - row["found"]) for row in rows], "missed", "x", COLOURS[1]),
-        ([-row["false"] for row in rows], "false", "+", COLOURS[3]),
+        ([row["count"] - row["found"] for row in rows], "missed", "x", COLOURS[1]),
+        ([row["false"] for row in rows], "false", "+", COLOURS[3]),
     )
+    totals = []
     for values, label, marker, colour in kinds:
         shown = np.array(values) != 0
-        ax.plot(level[shown], np.array(values)[shown], marker, color=colour, label=f"{label} ({abs(sum(values))})")
-    ax.axhline(0.0, color=GREY, lw=0.8)
-    ax.set(xlabel="signal-to-noise ratio [dB]", ylabel="modes of a structure\nerrors below the line")
+        totals.append(f"{sum(values)} {label}")
+        if shown.any():
+            ax.plot(level[shown], np.array(values)[shown], marker, color=colour, label=label)
+    ax.set(xlabel="signal-to-noise ratio [dB]", ylabel="number of modes of a structure [-]")
+    ax.set_title(f"modes of {len(rows)} structures: {', '.join(totals)}")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    if len(ax.lines) > 1:
+        ax.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 

@@ -38,10 +38,11 @@ def plot_feedback_index(places, index, found):
     axes[0].plot(places, index, color=COLOURS[0], label="one pair")
     axes[1].set(xlabel="middle of the patch, x [m]", ylabel="pairs", yticks=list(found), ylim=(0.4, max(found) + 0.6))
     for (count, best), colour in zip(found.items(), COLOURS[1:], strict=False):
-        axes[0].axhline(best.index, color=colour, linestyle="--", label=f"best of {count}: E = {best.index:.4f}")
+        label = f"best of {count} pair{'s' * (count > 1)}: E = {best.index:.4f} J s"
+        axes[0].axhline(best.index, color=colour, linestyle="--", label=label)
         axes[1].plot(best.positions, np.full(best.positions.size, count), "s", color=colour, markersize=9)
-    axes[0].set(ylabel="energy integral E [J s]", title="direct velocity feedback by collocated piezo pairs")
-    axes[0].legend()
+    axes[0].set(ylabel="energy integral E [J s]", title="collocated piezo pairs")
+    axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure
 
 

@@ -37,6 +37,7 @@ DECIMATION, DELAYS, ORDERS = 6, 150, range(6, 25)
 SEEN_HZ = (39.4, 108.8, 212.0, 352.6, 517.9, 729.0)
 OTHERS_HZ = (6.7, 551.0)
 DAMPING_WANTED = 0.05
+LEAST_WORK = 1e-13  # of a residual mode that is drawn: with an actuator at a node it is rounding alone
 SHIFTING = ("point_mass", "local_stiffness_loss", "axial_load", "ground_spring")  # kinds that shift frequencies
 
 
@@ -64,7 +65,7 @@ def measured_modes(bending, others, pairing, model):
     for ax in axes.ravel()[n:]:
         ax.set_visible(False)
     for ax in np.atleast_2d(axes)[-1]:
-        ax.set_xlabel("x / length")
+        ax.set_xlabel("x / length [-]")
     for ax in np.atleast_2d(axes)[:, 0]:
         ax.set_ylabel("mode shape, largest 1")
     named = {label: line for ax in axes.ravel() for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
@@ -86,13 +87,16 @@ def placement_on_shapes(modes, placements, *, n_controlled):
         colour = COLOURS[i + 1]
         level = bottom - 0.35 * (i + 1)
         left.plot(placement.positions, np.full(len(placement.positions), level), "^", color=colour, ms=9)
-        label = f"{name}: W_R = {placement.residual_work:.2e}, effort {placement.effort:.3g}"
+        label = f"{name}: W_R = {placement.residual_work:.2g}, effort {placement.effort:.3g}"
         number = np.arange(n_controlled + 1, modes.n_modes + 1)
-        work = np.maximum(placement.residual_work_by_mode, 1e-12)
-        right.bar(number + (i - 1) * width, work, width, bottom=1e-12, color=colour, label=label)
-    left.set(xlabel="x / length", ylabel="mode shape; triangles: actuators")
+        at, work = number + (i - 1) * width, placement.residual_work_by_mode
+        right.bar(at, np.maximum(work, LEAST_WORK), width, color=colour, label=label)
+        for x in at[work < LEAST_WORK]:
+            right.text(x, 1.3 * LEAST_WORK, "≈ 0", ha="center", fontsize=8, color=colour)
+    left.set(xlabel="x / length [-]", ylabel="mode shape, mass 1 [-]; triangles: actuators")
     left.legend(loc="upper center", ncols=2)
-    right.set(yscale="log", ylim=(1e-12, None), xticks=number, xlabel="residual mode", ylabel="spillover work W_r")
+    right.set(yscale="log", ylim=(LEAST_WORK, None), xticks=number, xlabel="residual mode")
+    right.set_ylabel("spillover work W_r [-], length and mass 1")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure
 

@@ -29,7 +29,7 @@ def margins_of_filter(modes, way, actuators, count=24):
 
 
 def plot_sensor_counts(margins, counts):
-    """Stability margin of the full plant against the number of sensors, one line an estimator."""
+    """Decay rate of the full plant against the number of sensors, one line an estimator."""
     figure, ax = new_figure(width=9, height=4.5)
     for (name, values), colour, mark in zip(margins.items(), COLOURS, "osD", strict=False):
         numbers = np.arange(1, len(values) + 1)
@@ -40,8 +40,8 @@ def plot_sensor_counts(margins, counts):
     ax.axhline(0.0, color=GREY, linewidth=1.0)
     largest = max(v[np.isfinite(v)].max() for v in margins.values())
     ax.set_yscale("symlog", linthresh=max(largest, 1e-6))
-    ax.set(xlabel="number of sensors, evenly spaced", ylabel="stability margin [1/s]; below zero unstable")
-    ax.set_title("observation spillover: stability margin against the number of sensors")
+    ax.set(xlabel="number of sensors, evenly spaced", ylabel="decay rate, −max Re λ [1/s]; below zero unstable")
+    ax.set_title("observation spillover: decay rate of the full plant against the number of sensors")
     ax.legend()
     return figure
 
@@ -155,5 +155,5 @@ def study(outcome, data=None):
         "How fast each residual mode grows or decays under control, and the paths that make it.",
     )
     outcome.figure(
-        "cure", plot_sensor_counts(margins, counts), "Stability margin of the full plant against the number of sensors."
+        "cure", plot_sensor_counts(margins, counts), "Decay rate of the full plant against the number of sensors."
     )

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 import workbench as wb
+from workbench.design.placement.placement import placement_task
+from workbench.draw.placement import plot_member_placement, plot_placement
 from workbench.draw.plot import plot
+from workbench.records.units import Units
+from workbench.structure.member import Beam
 
 A, B = 1.2, 0.8
 
@@ -61,3 +65,23 @@ def test_at_named_points_their_names_are_written_where_positions_are_known(posit
     missed = (read[0] * phi - np.eye(3)[0]) ** 2 * modes.omega**-2.0 * modes.omega[0] ** 2
     errors = drawn_errors(figure)
     np.testing.assert_allclose([errors[r] for r in (1, 2, 3)], 100 * np.sqrt(missed), rtol=1e-9)
+
+
+@pytest.mark.parametrize("units", [Units(), Units("mm", "t", "s", "N")], ids=["SI", "mm"])
+def test_numbers_of_a_placement_have_their_units(units):
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(4)
+    task = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
+    placed = task.placed([3.0, 7.0], "")
+    energy, m = units.named("J"), units.length
+    title = plot_placement(placed, units=units).axes[0].get_title("left")
+    assert title == f"actuators at 3; 7 {m}: W_R = {placed.residual_work:.3g} {energy}, effort {placed.effort:.3g} N² s"
+    left = plot_member_placement(task, {"here": placed}, units=units).axes[0]
+    assert f"here: W_R = {placed.residual_work:.2g} {energy}" in left.get_legend_handles_labels()[1]
+
+
+def test_a_mode_that_no_actuator_drives_is_marked_on_the_logarithmic_axis():
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(5)
+    task = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
+    nodes = task.placed([10.0 / 3.0, 20.0 / 3.0], "")  # of mode 3
+    right = plot_member_placement(task, {"nodes": nodes}).axes[1]
+    assert [(text.get_text(), text.get_position()[0]) for text in right.texts] == [("≈ 0", pytest.approx(3.0))]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from workbench.draw.style import new_figure, plain_ticks
+from workbench.draw.style import new_figure, plain_ticks, prefixed
 
 
 @pytest.mark.parametrize(("low", "high", "expected"), [(0.1, 30.0, "1"), (1.2, 4.0, "2"), (1e-12, 1.0, None)])
@@ -38,3 +38,19 @@ def test_a_short_logarithmic_axis_has_two_numbers_at_least_and_no_crowd(low, ext
     marks = [*ax.xaxis.get_major_ticks(), *ax.xaxis.get_minor_ticks()]
     shown = {m.label1.get_text() for m in marks if low <= m.get_loc() <= low * extent} - {""}
     assert 2 <= len(shown) <= (8 if extent < 2.9 else 5)
+
+
+@pytest.mark.parametrize(
+    ("largest", "unit", "factor", "expected"),
+    [
+        (2e-5, "m", 1e6, "µm"),
+        (1.2e-12, "J", 1e12, "pJ"),
+        (0.02, "m", 1.0, "m"),
+        (0.0, "J", 1.0, "J"),
+        (2e-5, "N mm", 1e6, "10⁻⁶ N mm"),
+        (3e-17, "J", 1e18, "10⁻¹⁸ J"),
+    ],
+)
+def test_small_values_are_in_a_unit_with_a_prefix(largest, unit, factor, expected):
+    found, name = prefixed(largest, unit)
+    assert found == pytest.approx(factor) and name == expected

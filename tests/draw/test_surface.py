@@ -86,6 +86,13 @@ def test_motion_has_a_row_a_response_and_a_panel_an_instant():
     figure = plot_surface_motion({"one": response, "two": response}, [0.0, 0.52, 1.0], impulse_at=(0.2, 0.2))
     titles = [ax.get_title("left") for ax in figure.axes]
     assert titles[:6] == ["0 s", "0.5 s", "1 s"] * 2 and figure.axes[3].get_ylabel() == "two"
+    assert figure.axes[3].get_xlabel() == "x [m]" and figure.axes[-1].get_ylabel() == "displacement [m]"
+    small = Response(0.01 * time, np.full((8, 11), 1e-6), np.zeros((1, 11)), modes)
+    figure = plot_surface_motion({"one": small}, [0.0, 0.0052])
+    assert [ax.get_title("left") for ax in figure.axes[:2]] == ["0 s", "5 ms"]
+    assert figure.axes[-1].get_ylabel() == "displacement [µm]" and [
+        text.get_text() for text in figure.axes[0].texts
+    ] == ["y [m]"]
 
 
 def test_named_points_are_drawn_moved_along_their_directions():

@@ -232,7 +232,26 @@ def test_a_figure_of_a_check_shows_the_stretch_of_the_worst_reading(plain):
     off[1, 1100] += 100.0 * off[1].std()
     told = predict(uncertain(plain), new, draws=60)
     figure = plot_prediction(told, replace(new, outputs=off))
-    lines = {line.get_label(): line for line in figure.axes[2].lines}
+    lines = {line.get_label(): line for line in figure.axes[4].lines}
     assert lines["measured"].get_xdata().size == 400
     assert told.time[1100] in lines["measured"].get_xdata()
-    assert lines["measured"].get_zorder() < figure.axes[2].collections[0].get_zorder()
+    drawn = figure.axes[4].get_children()
+    assert drawn.index(lines["measured"]) > drawn.index(lines["predicted"]), "on top"
+    titles = [ax.get_title("left") for ax in figure.axes[:3:2]]
+    assert titles == ["readings near the one farthest outside its band", "d1: measured − predicted"]
+
+
+@pytest.mark.parametrize("made", [False, True], ids=["predicted", "checked"])
+def test_below_each_response_is_its_difference_from_the_prediction(plain, made):
+    """The band about zero, which a response far larger hides, and the reading less its prediction."""
+    new = measured(plain, 1.0, np.random.default_rng(8), n=300)
+    told = predict(uncertain(plain), new, draws=60)
+    axes = np.reshape(plot_prediction(told, new if made else None).axes, (4, 2))
+    for j in range(2):
+        band = axes[2 * j + 1, 0].collections[0].get_paths()[0].vertices[:, 1]
+        assert band.min() == pytest.approx((told.lower - told.median)[j].min())
+        assert band.max() == pytest.approx((told.upper - told.median)[j].max())
+        lines = {line.get_label(): line.get_ydata() for line in axes[2 * j + 1, 0].lines}
+        assert ("measured" in lines) == made
+        if made:
+            np.testing.assert_allclose(lines["measured"], (new.outputs - told.median)[j])

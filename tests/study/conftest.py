@@ -68,7 +68,7 @@ def drawn():
 
     def waited(browser, count):
         wait_until(lambda: len(browser.find_elements("css selector", ".panel svg .marks > *:first-child")) == count)
-        return browser.find_elements("css selector", ".panel svg")
+        return browser.find_elements("css selector", ".panel > svg")
 
     return waited
 

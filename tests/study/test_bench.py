@@ -473,7 +473,7 @@ document.querySelectorAll(".handle > path").forEach(add("mark"));
 document.querySelectorAll(".stand text").forEach(add("text"));
 document.querySelectorAll(".key > span").forEach(add("key"));
 document.querySelectorAll(".figures text").forEach(add("axis"));
-var ticks = Array.from(document.querySelectorAll(".figures svg")).map(function (s) {
+var ticks = Array.from(document.querySelectorAll(".figures .panel > svg")).map(function (s) {
   return Array.from(s.querySelectorAll("text[text-anchor=end]")).length;
 });
 return { boxes: boxes, ticks: ticks };

@@ -8,6 +8,7 @@ import pytest
 
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
+from workbench.draw.design import plot_poles
 from workbench.draw.interactive import Undescribed, described, drawable
 from workbench.draw.motion import mode_motion, response_motion
 from workbench.draw.style import new_figure
@@ -156,6 +157,42 @@ def test_a_legend_has_the_colours_of_its_lines_in_the_dark(stacked, look, drawn)
     drawn(browser, 2)
     brightened = [browser.find_element("css selector", at) for at in (".legend i", ".marks path")]
     assert {one.value_of_css_property("filter") for one in brightened} == {"brightness(1.3)"}
+
+
+@pytest.fixture(scope="module")
+def poles(tmp_path_factory):
+    figure, ax = new_figure()
+    ax.plot([0.0, 1.0], [0.0, 1.0], "--", linewidth=3.0, label="nominal")
+    ax.fill_between([0.0, 1.0], 0.0, 1.0, alpha=0.3, label="band")
+    ax.legend()
+    both = plot_poles({name: np.array([-1.0 + 5.0j]) for name in ("IMSC", "coupled", "a", "b", "c", "d", "e")})
+    content = PageContent(title="Poles", blocks=[block(figure, "lines"), block(both, "poles")])
+    return write_page(tmp_path_factory.mktemp("page") / "l.html", content)
+
+
+def test_a_legend_has_the_dash_width_and_marker_of_each_line(poles, look, drawn):
+    """As they are drawn: pole markers are hollow, so that one does not cover another."""
+    browser = look(poles.as_uri(), 1200)
+    lines, plane = drawn(browser, 2)
+
+    def sample(name):
+        return browser.find_elements("xpath", f"//button[text()='{name}']//*[local-name()='svg']/*")
+
+    def look_of(mark, *names):
+        return [mark.get_attribute(name) for name in names]
+
+    [dashed] = sample("nominal")
+    line = lines.find_element("css selector", ".marks path[stroke-dasharray]")
+    names = ("stroke", "stroke-width", "stroke-dasharray")
+    assert look_of(dashed, *names) == look_of(line, *names) == ["#0072b2", "4", "6 4"]
+    assert not sample("band"), "an area has a colour"
+    for name, tag in (("IMSC", "circle"), ("coupled", "path"), ("b", "rect"), ("c", "path"), ("d", "path")):
+        [mark] = sample(name)
+        assert mark.tag_name == tag and mark.get_attribute("fill") in (None, "none")
+    hollow = plane.find_elements("css selector", ".marks [fill]:not([fill=none])")
+    assert not hollow
+    assert len({one.rect["width"] for one in plane.find_elements("css selector", ".marks > :not(line)")}) >= 6
+    assert browser.get_log("browser") == []
 
 
 def test_a_figure_is_zoomed_by_keyboard(stacked, look, drawn):

@@ -9,7 +9,7 @@ from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.controlled_modes import ControlledModeCount
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
-from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, grouped_bars, new_figure
+from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, grouped_bars, new_figure, prefixed
 from workbench.records.units import SI, Units
 from workbench.structure.printed import place_text
 
@@ -45,11 +45,11 @@ def plot_work_linear(works: Mapping[str, np.ndarray], *, first: int, units: Unit
     """
     figure, ax = new_figure(width=9, height=4)
     shifts, width = grouped_bars(len(works))
+    factor, unit = prefixed(max(float(work.max(initial=0.0)) for work in works.values()), units.named("J"))
     for shift, (name, work) in zip(shifts, works.items(), strict=True):
         numbers = first + 1 + np.arange(work.size)
-        ax.bar(numbers + shift, work, width, label=f"{name}: W_R = {work.sum():.3g} {units.named('J')}")
-    label = units.named("spillover work in the mode, W_r [J]")
-    ax.set(xticks=few_ticks(numbers), xlabel="residual mode", ylabel=label)
+        ax.bar(numbers + shift, factor * work, width, label=f"{name}: W_R = {factor * work.sum():.3g} {unit}")
+    ax.set(xticks=few_ticks(numbers), xlabel="residual mode", ylabel=f"spillover work in the mode, W_r [{unit}]")
     ax.set_title("spillover work by residual mode")
     ax.legend()
     return figure
@@ -96,9 +96,11 @@ def plot_poles(poles: Mapping[str, np.ndarray]) -> Figure:
     """Closed-loop poles (complex, rad/s) of each law in the upper half plane."""
     figure, ax = new_figure(width=9, height=4.5)
     ax.axvline(0.0, color=GREY, linewidth=0.8)
-    for (name, values), colour, marker in zip(poles.items(), COLOURS, "ox+s^v."):
+    for i, ((name, values), colour, marker) in enumerate(zip(poles.items(), COLOURS, "ox+s^vD")):
         upper = values[values.imag >= 0]
-        ax.plot(upper.real, upper.imag, marker, color=colour, label=name, linestyle="none")
+        # hollow, and each smaller than the one before: equal poles of several laws are all seen
+        look = {"color": colour, "linestyle": "none", "fillstyle": "none", "markersize": 11.0 - 1.1 * i}
+        ax.plot(upper.real, upper.imag, marker, label=name, **look)
     ax.set(xlabel="real part [rad/s]", ylabel="imaginary part [rad/s]", title="closed-loop poles")
     ax.legend()
     return figure

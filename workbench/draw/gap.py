@@ -5,10 +5,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import NullLocator
 
 from workbench.arrays import Floats
-from workbench.draw.style import COLOURS, GREY, few_ticks, in_units, new_figure, plain_ticks
+from workbench.draw.style import COLOURS, GREY, MODEL_COLOURS, RAISED, few_ticks, in_units, new_figure, plain_ticks
 from workbench.gap.effects.effect import apply_all, label_in_words
 from workbench.gap.effects.nonlinear import any_beyond
 from workbench.gap.localisation.evidence import Evidence
@@ -23,6 +26,9 @@ from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
 MOST_BARS, FEW_BARS = 16, 6  # named points that are shown; sensors whose names fit horizontally
 YELLOW = "#F0E442"  # of the same palette; a second grey is not to be told from the first on a dark page
 SHOWN = 0.005  # least share of the gap that is drawn
+BELOW = "log-likelihood below its maximum [-]"
+ALIKE = 0.1  # difference of log-likelihoods up to which places are drawn as equally likely
+MAP_LEVELS = 13
 
 
 def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record], *, time_unit: str = "s") -> Figure:
@@ -40,7 +46,8 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record], *, time_u
         channel = record.output_channels[j]
         time = record.time[piece]
         ax.plot(time, record.outputs[j, piece], color=COLOURS[6], label="measured", linewidth=5.0, alpha=0.35)
-        for (name, values), colour, style in zip(outputs.items(), (COLOURS[1], COLOURS[0]), ("--", "-")):
+        for (name, values), other, style in zip(outputs.items(), (COLOURS[1], COLOURS[0]), ("--", "-")):
+            colour = MODEL_COLOURS.get(name, other)
             ax.plot(time, values[j, piece], color=colour, label=name, linestyle=style, linewidth=1.4)
         ax.set(title=f"record {record.name}, sensor {channel.name}", ylabel=in_units(channel.quantity, channel.unit))
     axes[-1, 0].set_xlabel(f"time [{time_unit}]")
@@ -115,8 +122,9 @@ def plot_where(verdict: Verdict) -> Figure:
     by_time.set_xticks(np.arange(8) + 0.5, np.arange(1, 9))
     by_time.set_yticks(np.arange(len(order)) + 0.5, where.record_names)
     by_time.grid(False)
+    plain_ticks(figure)
     _plot_places(by_place, verdict)
-    return plain_ticks(figure)
+    return figure
 
 
 def _plot_modes(ax: Axes, verdict: Verdict) -> None:
@@ -138,9 +146,8 @@ def _plot_modes(ax: Axes, verdict: Verdict) -> None:
 
 
 def _plot_places(ax: Axes, verdict: Verdict) -> None:
-    """The log-likelihood of each place of one unmodelled force: a curve, a map, or bars at named points."""
+    """By how much each place of one unmodelled force is less likely: a curve, a map, or bars at named points."""
     place = verdict.where.place
-    profile = place.profile
     if place.is_single_force is None:
         ax.set_axis_off()
         ax.text(0.5, 0.5, "no place of a force can be identified", ha="center", va="center", transform=ax.transAxes)
@@ -154,13 +161,16 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
     if isinstance(domain, NamedPoints):
         _rank(ax, verdict)
         return
-    ax.plot(place.places, profile, color=COLOURS[3])
+    below, most = _below(place.profile)
+    ax.plot(place.places, below, color=COLOURS[3])
     ax.axvline(place.at, color=GREY, linestyle=":", label="likeliest")
     acting, called = _acting(verdict)
     for i, at in enumerate(acting):
-        ax.axvline(at, color=COLOURS[0], label="" if i else called)
-    low = _lowest(profile)
-    ax.set(xlabel=f"x [{verdict.units.length}]", ylabel="log-likelihood below its maximum", ylim=(low, -0.06 * low))
+        ax.axvline(at, color=COLOURS[0], label="" if i else f"{called} effect")
+    ax.set(xlabel=f"x [{verdict.units.length}]", ylabel=BELOW, yscale="log", ylim=(1.5 * most, ALIKE / 1.3))
+    ticks = _decades(most)
+    ax.set_yticks(ticks, _numbered(ticks))
+    ax.yaxis.set_minor_locator(NullLocator())
     ax.legend()
 
 
@@ -181,7 +191,7 @@ def _rank(ax: Axes, verdict: Verdict) -> None:
     ax.set_xscale("symlog", linthresh=1.0, linscale=0.5)
     top = int(np.ceil(np.log10(max(below.max(), 10.0))))
     ax.set_xticks([0.0, *10.0 ** np.arange(0, top + 1, 1 + top // 6)])
-    ax.set(xlim=(0.0, 10.0**top), xlabel="log-likelihood below that of the likeliest")
+    ax.set(xlim=(0.0, 10.0**top), xlabel=BELOW)
     ax.annotate("likeliest", (0.0, 0), (8, 0), textcoords="offset points", va="center", fontsize=8)
     unseen = [_short(at) for at in acting if all(separation(at, other) > 0 for other in shown)]
     if unseen:
@@ -196,22 +206,45 @@ def _acting(verdict: Verdict) -> tuple[list[Any], str]:
 
 
 def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
-    """The log-likelihood over a rectangle, its maximum, and the places of named effects."""
+    """The same over a rectangle, the likeliest place, and the places of named effects."""
     place = verdict.where.place
     x, y = np.array(place.places).T
-    ax.tricontourf(x, y, np.maximum(place.profile, _lowest(place.profile)), levels=12, cmap="Blues")
-    ax.plot(*place.at, "+", color=GREY, markersize=12)
-    for at in _acting(verdict)[0]:
-        ax.plot(*at, "o", color=COLOURS[0], fillstyle="none", markersize=9)
+    below, most = _below(place.profile)
+    levels = np.geomspace(ALIKE, most, MAP_LEVELS)
+    shades = ax.tricontourf(x, y, below, levels=levels, norm=LogNorm(ALIKE, most), cmap="Blues_r")
+    bar = ax.figure.colorbar(shades, ax=ax, label=BELOW)
+    bar.ax.invert_yaxis()
+    bar.minorticks_off()
+    ticks = _decades(most)
+    bar.set_ticks(list(ticks), labels=_numbered(ticks))
+    acting, called = _acting(verdict)
+    look: Any = {"clip_on": False, "zorder": 3, "path_effects": [withStroke(linewidth=4.5, foreground="white")]}
+    ax.plot(*place.at, "+", color=COLOURS[6], markersize=9, markeredgewidth=2, label="likeliest", **look)
+    look |= {"fillstyle": "none", "markersize": 14, "markeredgewidth": 2}  # around the likeliest, if it is there
+    for i, at in enumerate(acting):
+        ax.plot(*at, "o", color=COLOURS[1], label="" if i else f"{called} effect", **look)
+    ax.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     a, b = domain.length
     m = verdict.units.length
     ax.set(xlabel=f"x [{m}]", ylabel=f"y [{m}]", xlim=(0.0, a), ylim=(0.0, b), aspect="equal")
 
 
-def _lowest(profile: Floats) -> float:
-    """The least log-likelihood that is drawn, relative to that of the three likeliest places."""
-    near = abs(np.sort(profile)[-min(3, profile.size)])
-    return float(min(max(profile.min(), -50.0 * max(1.0, near)), -1.0))
+def _below(profile: Floats) -> tuple[Floats, float]:
+    """By how much each log-likelihood is below the largest, `ALIKE` or more; and the most of them, 10 or more."""
+    below = np.maximum(profile.max() - profile, ALIKE)
+    return below, max(float(below.max()), 10.0)
+
+
+def _decades(most: float) -> Floats:
+    """Powers of ten from `ALIKE` to `most`, seven or fewer."""
+    last = int(np.floor(np.log10(most)))
+    powers = np.arange(0, last + 2, 1 + last // 6)
+    return np.asarray(ALIKE * 10.0**powers, float)
+
+
+def _numbered(ticks: Floats) -> list[str]:
+    numbers = [f"{tick:g}" if tick < 1e5 else f"10{str(round(np.log10(tick))).translate(RAISED)}" for tick in ticks]
+    return [f"≤ {numbers[0]}", *numbers[1:]]
 
 
 def _short(where: Where) -> str:

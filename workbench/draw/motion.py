@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from workbench.design.loop.closed_loop import Response
+from workbench.draw.style import MODEL_COLOURS
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.domain import ROTATIONS, TRANSLATIONS, Between, Domain, Interval, NamedPoints, Rectangle
@@ -124,7 +125,7 @@ def _modes_on_net(
 
 def _track(name: str, modes: Modes | SampledModes, **shapes: Any) -> dict[str, Any]:
     numbers = {"frequencies_hz": _numbers(modes.frequencies_hz), "damping": _numbers(modes.zeta)}
-    return {"label": name, **shapes, **numbers}
+    return {"label": name, "colour": MODEL_COLOURS.get(name), **shapes, **numbers}
 
 
 def _aligned(shapes: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -7,13 +7,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle as Bar
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.sensor_placement import SensorPlacement
 from workbench.design.placement.task import Placement, PlacementTask, extent
 from workbench.draw.motion import frame_net
-from workbench.draw.style import COLOURS, GREY, few_ticks, grouped_bars, new_figure, plain_ticks
+from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, grouped_bars, new_figure, plain_ticks
 from workbench.draw.surface import draw_moved, draw_nodal_lines, rest_and_moved
 from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
@@ -53,8 +54,10 @@ def plot_placement(placement: Placement, *, units: Units = SI) -> Figure:
     numbers = len(placement.positions) + 1 + np.arange(placement.residual_work_by_mode.size)
     ax.bar(numbers, placement.residual_work_by_mode)
     where = "; ".join(place_text(place) for place in listed(placement.positions))
+    where += "" if placement.positions.dtype.kind == "U" else f" {units.named('m')}"
     ax.set(xlabel="residual mode", ylabel=units.named("spillover work, W_r [J]"), xticks=few_ticks(numbers))
-    ax.set_title(f"actuators at {where}: W_R = {placement.residual_work:.3g}, effort {placement.effort:.3g}")
+    work, spent = f"{placement.residual_work:.3g}", f"{placement.effort:.3g}"
+    ax.set_title(f"actuators at {where}: W_R = {units.named(f'{work} J')}, effort {units.named(f'{spent} N² s')}")
     return figure
 
 
@@ -136,7 +139,7 @@ def plot_member_placement(
         left.axvspan(low, high, facecolor="white", edgecolor=GREY, hatch="////", label="forbidden" if i == 0 else None)
     half = 0.5 * extent(task.actuator)
     for i, (name, placement) in enumerate(placements.items()):
-        look = {"fmt": "o", "color": COLOURS[i], "markersize": 8, "label": _with_work(name, placement)}
+        look = {"fmt": "o", "color": COLOURS[i], "markersize": 8, "label": _with_work(name, placement, units)}
         left.errorbar(placement.positions, np.full(n, -1.25 - 0.2 * i), xerr=half, **look)
     if impulse_at is not None:
         left.plot(impulse_at, 1.2, **IMPULSE)
@@ -144,6 +147,7 @@ def plot_member_placement(
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=9, ncols=2)
     most, _ = _draw_works(right, task, placements, units)
     right.set_ylim(SHOWN_SHARE * most, 3.0 * most)
+    _mark_zeros(right)
     return figure
 
 
@@ -177,7 +181,7 @@ def plot_surface_placement(
         look = {
             "color": COLOURS[i],
             "markersize": 10,
-            "label": _with_work(name, placement),
+            "label": _with_work(name, placement, units),
             "zorder": 3,
             "clip_on": False,
         }
@@ -197,11 +201,12 @@ def plot_surface_placement(
     most, least = _draw_works(right, task, placements, units)
     # a mode with all actuators at its nodes has no work but rounding
     right.set_ylim(max(SHOWN_WORK * most, 0.3 * least), 3.0 * most)
+    _mark_zeros(right)
     return figure
 
 
-def _with_work(name: str, placement: Placement) -> str:
-    return f"{name}: W_R = {placement.residual_work:.2g}"
+def _with_work(name: str, placement: Placement, units: Units) -> str:
+    return f"{name}: W_R = {placement.residual_work:.2g} {units.named('J')}"
 
 
 def _draw_works(
@@ -216,6 +221,17 @@ def _draw_works(
     ax.set_yscale("log")
     work = np.concatenate([placement.residual_work_by_mode for placement in placements.values()])
     return float(work.max()), float(work.min())
+
+
+def _mark_zeros(ax: Axes) -> None:
+    """Mark the bars that end below a logarithmic axis, which are not seen, by ≈ 0."""
+    bottom, bars = ax.get_ylim()[0], [bar for bar in ax.patches if isinstance(bar, Bar)]
+    if len(bars) > MOST_TICKS * len(ax.containers):
+        return
+    for bar in bars:
+        if bar.get_height() < bottom:
+            at = (bar.get_x() + 0.5 * bar.get_width(), 1.2 * bottom)
+            ax.text(*at, "≈ 0", ha="center", fontsize=8, color=bar.get_facecolor())
 
 
 def plot_sensor_placement(placement: SensorPlacement) -> Figure:

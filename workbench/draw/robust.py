@@ -67,38 +67,53 @@ def plot_steps(result: Redesign) -> Figure:
 
 
 def plot_prediction(prediction: Prediction, measured: Record | None = None) -> Figure:
-    """A row per sensor: readings over time on the left, amplitudes of their Fourier transform on the right.
+    """Two rows per sensor: readings over time and amplitudes of their Fourier transform; both less the prediction.
+
+    The lower row shows the band about zero, which may be far narrower than the readings.
 
     Args:
         prediction: with its bands.
-        measured: the record of the test, drawn beneath the bands, around the reading farthest outside.
+        measured: the record of the test, drawn on top, around the reading farthest outside its band.
     """
     shown = min(len(prediction.channels), MOST_SENSORS)
-    figure, axes = new_figure(shown, 2, width=11, height=0.9 + 1.9 * shown, sharex="col", squeeze=False)
+    figure, axes = new_figure(2 * shown, 2, width=11, height=1.2 + 3.2 * shown, sharex="col", squeeze=False)
     rows = {} if measured is None else {c.name: row for c, row in zip(measured.output_channels, measured.outputs)}
     piece = _around_worst(prediction, rows)
-    time = prediction.time[piece]
-    f = prediction.frequencies_hz[1:]
-    for j, (left, right) in enumerate(axes):
+    time, f = prediction.time[piece], prediction.frequencies_hz[1:]
+    band = {"color": BAND, "alpha": 0.3, "linewidth": 0, "label": f"{100 * LEVEL:g} % band"}
+    line, test = {"color": BAND, "linewidth": 0.9, "label": "predicted"}, {"color": TEST, "linewidth": 0.9}
+    for j in range(shown):
+        (left, right), below = axes[2 * j], axes[2 * j + 1]
         channel = prediction.channels[j]
-        band = {"color": BAND, "alpha": 0.3, "linewidth": 0, "label": f"{100 * LEVEL:g} % band"}
-        left.fill_between(time, prediction.lower[j, piece], prediction.upper[j, piece], **band)
-        left.plot(time, prediction.median[j, piece], color=BAND, linewidth=0.8, label="predicted")
-        left.set_ylabel(in_units(channel.name, channel.unit))
-        low, high = prediction.spectrum_lower[j, 1:], prediction.spectrum_upper[j, 1:]
-        right.set_ylabel(in_units(f"|{channel.name}|", channel.unit))
-        least = 1e-3 * high[high > 0].min() if (high > 0).any() else 1e-300
-        right.fill_between(f, np.maximum(low, least), np.maximum(high, least), **band)
-        right.loglog(f, np.maximum(prediction.spectrum_median[j, 1:], least), color=BAND, linewidth=0.8)
-        if channel.name in rows:
-            test = {"color": TEST, "linewidth": 0.8, "zorder": 0.5}  # beneath the band
-            left.plot(time, rows[channel.name][piece], label="measured", **test)
-            right.loglog(f, np.maximum(amplitudes(rows[channel.name][None])[0, 1:], least), **test)
-    axes[0, 0].set_title("outputs")
-    axes[0, 1].set_title("amplitude spectrum")
+        reading = rows.get(channel.name)
+        middle, low, high = (y[j, piece] for y in (prediction.median, prediction.lower, prediction.upper))
+        left.fill_between(time, low, high, **band)
+        left.plot(time, middle, **line)
+        below[0].fill_between(time, low - middle, high - middle, **band)
+        spectra = prediction.spectrum_median, prediction.spectrum_lower, prediction.spectrum_upper
+        centre, lowest, highest = (spectrum[j, 1:] for spectrum in spectra)
+        least = 1e-3 * highest[highest > 0].min() if (highest > 0).any() else 1e-300
+        right.fill_between(f, np.maximum(lowest, least), np.maximum(highest, least), **band)
+        right.loglog(f, np.maximum(centre, least), **line)
+        below[1].fill_between(f, lowest - centre, highest - centre, **band)
+        if reading is not None:
+            size = amplitudes(reading[None])[0, 1:]
+            left.plot(time, reading[piece], label="measured", **test)
+            right.loglog(f, np.maximum(size, least), label="measured", **test)
+            below[0].plot(time, reading[piece] - middle, label="measured", **test)
+            below[1].plot(f, size - centre, label="measured", **test)
+        difference = f"{100 * LEVEL:g} % band about the prediction" if reading is None else "measured − predicted"
+        for ax, under, name in zip((left, right), below, (channel.name, f"|{channel.name}|"), strict=True):
+            ax.set_ylabel(in_units(name, channel.unit))
+            under.axhline(0.0, color=BAND, linewidth=0.9)
+            under.set_ylabel(in_units("difference", channel.unit))
+            under.set_title(f"{name}: {difference}")
+    whole = time.size == prediction.time.size
+    axes[0, 0].set_title("readings over time" if whole else "readings near the one farthest outside its band")
+    axes[0, 1].set_title("amplitude spectrum of the whole record")
     axes[-1, 0].set_xlabel("time [s]")
     axes[-1, 1].set_xlabel("frequency [Hz]")
-    axes[0, 0].legend(fontsize=8, ncols=3)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=8)
     return plain_ticks(figure)
 
 

@@ -15,8 +15,12 @@ matplotlib.use("Agg")
 # Okabe & Ito's palette, in the order of use
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GREY = "#8a8a8a"
+MODEL_COLOURS = {"nominal": COLOURS[1], "corrected": COLOURS[0], "nearest": COLOURS[0]}  # of models, in all figures
 MOST_POINTS = 4000  # of a drawn curve; a screen resolves no more
 PLAIN_LEAST, PLAIN_DECADES = 1e-4, 1e6  # least value and widest range of a logarithmic axis with plain numbers
+LEAST_PLAIN = 1e-3  # largest value of an axis below which its unit takes a prefix
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+PREFIXED, PREFIXES = ("m", "J"), {-3: "m", -6: "µ", -9: "n", -12: "p"}
 MOST_TICKS = 20  # numbers along an axis
 FEWER_NUMBERS = 2.9  # ratio of an axis's limits above which ticks at 1, 2, 3, 5 and 7 suffice: at least two are inside
 
@@ -68,6 +72,19 @@ def grouped_bars(count: int) -> tuple[np.ndarray, float]:
 def in_units(name: str, unit: str) -> str:
     """The label of an axis: a name, and its unit below."""
     return f"{name}\n[{unit.replace('^2', '²').replace('^3', '³')}]" if unit else name
+
+
+def prefixed(largest: float, unit: str) -> tuple[float, str]:
+    """A unit for values up to `largest`, and the factor to it: 1e6 and µm for 2e-5 m, so that no axis has an offset.
+
+    A unit that takes no prefix, such as N mm, has a power of ten before it.
+    """
+    if not 0.0 < largest < LEAST_PLAIN:
+        return 1.0, unit
+    power = 3 * int(np.floor(np.log10(largest) / 3.0))
+    if unit in PREFIXED and power in PREFIXES:
+        return 10.0**-power, f"{PREFIXES[power]}{unit}"
+    return 10.0**-power, f"10{str(power).translate(RAISED)} {unit}"
 
 
 def few_ticks(numbers: Sequence[int] | np.ndarray) -> np.ndarray:

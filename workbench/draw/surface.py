@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from workbench.design.loop.closed_loop import Response
 from workbench.draw.motion import SWAY, Net, frame_net, scattered_net
-from workbench.draw.style import COLOURS, GREY, new_figure, panels
+from workbench.draw.style import COLOURS, GREY, new_figure, panels, prefixed
 from workbench.identification.shapes.bands import Bands
 from workbench.renamed import former_arguments
 from workbench.structure.domain import Rectangle
@@ -125,21 +125,26 @@ def plot_surface_motion(
         instants[name] = response.time[nearest]
         drawn[name] = _over(response.modes, response.modal[: response.modes.n_modes, nearest])
     limit = max(float(np.abs(fields).max()) for _, _, fields in drawn.values()) or 1.0  # 1 if all are at rest
+    factor, unit = prefixed(limit, "m")
+    limit *= factor
     for row, (name, (x, y, fields)) in zip(grid, drawn.items()):
         for ax, time, field in zip(row, instants[name], fields):
-            image = _coloured(ax, x, y, field, limit)
+            image = _coloured(ax, x, y, factor * field, limit)
             if actuators is not None:
                 ax.plot(*actuators.T, "x", color="black", markersize=6, label="actuator")
             if impulse_at is not None:
                 ax.plot(*impulse_at, "*", color=COLOURS[4], markeredgecolor="black", markersize=11, label="impulse")
-            ax.set_title(f"{time:.3g} s", fontsize=10)
+            ax.set_title(f"{time:.3g} s" if time == 0 or time >= 0.1 else f"{1000.0 * time:.3g} ms", fontsize=10)
         row[0].set_ylabel(name, fontsize=11)
     for ax in grid.flat:
         _bare(ax, first.modes)
     a, b = cast(Rectangle, first.modes.domain).length
-    grid[-1, 0].set(xticks=[0.0, a], yticks=[0.0, b], xlabel="x, y [m]")
+    grid[-1, 0].set(xticks=[0.0, a], yticks=[0.0, b], xlabel="x [m]")
+    # between the numbers of its axis, whose label is the name of the response
+    look: Any = {"rotation": 90, "ha": "right", "va": "center", "transform": grid[-1, 0].transAxes}
+    grid[-1, 0].text(-0.04, 0.5, "y [m]", **look)
     ticks = [tick for tick in MaxNLocator(5).tick_values(-limit, limit) if abs(tick) <= limit]
-    figure.colorbar(image, ax=grid, label="displacement [m]", shrink=0.8, ticks=ticks)
+    figure.colorbar(image, ax=grid, label=f"displacement [{unit}]", shrink=0.8, ticks=ticks)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     if handles:
         figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9)

@@ -1,69 +1,70 @@
 """Figures of blind trials."""
 
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from collections import Counter
 
-from workbench.draw.style import COLOURS, GREY, new_figure
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from workbench.draw.style import COLOURS, new_figure
 from workbench.gap.effects.effect import label_in_words
 from workbench.trials.scoring import Tally
 
-FAMILY = {
-    "single": "one effect:",
-    "pair": "two effects:",
-    "none": "nothing hidden:",
-    "unknown": "outside the catalogue:",
-}
-BOTH, OTHER, ALWAYS_RIGHT = "both effects", "another two", "always right"
-MANY = 12  # number of kinds above which those that were always named share one row
+FAMILY = {"single": "one effect", "pair": "two effects", "none": "nothing", "unknown": "outside the catalogue"}
+PLAIN = {"none": "nothing", "unknown": "outside the catalogue"}
+BOTH = "two effects"  # the row of all pairs
+MOST_ROWS = 24  # of a column
 
 
 def plot_confusion(tally: Tally) -> Figure:
-    """The confusion matrix of true and diagnosed effects, with the number of cases in each square."""
-    counts = _gathered(tally)
-    rows = sorted({hidden for hidden, _ in counts}, key=_order)
-    columns = rows + sorted({named for _, named in counts} - set(rows), key=_order)
-    figure, ax = new_figure(width=max(8.0, 3.6 + 0.27 * len(columns)), height=2.6 + 0.24 * len(rows))
-    for (hidden, named), count in counts.items():
-        x, y, right = columns.index(named), rows.index(hidden), hidden == named
-        ax.add_patch(Rectangle((x - 0.46, y - 0.44), 0.92, 0.88, color=COLOURS[0 if right else 1], linewidth=0))
-        ax.text(x, y, str(count), ha="center", va="center", color="white", fontsize=8)
-    ax.plot([-0.5, len(rows) - 0.5], [-0.5, len(rows) - 0.5], color=GREY, linewidth=0.6, zorder=0)
-    ax.set_xticks(range(len(columns)), [_plain(c) for c in columns], rotation=90, fontsize=8)
-    ax.set_yticks(range(len(rows)), ["two effects" if r == BOTH else _plain(r) for r in rows], fontsize=8)
-    ax.set(
-        xlim=(-0.6, len(columns) - 0.4), ylim=(len(rows) - 0.4, -0.6), xlabel="diagnosed effect", ylabel="true effect"
-    )
+    """A row per true effect: the share of its cases that are named correctly, their number, and what else is named.
+
+    All pairs have one row.
+    """
+    rows = _rows(tally)
+    names = sorted(rows, key=_order)
+    columns = 1 + (len(names) > MOST_ROWS)
+    each = -(-len(names) // columns)
+    options = {"width": 7.0 + 4.0 * (columns - 1), "height": 1.5 + 0.24 * each, "squeeze": False}
+    figure, axes = new_figure(1, columns, **options)
+    for ax, first in zip(axes[0], range(0, len(names), each)):
+        _table(ax, names[first : first + each], rows, each)
     total = sum(of for _, of in tally.shares.values())
-    each = [f"{FAMILY[family]} {right} of {of}" for family, (right, of) in tally.shares.items()]
-    words = "\n".join("; ".join(each[i : i + 2]) for i in range(0, len(each), 2))
-    ax.set_title(f"{total} blind cases; number of each, blue correct, orange wrong\n{words}")
+    shares = [f"{FAMILY[family]} {right} of {of}" for family, (right, of) in tally.shares.items()]
+    figure.suptitle(f"{total} blind cases, named correctly: {', '.join(shares)}", x=0.01, ha="left", fontsize=11)
     return figure
 
 
-def _gathered(tally: Tally) -> dict[tuple[str, str], int]:
-    """Counts with all pairs in one row and two columns, and with many kinds those that are always right in one row."""
-    gathered: dict[tuple[str, str], int] = {}
+def _table(ax: Axes, names: list[str], rows: dict[str, Counter[str]], height: int) -> None:
+    for i, name in enumerate(names):
+        named, of = rows[name][name], rows[name].total()
+        share = 100.0 * named / of
+        ax.barh(i, share, color=COLOURS[0], height=0.64)
+        ax.barh(i, 100.0 - share, left=share, color=COLOURS[1], height=0.64)
+        ax.annotate(f"{named} / {of}", (100.0, i), (5, 0), textcoords="offset points", va="center", fontsize=8)
+        others = [f"{_plain(other)} {count}" for other, count in rows[name].items() if other != name]
+        if others:
+            ax.text(2.0, i, f"named instead: {', '.join(others)}", va="center", color="white", fontsize=8)
+    ax.set_yticks(np.arange(len(names)), [_plain(name) for name in names], fontsize=8)
+    ax.set(xlim=(0.0, 100.0), ylim=(height - 0.4, -0.6), xlabel="share named correctly [%]; named / cases")
+    ax.grid(False)
 
-    def add(hidden: str, named: str, count: int) -> None:
-        gathered[hidden, named] = gathered.get((hidden, named), 0) + count
 
-    singles = {hidden for hidden, _ in tally.counts if " + " not in hidden} - {"none", "unknown"}
-    mixed_up = {name for pair in tally.counts if pair[0] != pair[1] for name in pair}
-    sure = singles - mixed_up if len(singles) > MANY else set()
+def _rows(tally: Tally) -> dict[str, Counter[str]]:
+    """Numbers of cases by true effect and by what is named."""
+    rows: dict[str, Counter[str]] = {}
     for (hidden, named), count in tally.counts.items():
-        if " + " in hidden:
-            add(BOTH, BOTH if named == hidden else OTHER if " + " in named else named, count)
-        elif hidden in sure:
-            add(ALWAYS_RIGHT, ALWAYS_RIGHT, count)
-        else:
-            add(hidden, OTHER if " + " in named else named, count)
-    return gathered
+        pair = " + " in hidden
+        rows.setdefault(BOTH if pair else hidden, Counter())[BOTH if pair and named == hidden else named] += count
+    return rows
 
 
 def _order(name: str) -> tuple[int, str]:
-    return ({ALWAYS_RIGHT: 1, "none": 2, BOTH: 3, OTHER: 4, "unknown": 5}.get(name, 0), name)
+    return ({"none": 1, BOTH: 2, "unknown": 3}.get(name, 0), _plain(name).lower())
 
 
 def _plain(name: str) -> str:
-    plain = {"none": "nothing", "unknown": "outside the catalogue", ALWAYS_RIGHT: "one effect, always named"}
-    return plain.get(name, label_in_words(name))
+    """The words of an effect, or of several."""
+    if name == BOTH:
+        return name
+    return " + ".join(PLAIN.get(part, label_in_words(part)) for part in name.split(" + "))

@@ -103,14 +103,28 @@ var workbench = (function () {
       Object.keys(named).forEach(function (label) {
         var mark = named[label], entry = html("button", { type: "button", title: "hide or show" }, box);
         var swatch = html("i", {}, entry);
-        swatch.style.background = ink(mark.colour || mark.colours[0]);
-        if (mark.alpha) swatch.style.opacity = mark.alpha;
+        if (mark.kind === "line" || mark.kind === "rule") sample(mark, swatch);
+        else {
+          swatch.style.background = ink(mark.colour || mark.colours[0]);
+          if (mark.alpha) swatch.style.opacity = mark.alpha;
+        }
         entry.appendChild(document.createTextNode(label));
         entry.addEventListener("click", function () {
           of.forEach(function (panel) { panel.off[label] = !panel.off[label]; paint(panel); });
           entry.classList.toggle("off", of[0].off[label]);
         });
       });
+    }
+    // a line as it is drawn: its dash, width and marker
+    function sample(mark, box) {
+      var node = svg("svg", { class: "sample", viewBox: "0 0 30 12", width: 30, height: 12, "aria-hidden": "true" });
+      if (mark.width > 0) svg("line", { x1: 0, x2: 30, y1: 6, y2: 6, stroke: ink(mark.colour), "stroke-width": Math.min(mark.width, 8),
+        "stroke-dasharray": mark.dash || undefined, opacity: mark.alpha }, node);
+      if (mark.marker) marker(Object.assign({}, mark, { size: Math.min(mark.size, 11), colours: undefined }), [15, 6, 0], node);
+      box.appendChild(node);
+      box.style.width = "30px";
+      box.style.height = "12px";
+      node.style.cssText = "display: block; overflow: visible; cursor: inherit";
     }
     function view(panel, x, y) {
       panels.forEach(function (other) {
@@ -305,7 +319,11 @@ var workbench = (function () {
         var d = m === "x" ? "M-1,-1L1,1M-1,1L1,-1" : "M-1,0H1M0,-1V1";
         svg("path", { d: d, transform: "translate(" + q[0] + "," + q[1] + ") scale(" + r + ")", stroke: colour, "stroke-width": 2 / r, opacity: mark.alpha }, layer);
       } else if (m === "^" || m === "v") {
-        svg("path", { d: m === "^" ? "M0,-1L1,1H-1Z" : "M0,1L1,-1H-1Z", transform: "translate(" + q[0] + "," + q[1] + ") scale(" + r + ")", fill: colour, opacity: mark.alpha }, layer);
+        svg("path", { d: m === "^" ? "M0,-1L1,1H-1Z" : "M0,1L1,-1H-1Z", transform: "translate(" + q[0] + "," + q[1] + ") scale(" + r + ")", fill: look.fill, stroke: look.stroke,
+          "stroke-width": mark.hollow ? 1.3 / r : undefined, opacity: mark.alpha }, layer);
+      } else if (m === "D" || m === "d") {
+        svg("path", { d: "M0,-1L1,0L0,1L-1,0Z", transform: "translate(" + q[0] + "," + q[1] + ") scale(" + r + ")", fill: look.fill, stroke: look.stroke,
+          "stroke-width": mark.hollow ? 1.3 / r : undefined, opacity: mark.alpha }, layer);
       } else svg("circle", Object.assign({ cx: q[0], cy: q[1], r: r }, look), layer);
     }
 
