@@ -9,8 +9,9 @@ import numpy as np
 from workbench.identification.ambient import AmbientModes, identify_ambient
 from workbench.identification.driven import Driven, identify_driven
 from workbench.identification.free_decay.assumptions import AmplitudeDependence, ProportionalFit
-from workbench.identification.ring_down import RingDown, ring_down
+from workbench.identification.ring_down import RingDown, by_remark, ring_down
 from workbench.identification.signal.data_quality import check_data_quality
+from workbench.identification.signal.harmonics import MAINS_HZ
 from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
 from workbench.identification.signal.searches import SECONDS, STOPPED, Progress
 from workbench.identification.transfer import TransferModes, identify_transfer
@@ -21,7 +22,7 @@ from workbench.structure.printed import counted
 TURN = 2.0 * np.pi
 UNLIKELY, MOST_MODES = 0.01, 40
 IMPLAUSIBLE_DAMPING = 0.1  # damping ratio above which a mode of transfer functions is doubtful
-MAINS_HZ, SURE = (50.0, 60.0), 3.0
+SURE = 3.0
 COLLINEAR = 0.8  # modal phase collinearity below which a shape counts as complex
 
 
@@ -108,8 +109,7 @@ def identification_report(
 def of_ring_down(decay: RingDown) -> IdentificationReport:
     """The report of free decays."""
     found = decay.refined
-    lines = [f"mode {r + 1}: {remark}" for r, remark in enumerate(decay.remarks) if remark]
-    lines += [*decay.notes, *_proportional(decay.proportional), *decay.by_amplitude.remarks]
+    lines = [*by_remark(decay.remarks), *decay.notes, *_proportional(decay.proportional), *decay.by_amplitude.remarks]
     if decay.noise_modes.n_modes:
         rejected = ", ".join(f"{f:.4g}" for f in decay.noise_modes.frequencies_hz)
         lines.append(f"rejected as noise or as part of another mode: {rejected} Hz")
