@@ -46,7 +46,10 @@ EXTRA_ORDERS = 8  # highest model order of the diagram, above the number of mode
 SAMPLES_PER_ORDER = 8  # at least
 INVISIBLE = 0.005  # standard error over the range of the values, below which its bar is shorter than a dot
 ROBUSTNESS = "share of perturbed models stable"
-STABLE = "Stabilisation diagram: the poles of models of each order, blue if the shape is real; bands mark stable poles."
+STABLE = (
+    "Stabilisation diagram: the poles of models of each order. Dots, on the bands of stable modes, agree with them in"
+    " frequency and shape; crosses do not."
+)
 
 
 def page_content_about(what: str) -> tuple[str, PageContent]:
