@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
 
 from workbench.arrays import Flags
 from workbench.draw.style import COLOURS, GREY, few_ticks, new_figure
@@ -64,10 +65,10 @@ def plot_standard_errors(refined: Refined) -> Figure:
     return figure
 
 
-def plot_deviations(names: Sequence[str], values: Sequence[float], deviations: Sequence[float], label: str) -> Figure:
+def plot_deviations(names: Sequence[str], values: ArrayLike, deviations: ArrayLike, label: str) -> Figure:
     """Estimates with bars of ± 2 standard errors."""
     figure, ax = new_figure(width=9, height=3.5)
-    at, spread = np.arange(len(values)), 2 * np.asarray(deviations)
+    at, spread = np.arange(len(names)), 2.0 * np.asarray(deviations)
     ax.vlines(at, np.subtract(values, spread), np.add(values, spread), color=COLOURS[1], label="± 2 standard errors")
     ax.plot(at, values, "o", color=COLOURS[0], label="estimate")
     ax.set_xticks(at, list(names))

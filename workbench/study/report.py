@@ -15,7 +15,7 @@ from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.identification import plot_deviations, plot_mac, stabilisation_diagram
 from workbench.draw.motion import mode_motion
 from workbench.draw.placement import plot_places
-from workbench.draw.signals import plot_frf, plot_spectra, plot_transfer
+from workbench.draw.signals import frequency_response, plot_coherence, plot_spectra, plot_transfer
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
@@ -44,6 +44,7 @@ MOST_BYTES = 200_000_000
 MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram
 EXTRA_ORDERS = 8  # highest model order of the diagram, above the number of modes
 SAMPLES_PER_ORDER = 8  # at least
+MOST_SENSORS = 6  # whose frequency responses are drawn
 INVISIBLE = 0.005  # standard error over the range of the values, below which its bar is shorter than a dot
 ROBUSTNESS = "share of perturbed models stable"
 STABLE = (
@@ -382,6 +383,14 @@ def _response(measured: Record | TransferFunctions, fitted: TransferFunctions | 
             kept = np.isin(measured.frequencies_hz, fitted.frequencies_hz)
             measured = replace(measured, values=measured.values[..., kept], frequencies_hz=fitted.frequencies_hz)
         return [block(plot_transfer(measured, fitted), "Transfer functions, measured and fitted (dashed).")]
-    if measured.n_inputs == 1 and np.ptp(measured.inputs):
-        return [block(plot_frf(measured), "Frequency response functions and coherence.")]
+    if measured.n_inputs == 1 and np.ptp(measured.inputs) and fitted is not None:
+        names = measured.output_names[:MOST_SENSORS]
+        beside = plot_transfer(frequency_response(measured).select_outputs(names), fitted.select_outputs(names))
+        left_out = measured.output_names[MOST_SENSORS:]
+        rest = f" Not drawn: {', '.join(left_out)}." if left_out else ""
+        measured_by = "Frequency response, measured by Welch's method, whose windows blunt sharp peaks"
+        return [
+            block(beside, f"{measured_by}, and of the identified modes (dashed).{rest}"),
+            block(plot_coherence(measured.select_outputs(names)), "Coherence of each sensor with the input."),
+        ]
     return [block(plot_spectra(measured), f"Power spectral density of {measured.name}, by Welch's method.")]

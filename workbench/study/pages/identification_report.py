@@ -23,6 +23,7 @@ TURN = 2.0 * np.pi
 UNLIKELY, MOST_MODES = 0.01, 40
 IMPLAUSIBLE_DAMPING = 0.1  # damping ratio above which a mode of transfer functions is doubtful
 SURE = 3.0
+LINES = 2049  # of the transfer functions of a model, besides those about its modes
 COLLINEAR = 0.8  # modal phase collinearity below which a shape counts as complex
 
 
@@ -36,7 +37,8 @@ class IdentificationReport:
         lines: remarks.
         content: for JSON.
         decays: the free decays, or the correlation functions, that were fitted; empty for other data.
-        fitted: the model of transfer functions at the fitted lines; None for other data.
+        fitted: transfer functions of the model, at the fitted lines, or of records of one input up to half the sample
+            rate; None for other data.
     """
 
     heading: str
@@ -147,7 +149,27 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
         "noise_std": found.noise_std,
         "converged": found.converged,
     }
-    return _report(records, found, lines, content)
+    return replace(_report(records, found, lines, content), fitted=_model_of(found) if len(found.delays) == 1 else None)
+
+
+def _model_of(found: Driven) -> TransferFunctions:
+    """The transfer functions of the model as those of records are: with the hold of the inputs, and their delays."""
+    dt, hertz = found.sample_time, found.modes.frequencies_hz
+    nyquist, width = 0.5 / dt, found.modes.zeta * hertz
+    # as close about a peak as it is narrow
+    about = (hertz[:, None] + width[:, None] * np.linspace(-4.0, 4.0, 33)).ravel()
+    lines = np.unique(np.r_[np.linspace(0.0, nyquist, LINES), about])
+    lines = lines[(lines > 0.0) & (lines < nyquist)]
+    s = 1j * TURN * lines
+    hold = {"zero": "zoh", "first": "foh"}.get(found.input_hold)
+    values = (
+        found.state_space(s, squeeze=False)
+        if hold is None
+        else found.state_space.sample(dt, hold)(np.exp(s * dt), squeeze=False)
+    )
+    late = np.exp(-s * found.delays[:, None])
+    names = tuple(channel.name for channel in found.input_channels)
+    return TransferFunctions(values * late, lines, found.output_channels, names)
 
 
 def _on_convergence(converged: bool, remarks: Sequence[str], remedy: str) -> list[str]:
