@@ -101,9 +101,10 @@ def identification_report(
         most = MOST_MODES if n_modes is None else n_modes
         return of_driven(identify_driven(records, max_modes=most, **on), records)
     if len(records) > 1 or records[0].n_inputs:
+        remedy = "give one file" if len(records) > 1 else "leave --ambient out, to identify from the inputs"
         raise ValueError(
-            f"ambient identification needs one record without inputs; got {len(records)} records with"
-            f" {records[0].n_inputs} inputs"
+            f"ambient identification needs one record without inputs; got {counted(len(records), 'record')} with"
+            f" {counted(records[0].n_inputs, 'input')}: {remedy}"
         )
     return of_ambient(identify_ambient(records[0], n_modes=n_modes, **on), records[0])
 
