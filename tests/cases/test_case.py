@@ -106,18 +106,33 @@ def test_what_the_format_cannot_say_is_refused(case, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('kind = "beam"', 'kind = "shell"', "beam, rod, plate or modal; got 'shell'"),
+        ('kind = "beam"', 'kind = "shell"', "beam, rod, plate or modal; got 'shell'$"),
+        ('kind = "beam"', 'kind = "baem"', r"got 'baem'; did you mean 'beam'\?$"),
+        ('kind = "beam"', "kind = 3", "got 3$"),
         ("length = 2.0", "length = -2.0", "length"),
-        ('left = "clamped"', 'left = "pinned"', "left is one of hinged, clamped, free, sliding; got 'pinned'$"),
+        (
+            'left = "clamped"',
+            'left = "pinned"',
+            "left is one of hinged, clamped, free, sliding; got 'pinned', which is 'hinged' here$",
+        ),
+        ('left = "clamped"', 'left = "Fixed"', "got 'Fixed', which is 'clamped' here$"),
+        ('left = "clamped"', 'left = "simply-supported"', "got 'simply-supported', which is 'hinged' here$"),
+        ('left = "clamped"', 'left = "clampd"', r"got 'clampd'; did you mean 'clamped'\?$"),
+        ('left = "clamped"', 'left = "xyz"', "got 'xyz'$"),
         ('right = "hinged"', 'right = "pinned"', r"\[structure\]: right is one of hinged"),
         ("[[input]]", "[input]", r"write \[\[input\]\], with two brackets, for each input"),
         ("modes = 5", "modes = 5.5", "whole number"),
-        ("at = 0.7", "at = 7.0", "outside the structure"),
+        ("at = 0.7", "at = 7.0", "at = 7 m is outside the structure, which runs 0 to 2 m$"),
         ('quantity = "acceleration"', 'quantity = "volts"', "quantity is one of"),
+        ('quantity = "acceleration"', 'quantity = "accelaration"', r"did you mean 'acceleration'\?$"),
         ("noise_std = 0.0001", "noise_std = 0.0", "noise_std must be positive"),
         ('name = "a1"', 'name = "d1"', "names must differ"),
         ('name = "a1"', 'name = "a2"', "channel 'a2' of case.toml is missing"),
-        ("sample_time = 0.02", "sample_time = 0.03", "must rise by sample_time"),
+        (
+            "sample_time = 0.02",
+            "sample_time = 0.03",
+            "sample_time = 0.03 s, but t steps by 0.02: write sample_time = 0.02$",
+        ),
         ('use = "fit"', 'use = "test"', "fit or validate"),
         ('use = "fit"', 'use = "validate"', 'no record has use = "fit"'),
         ("records/one.npz", "../elsewhere.npz", "outside the case folder"),
@@ -369,6 +384,30 @@ def test_sample_instants_in_milliseconds_are_told_how_to_be_named(folder):
     _spoiled(folder, t=lambda t: 1000.0 * t)
     with pytest.raises(CaseError, match=r"if it is in ms, name it 't \[ms\]'"):
         read_case(folder)
+
+
+def test_instants_that_are_not_even_name_the_extremes_of_their_steps(folder):
+    _spoiled(folder, t=lambda t: np.where(np.arange(t.size) < 100, t, t + 0.02))
+    with pytest.raises(CaseError, match=r"t must rise by sample_time = 0.02 .* steps from 0.02 to 0.04$"):
+        read_case(folder)
+
+
+def test_a_place_outside_is_refused_in_the_unit_of_the_case(case, tmp_path):
+    path = write_case(replace(case, units=Units("mm", "t", "s", "N")), tmp_path / "case")
+    path.write_text(path.read_text().replace("at = 0.7", "at = 7.0"))
+    with pytest.raises(CaseError, match=r"at = 7 mm is outside the structure, which runs 0 to 2 mm$"):
+        read_case(path.parent)
+
+
+@pytest.mark.parametrize("word", ["clamped", "hinged", "pinned"])
+def test_an_end_of_a_rod_that_is_held_is_fixed(word, tmp_path):
+    rod = Bar(length=1.0, mass_per_length=1.0, axial_stiffness=2.0, left="fixed", right="free")
+    rig = Rig(rod.modes(3), (Actuator("F1", 0.7),), (Sensor("d1", 0.5, noise_std=1e-4),), structure=rod)
+    record = simulate(rig, np.random.default_rng(1).standard_normal((1, 200)), sample_time=0.02, name="one")
+    path = write_case(Case("a rod", rig, (record,), (replace(record, name="kept"),)), tmp_path / "case")
+    path.write_text(path.read_text().replace('left = "fixed"', f'left = "{word}"'))
+    with pytest.raises(CaseError, match=f"left is one of fixed, free; got '{word}', which is 'fixed' here$"):
+        read_case(path.parent)
 
 
 def test_units_of_a_file_that_nobody_can_tell_in_those_of_the_case_are_refused(tmp_path):

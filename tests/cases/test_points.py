@@ -257,6 +257,8 @@ def test_points_go_through_a_file_unchanged(tmp_path):
     ("case", "points", "words"),
     [
         (PLATE.replace("[0.5, 0.4]", "[0.5, 1.4]"), POINTS, r"'a1': .* \(0.5, 1.4\) lies outside the structure"),
+        (PLATE.replace("simply supported", "pinned"), POINTS, "got 'pinned', which is 'simply supported' here$"),
+        (PLATE.replace("simply supported", "fixed"), POINTS, "got 'fixed', which is 'clamped' here$"),
         (PLATE.replace("[0.5, 0.4]", "0.5"), POINTS, "at must be a list of 2 numbers; got 0.5"),
         (PLATE.replace("[0.3, 0.2]", "[0.3, 0.2]\npatch = 0.1"), POINTS, "'F1': patch must be a list of 2 numbers"),
         (PLATE.replace("[0.3, 0.2]", "[0.05, 0.2]\npatch = [0.2, 0.1]"), POINTS, "'F1': a patch of 0.2 m by 0.1 m at"),

@@ -87,6 +87,10 @@ def test_identify_says_which_modes_and_options_go_nowhere(tmp_path):
     path = write_record(record, tmp_path / "ring.csv")
     many = run("identify", path, "--modes", 15)
     assert many.exit_code == 0 and "14 of the 15 modes asked for are found" in many.output, many.output
+    assert "no further one is significant" not in many.output  # none was tested
+    assert "cannot be modes; only without a number of modes is each tested for significance" in many.output.replace(
+        "\n", " "
+    )
     assert "asked for" not in run("identify", path, "--modes", 2).output
     held = run("identify", path, "--input-hold", "first")
     assert held.exit_code == 2 and "--input-hold is for records with inputs: name them by --inputs" in held.output

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from workbench.records.files import read_record, write_record
 from workbench.records.record import Channel, Record
@@ -46,6 +47,39 @@ def test_the_page_says_how_it_was_made_in_the_words_of_the_command(run, decay, t
     assert content["made_by"] == f"workbench identify {decay} {' '.join(options)}"
     assert any("allow more time by --seconds" in line for line in content["lines"])
     assert content["blocks"][0]["motion"]["label"] == "sensor"
+
+
+def test_the_page_of_a_driven_record_shows_the_response_of_the_modes_beside_the_measured_one(run, tmp_path):
+    """Truth: the z-transform of a mode under a held force that acts three samples late."""
+    rng, pole = np.random.default_rng(0), (-0.02 + 1j) * 2.0 * np.pi * 30.0
+    force, step = rng.standard_normal(6000), np.exp(pole / RATE)
+    gain = (step - 1.0) / pole / (2j * pole.imag)
+    late = np.r_[np.zeros(3), force[:-3]]
+    motion = 2.0 * np.real(lfilter([0.0, gain], [1.0, -step], late.astype(complex)))
+    sizes = np.linspace(1.0, 2.0, 7)
+    outputs = sizes[:, None] * motion + 1e-3 * motion.std() * rng.standard_normal((7, 6000))
+    channels = tuple(Channel(f"y{j + 1}", "displacement") for j in range(7))
+    write_record(Record(1.0 / RATE, outputs, channels, force[None], (Channel("F", "force"),)), tmp_path / "driven.csv")
+    page = tmp_path / "driven.html"
+    found = run("identify", tmp_path / "driven.csv", "--page", page)
+    assert found.exit_code == 0, found.output
+    shown, coherence = json.loads(page.with_suffix(".page.json").read_text())["blocks"][-2:]
+    assert shown["caption"].endswith("and of the identified modes (dashed). Not drawn: y7.")
+    panels = shown["figure"]["panels"]
+    assert len(panels) == 12 and len(coherence["figure"]["panels"][0]["marks"]) == 6
+    for panel, size in zip(panels[::2], sizes[:6], strict=True):
+        measured, model = panel["marks"]
+        z = np.exp(2j * np.pi * np.array(model["x"]) / RATE)
+        exact = size * np.abs(gain / (z - step) + np.conj(gain) / (z - np.conj(step)))
+        seen = np.array(model["x"]) < 100.0  # beyond it is less than the noise
+        assert model["dash"] and np.abs(np.array(model["y"]) / exact - 1.0)[seen].max() < 0.02
+        assert min(measured["x"]) > 0 and max(model["x"]) < RATE / 2
+    for panel in panels[1::2]:  # in phase too, where there is more than noise
+        measured, model = panel["marks"]
+        near = [k for k, hertz in enumerate(measured["x"]) if 10 < hertz < 60]
+        turned = np.interp(np.array(measured["x"])[near], model["x"], np.unwrap(model["y"], period=360.0))
+        apart = (np.array(measured["y"])[near] - turned + 180.0) % 360.0 - 180.0
+        assert np.median(np.abs(apart)) < 3.0
 
 
 @pytest.mark.slow

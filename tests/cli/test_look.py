@@ -1,5 +1,6 @@
 """`workbench look`: what a stranger's file holds, and a command that then works."""
 
+import json
 import shlex
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 from scipy.signal import firwin, lfilter
 
 from workbench.cli.terminal import by_options, names_in
+from workbench.records.files import write_record
+from workbench.records.record import Channel, Record
 
 RATE, N = 1000.0, 4000
 OMEGA, ZETA = 2.0 * np.pi * 40.0, 0.01
@@ -45,6 +48,39 @@ def test_a_ring_down_that_is_far_from_over_is_one(run, tmp_path):
     noisy = rings + 0.01 * np.random.default_rng(0).normal(size=time.size)
     path = write(tmp_path / "ring.csv", ["t", "a1", "a2"], [time, noisy, 0.4 * rings])
     assert "--ambient" not in run("look", path, "--page", tmp_path / "p.html").output
+
+
+def test_a_folder_is_no_file_and_a_record_in_it_is_named(run, tmp_path):
+    refused = run("look", tmp_path)
+    assert refused.exit_code == 2 and "is a folder; give a file of .csv, .txt" in " ".join(refused.output.split())
+    (tmp_path / "records").mkdir()
+    (tmp_path / "case.toml").write_text("")
+    time, tip = decay(np.random.default_rng(0))
+    write(tmp_path / "records" / "tip.csv", ["time", "tip"], [time, tip])
+    refused = " ".join(run("identify", tmp_path).output.split())
+    assert "is a folder; give a file in it, such as" in refused and refused.endswith("records/tip.csv")
+
+
+@pytest.mark.parametrize(("stored", "shown"), [("simulated", "tip"), ("by hand", "by hand")])
+def test_a_record_that_nobody_named_is_shown_by_its_file(run, tmp_path, stored, shown):
+    _, tip = decay(np.random.default_rng(0))
+    record = Record(1.0 / RATE, tip[None], (Channel("tip", "displacement"),), name=stored)
+    path, page = write_record(record, tmp_path / "tip.npz"), tmp_path / "p.html"
+    assert run("look", path, "--page", page).exit_code == 0
+    assert json.loads(page.with_suffix(".page.json").read_text())["blocks"][0]["figure"]["panels"][0]["title"] == shown
+    assert run("identify", path, "--page", page).exit_code == 0
+    captions = [block["caption"] for block in json.loads(page.with_suffix(".page.json").read_text())["blocks"]]
+    assert f"Power spectral density of {shown}, by Welch's method." in captions
+
+
+def test_ambient_identification_of_a_record_with_inputs_is_refused_with_the_option_to_leave_out(run, tmp_path):
+    rng = np.random.default_rng(0)
+    force, moves = rng.standard_normal((2, N))
+    path = write(tmp_path / "driven.csv", ["t", "F", "a"], [np.arange(N) / RATE, force, moves])
+    refused = run("identify", path, "--inputs", "F", "--ambient")
+    said = " ".join(refused.output.split())
+    assert refused.exit_code == 2
+    assert "got 1 record with 1 input: leave --ambient out, to identify from the inputs" in said
 
 
 @pytest.mark.slow

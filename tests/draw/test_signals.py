@@ -24,6 +24,14 @@ def test_the_frequency_response_is_that_of_the_filter_between_input_and_output()
         plot_frf(Record(1 / rate, u[None], (Channel("y"),)))
 
 
+def test_lines_of_the_same_colour_differ_by_their_dashes():
+    rng = np.random.default_rng(0)
+    channels = tuple(Channel(f"y{j}") for j in range(9))
+    record = Record(0.01, rng.standard_normal((9, 500)), channels, rng.standard_normal((1, 500)), (Channel("F"),))
+    for ax in plot_frf(record).axes:
+        assert len({(line.get_color(), line.get_linestyle()) for line in ax.lines}) == 9
+
+
 def test_transfer_functions_are_drawn_by_magnitude_and_phase_with_what_was_fitted():
     """Of one mode: 1 / c ω in size and -90° at its frequency."""
     lines, omega, zeta = np.linspace(1.0, 40.0, 391), 2.0 * np.pi * 20.0, 0.02

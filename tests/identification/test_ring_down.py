@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from workbench.identification.ring_down import _check_undriven, ring_down
+from workbench.identification.ring_down import _check_undriven, by_remark, ring_down
 from workbench.identification.signal.data_quality import dropouts
+from workbench.identification.signal.harmonics import near_mains
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -182,7 +183,19 @@ def test_a_tone_is_remarked():
     tone = 10.0 * np.sin(13.0 * record.time) * [[1.0], [-0.5]]
     told = ring_down(replace(record, outputs=record.outputs + tone))
     assert "does not decay within the record" in told.notes[0]
-    assert told.remarks == ("", "does not decay: mains hum?", "")
+    assert told.remarks == ("", "does not decay within the record", "")
+
+
+@pytest.mark.parametrize(("hertz", "told"), [(50.4, True), (50.7, False), (59.5, True), (149.6, True), (2.07, False)])
+def test_mains_hum_is_asked_about_near_multiples_of_its_frequency(hertz, told):
+    assert near_mains(hertz) == told
+
+
+def test_modes_of_the_same_remark_share_a_line():
+    assert by_remark(["", "grows", "hardly rings: a drift?", "grows"]) == [
+        "modes 2 and 4: grows",
+        "mode 3: hardly rings: a drift?",
+    ]
 
 
 def test_proportional_damping_is_told():

@@ -75,6 +75,24 @@ def test_identified_modes_swing(tmp_path):
     assert track["imaginary"] == [[0.0], [0.1]]
 
 
+def test_identified_modes_are_shown_to_the_digits_of_their_errors_and_damping_in_per_cent(tmp_path):
+    """The file holds ratios."""
+    two = {**IDENTIFIED, "frequencies_hz": [3.00123, 9.0], "frequencies_std_hz": [0.012, 0.0],
+           "damping_ratios": [0.0040128, 0.02], "damping_std": [1.4e-5, 2e-5],
+           "shapes_real": [[1.0, 1.0], [0.5, -0.5]], "shapes_imag": [[0.0, 0.0], [0.1, 0.0]]}  # fmt: skip
+    shown = page_content_in(written(tmp_path, two))
+    [(_, heads, rows)] = shown.tables
+    assert heads == ("mode", "frequency [Hz]", "std [Hz]", "damping [%]", "std [%]")
+    assert rows == [[1, "3.001", "0.012", "0.4013", "0.0014"], [2, "9", "0", "2.0000", "0.0020"]]
+    [track] = shown.blocks[0]["motion"]["tracks"]
+    assert track["frequencies_hz"] == [3.001, 9.0] and track["damping"] == [0.004013, 0.02]
+    caption, panel = shown.blocks[1]["caption"], shown.blocks[1]["figure"]["panels"][0]
+    assert panel["y"]["label"] == "damping [%]"
+    assert caption.endswith("The bars are shorter than the dots: no standard error is above 0.35 % of its value.")
+    seen = page_content_in(written(tmp_path, {**two, "damping_std": [1e-3, 1e-3]})).blocks[1]["caption"]
+    assert seen == "Damping of each mode, ± 2 standard errors."
+
+
 @pytest.mark.parametrize("counted_from", [1, 0])
 def test_a_design_shows_what_it_spills(tmp_path, counted_from):
     """Modes are counted from one; a file written before they were is read too."""

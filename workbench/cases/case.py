@@ -175,7 +175,7 @@ def _read_record(
     file = inside(folder, text(entry, "file", where), where)
     arrays, stated = _arrays(file, where, units, renamed)
     _check_channels(file, arrays, rig)
-    _check_instants(file, arrays["t"], sample_time, rig)
+    _check_instants(file, arrays["t"], sample_time, rig, units.time)
     for sensor in rig.sensors:
         if np.ptp(arrays[sensor.name]) == 0:
             level = arrays[sensor.name][0]
@@ -239,12 +239,16 @@ def _check_channels(file: Path, arrays: dict[str, np.ndarray], rig: Rig) -> None
             raise CaseError(f"{file}: channel {channel!r}, sample {at} is {values[at]}; fill it, or cut the record")
 
 
-def _check_instants(file: Path, t: np.ndarray, sample_time: float, rig: Rig) -> None:
+def _check_instants(file: Path, t: np.ndarray, sample_time: float, rig: Rig, unit: str) -> None:
     """Refuse sample instants that are not a sample time apart, or span less than a period of the first mode."""
     steps = np.diff(t)
     if t.size < LEAST_SAMPLES or np.abs(steps - sample_time).max() > 0.01 * sample_time:
         is_in_ms = steps.size and np.abs(1e-3 * steps - sample_time).max() < 0.01 * sample_time
         in_ms = "; if it is in ms, name it 't [ms]'" if is_in_ms else ""
+        step = float(f"{np.median(steps):.6g}") if t.size >= LEAST_SAMPLES else 0.0
+        if step > 0.0 and np.abs(steps - step).max() < 0.01 * step:
+            remedy = in_ms or f": write sample_time = {step:g}"
+            raise CaseError(f"{file}: sample_time = {sample_time:g} {unit}, but t steps by {step:g}{remedy}")
         raise CaseError(
             f"{file}: t must rise by sample_time = {sample_time:g} over at least {LEAST_SAMPLES} samples;"
             f" it has {t.size} and steps from {steps.min() if steps.size else np.nan:g} to"

@@ -16,6 +16,7 @@ from workbench.cases.tables import (
     numbers,
     one_of,
     profile,
+    said,
     shown,
     table_of,
     tables,
@@ -38,11 +39,24 @@ PLATE_TOLERANCE = 1e-5  # of frequencies; where a clamped edge meets a free one,
 TABLES = ("title", "input_hold", "units", "channels", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
+KINDS = (*STRUCTURES, "plate", "modal")
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
 PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio", "edges", "damping_ratio", "modes")
 EDGES = ("left", "right", "bottom", "top")
 ENDS = {"beam": ("hinged", "clamped", "free", "sliding"), "rod": ("fixed", "free")}
 EDGE = ("simply supported", "clamped", "guided", "free")
+# What others call ends and edges. A rod has no bending: whatever holds its end fixes it.
+PINNED = ("pinned", "simply supported", "supported")
+BUILT_IN = ("fixed", "built in")
+SYNONYMS: dict[str, dict[str, str]] = {
+    "beam": {**dict.fromkeys(PINNED, "hinged"), **dict.fromkeys(BUILT_IN, "clamped"), "guided": "sliding"},
+    "rod": dict.fromkeys((*PINNED, *BUILT_IN, "hinged", "clamped"), "fixed"),
+    "plate": {
+        **dict.fromkeys(("pinned", "supported", "hinged"), "simply supported"),
+        **dict.fromkeys(BUILT_IN, "clamped"),
+        "sliding": "guided",
+    },
+}
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
 # Further keys of an input and of an output, for moments, patches and directions, by the kind of structure.
@@ -96,21 +110,25 @@ def rig_of(table: dict[str, Any], path: Path) -> Rig:
             return _plate_rig(structure, inputs, outputs)
         if structure.get("kind") == "modal":
             return _modal_rig(structure, inputs, outputs, path)
-        return _member_rig(structure, inputs, outputs)
+        units = table.get("units")
+        return _member_rig(
+            structure, inputs, outputs, str(units.get("length", "m") if isinstance(units, dict) else "m")
+        )
     except (ValueError, TypeError, ArithmeticError) as error:
         raise CaseError(f"{path}: {error}") from error
 
 
-def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
+def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], unit: str) -> Rig:
+    """The rig of a rod or a beam, whose lengths are in a unit."""
     kind = "rod" if table.get("kind") == "bar" else table.get("kind")  # synonyms
     if not isinstance(kind, str) or kind not in STRUCTURES:
-        raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {shown(kind)}")
+        raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {said(kind, KINDS)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
     _check_ports(inputs, outputs, "at", kind)
     common: dict[str, Any] = {
         "length": number(table, "length", "[structure]"),
         "mass_per_length": profile(table, "mass_per_length"),
-        **{side: one_of(table, side, ENDS[kind], "[structure]") for side in ("left", "right")},
+        **{side: one_of(table, side, ENDS[kind], "[structure]", synonyms=SYNONYMS[kind]) for side in ("left", "right")},
         "damping": ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     }
     structure: Structure
@@ -123,7 +141,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     else:
         structure = Bar(axial_stiffness=profile(table, "axial_stiffness"), **common)
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=1e-9)
-    return _rig_of(modes, inputs, outputs, lambda e, where: _place(e, structure.length, where), structure)
+    return _rig_of(modes, inputs, outputs, lambda e, where: _place(e, structure.length, unit, where), structure)
 
 
 def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
@@ -139,7 +157,7 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
         mass_per_area=number(table, "mass_per_area", "[structure]", low=0.0),
         bending_stiffness=number(table, "bending_stiffness", "[structure]", low=0.0),
         poisson_ratio=number(table, "poisson_ratio", "[structure]"),
-        edges={side: one_of(edges, side, EDGE, "[structure] edges") for side in EDGES},
+        edges={side: one_of(edges, side, EDGE, "[structure] edges", synonyms=SYNONYMS["plate"]) for side in EDGES},
         damping=ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     )
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=PLATE_TOLERANCE)
@@ -226,10 +244,10 @@ def _direction(entry: dict[str, Any], turning: bool, where: str) -> str | None:
     return text(entry, key, where) if key in entry else None
 
 
-def _place(entry: dict[str, Any], length: float, where: str) -> float:
+def _place(entry: dict[str, Any], length: float, unit: str, where: str) -> float:
     at = number(entry, "at", where)
     if not 0 <= at <= length:
-        raise CaseError(f"{where}: at = {at:g} is outside the structure, which runs 0 to {length:g}")
+        raise CaseError(f"{where}: at = {at:g} {unit} is outside the structure, which runs 0 to {length:g} {unit}")
     return at
 
 
@@ -277,7 +295,7 @@ def _sensor(entry: dict[str, Any], at: Place, modes: Modes) -> Sensor:
     where = f"[[output]] {entry['name']!r}"
     quantity = entry.get("quantity")
     if quantity not in MEASURED:
-        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {shown(quantity)}")
+        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {said(quantity, MEASURED)}")
     noise = number(entry, "noise_std", where, low=0.0) if "noise_std" in entry else 0.0
     if noise == 0 and "noise_std" in entry:
         raise CaseError(f"{where}: noise_std must be positive; leave it out where it is not known")

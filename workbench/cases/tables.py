@@ -2,16 +2,19 @@
 
 import re
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from reprlib import Repr
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 MOST_BYTES = 2**24
 MOST_ENTRIES = 1000
+MOST_LETTERS = 60  # of a word that is compared with those allowed
+NO_SYNONYMS: Mapping[str, str] = MappingProxyType({})
 
 _DEEP_KEY = re.compile(r"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
 
@@ -108,16 +111,31 @@ def text(entry: dict[str, Any], key: str, where: str) -> str:
     return value
 
 
-def one_of(entry: dict[str, Any], key: str, allowed: Sequence[str], where: str) -> str:
+def one_of(
+    entry: dict[str, Any], key: str, allowed: Sequence[str], where: str, *, synonyms: Mapping[str, str] = NO_SYNONYMS
+) -> str:
     """The text under `key`, which must be one of those allowed.
 
+    Args:
+        entry, key, allowed, where: of the text.
+        synonyms: the allowed text by what others call it.
+
     Raises:
-        CaseError: the value is anything else.
+        CaseError: the value is anything else, with the text that is probably meant.
     """
     value = text(entry, key, where)
     if value not in allowed:
-        raise CaseError(f"{where}: {key} is one of {', '.join(allowed)}; got {shown(value)}")
+        raise CaseError(f"{where}: {key} is one of {', '.join(allowed)}; got {said(value, allowed, synonyms)}")
     return value
+
+
+def said(value: object, allowed: Iterable[str], synonyms: Mapping[str, str] = NO_SYNONYMS) -> str:
+    """A value that is not allowed, for a message, and the allowed text that is probably meant."""
+    word = str(value).lower().replace("-", " ").replace("_", " ")[:MOST_LETTERS]
+    if word in synonyms:
+        return f"{shown(value)}, which is {synonyms[word]!r} here"
+    close = get_close_matches(word, allowed, 1)
+    return shown(value) + (f"; did you mean {close[0]!r}?" if close else "")
 
 
 def inside(folder: Path, file: str, where: str) -> Path:

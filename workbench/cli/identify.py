@@ -63,7 +63,7 @@ def identify(
     Example: workbench identify ringdown.csv --outputs a,b --json modes.json
     """
     from workbench.identification.signal.modal_estimates import HEADINGS
-    from workbench.records.files import read_measured
+    from workbench.records.files import named_by_file, read_measured
     from workbench.records.limits import Limits
     from workbench.study.pages.identification_report import identification_report
 
@@ -71,13 +71,16 @@ def identify(
     limits = Limits.of_gib(memory)
     with reporting("reading") as report:
         read = [
-            read_measured(
+            named_by_file(
+                read_measured(
+                    path,
+                    sample_rate_hz=sample_rate_hz,
+                    inputs=names_in(inputs),
+                    outputs=names_in(outputs),
+                    input_hold=input_hold,
+                    limits=limits,
+                ),
                 path,
-                sample_rate_hz=sample_rate_hz,
-                inputs=names_in(inputs),
-                outputs=names_in(outputs),
-                input_hold=input_hold,
-                limits=limits,
             )
             for path in records
         ]

@@ -4,37 +4,50 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
 
+from workbench.arrays import Flags
 from workbench.draw.style import COLOURS, GREY, few_ticks, new_figure
-from workbench.identification.free_decay.ibrahim import Stabilisation
+from workbench.identification.free_decay.ibrahim import STABILITY, Stabilisation
 from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.modal_estimates import Refined
-from workbench.structure.modes import Modes, SampledModes
+from workbench.structure.modes import Modes, SampledModes, mac
 
-# from complex to real shapes; both ends are visible on white and on black
-REAL = LinearSegmentedColormap.from_list("real", ["#8f979f", COLOURS[0]])
+MOST_NUMBERED = 12  # modes of a MAC matrix whose values are written in its cells
 
 
 def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz: float) -> Figure:
-    """Frequencies at each order; blue dots have real shapes (phase collinearity near 1), grey ones complex shapes."""
+    """Frequencies at each order: dots are poles of modes that stay, in frequency and shape; crosses are others."""
     figure, ax = new_figure(width=9, height=4.5)
-    look: Any = {"cmap": REAL, "vmin": 0, "vmax": 1, "s": 22, "edgecolors": GREY, "linewidths": 0.4, "zorder": 3}
     for line, frequency in enumerate(stayed.frequencies_hz):
-        ax.axvline(frequency, color=COLOURS[1], alpha=0.5, lw=5, label=None if line else "stable")
-    for order, modes in zip(diagram.orders, diagram.found, strict=True):
-        keep = modes.frequencies_hz < band_hz
-        at, collinearity = np.full(keep.sum(), order), modes.phase_collinearity[keep]
-        dots = ax.scatter(modes.frequencies_hz[keep], at, c=collinearity, **look)
-    figure.colorbar(dots, ax=ax, label="phase collinearity of the shape")
+        ax.axvline(frequency, color=COLOURS[1], alpha=0.5, lw=5, label=None if line else "stable mode")
+    points = [
+        (hertz, order, stable)
+        for order, modes in zip(diagram.orders, diagram.found, strict=True)
+        for hertz, stable in zip(modes.frequencies_hz, _stays(modes, stayed), strict=True)
+        if hertz < band_hz
+    ]
+    hertz, orders, stable = np.array(points).reshape(-1, 3).T
+    for kind, look in ((stable == 0.0, {"marker": "x", "color": GREY, "label": "pole that is not stable"}),
+                       (stable == 1.0, {"marker": "o", "color": COLOURS[0], "label": "stable pole"})):  # fmt: skip
+        if kind.any():
+            ax.plot(hertz[kind], orders[kind], lw=0, ms=5, zorder=3, **look)
     ax.set(xlabel="frequency [Hz]", ylabel="model order (modes)")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-    if stayed.n_modes:
-        figure.legend(loc="outside upper right")
+    figure.legend(loc="outside upper right", ncols=3)
     return figure
+
+
+def _stays(modes: SampledModes, stayed: SampledModes) -> Flags:
+    """Which modes agree in frequency and shape with one that stays, and decay, (n_modes,)."""
+    if not stayed.n_modes:
+        return np.zeros(modes.n_modes, bool)
+    near = np.abs(modes.omega[:, None] / stayed.omega - 1.0) <= STABILITY.frequency
+    alike = mac(modes.shapes, stayed.shapes) >= STABILITY.shape
+    return np.asarray((near & alike).any(axis=1) & (modes.zeta > 0.0) & (modes.zeta < STABILITY.most_damped))
 
 
 def plot_standard_errors(refined: Refined) -> Figure:
@@ -52,10 +65,10 @@ def plot_standard_errors(refined: Refined) -> Figure:
     return figure
 
 
-def plot_deviations(names: Sequence[str], values: Sequence[float], deviations: Sequence[float], label: str) -> Figure:
+def plot_deviations(names: Sequence[str], values: ArrayLike, deviations: ArrayLike, label: str) -> Figure:
     """Estimates with bars of ± 2 standard errors."""
     figure, ax = new_figure(width=9, height=3.5)
-    at, spread = np.arange(len(values)), 2 * np.asarray(deviations)
+    at, spread = np.arange(len(names)), 2.0 * np.asarray(deviations)
     ax.vlines(at, np.subtract(values, spread), np.add(values, spread), color=COLOURS[1], label="± 2 standard errors")
     ax.plot(at, values, "o", color=COLOURS[0], label="estimate")
     ax.set_xticks(at, list(names))
@@ -65,8 +78,9 @@ def plot_deviations(names: Sequence[str], values: Sequence[float], deviations: S
 
 
 def plot_mac(values: np.ndarray) -> Figure:
-    """A MAC matrix (n_modes, n_modes), with values from 0 to 1."""
-    figure, ax = new_figure(width=5.5, height=4.8)
+    """A MAC matrix (n_modes, n_modes), values from 0 to 1, written in the cells where they are those of few modes."""
+    side = max(4.8, 0.55 * min(len(values), MOST_NUMBERED))
+    figure, ax = new_figure(width=side + 0.7, height=side)
     modes = np.arange(1, len(values) + 1)
     image = ax.imshow(values, cmap="Blues", vmin=0.0, vmax=1.0, origin="lower")
     ax.set_xticks(modes - 1, [str(mode) for mode in modes])
@@ -74,6 +88,12 @@ def plot_mac(values: np.ndarray) -> Figure:
     ax.set(xlabel="mode", ylabel="mode", title="modal assurance criterion")
     ax.grid(False)
     figure.colorbar(image, ax=ax, label="MAC")
+    if len(values) <= MOST_NUMBERED:
+        for (i, j), value in np.ndenumerate(values):
+            colour = "#ffffff" if value > 0.5 else "#1a1a1a"  # on the cell, whatever the page
+            ax.text(
+                j, i, f"{value:.2f}", ha="center", va="center", fontsize=8 if len(values) <= 8 else 6.5, color=colour
+            )
     return figure
 
 

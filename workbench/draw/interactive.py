@@ -72,6 +72,7 @@ def _panel(ax: Axes, axes: list[Axes], height: float) -> dict[str, Any]:
         "x": _axis(ax, ax.xaxis, ax.get_shared_x_axes(), axes),
         "y": _axis(ax, ax.yaxis, ax.get_shared_y_axes(), axes),
         "legend": ax.get_legend() is not None,
+        **({"square": True} if ax.images and ax.get_aspect() == 1.0 else {}),
         "marks": [mark for artist in _artists(ax) for mark in _described(ax, artist)],
     }
 

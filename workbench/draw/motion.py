@@ -68,21 +68,49 @@ def response_motion(
 
 
 def mode_motion(
-    modes: Mapping[str, Modes | SampledModes], *, actuators: Sequence[Actuator] = (), sensors: Sequence[Sensor] = ()
+    modes: Mapping[str, Modes | SampledModes],
+    *,
+    actuators: Sequence[Actuator] = (),
+    sensors: Sequence[Sensor] = (),
+    std: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
 ) -> dict[str, Any]:
     """An animation of mode shapes, one mode at a time; several sets of modes are superposed, each scaled to one.
 
     Sampled modes are shown at their sensors, with phase. A plate is drawn as a grid of lines, a frame or the sensors on
     a plate as nodes with lines between neighbours, in an oblique view; a plane frame is seen from the front.
 
+    Args:
+        modes: by the displayed name.
+        actuators, sensors: marked at their places.
+        std: standard errors (n_modes,) of the frequencies, Hz, and of the damping ratios of a set of modes; both are
+            displayed to the second digit of their error.
+
     Raises:
         ValueError: modes at named points without positions.
     """
     first = next(iter(modes.values()))
     if isinstance(first, SampledModes) and first.on_plate:
-        return _modes_on_net(scattered_net(first.positions), modes, actuators, sensors)
-    if isinstance(first, Modes) and not isinstance(first.domain, Interval):
-        return _modes_on_net(_net(first.domain), modes, actuators, sensors)
+        shown = _modes_on_net(scattered_net(first.positions), modes, actuators, sensors)
+    elif isinstance(first, Modes) and not isinstance(first.domain, Interval):
+        shown = _modes_on_net(_net(first.domain), modes, actuators, sensors)
+    else:
+        shown = _modes_along(modes, actuators, sensors)
+    for track in shown["tracks"]:
+        for key, errors in zip(("frequencies_hz", "damping"), (std or {}).get(track["label"], ()), strict=False):
+            track[key] = [_to_error(*pair) for pair in zip(track[key], np.asarray(errors).tolist(), strict=True)]
+    return shown
+
+
+def _to_error(value: float, error: float) -> float:
+    """A value to the second digit of its error."""
+    return round(value, 1 - int(np.floor(np.log10(error)))) if 0.0 < error < np.inf else value
+
+
+def _modes_along(
+    modes: Mapping[str, Modes | SampledModes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]
+) -> dict[str, Any]:
+    """Mode shapes along a line, or over the numbers of the sensors."""
+    first = next(iter(modes.values()))
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
         if isinstance(found, SampledModes):

@@ -20,6 +20,8 @@ DISTORTION_LIMIT = 4.0  # highest frequency of a figure of distortion, over the 
 SEGMENTS_IN_MEMORY = 256  # at once
 SEGMENTS = 4  # of a record, at least
 MOST_PANELS = 12
+# of the lines of one panel: the colours repeat after seven
+DASHES = [*["-"] * len(COLOURS), *["--"] * (MOST_PANELS - len(COLOURS))]
 
 
 def power_spectrum(values: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
@@ -112,8 +114,8 @@ def plot_transfer(measured: TransferFunctions, fitted: TransferFunctions | None 
     return figure
 
 
-def plot_frf(record: Record) -> Figure:
-    """Frequency response of each output to the single input, H1 = S_uy / S_uu, and its coherence.
+def frequency_response(record: Record) -> TransferFunctions:
+    """The response of each output to the single input, H1 = S_uy / S_uu, by Welch's method; NaN where S_uu is small.
 
     Raises:
         ValueError: a record with no input, or several.
@@ -123,19 +125,46 @@ def plot_frf(record: Record) -> Figure:
     rate, segment = record.sample_rate_hz, _segment(record.n_samples)
     u = record.inputs[0] - record.inputs[0].mean()
     lines, power = welch(u, rate, nperseg=segment)
+    values = np.full((record.n_outputs, 1, lines.size), complex(np.nan, np.nan))
+    for response, row in zip(values[:, 0], record.outputs, strict=True):
+        cross = csd(u, row - row.mean(), rate, nperseg=segment)[1]
+        np.divide(cross, power, out=response, where=power > SHOWN * power.max())
+    return TransferFunctions(values[..., 1:], lines[1:], record.output_channels, record.input_names, name=record.name)
+
+
+def plot_coherence(record: Record) -> Figure:
+    """Coherence of each output with the single input."""
+    figure, ax = new_figure(width=9, height=2.4)
+    _coherence(ax, record)
+    ax.legend(ncols=4, fontsize=8)
+    return figure
+
+
+def _coherence(ax: Axes, record: Record) -> None:
+    rate, segment = record.sample_rate_hz, _segment(record.n_samples)
+    u = record.inputs[0] - record.inputs[0].mean()
+    for (channel, row), dashes in zip(zip(record.output_channels, record.outputs, strict=True), DASHES, strict=False):
+        lines, found = coherence(u, row - row.mean(), rate, nperseg=segment)
+        ax.plot(lines[1:], found[1:], linewidth=0.9, linestyle=dashes, label=channel.name)
+    ax.set(xlabel="frequency [Hz]", ylabel="coherence", ylim=(0.0, 1.05))
+
+
+def plot_frf(record: Record) -> Figure:
+    """Frequency response of each output to the single input, H1 = S_uy / S_uu, and its coherence.
+
+    Raises:
+        ValueError: a record with no input, or several.
+    """
+    found = frequency_response(record)
     figure, axes = new_figure(2, 1, width=9, height=5.5, sharex=True, height_ratios=(3, 1))
-    for channel, row in list(zip(record.output_channels, record.outputs))[:MOST_PANELS]:
-        y = row - row.mean()
-        cross = np.abs(csd(u, y, rate, nperseg=segment)[1])
-        response = np.divide(cross, power, out=np.full_like(power, np.nan), where=power > SHOWN * power.max())
-        axes[0].semilogy(lines[1:], response[1:], linewidth=0.9, label=channel.name)
-        axes[1].plot(lines[1:], coherence(u, y, rate, nperseg=segment)[1][1:], linewidth=0.9)
+    for channel, row, dashes in zip(found.output_channels, found.values[:, 0], DASHES, strict=False):
+        axes[0].semilogy(found.frequencies_hz, np.abs(row), linewidth=0.9, linestyle=dashes, label=channel.name)
+    _coherence(axes[1], record)
     (force,), units = record.input_channels, {channel.unit for channel in record.output_channels}
     output = units.pop() if len(units) == 1 else ""
     per_input = f"({output})/{force.unit}" if "/" in output else f"{output}/{force.unit}"
     label = in_units(f"|output / {force.name}|", per_input if output and force.unit else "")
     axes[0].set(ylabel=label, title="frequency response (H1)")
-    axes[1].set(xlabel="frequency [Hz]", ylabel="coherence", ylim=(0.0, 1.05))
     axes[0].legend(ncols=4, fontsize=8)
     return figure
 

@@ -29,14 +29,14 @@ from workbench.identification.signal.data_quality import (
     dropout_remark,
     of_same_sensors,
 )
-from workbench.identification.signal.harmonics import multiple_of
+from workbench.identification.signal.harmonics import multiple_of, near_mains
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import Record, as_records
 from workbench.renamed import Renamed
 from workbench.structure.modes import SampledModes
-from workbench.structure.printed import mode_text
+from workbench.structure.printed import joined_in_words, mode_text
 from workbench.threads import one_blas_thread
 
 
@@ -65,6 +65,7 @@ class RingDownSettings:
 
 RING_DOWN = RingDownSettings()
 SURE = 3.0
+WITHIN_ERROR = "damping no larger than its error"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,8 +97,7 @@ class RingDown(OfRefined):
     noise_evidence, limit = Renamed("noise_statistic"), Renamed("threshold")
 
     def _remarks(self) -> tuple[str, ...]:
-        of_modes = (f"mode {r + 1}: {remark}" for r, remark in enumerate(self.remarks) if remark)
-        return (*of_modes, *self.notes, *self.by_amplitude.remarks)
+        return (*by_remark(self.remarks), *self.notes, *self.by_amplitude.remarks)
 
 
 @one_blas_thread
@@ -163,7 +163,7 @@ def ring_down(
         (
             *notes,
             *drift_notes,
-            *_missing_modes(identified.refined, n_modes),
+            *_on_given_number(mode_remarks, n_modes),
             *budget.remarks,
             *_undecaying(identified.refined, decays),
             *_ambient_excitation(identified.refined, mode_remarks),
@@ -176,12 +176,17 @@ def ring_down(
     )
 
 
-def _missing_modes(refined: Refined, n_modes: int | None) -> list[str]:
-    """A note where there are fewer modes than were asked for."""
-    found = refined.modes.n_modes
-    if n_modes is None or found >= n_modes:
+def _on_given_number(mode_remarks: Sequence[str], n_modes: int | None) -> list[str]:
+    """A note where there are fewer modes than were asked for, or the damping of some is not significant."""
+    if n_modes is None:
         return []
-    return [f"{found} of the {n_modes} modes asked for are found: no further one is significant in the records"]
+    found, untested = len(mode_remarks), "only without a number of modes is each tested for significance"
+    if found < n_modes:
+        return [
+            f"{found} of the {n_modes} modes asked for are found, as the other poles of a model of this order cannot be"
+            f" modes; {untested}"
+        ]
+    return [f"{n_modes} modes are given as asked for; {untested}"] if WITHIN_ERROR in mode_remarks else []
 
 
 def _cut_to_decay(record: Record, start: float | None) -> tuple[Record, list[str]]:
@@ -463,13 +468,22 @@ def _coloured_residual(records: list[Record], residuals: list[np.ndarray]) -> tu
     )
 
 
+def by_remark(remarks: Sequence[str]) -> list[str]:
+    """The remarks of all modes, in one line where several modes have the same."""
+    modes: dict[str, list[str]] = {}
+    for r, remark in enumerate(remarks):
+        modes.setdefault(remark, []).append(str(r + 1))
+    modes.pop("", None)
+    return [f"mode{'s' * (len(which) > 1)} {joined_in_words(which)}: {remark}" for remark, which in modes.items()]
+
+
 def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, ...]:
     """One remark per mode, empty where there is none.
 
-    A period longer than the record: a drift. A damping ratio not three standard errors above zero: mains hum, if the
-    motion lasts to the end of the record; three below zero, a growing motion. A whole multiple of the frequency of a
-    mode thirty times as strong: perhaps its harmonic distortion (a hinged beam has modes at such frequencies too). A
-    damping ratio above 0.3: perhaps a drift.
+    A period longer than the record: a drift. A damping ratio not three standard errors above zero, which does not decay
+    if the motion lasts to the end of the record: mains hum at a multiple of its frequency; three below zero, a growing
+    motion. A whole multiple of the frequency of a mode thirty times as strong: perhaps its harmonic distortion (a
+    hinged beam has modes at such frequencies too). A damping ratio above 0.3: perhaps a drift.
     """
     modes, texts = refined.modes, []
     size = np.abs(np.stack(refined.amplitudes) / refined.noise[:, :, None]).max(axis=(0, 1))
@@ -486,7 +500,8 @@ def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, 
             texts.append(f"{times} × mode {base + 1}: its harmonic?")
         elif zeta < error:
             lasts = zeta * modes.omega[r] * span < 1.0
-            texts.append("does not decay: mains hum?" if lasts else "damping no larger than its error")
+            endless = "does not decay: mains hum?" if near_mains(f) else "does not decay within the record"
+            texts.append(endless if lasts else WITHIN_ERROR)
         elif zeta > SELECTION.most_damped:
             texts.append("hardly rings: a drift?")
         else:

@@ -36,6 +36,7 @@ FORMATS = {
     ".wav": wav_file,
 }
 READ_ONLY = (".tdms", ".wav")
+GIVEN = ("record", "simulated", "free decay")  # names of records that nobody named
 
 
 def read_record(
@@ -126,6 +127,12 @@ def read_measured(
     return record if input_hold is None else replace(record, input_hold=input_hold)
 
 
+def named_by_file(measured: Record | TransferFunctions, path: Path) -> Record | TransferFunctions:
+    """What was read from a file, by the file's name where it was stored under a name that nobody gave it."""
+    unnamed = isinstance(measured, Record) and measured.name in GIVEN
+    return replace(measured, name=path.stem) if unnamed else measured
+
+
 def write_record(record: Record, path: str | Path) -> Path:
     """Write a record to a file, whose suffix selects the format; reading it gives the same record, without remarks.
 
@@ -157,6 +164,11 @@ def write_record(record: Record, path: str | Path) -> Path:
 
 
 def _format(path: Path) -> ModuleType:
+    if path.is_dir():
+        files = (file for depth in ("*", "*/*") for file in sorted(path.glob(depth)) if file.suffix.lower() in FORMATS)
+        found = next(filter(Path.is_file, files), None)
+        remedy = f"give a file of {', '.join(FORMATS)}" if found is None else f"give a file in it, such as {found}"
+        raise RecordFileError(f"{path} is a folder; {remedy}")
     if path.suffix.lower() not in FORMATS:
         raise RecordFileError(f"{path}: the ending {path.suffix!r} names no format; use one of {', '.join(FORMATS)}")
     return FORMATS[path.suffix.lower()]

@@ -15,7 +15,7 @@ from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.identification import plot_deviations, plot_mac, stabilisation_diagram
 from workbench.draw.motion import mode_motion
 from workbench.draw.placement import plot_places
-from workbench.draw.signals import plot_frf, plot_spectra, plot_transfer
+from workbench.draw.signals import frequency_response, plot_coherence, plot_spectra, plot_transfer
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
@@ -44,8 +44,13 @@ MOST_BYTES = 200_000_000
 MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram
 EXTRA_ORDERS = 8  # highest model order of the diagram, above the number of modes
 SAMPLES_PER_ORDER = 8  # at least
+MOST_SENSORS = 6  # whose frequency responses are drawn
+INVISIBLE = 0.005  # standard error over the range of the values, below which its bar is shorter than a dot
 ROBUSTNESS = "share of perturbed models stable"
-STABLE = "Stabilisation diagram: the poles of models of each order, blue if the shape is real; bands mark stable poles."
+STABLE = (
+    "Stabilisation diagram: the poles of models of each order. Dots, on the bands of stable modes, agree with them in"
+    " frequency and shape; crosses do not."
+)
 
 
 def page_content_about(what: str) -> tuple[str, PageContent]:
@@ -165,13 +170,13 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
     given = content.get("positions") or [None] * len(shapes)
     places = place_array([None if at is None else same_place(at) for at in given])
     modes = SampledModes(TURN * hertz, np.array(content["damping_ratios"], float), shapes, places)
-    columns = [content[n] for n in ("frequencies_hz", "frequencies_std_hz", "damping_ratios", "damping_std")]
+    hertz_std, zeta_std = (np.array(content[n], float) for n in ("frequencies_std_hz", "damping_std"))
     names = [f"mode {r + 1}" for r in range(hertz.size)]
-    damping = plot_deviations(names, columns[2], columns[3], "damping ratio")
-    heads = ("mode", "frequency [Hz]", "standard error", "damping ratio", "standard error ")
-    blocks = [block(damping, "Damping ratio of each mode, ± 2 standard errors.")]
+    damping = plot_deviations(names, 100.0 * modes.zeta, 100.0 * zeta_std, "damping [%]")
+    heads = ("mode", "frequency [Hz]", "std [Hz]", "damping [%]", "std [%]")
+    blocks = [block(damping, f"Damping of each mode, ± 2 standard errors.{_short_bars(modes.zeta, zeta_std)}")]
     if len(shapes) > 1:  # one sensor gives no shape
-        moving = mode_motion({"identified": modes})
+        moving = mode_motion({"identified": modes}, std={"identified": (hertz_std, zeta_std)})
         numbered = "" if modes.on_interval or modes.on_plate else ", numbered as in the record"
         blocks.insert(0, block(moving, f"The identified shapes at the sensors{numbered}, with phase."))
     if len(shapes) > 1 and hertz.size > 1:
@@ -179,8 +184,8 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
             block(plot_mac(mac(modes.shapes, modes.shapes)), "Modal assurance criterion of each pair of modes.")
         )
     rows = [
-        [r + 1, *to_its_error(f, f_std), *to_its_error(zeta, zeta_std)]
-        for r, (f, f_std, zeta, zeta_std) in enumerate(zip(*columns, strict=True))
+        [r + 1, *to_its_error(float(f), float(f_std)), *to_its_error(float(100.0 * zeta), float(100.0 * error))]
+        for r, (f, f_std, zeta, error) in enumerate(zip(hertz, hertz_std, modes.zeta, zeta_std, strict=True))
     ]
     return {
         "lead": "; ".join([_band(hertz), *filter(None, _words([content.get("heading", "")]))]),
@@ -188,6 +193,14 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
         "blocks": blocks,
         "tables": [("Modes", heads, rows)],
     }
+
+
+def _short_bars(values: np.ndarray, std: np.ndarray) -> str:
+    """A sentence where bars of ± 2 standard errors are too short to be seen beside the differences of the values."""
+    if not (values.size > 1 and (values != 0.0).all() and std.max() < INVISIBLE * np.ptp(values)):
+        return ""
+    largest = 100.0 * float((std / np.abs(values)).max())
+    return f" The bars are shorter than the dots: no standard error is above {largest:.2g} % of its value."
 
 
 def _band(hertz: np.ndarray) -> str:
@@ -388,6 +401,14 @@ def _response(measured: Record | TransferFunctions, fitted: TransferFunctions | 
             kept = np.isin(measured.frequencies_hz, fitted.frequencies_hz)
             measured = replace(measured, values=measured.values[..., kept], frequencies_hz=fitted.frequencies_hz)
         return [block(plot_transfer(measured, fitted), "Transfer functions, measured and fitted (dashed).")]
-    if measured.n_inputs == 1 and np.ptp(measured.inputs):
-        return [block(plot_frf(measured), "Frequency response functions and coherence.")]
+    if measured.n_inputs == 1 and np.ptp(measured.inputs) and fitted is not None:
+        names = measured.output_names[:MOST_SENSORS]
+        beside = plot_transfer(frequency_response(measured).select_outputs(names), fitted.select_outputs(names))
+        left_out = measured.output_names[MOST_SENSORS:]
+        rest = f" Not drawn: {', '.join(left_out)}." if left_out else ""
+        measured_by = "Frequency response, measured by Welch's method, whose windows blunt sharp peaks"
+        return [
+            block(beside, f"{measured_by}, and of the identified modes (dashed).{rest}"),
+            block(plot_coherence(measured.select_outputs(names)), "Coherence of each sensor with the input."),
+        ]
     return [block(plot_spectra(measured), f"Power spectral density of {measured.name}, by Welch's method.")]

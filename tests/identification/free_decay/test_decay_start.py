@@ -111,6 +111,28 @@ def test_a_sample_at_rest_before_the_blow_is_left_out(n):
         assert not identify(record.between(DT)).remarks
 
 
+@pytest.mark.parametrize("kind", ["noise", "blow at the start", "constant", "noise of the hammer's channel"])
+def test_a_driven_record_is_said_to_be_no_free_decay(kind):
+    """A blow, a constant force and a channel that reads only noise leave the decay free."""
+    rng, forces = np.random.default_rng(0), np.zeros((N, LENGTH))
+    start = np.r_[np.zeros(2 * N)] if kind in ("noise", "blow at the start") else np.r_[np.ones(N), np.zeros(N)]
+    if kind == "noise":
+        forces[2] = rng.standard_normal(LENGTH)
+    elif kind == "blow at the start":
+        forces[2, :2] = 1.0 / DT
+    elif kind == "constant":
+        forces[2] = 3.0
+    read = stepped(forces, start)[[N + 2, N + 3]]
+    read += 1e-3 * read.std() * rng.standard_normal(read.shape)
+    force = forces[2] + 1e-3 * rng.standard_normal(LENGTH)
+    channels = (Channel("a", "velocity"), Channel("b", "velocity"))
+    record = Record(DT, read, channels, force[None], (Channel("f", "force"),), name="one")
+    said = [remark for remark in identify(record, max_modes=5).remarks if "is driven by input 'f'" in remark]
+    assert bool(said) == (kind == "noise"), said
+    if said:
+        assert "(rms 1 N)" in said[0] and "use identify_driven, or cut the record" in said[0], said
+
+
 def test_what_a_few_samples_or_silence_allow():
     channels = (Channel("a"),)
     assert decay_start(Record(0.01, np.exp(-np.arange(50.0))[None], channels, start_time=1.0)) == 1.0

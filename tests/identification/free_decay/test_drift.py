@@ -44,7 +44,7 @@ def test_remarks_name_what_is_no_mode_of_the_structure():
     overtone = 0.02 * np.exp(-2 * 0.08 * time) * np.cos(16.0 * time)
     found = identify(replace(record, outputs=record.outputs + np.outer([1.0, 0.4], hum) + np.outer([1, 0.3], overtone)))
     said = dict(zip(np.round(found.modes.omega, 1), remarks(found.refined, record), strict=True))
-    assert said == {8.0: "", 16.0: "2 × mode 1: its harmonic?", 30.0: "", 44.0: "does not decay: mains hum?"}
+    assert said == {8.0: "", 16.0: "2 × mode 1: its harmonic?", 30.0: "", 44.0: "does not decay within the record"}
 
 
 def test_drift_of_a_long_record_takes_little_memory():

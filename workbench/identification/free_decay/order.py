@@ -23,7 +23,7 @@ from workbench.arrays import Complexes, Floats
 from workbench.identification.free_decay.assumptions import amplitude_dependence
 from workbench.identification.free_decay.backbone import are_two, band_about
 from workbench.identification.free_decay.long_records import identify_long
-from workbench.identification.free_decay.preparation import decay_start
+from workbench.identification.free_decay.preparation import decay_start, decays
 from workbench.identification.free_decay.refinement import (
     amplitude_statistic,
     identified,
@@ -84,6 +84,7 @@ class OrderSettings:
     # bandwidths by which a mode selected in whitened records may move when refined in the records as measured
     lost: float = 5.0
     most_residual: float = 0.5  # largest share of a record's energy in the residual of modes that explain it
+    acting: float = 0.01  # rms of an input that acts after the start of the decay, over its largest value, at least
     same: float = 0.05  # bandwidths that two poles may move before the test for one nonlinear mode is repeated
 
 
@@ -123,10 +124,29 @@ def identify(
     budget = Budget(seconds, progress)
     result = identify_within(records, budget, max_modes=max_modes, false_alarm=false_alarm)
     result = result.without_artefacts(np.pi / records[0].sample_time)
-    start_remarks = tuple(remark for record in records for remark in _starts_later(record))
+    start_remarks = tuple(remark for record in records for remark in (*_driven(record), *_starts_later(record)))
     by_amplitude = amplitude_dependence(records, result.refined, budget=budget)
     other_remarks = tuple(remark for remark in result.remarks if not remark.startswith(STOPPED))
     return replace(result, remarks=(*start_remarks, *other_remarks, *budget.remarks, *by_amplitude.remarks))
+
+
+def _driven(record: Record) -> tuple[str, ...]:
+    """A remark where inputs vary after the start of the decay and the outputs do not decay.
+
+    The channel of a hammer is noise after the impact; that of a constant force does not vary.
+    """
+    if not record.inputs.any():
+        return ()
+    after = record.between(decay_start(record)).inputs.std(axis=1)
+    acts = after > ORDER.acting * np.abs(record.inputs).max(axis=1)
+    if not acts.any() or decays(record):
+        return ()
+    each = zip(record.input_channels, after, acts, strict=True)
+    found = ", ".join(f"{one.name!r} (rms {rms:.3g} {one.unit}".rstrip() + ")" for one, rms, act in each if act)
+    return (
+        f"record {record.name!r} is driven by input {found}: what is found in it is no free decay; use identify_driven,"
+        " or cut the record to where nothing drives it",
+    )
 
 
 def _starts_later(record: Record) -> tuple[str, ...]:

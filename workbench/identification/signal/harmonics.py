@@ -46,6 +46,7 @@ class OvertoneSettings:
 
 
 OVERTONES = OvertoneSettings()
+MAINS_HZ = (50.0, 60.0)
 
 
 def harmonic_remarks(
@@ -97,6 +98,12 @@ def _is_steady(lines: Complexes, power: Floats, pole: complex) -> bool:
         return True
     envelope = np.abs(np.fft.ifft(strongest, 4 * strongest.size)) ** 2
     return bool((envelope**2).mean() < HARMONICS.steady * envelope.mean() ** 2)
+
+
+def near_mains(frequency_hz: float) -> bool:
+    """Whether a frequency is within a hundredth of the mains' of a multiple of it, 50 or 60 Hz."""
+    each = ((mains, round(frequency_hz / mains)) for mains in MAINS_HZ)
+    return any(times and abs(frequency_hz - times * mains) <= 0.01 * mains for mains, times in each)
 
 
 def multiple_of(frequencies: Floats, size: Floats, r: int) -> tuple[int | None, int]:

@@ -2,7 +2,7 @@
 // keyboard + and − zoom, the arrows move, Escape shows all.
 "use strict";
 var workbench = (function () {
-  var NS = "http://www.w3.org/2000/svg", count = 0;
+  var NS = "http://www.w3.org/2000/svg", count = 0, BAR = 58;  // px, for the bar of colours beside a field
 
   function svg(name, attributes, parent, text) {
     var node = document.createElementNS(NS, name);
@@ -143,15 +143,16 @@ var workbench = (function () {
       return all.map(function (other) { return other.spec[axis].label; }).filter(Boolean)[0] || "";
     }
     function sized(panel) {
-      var p = panel.spec, width = panel.svg.clientWidth || panel.root.clientWidth, narrow = grid.clientWidth < 600;
+      var p = panel.spec, width = (!p.square && panel.svg.clientWidth) || panel.root.clientWidth, narrow = grid.clientWidth < 600;
       // on a narrow screen panels are stacked, and one without a label gets that of its row or column
       var apart = narrow && spec.columns > 1, x = apart ? labelled(panel, "x") : p.x.label, y = apart ? labelled(panel, "y") : p.y.label;
       var height = Math.max(150, Math.min(narrow ? 300 : 620, p.height * (narrow ? 1 : Math.min(1, grid.clientWidth / spec.width)) + 34));
       if (narrow) height = Math.max(height, 0.5 * width);
       var bottom = height - (x ? 38 : 22), yTicks = ticks(p.y, panel.y, Math.max(3, Math.round(bottom / 38)));
       var longest = Math.max.apply(null, yTicks.map(function (t) { return textWidth(t[1]); }).concat([7]));
-      return { width: width, height: height, bottom: bottom, yTicks: yTicks, x: x, y: y,
-        left: Math.min(0.42 * width, 12 + longest) + (y ? 17 : 0) };
+      var left = Math.min(0.42 * width, 12 + longest) + (y ? 17 : 0);
+      if (p.square) width = Math.min(width, left + (bottom - 8) + BAR + 10);
+      return { width: width, height: height, bottom: bottom, yTicks: yTicks, x: x, y: y, left: left };
     }
     function paintAll() {
       panels.forEach(function (panel) { panel.size = sized(panel); });
@@ -165,12 +166,13 @@ var workbench = (function () {
       while (node.firstChild) node.removeChild(node.firstChild);
       node.setAttribute("viewBox", "0 0 " + width + " " + height);
       node.setAttribute("height", height);
+      if (p.square) node.style.width = width + "px";
       // stacked panels that share x are aligned
       var left = Math.max.apply(null, panels.filter(function (other) {
         return other === panel || (other.spec.x.group === p.x.group && other.size.width === width);
       }).map(function (other) { return other.size.left; }));
       var field = p.marks.filter(function (m) { return m.kind === "field"; })[0];
-      if (field) right -= 58;
+      if (field) right -= BAR;
       p.marks.forEach(function (m) {  // room for texts at the right edge
         var out = m.kind === "text" && m.frame === "data" && m.across === "left" && m.x >= p.x.limits[1] - 0.01 * (p.x.limits[1] - p.x.limits[0]);
         if (out) right = Math.min(right, width - 6 - 6.6 * m.text.length);

@@ -9,8 +9,9 @@ import numpy as np
 from workbench.identification.ambient import AmbientModes, identify_ambient
 from workbench.identification.driven import Driven, identify_driven
 from workbench.identification.free_decay.assumptions import AmplitudeDependence, ProportionalFit
-from workbench.identification.ring_down import RingDown, ring_down
+from workbench.identification.ring_down import RingDown, by_remark, ring_down
 from workbench.identification.signal.data_quality import check_data_quality
+from workbench.identification.signal.harmonics import MAINS_HZ
 from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
 from workbench.identification.signal.searches import SECONDS, STOPPED, Progress
 from workbench.identification.transfer import TransferModes, identify_transfer
@@ -21,7 +22,8 @@ from workbench.structure.printed import counted
 TURN = 2.0 * np.pi
 UNLIKELY, MOST_MODES = 0.01, 40
 IMPLAUSIBLE_DAMPING = 0.1  # damping ratio above which a mode of transfer functions is doubtful
-MAINS_HZ, SURE = (50.0, 60.0), 3.0
+SURE = 3.0
+LINES = 2049  # of the transfer functions of a model, besides those about its modes
 COLLINEAR = 0.8  # modal phase collinearity below which a shape counts as complex
 
 
@@ -35,7 +37,8 @@ class IdentificationReport:
         lines: remarks.
         content: for JSON.
         decays: the free decays, or the correlation functions, that were fitted; empty for other data.
-        fitted: the model of transfer functions at the fitted lines; None for other data.
+        fitted: transfer functions of the model, at the fitted lines, or of records of one input up to half the sample
+            rate; None for other data.
     """
 
     heading: str
@@ -98,9 +101,10 @@ def identification_report(
         most = MOST_MODES if n_modes is None else n_modes
         return of_driven(identify_driven(records, max_modes=most, **on), records)
     if len(records) > 1 or records[0].n_inputs:
+        remedy = "give one file" if len(records) > 1 else "leave --ambient out, to identify from the inputs"
         raise ValueError(
-            f"ambient identification needs one record without inputs; got {len(records)} records with"
-            f" {records[0].n_inputs} inputs"
+            f"ambient identification needs one record without inputs; got {counted(len(records), 'record')} with"
+            f" {counted(records[0].n_inputs, 'input')}: {remedy}"
         )
     return of_ambient(identify_ambient(records[0], n_modes=n_modes, **on), records[0])
 
@@ -108,8 +112,7 @@ def identification_report(
 def of_ring_down(decay: RingDown) -> IdentificationReport:
     """The report of free decays."""
     found = decay.refined
-    lines = [f"mode {r + 1}: {remark}" for r, remark in enumerate(decay.remarks) if remark]
-    lines += [*decay.notes, *_proportional(decay.proportional), *decay.by_amplitude.remarks]
+    lines = [*by_remark(decay.remarks), *decay.notes, *_proportional(decay.proportional), *decay.by_amplitude.remarks]
     if decay.noise_modes.n_modes:
         rejected = ", ".join(f"{f:.4g}" for f in decay.noise_modes.frequencies_hz)
         lines.append(f"rejected as noise or as part of another mode: {rejected} Hz")
@@ -147,7 +150,27 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
         "noise_std": found.noise_std,
         "converged": found.converged,
     }
-    return _report(records, found, lines, content)
+    return replace(_report(records, found, lines, content), fitted=_model_of(found) if len(found.delays) == 1 else None)
+
+
+def _model_of(found: Driven) -> TransferFunctions:
+    """The transfer functions of the model as those of records are: with the hold of the inputs, and their delays."""
+    dt, hertz = found.sample_time, found.modes.frequencies_hz
+    nyquist, width = 0.5 / dt, found.modes.zeta * hertz
+    # as close about a peak as it is narrow
+    about = (hertz[:, None] + width[:, None] * np.linspace(-4.0, 4.0, 33)).ravel()
+    lines = np.unique(np.r_[np.linspace(0.0, nyquist, LINES), about])
+    lines = lines[(lines > 0.0) & (lines < nyquist)]
+    s = 1j * TURN * lines
+    hold = {"zero": "zoh", "first": "foh"}.get(found.input_hold)
+    values = (
+        found.state_space(s, squeeze=False)
+        if hold is None
+        else found.state_space.sample(dt, hold)(np.exp(s * dt), squeeze=False)
+    )
+    late = np.exp(-s * found.delays[:, None])
+    names = tuple(channel.name for channel in found.input_channels)
+    return TransferFunctions(values * late, lines, found.output_channels, names)
 
 
 def _on_convergence(converged: bool, remarks: Sequence[str], remedy: str) -> list[str]:
