@@ -66,7 +66,7 @@ def test_a_rig_shows_what_differs_from_the_defaults(rig):
 def test_a_structure_says_its_ends_and_profiles(beam):
     text = str(beam).splitlines()
     assert text[0] == "beam, 2 m, left clamped, right free"
-    assert text[2].split() == ["mass_per_length", "1.5", "1.5", "1.5"]
+    assert text[2].split() == ["mass", "per", "length", "[kg/m]", "1.5", "1.5", "1.5"]
 
 
 def test_places_are_parted_by_commas_and_pairs_by_semicolons():

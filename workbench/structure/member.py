@@ -36,6 +36,7 @@ MOST_FUNCTIONS = 2400
 MOST_SEGMENTS = 600  # more would take minutes and gigabytes
 THINNEST = {0: 1e-9, 1: 1e-4}  # least segment over the length, by continuity; bending is lost in round-off below
 NO_SLIVER = 1e-5  # of the length: a jump of a profile nearer to an end, or to another jump, is moved there
+PROFILE_UNITS = {"mass_per_length": "kg/m", "axial_stiffness": "N", "bending_stiffness": "N m²"}
 TIP = 1e-9  # of the stiffness at midspan: an end of no more stiffness is a tip, where the stiffness vanishes
 CROWDING, COARSEST = 4.0, 0.25  # ratio of neighbouring segments towards a tip, and the largest of them over the length
 INSIDE = (np.arange(8) + 0.5) / 8  # points along a segment at which the wavelength is evaluated
@@ -70,7 +71,10 @@ class _Member(Printed):
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         at = self.length * np.array([0.0, 0.5, 1.0])
         profiles = {name: value for name, value in vars(self).items() if isinstance(value, Profile)}
-        rows = [(name, *(f"{v:.4g}" for v in profile(at))) for name, profile in profiles.items()]
+        rows = [
+            (f"{name.replace('_', ' ')} [{PROFILE_UNITS[name]}]", *(f"{v:.4g}" for v in profile(at)))
+            for name, profile in profiles.items()
+        ]
         ends = f"left {_end_text(self.left)}, right {_end_text(self.right)}"
         line = f"{type(self).__name__.lower()}, {self.length:g} m, {ends}"
         return line, ("", *(f"x = {x:.4g} m" for x in at)), rows, tuple(map(str, self.attachments))
