@@ -11,7 +11,7 @@ from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
-from workbench.gap.report.budget import budget_of, measure
+from workbench.gap.report.budget import budget_of, measure, sizes_of
 from workbench.gap.report.verdict import proportional_points
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
@@ -84,6 +84,14 @@ def test_a_delay_of_all_sensors_may_be_one_of_the_actuators(hinged_rig, record_o
     found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
     shown = replace(found, budget=replace(budget, nominal=0.3), outcome="explained", effects=())
     assert words in shown.sentence
+
+
+def test_delays_far_below_a_sample_are_not_reported(hinged_rig):
+    rig, prior = hinged_rig(3), NominalPrior(delay=0.1, sample_time=0.01)
+    names = [f"delay_{sensor.name}" for sensor in rig.sensors]
+    assert sizes_of(nominal_errors(rig, prior, dict.fromkeys(names, 5e-4))) == {}
+    late = sizes_of(nominal_errors(rig, prior, dict(zip(names, (2e-3, 0.0, 0.0, 0.0), strict=True))))
+    assert late["delays_ms"] == pytest.approx(10.0 * 2e-3 / 2.0)
 
 
 @pytest.mark.parametrize(
