@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from workbench.rig.sensors import Sensor
 from workbench.structure.member import Beam
 from workbench.study.runs.cases import StudyError
 from workbench.study.runs.fingerprint import fingerprint
@@ -144,6 +145,14 @@ def test_it_follows_closures_parts_and_methods():
     assert prints[0] == prints[2] != prints[1]
     assert fingerprint(functools.partial(outer, held=1)) != fingerprint(functools.partial(outer, held=2))
     assert fingerprint(functools.lru_cache(outer(1))) != fingerprint(functools.lru_cache(outer(2)))
+
+
+def test_members_of_a_set_count_by_all_their_digits():
+    def of(at):
+        sensors = {Sensor("a", 0.5), Sensor("b", at)}
+        return fingerprint(lambda: sensors)
+
+    assert of(0.1) == of(0.1) != of(0.1 + 1e-12)
 
 
 @pytest.mark.slow

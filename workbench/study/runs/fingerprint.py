@@ -83,7 +83,7 @@ class _Walk:
             self.add(type(value).__name__, len(value))
             return self._each(value, where)
         if isinstance(value, set | frozenset):
-            return self.add("set", *sorted(map(repr, value)))
+            return self.add("set", *sorted(self._of_member(member, where) for member in value))
         if isinstance(value, functools.cached_property):
             return self.visit(value.func, where)
         if callable(getattr(value, "__wrapped__", None)) or callable(getattr(value, "py_func", None)):
@@ -102,6 +102,13 @@ class _Walk:
                 self.add(at, name)
                 self.visit(vars(self.modules[at])[name], f"{at}.{name}")
             done |= held
+
+    def _of_member(self, value: object, where: str) -> str:
+        """The hash of a member of a set, by which members are sorted; its repr may be rounded."""
+        walk = _Walk()
+        walk.modules, walk.names = self.modules, self.names
+        walk.visit(value, where)
+        return walk.digest.hexdigest()
 
     def _each(self, values: Iterable[object], where: str) -> None:
         for value in values:
