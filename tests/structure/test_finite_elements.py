@@ -109,7 +109,7 @@ def test_a_beam_is_the_same_along_an_interval_at_named_points_and_as_elements(be
                           (elements, [f"w{20 * x:.0f}" for x in places])):  # fmt: skip
         struck = modes.phi(6.3 if modes is along else "w126")[0]
         law = imsc(modes, 4, [Actuator(f"F{i}", at) for i, at in enumerate(wheres)], weight=20.0)
-        works.append(spillover(modes, law, np.r_[np.zeros(n), struck * (np.arange(n) < 4)]).residual_total)
+        works.append(spillover(modes, law, np.r_[np.zeros(n), struck * (np.arange(n) < 4)]).residual_work)
         signs = np.sign(modes.phi([wheres[0]])[0][:4] / along.phi([places[0]])[0][:4])
         gains.append(law.gain * np.r_[signs, signs])
     np.testing.assert_allclose(works, works[0], rtol=1e-5)
