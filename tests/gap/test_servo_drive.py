@@ -66,6 +66,6 @@ def test_dry_friction_and_a_constant_force_are_named_in_one_form_and_the_other_n
     assert not any("bouc_wen" in kind for kind, _ in verdict.alternatives)
     assert verdict.budget.unexplained < 0.01
     if quantity == "velocity":
-        assert set(told) == {"two_way_friction"} and "a constant force of an actuator, drive cannot be excluded" in (
+        assert set(told) == {"two_way_friction"} and "a constant force of an actuator (drive) cannot be excluded" in (
             verdict.sentence
         )
