@@ -52,7 +52,7 @@ def docstring_of(path: str) -> str:
 class PublicNames(SphinxDirective):
     """`.. public-names:: ROOM core` documents the names `wb.NAME` of a room, `... further` those of its files.
 
-    A table of the names with the first sentence of each comes first.
+    A table of the names with the first paragraph of each comes first.
     """
 
     required_arguments = 2
@@ -65,7 +65,7 @@ class PublicNames(SphinxDirective):
         lines = [".. list-table::", "   :widths: 35 65", ""] if paths else []
         for path in paths:
             shown = path.removeprefix("workbench.") if part == "further" else f"wb.{path.rpartition('.')[2]}"
-            lines += [f"   * - :py:obj:`{shown} <{path}>`", f"     - {escaped(first_sentence(docstring_of(path)))}"]
+            lines += [f"   * - :py:obj:`{shown} <{path}>`", f"     - {escaped(first_paragraph(docstring_of(path)))}"]
         lines.append("")
         for path in paths:
             module, _, name = path.rpartition(".")
@@ -82,7 +82,7 @@ class PublicNames(SphinxDirective):
         return parent.children
 
 
-def first_sentence(text: str) -> str:
+def first_paragraph(text: str) -> str:
     """The first paragraph of a docstring, on one line."""
     return " ".join(text.split("\n\n")[0].split())
 

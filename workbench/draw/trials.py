@@ -11,8 +11,7 @@ from workbench.gap.effects.effect import label_in_words
 from workbench.trials.scoring import Tally
 
 FAMILY = {"single": "one effect", "pair": "two effects", "none": "nothing", "unknown": "outside the catalogue"}
-PLAIN = {"none": "nothing", "unknown": "outside the catalogue"}
-BOTH = "two effects"  # the row of all pairs
+BOTH = FAMILY["pair"]  # the row of all pairs
 MOST_ROWS = 24  # of a column
 
 
@@ -67,4 +66,4 @@ def _plain(name: str) -> str:
     """The words of an effect, or of several."""
     if name == BOTH:
         return name
-    return " + ".join(PLAIN.get(part, label_in_words(part)) for part in name.split(" + "))
+    return " + ".join(FAMILY.get(part, label_in_words(part)) for part in name.split(" + "))
