@@ -15,6 +15,11 @@ from workbench.structure.member import Beam
 from workbench.study.runs.cases import StudyError
 from workbench.study.runs.fingerprint import fingerprint
 
+
+class Node:
+    """Equal to itself alone, so that sets can hold it."""
+
+
 SOURCE = """
 import numpy as np
 from dataclasses import dataclass, field
@@ -153,6 +158,15 @@ def test_members_of_a_set_count_by_all_their_digits():
         return fingerprint(lambda: sensors)
 
     assert of(0.1) == of(0.1) != of(0.1 + 1e-12)
+
+
+def test_a_member_of_a_set_may_lead_back_to_it():
+    def of(number):
+        node = Node()
+        node.number, node.all = number, {node}
+        return fingerprint(lambda: node.all)
+
+    assert of(1) == of(1) != of(2)
 
 
 @pytest.mark.slow

@@ -15,7 +15,9 @@ def trial(
     cases: Annotated[int, typer.Option(help="Number of blind cases to make, diagnose and score.")] = 30,
     seed: Annotated[int, typer.Option(help="Seed of the random cases.")] = 0,
     json_path: options.JsonPath = None,
-    picture: Annotated[Path, typer.Option("--figure", help="File of the figure: each true effect, and how often it is named.")] = Path("out/trial.png"),
+    picture: Annotated[
+        Path, typer.Option("--figure", help="File of the figure: each true effect, and how often it is named.")
+    ] = Path("out/trial.png"),
 ) -> None:
     """Score the diagnosis on blind cases of your own rig: made, diagnosed, and only then compared with the truth.
 

@@ -107,6 +107,7 @@ class _Walk:
         """The hash of a member of a set, by which members are sorted; its repr may be rounded."""
         walk = _Walk()
         walk.modules, walk.names = self.modules, self.names
+        walk.seen = dict(self.seen)  # a member may lead back to its set
         walk.visit(value, where)
         return walk.digest.hexdigest()
 
