@@ -21,7 +21,7 @@ from workbench.gap.search.errors_as_effects import (
     is_linear_structural,
     is_plausible_error,
 )
-from workbench.gap.search.finish import finished, ranked
+from workbench.gap.search.finish import finished, other_places, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import Step
@@ -232,8 +232,12 @@ def _with_one_linear_effect(
     given = start.effects
     screened = Screening.of(replace(search, catalogue=linear_kinds), given, search.evidence_with(given)).likeliest()
     likeliest = first_of_each(screened, lambda effect: effect.kind)[: PLAIN.likeliest]
-    sets = [(*given, effect, *some) for effect in likeliest for some in dict.fromkeys(((), common))]
+    beside = tuple(dict.fromkeys(((), common)))
+    sets = [(*given, effect, *some) for effect in likeliest for some in beside]
     found = _simplest_explaining(search, sets, step)
+    if found is None:  # what is given may have absorbed part of the effect, which then seems to act elsewhere
+        places = _elsewhere(search, [(*given, effect) for effect in likeliest], start)
+        found = _simplest_explaining(search, [(*given, effect, *some) for effect in places for some in beside], step)
     if found is None:
         return None
     others = [e for e in found.effects if e.kind in UNIFORM or any(e.label == other.label for other in given)]
@@ -241,3 +245,15 @@ def _with_one_linear_effect(
     extra = found.n_parameters - without.n_parameters
     is_justified = without.cost - found.cost > SEARCH.significant and search.surely_better(found, without.cost, extra)
     return found if is_justified else None
+
+
+def _elsewhere(search: Search, sets: Sequence[tuple[Effect, ...]], start: Fit) -> list[Effect]:
+    """The last effect of the best set at other places; none unless it leaves little of what the start does."""
+    fits = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAIN.plainly), sets)
+    best = min(fits, key=lambda f: f.cost, default=start)
+    if best is start or best.cost - 1.0 > PAIRS.nearer * (start.cost - 1.0):
+        return []
+    effect = best.effects[-1]
+    if effect.at is None:
+        return []
+    return [effect.moved_to(where) for where in other_places(effect, search.rig.modes.domain)]
