@@ -304,7 +304,7 @@ def plot_single_effects(verdict: Verdict) -> Figure:
     ax.barh(labels[::-1], costs[::-1], color=colours[::-1])
     ax.axvline(1.0, color=COLOURS[2], label="noise floor")
     ax.axvline(verdict.attribution.nominal_cost, color=COLOURS[1], linestyle="--", label="nominal")
-    title = f"best fit of each effect {'beside the exchange' if verdict.attribution.exchanged else 'alone'}"
+    title = f"best fit of each effect {verdict.attribution.beside}"
     ax.set(xscale="log", xlabel="mean square residual / noise power [-]", title=title)
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure

@@ -138,7 +138,7 @@ def diagnose(
     seen, as_wired, evidence = baseline(
         wired, records, settle=settle, guessed=without_noise, workers=sharing, deadline=deadline
     )
-    nominal, given = evidence.of_rig(rig) if exchanged else as_wired, (*exchanged, *seen)
+    nominal, given, added = evidence.of_rig(rig) if exchanged else as_wired, (*exchanged, *seen), exchanged
     with (
         sharing.in_background(lambda: locate_force(nominal.without(_faulty(given)))) as place,
         sharing.in_background(lambda: detectability(nominal, catalogue=catalogue)) as ready,
@@ -153,14 +153,17 @@ def diagnose(
             tolerance=tolerance,
             identified=identified or IdentifiedPrior.of_modes(rig),
         )
+        if attribution.missing:
+            wired, added = apply_all(wired, attribution.missing), (*exchanged, *attribution.missing)
+            evidence = evidence.of_rig(apply_all(evidence.rig, attribution.missing))
         if attribution.outcome == "explained" and attribution.random is None:
             # rivals are fitted to the same whitened records as the best set
             alike, search = ready().indistinguishable, replace(attribution.search, data=attribution.weighed)
             rivals = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
             attribution = replace(attribution, alternatives=rivals)
         attribution = _validated(wired, attribution, validation, settle)
-        if exchanged:
-            attribution = attribution.with_exchanges(exchanged, nominal)
+        if added:
+            attribution = attribution.with_given(added, nominal)
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)
         accounted = with_held_out(rig, attribution.best.effects, validation, settle=settle)

@@ -49,7 +49,8 @@ class Attribution:
         logged: input noise estimated from the residual, as a share of the inputs' rms.
         seen: effects that show in the readings themselves, which no fit alters.
         is_cut: whether the search reached its deadline and ended with the best so far.
-        exchanged: exchanges of channels that were given; `search`, `tried` and `ahead` are of the rig with them.
+        missing: modes that the rig of `search` has beside those of the nominal rig.
+        given: exchanges of channels and missing modes; `search`, `tried` and `ahead` are of the rig with them.
     """
 
     outcome: str
@@ -66,12 +67,20 @@ class Attribution:
     logged: float
     seen: tuple[Effect, ...] = ()
     is_cut: bool = False
-    exchanged: tuple[Effect, ...] = ()
+    missing: tuple[Effect, ...] = ()
+    given: tuple[Effect, ...] = ()
 
     @property
     def noise_ratio(self) -> float:
         """Estimated over stated noise, median of all sensors."""
         return float(np.median(self.noise / self.search.data.noise))
+
+    @property
+    def beside(self) -> str:
+        """What each of `singles` was fitted beside, in words."""
+        modes = sum(effect.kind.adds_modes for effect in self.given)
+        given = ["the exchange"] * (len(self.given) > modes) + ["the missing modes"] * (modes > 0)
+        return f"beside {' and '.join(given)}" if given else "alone"
 
     def without(self, *effects: Effect) -> "Attribution":
         """The attribution without some effects; the others are refitted, with new intervals."""
@@ -82,28 +91,28 @@ class Attribution:
         best = replace(best, effects=(*self.seen, *best.effects))
         return replace(self, best=best, noise=search.noise_with(best))
 
-    def with_exchanges(self, exchanges: tuple[Effect, ...], nominal: Evidence) -> "Attribution":
-        """The attribution to the nominal rig, of one to that rig with channels exchanged.
+    def with_given(self, given: tuple[Effect, ...], nominal: Evidence) -> "Attribution":
+        """The attribution to the nominal rig, of one to that rig with channels exchanged or more modes.
 
         Args:
-            exchanges: of two channels each.
+            given: exchanges of two channels each, and missing modes.
             nominal: evidence of the rig without them.
         """
         return replace(
             self,
             outcome="explained" if self.outcome == "none" else self.outcome,
-            best=_with_exchanges(self.best, exchanges),
-            alternatives=tuple((_with_exchanges(found, exchanges), p) for found, p in self.alternatives),
+            best=_with_given(self.best, given),
+            alternatives=tuple((_with_given(found, given), p) for found, p in self.alternatives),
             nominal_cost=cost_of(nominal.rig, (), nominal.data),
             evidence=nominal,
-            exchanged=exchanges,
+            given=given,
         )
 
     @cached_property
     def singles(self) -> tuple[Fit, ...]:
         """The best effect of each likely kind alone, on whole records, best first; missing ones are fitted now.
 
-        Channels that are exchanged come first, and are exchanged with each of the others.
+        What was given comes first, and is beside each of the others.
         """
         kinds = {f.effects[0].kind for f in self.tried if f.effects}
         others = [f for f in best_of_each_kind(self.ahead) if f.effects[0].kind not in kinds][: ATTRIBUTION.shown]
@@ -113,15 +122,15 @@ class Attribution:
 
         fitted = one_blas_thread(self.search.workers.map)(on_all, others)
         alone = best_of_each(sorted((*self.tried, *fitted), key=lambda f: f.cost))
-        if not self.exchanged:
+        if not self.given:
             return tuple(alone)
         each = (self.search.without_effects(), *alone)
-        return tuple(_with_exchanges(found, self.exchanged) for found in each)
+        return tuple(_with_given(found, self.given) for found in each)
 
 
-def _with_exchanges(found: Fit, exchanges: tuple[Effect, ...]) -> Fit:
-    """The fit, of a rig with channels exchanged, as one of the rig without."""
-    return replace(found, effects=exchanged_last((*exchanges, *found.effects)))
+def _with_given(found: Fit, given: tuple[Effect, ...]) -> Fit:
+    """The fit, of a rig with these effects, as one of the rig without."""
+    return replace(found, effects=exchanged_last((*given, *found.effects)))
 
 
 def baseline(
@@ -206,6 +215,8 @@ def attribute(
     search = Search(rig, data, quick, first, catalogue, report, workers, of_nominal, tolerance=tolerance)
     stages = Stages(search, start, evidence, nominal, uncertain_nominal)
     outcome, best, random, rivals, noise, own_search = stages.decision()
+    missing, stages = stages.missing, stages.beside_missing or stages
+    search = stages.search
     is_cut = search.is_over
     final_search = own_search or search
     best = uniform_as_nominal_errors(search, best, alone=random is not None)
@@ -253,6 +264,7 @@ def attribute(
         logged=logged,
         seen=seen,
         is_cut=is_cut,
+        missing=missing,
     )
 
 

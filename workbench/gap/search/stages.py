@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.gap.effects.effect import apply_all
+from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nonlinear import BEYOND, any_beyond, in_catalogue
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
@@ -19,7 +19,7 @@ from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.other_errors import with_mode_errors, with_record_deviations
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
-from workbench.gap.search.search import Decision, Search, nearest, promise
+from workbench.gap.search.search import Decision, Search, most_informative, nearest, promise
 from workbench.gap.search.settings import ATTRIBUTION, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 from workbench.rig.simulate import is_stepped
@@ -40,6 +40,8 @@ class Stages:
         uncertain_nominal: whether nominal errors are fitted with every effect from the first.
         ahead: single effects fitted to one-step-ahead predictions, best first; empty if a stage before decides.
         singles: single effects on whole records, best first, or sets that were tried with a random disturbance.
+        missing, beside_missing: modes without which there is no evidence of what else is there, and the stages of the
+            search in the model with them, which decide; none and None where there are no such modes.
     """
 
     search: Search
@@ -49,6 +51,8 @@ class Stages:
     uncertain_nominal: bool = False
     ahead: list[Fit] = field(default_factory=list)
     singles: list[Fit] = field(default_factory=list)
+    missing: tuple[Effect, ...] = ()
+    beside_missing: "Stages | None" = None
 
     def decision(self) -> Decision:
         """The decision of the first stage that comes to one."""
@@ -57,7 +61,8 @@ class Stages:
             return early
         self.ahead = one_more(self.search, (), self.evidence, self.screened)
         self.singles = self._singles_on_whole_records()
-        return nearest(self.search, self.start, _first_of(STAGES, self) or self.nearest_set(), self.singles)
+        found = _first_of(STAGES, self) or self.nearest_set()
+        return found if self.missing else nearest(self.search, self.start, found, self.singles)
 
     # Before single effects
 
@@ -142,6 +147,28 @@ class Stages:
         if decision is None or decision.outcome != "explained":
             return None
         return decision._replace(noise=noise)
+
+    def with_missing_modes(self) -> Decision | None:
+        """Effects in the model with the modes that are missing, where these close most of the gap and not all of it."""
+        search, best = self.search, self.singles[0] if self.singles else self.start
+        missing = tuple(effect for effect in best.effects if effect.kind.adds_modes)
+        if not missing or missing != best.effects or not search.near(best, ATTRIBUTION.of_modes):
+            return None
+        if self.is_explained_by_one_beside_errors:
+            return None
+        evidence = self.evidence.of_rig(apply_all(search.rig, missing))
+        quick, first = most_informative(search.data, best.cost_by_channel)
+        with_them = replace(
+            search,
+            rig=evidence.rig,
+            quick=quick,
+            first=first,
+            catalogue=tuple(kind for kind in search.catalogue if not kind.adds_modes),
+            nominal=best.cost_by_channel,
+        )
+        start = replace(best, effects=(), n_parameters=0)
+        self.missing, self.beside_missing = missing, Stages(with_them, start, evidence, evidence)
+        return self.beside_missing.decision()
 
     def random_beside_effects(self) -> Decision | None:
         """A random disturbance beside stronger effects, or beside small errors of the model."""
@@ -263,14 +290,18 @@ class Stages:
         return Stepwise(self.search, self.ahead)
 
     @cached_property
+    def is_explained_by_one_beside_errors(self) -> bool:
+        """Whether small errors of the model explain the records, alone or with one effect."""
+        stepwise = self.stepwise
+        return bool(stepwise.is_sufficient or stepwise.without_errors() or stepwise.by_singles())
+
+    @cached_property
     def is_explained_beside_errors(self) -> bool:
         """Whether small errors of the model explain the records, alone or with few effects."""
         stepwise = self.stepwise
         # damping is hardly known: if only its errors are large, only an effect that makes them smaller is searched for
         return bool(
-            stepwise.is_sufficient
-            or stepwise.without_errors()
-            or stepwise.by_singles()
+            self.is_explained_by_one_beside_errors
             or stepwise.by_few()
             or stepwise.by_almost_alone(self.singles)
             or (stepwise.is_noise_only and stepwise.has_plausible_errors)
@@ -294,6 +325,7 @@ STAGES: tuple[Stage, ...] = (
     Stages.random_at_one_sensor,
     Stages.pair_at_noise_floor,
     Stages.single_in_louder_noise,
+    Stages.with_missing_modes,
     Stages.random_beside_effects,
     Stages.beside_small_errors,
     Stages.other_law,

@@ -69,7 +69,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             made = "The unmodelled force reconstructed from the records, over the motion at its place."
             blocks.append(block(plot_unmodelled_force(verdict), made))
         if verdict.attribution.singles:  # single effects are not fitted if model errors were fitted from the start
-            beside = "beside the exchange" if verdict.attribution.exchanged else "alone"
+            beside = verdict.attribution.beside
             each = (
                 f"Residual with each effect {beside}, without model errors; an effect at the noise floor explains all."
             )
